@@ -1,0 +1,135 @@
+"""Bus and device contracts: what a driver may assume, and no more.
+
+One required method per bus, the rest derived (embedded-hal). Timeouts are per call, total, in seconds;
+``0`` polls. ``close()`` is idempotent. No method prints or retries. Every adapter, emulated or not, passes
+``tests/contract``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.types import CanFrame, CanStats, I2cOp, OutputLimit, PortInfo, ScanBlock, ScanConfig, ScanInfo
+
+Float64Array = NDArray[np.float64]
+Int16Array = NDArray[np.int16]
+
+
+class Clock(Protocol):
+    """The bench clock: monotonic integer nanoseconds, the same in every process of a bench."""
+
+    def now_ns(self) -> int:
+        """Time now."""
+        ...
+
+    def sleep_until_ns(self, t_ns: int) -> int:
+        """Return at or after ``t_ns``; the result is the lateness in ns (>= 0)."""
+        ...
+
+
+class SerialPort(Protocol):
+    """A byte stream, 8N1. Modem lines are not part of the contract (a pty has none)."""
+
+    def read_into(self, buf: memoryview, timeout_s: float) -> int:
+        """Read 1..len(buf) bytes as soon as any are there; 0 means that ``timeout_s`` passed.
+
+        Raises ``Disconnected`` when the peer is gone.
+        """
+        ...
+
+    def write(self, data: bytes, timeout_s: float) -> None:
+        """Write all of ``data`` or raise ``HalTimeout`` (with ``partial``) or ``Disconnected``."""
+        ...
+
+    def drain_input(self) -> int:
+        """Throw away what has arrived; return how many bytes that was."""
+        ...
+
+    def info(self) -> PortInfo: ...
+    def close(self) -> None: ...
+
+
+class I2cBus(Protocol):
+    """An I2C master. Addresses are 7 bit, right-aligned."""
+
+    def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
+        """One START, a repeated START between the segments, one STOP.
+
+        Returns the bytes of all read segments, in order. Raises ``I2cNack`` (kind says address or data),
+        ``BusError`` or ``Disconnected``.
+        """
+        ...
+
+    def info(self) -> PortInfo: ...
+    def close(self) -> None: ...
+
+
+class CanBus(Protocol):
+    """A CAN controller with classic frames (up to 8 data bytes). It does not hear its own frames."""
+
+    def send(self, frame: CanFrame, timeout_s: float) -> None:
+        """Queue one frame; ``HalTimeout`` when the queue stays full."""
+        ...
+
+    def recv(self, timeout_s: float) -> CanFrame | None:
+        """Next frame or ``None`` after ``timeout_s``; ``t_ns`` is on the bench clock."""
+        ...
+
+    def stats(self) -> CanStats: ...
+    def info(self) -> PortInfo: ...
+    def close(self) -> None: ...
+
+
+class AnalogInputScan(Protocol):
+    """Hardware-timed scans of several channels."""
+
+    def configure(self, config: ScanConfig) -> ScanInfo:
+        """Set the device up; the answer is what it really does. ``BenchError`` when it cannot."""
+        ...
+
+    def start(self) -> None: ...
+
+    def read_scans(self, out: Int16Array, timeout_s: float) -> ScanBlock:
+        """Fill rows of ``out[max_scans, n_channels]`` with raw counts, oldest first; ``block.n`` says how many.
+
+        Waits for the first scan at most ``timeout_s``, then takes what is there. Never drops silently:
+        ``lost`` and ``Status.GAP`` say so, ``Overrun`` is raised when the device stopped by itself.
+        ``n == 0`` means timeout. Volts are ``counts * lsb_V``.
+        """
+        ...
+
+    def stop(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class AnalogOutput(Protocol):
+    """A group of analog outputs that move together and know their safe state."""
+
+    limits: tuple[OutputLimit, ...]
+
+    def arm(self) -> None:
+        """Allow ``write``. Raises ``SafetyTrip`` when the self-test fails."""
+        ...
+
+    def write(self, values_V: Float64Array) -> int:
+        """Output one value per channel; returns a bit mask of the channels that were clipped or slew limited.
+
+        Raises ``SafetyTrip`` before ``arm()`` and on a value that is not finite. Never raises for clipping.
+        """
+        ...
+
+    def safe_step(self) -> bool:
+        """One tick of the ramp to ``safe_V``; True once there. Works armed or not, and disarms."""
+        ...
+
+    def readback_V(self) -> Float64Array:
+        """What the device itself says its outputs are, in V."""
+        ...
+
+    def close(self) -> None:
+        """Go to the safe state if not there, then release the device."""
+        ...

@@ -1,0 +1,130 @@
+"""Errors of the hardware layer: a portable kind for code, a message and a cause for people.
+
+Every message says what happened, where, and what to do. Sources: embedded-hal ``ErrorKind`` (portable
+kinds), nidaqmx (partial progress), ophyd-async (one tree of all failed connections).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+
+
+class ErrorKind(Enum):
+    """What went wrong, independent of device and backend."""
+
+    CONFIG = "config"
+    NOT_FOUND = "not found"
+    NACK_ADDRESS = "address not acknowledged"
+    NACK_DATA = "data not acknowledged"
+    ARBITRATION = "arbitration lost"
+    BUS = "bus error"
+    CRC = "checksum"
+    FRAMING = "framing"
+    TIMEOUT = "timeout"
+    OVERRUN = "overrun"
+    DISCONNECTED = "disconnected"
+    IDENTITY = "wrong device"
+    PROTOCOL = "protocol"
+    SAFETY = "safety"
+    CLOSED = "closed"
+
+
+class HalError(Exception):
+    """Base of all hardware errors.
+
+    ``device`` names the bench entry (``"daq"``, ``"i2c0"``), ``partial`` says how far a transfer got and
+    ``lost`` how many samples are gone; the original exception is ``__cause__``.
+    """
+
+    default_kind = ErrorKind.BUS
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        kind: ErrorKind | None = None,
+        device: str = "",
+        partial: int = 0,
+        lost: int = 0,
+    ) -> None:
+        super().__init__(f"{device}: {message}" if device else message)
+        self.kind = kind or self.default_kind
+        self.device = device
+        self.partial = partial
+        self.lost = lost
+
+
+class BenchError(HalError):
+    """The bench description or a configuration is wrong (exit status 2)."""
+
+    default_kind = ErrorKind.CONFIG
+
+
+class DeviceNotFound(HalError):
+    """A declared device or port is not there (exit status 4)."""
+
+    default_kind = ErrorKind.NOT_FOUND
+
+
+class BusError(HalError):
+    """A transfer failed on the wire."""
+
+
+class I2cNack(BusError):
+    """Nobody acknowledged the address, or the device refused a data byte."""
+
+    default_kind = ErrorKind.NACK_ADDRESS
+
+
+class HalTimeout(HalError):
+    """A bounded wait ended without an answer."""
+
+    default_kind = ErrorKind.TIMEOUT
+
+
+class Overrun(HalError):
+    """A buffer overflowed; ``lost`` says how many samples, as far as known."""
+
+    default_kind = ErrorKind.OVERRUN
+
+
+class Disconnected(HalError):
+    """The port or peer went away."""
+
+    default_kind = ErrorKind.DISCONNECTED
+
+
+class ProtocolError(HalError):
+    """The device answered something its manual does not allow."""
+
+    default_kind = ErrorKind.PROTOCOL
+
+
+class WrongDevice(HalError):
+    """The identity check failed."""
+
+    default_kind = ErrorKind.IDENTITY
+
+
+class SafetyTrip(HalError):
+    """An output was refused or driven to its safe state."""
+
+    default_kind = ErrorKind.SAFETY
+
+
+class Closed(HalError):
+    """Used after ``close()``."""
+
+    default_kind = ErrorKind.CLOSED
+
+
+class OpenFailed(HalError):
+    """Several devices failed to open: one tree, every cause."""
+
+    default_kind = ErrorKind.NOT_FOUND
+
+    def __init__(self, errors: Sequence[HalError]) -> None:
+        lines = "\n".join(f"  - {e}" for e in errors)
+        super().__init__(f"{len(errors)} part(s) of the bench did not open:\n{lines}")
+        self.errors = tuple(errors)

@@ -1,0 +1,132 @@
+"""Values that cross the hardware boundary: samples, frames, transfers, and where their time comes from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from enum import Enum, IntFlag
+
+
+class TimeSource(Enum):
+    """Which clock stamped a sample."""
+
+    DEVICE_CLOCK = "device clock"
+    KERNEL = "kernel"
+    HOST = "host"
+    SIMULATION = "simulation"
+
+
+class Status(IntFlag):
+    """Condition of a sample; ordinary trouble travels here, not as an exception."""
+
+    OK = 0
+    OVERRUN = 1
+    SATURATED = 2
+    GAP = 4
+    STALE = 8
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelInfo:
+    """One measured quantity: ``lo``..``hi`` is the range and ``epsilon`` the resolution, all in ``unit``."""
+
+    name: str
+    unit: str
+    lo: float
+    hi: float
+    epsilon: float
+
+
+@dataclass(frozen=True, slots=True)
+class ScanConfig:
+    """A wish for hardware-timed scans: ``channels`` in scan order, full scale ``range_V`` per channel."""
+
+    rate_hz: float
+    channels: tuple[int, ...]
+    range_V: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class ScanInfo:
+    """What the device really does: rate, full scale and step per channel, FIFO depth in scans."""
+
+    rate_hz: float
+    channels: tuple[int, ...]
+    range_V: tuple[float, ...]
+    lsb_V: tuple[float, ...]
+    buffer_scans: int
+    simultaneous: bool
+
+
+@dataclass(slots=True)
+class ScanBlock:
+    """What ``read_scans`` delivered.
+
+    ``n`` scans, the first taken at ``t0_ns`` (bench clock) with device sequence number ``seq0``, ``dt_ns``
+    apart; ``lost`` scans are known to be missing before the first one.
+    """
+
+    n: int
+    t0_ns: int
+    dt_ns: int
+    seq0: int
+    source: TimeSource
+    status: Status = Status.OK
+    lost: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class I2cWrite:
+    """One write segment of an I2C transfer."""
+
+    data: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class I2cRead:
+    """One read segment of ``n`` bytes of an I2C transfer."""
+
+    n: int
+
+
+I2cOp = I2cWrite | I2cRead
+
+
+@dataclass(frozen=True, slots=True)
+class CanFrame:
+    """A CAN data frame. ``t_ns`` is bench time of reception (0 when not yet sent)."""
+
+    can_id: int
+    data: bytes
+    extended: bool = False
+    t_ns: int = 0
+    source: TimeSource = TimeSource.HOST
+
+
+@dataclass(slots=True)
+class CanStats:
+    """Counters of a CAN adapter since it was opened."""
+
+    rx: int = 0
+    tx: int = 0
+    dropped: int = 0
+    error_frames: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class OutputLimit:
+    """Limits of one analog output channel. ``safe_V`` is where it rests when nothing commands it."""
+
+    lo_V: float
+    hi_V: float
+    slew_V_per_s: float
+    safe_V: float
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """What an adapter is, for reports: ``emulated`` is information for people, never a branch in code."""
+
+    uri: str
+    description: str
+    emulated: bool
+    details: dict[str, str] = field(default_factory=dict[str, str])
