@@ -1,0 +1,335 @@
+"""The bench description: which buses and devices there are, and whether each is real or emulated.
+
+Only a URI decides that (``serial:///dev/ttyACM0`` or ``sim://daq0``); no code above this module knows.
+The description is checked as a whole before anything is opened: unknown keys, duplicate addresses and
+channels, dangling references. What a driver's own keys may be is checked by ``drivers.specs``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import tomllib
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import TracebackType
+from typing import Annotated, Any, Literal, Protocol, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from hal.clock import MonotonicClock, VirtualClock
+from hal.contracts import CanBus, Clock, I2cBus, SerialPort
+from hal.errors import BenchError, HalError, OpenFailed
+
+SIM_SCHEME = "sim://"
+Port = SerialPort | I2cBus | CanBus
+
+
+class _Strict(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class ClockSpec(_Strict):
+    """The firmware's tick. Task rates are whole divisions of it."""
+
+    tick_hz: int = Field(default=1000, ge=10, le=10_000)
+
+
+class SerialSpec(_Strict):
+    """A serial port; USB CDC devices ignore ``baud``."""
+
+    kind: Literal["serial"]
+    uri: str
+    baud: int = Field(default=115_200, ge=300, le=4_000_000)
+
+
+class I2cSpec(_Strict):
+    """An I2C bus; ``speed_hz`` is what the controller is set to, and what the bus-time check uses."""
+
+    kind: Literal["i2c"]
+    uri: str
+    speed_hz: int = Field(default=400_000, ge=10_000, le=3_400_000)
+
+
+class CanSpec(_Strict):
+    """A CAN bus with classic frames."""
+
+    kind: Literal["can"]
+    uri: str
+    bitrate: int = Field(default=500_000, ge=10_000, le=1_000_000)
+
+
+BusSpec = Annotated[SerialSpec | I2cSpec | CanSpec, Field(discriminator="kind")]
+
+
+class DeviceSpec(BaseModel):
+    """One device: which driver, on which bus or behind which other device; the rest is the driver's own."""
+
+    model_config = ConfigDict(extra="allow", frozen=True)
+
+    driver: str
+    bus: str | None = None
+    daq: str | None = None
+    adc: str | None = None
+    address: int | None = Field(default=None, ge=0x08, le=0x77)
+
+    def options(self) -> dict[str, Any]:
+        """The driver's own keys."""
+        return dict(self.__pydantic_extra__ or {})
+
+
+class BenchDescription(_Strict):
+    """A whole bench file. ``emulation`` and ``firmware`` are checked by those who read them."""
+
+    format: Literal[1]
+    name: str
+    clock: ClockSpec = ClockSpec()
+    emulation: dict[str, Any] = Field(default_factory=dict)
+    bus: dict[str, BusSpec] = Field(default_factory=dict)
+    device: dict[str, DeviceSpec] = Field(default_factory=dict)
+    firmware: dict[str, Any] = Field(default_factory=dict)
+
+    def emulated_buses(self) -> list[str]:
+        return [name for name, spec in self.bus.items() if spec.uri.startswith(SIM_SCHEME)]
+
+    def devices_with(self, *drivers: str) -> dict[str, DeviceSpec]:
+        """All devices of the named drivers, in the order of the file."""
+        return {name: spec for name, spec in self.device.items() if spec.driver in drivers}
+
+
+@dataclass(frozen=True)
+class BenchFile:
+    """A checked description together with where it came from and its text (kept in recordings)."""
+
+    path: Path
+    text: str
+    description: BenchDescription
+
+    def resolve(self, relative: str) -> Path:
+        """A path named in the bench file, relative to the file."""
+        return (self.path.parent / relative).resolve()
+
+
+def describe_validation_error(error: ValidationError, where: str) -> str:
+    """One line per wrong key: file, key, what is wrong with it."""
+    lines: list[str] = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"] if part not in ("serial", "i2c", "can")) or "(top level)"
+        message = item["msg"]
+        if item["type"] == "extra_forbidden":
+            message = "unknown key; check the spelling"
+        elif item["type"] == "missing":
+            message = "this key is missing"
+        lines.append(f"{where}: [{key}] {message}")
+    return "\n".join(lines)
+
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def validate_table(model: type[_Model], table: Mapping[str, Any], where: str) -> _Model:
+    """``model`` from ``table``, with a ``BenchError`` that names file and key when that is impossible."""
+    try:
+        return model.model_validate(dict(table))
+    except ValidationError as error:
+        raise BenchError(describe_validation_error(error, where)) from error
+
+
+def load_bench(path: Path) -> BenchFile:
+    """Read and check a bench file. Raises ``BenchError`` with file and key."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise BenchError(f"{path}: cannot be read ({error}); name an existing bench file with --bench") from error
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise BenchError(f"{path}: not valid TOML: {error}") from error
+    description = validate_table(BenchDescription, table, str(path))
+    _check_references(description, str(path))
+    return BenchFile(path.resolve(), text, description)
+
+
+def _check_references(description: BenchDescription, where: str) -> None:
+    problems: list[str] = []
+    for name, spec in description.device.items():
+        if spec.bus is not None and spec.bus not in description.bus:
+            problems.append(f"[device.{name}.bus] no bus named '{spec.bus}'; buses are {_names(description.bus)}")
+        for key in ("daq", "adc"):
+            parent: str | None = getattr(spec, key)
+            if parent is not None and parent not in description.device:
+                problems.append(
+                    f"[device.{name}.{key}] no device named '{parent}'; devices are {_names(description.device)}"
+                )
+        if spec.address is not None and spec.bus is None:
+            problems.append(f"[device.{name}.address] an address needs a bus; add 'bus = ...'")
+    problems += _duplicates(
+        ((spec.bus, spec.address), name)
+        for name, spec in description.device.items()
+        if spec.bus is not None and spec.address is not None
+    )
+    if description.emulated_buses() and "provider" not in description.emulation:
+        problems.append(
+            f"[emulation.provider] is missing, and {_names(description.emulated_buses())} have sim:// URIs; "
+            'add provider = "sim_devices.register:provider"'
+        )
+    if problems:
+        raise BenchError("\n".join(f"{where}: {p}" for p in problems))
+
+
+def _names(names: Iterable[str]) -> str:
+    return ", ".join(names) or "(none)"
+
+
+def _duplicates(claims: Iterable[tuple[tuple[str | None, int | None], str]]) -> list[str]:
+    seen: dict[tuple[str | None, int | None], str] = {}
+    problems: list[str] = []
+    for claim, name in claims:
+        if claim in seen:
+            bus, address = claim
+            problems.append(
+                f"[device.{name}.address] 0x{address or 0:02x} on '{bus}' is already taken by '{seen[claim]}'; "
+                "strap one of them to another address or put it on another bus"
+            )
+        seen.setdefault(claim, name)
+    return problems
+
+
+class EmulatedWorld(Protocol):
+    """What an emulation provider returns: the far ends of the ``sim://`` buses, and the physical truth."""
+
+    def endpoint(self, bus: str) -> str | Port:
+        """A URI for the ordinary adapters (own process, real time) or a port object (virtual time)."""
+        ...
+
+    def alive(self) -> bool: ...
+    def stop(self) -> None: ...
+    def truth(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]: ...
+
+
+Provider = Callable[..., EmulatedWorld]
+
+
+@dataclass
+class OpenBench:
+    """An opened bench: its clock, its ports by bus name and, where something is emulated, the world behind."""
+
+    file: BenchFile
+    clock: Clock
+    ports: dict[str, Port]
+    world: EmulatedWorld | None
+    runtime_dir: Path
+    closers: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
+
+    def serial(self, bus: str) -> SerialPort:
+        return cast(SerialPort, self.ports[bus])
+
+    def i2c(self, bus: str) -> I2cBus:
+        return cast(I2cBus, self.ports[bus])
+
+    def can(self, bus: str) -> CanBus:
+        return cast(CanBus, self.ports[bus])
+
+    @property
+    def virtual(self) -> bool:
+        return isinstance(self.clock, VirtualClock)
+
+    def close(self) -> None:
+        """Close every port, then end the emulated world. Idempotent; every port gets its turn."""
+        first: Exception | None = None
+        while self.closers:
+            try:
+                self.closers.pop()()
+            except Exception as error:
+                first = first or error
+        if first is not None:
+            raise first
+
+    def __enter__(self) -> OpenBench:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+@contextmanager
+def open_bench(
+    bench: BenchFile,
+    *,
+    virtual: bool,
+    runtime_dir: Path,
+    hand_file: Path | None = None,
+    hand_scale: float | None = None,
+    seed: int | None = None,
+) -> Iterator[OpenBench]:
+    """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
+
+    ``hand_file`` and ``hand_scale`` go to the emulated world. Raises ``OpenFailed`` with every cause.
+    """
+    description = bench.description
+    emulated = description.emulated_buses()
+    if virtual and len(emulated) < len(description.bus):
+        real = [name for name in description.bus if name not in emulated]
+        raise BenchError(f"{bench.path}: virtual time needs every bus emulated, but {_names(real)} are real")
+    if hand_file is not None and not emulated:
+        raise BenchError(f"{bench.path}: --hand moves an emulated instrument, but this bench is all real")
+    clock = VirtualClock() if virtual else MonotonicClock()
+    opened = OpenBench(bench, clock, {}, None, runtime_dir)
+    try:
+        if emulated:
+            table = description.model_dump()
+            if seed is not None:
+                table["emulation"]["seed"] = seed
+            world = _provider(bench)(
+                table,
+                clock=clock if virtual else None,
+                runtime_dir=runtime_dir,
+                hand_file=hand_file,
+                hand_scale=hand_scale,
+            )
+            opened.world = world
+            opened.closers.append(world.stop)
+        failures: list[HalError] = []
+        for name, spec in description.bus.items():
+            try:
+                opened.ports[name] = _open_port(name, spec, opened)
+                opened.closers.append(opened.ports[name].close)
+            except HalError as error:
+                failures.append(error)
+        if failures:
+            raise failures[0] if len(failures) == 1 else OpenFailed(failures)
+        yield opened
+    finally:
+        opened.close()
+
+
+def _open_port(name: str, spec: SerialSpec | I2cSpec | CanSpec, bench: OpenBench) -> Port:
+    from hal.backends import open_can, open_i2c, open_serial
+
+    target: str | Port = spec.uri
+    if spec.uri.startswith(SIM_SCHEME):
+        assert bench.world is not None
+        target = bench.world.endpoint(name)
+    if not isinstance(target, str):
+        return target
+    match spec:
+        case SerialSpec():
+            return open_serial(target, baud=spec.baud)
+        case I2cSpec():
+            return open_i2c(target, speed_hz=spec.speed_hz)
+        case CanSpec():
+            return open_can(target, bitrate=spec.bitrate)
+
+
+def _provider(bench: BenchFile) -> Provider:
+    target = str(bench.description.emulation["provider"])
+    module_name, _, attribute = target.partition(":")
+    try:
+        return cast(Provider, getattr(importlib.import_module(module_name), attribute))
+    except (ImportError, AttributeError) as error:
+        raise BenchError(f"{bench.path}: [emulation.provider] '{target}' cannot be loaded: {error}") from error
