@@ -1,0 +1,1 @@
+"""Where the parts become an instrument: wiring, the loop, its tasks, and the supervisor that may stop it."""

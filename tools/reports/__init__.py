@@ -1,0 +1,1 @@
+"""What people look at: figures computed from recordings and truth, tables, pictures, HTML."""

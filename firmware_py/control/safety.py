@@ -1,0 +1,100 @@
+"""The supervisor: one state machine that decides whether the actuators may move.
+
+Outputs are armed only after the self-test. Whatever goes wrong, the first reason wins, the amplifier ramps to
+neutral, one step a tick, within ``RAMP_TICKS``, and stays there: there is no way back to RUNNING in one run.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+from hal.contracts import AnalogOutput
+from hal.errors import HalError
+
+RAMP_TICKS = 20
+"""Neutral within 20 ms of the decision, at one step a millisecond."""
+
+
+class State(IntEnum):
+    """What the outputs may do. The numbers go into telemetry and recordings."""
+
+    BOOT = 0
+    SELF_TEST = 1
+    RUNNING = 2
+    SAFE_RAMP = 3
+    SAFE = 4
+
+
+@dataclass(frozen=True)
+class SafetyLimits:
+    """When data count as stale, what is too hot, how long an axis may sit at its limit."""
+
+    stale_ms: float = 5.0
+    temperature_C: tuple[float, float] = (0.0, 60.0)
+    supply_V: tuple[float, float] = (4.5, 5.5)
+    saturated_ms: float = 50.0
+    stop_button_silence_ms: float = 1500.0
+    amplifier_silence_ms: float = 500.0
+
+
+@dataclass(frozen=True)
+class Trip:
+    """Why and when the outputs were taken to their safe state; ``normal`` for the end of an ordinary run."""
+
+    reason: str
+    tick: int
+    t_ns: int
+    normal: bool = False
+
+
+class Supervisor:
+    """Owns the permission to move. ``amplifier`` is the only thing it touches."""
+
+    def __init__(self, amplifier: AnalogOutput) -> None:
+        self._amplifier = amplifier
+        self._ramp_ticks = 0
+        self.state = State.BOOT
+        self.trip_cause: Trip | None = None
+        self.safe_reached = False
+        self.ramp_failure = ""
+
+    @property
+    def may_move(self) -> bool:
+        """Only this lets a command through."""
+        return self.state is State.RUNNING
+
+    def begin_self_test(self) -> None:
+        if self.state is State.BOOT:
+            self.state = State.SELF_TEST
+
+    def arm(self) -> None:
+        """Arm the amplifier (it tests itself) and allow motion. Nothing is armed after a trip."""
+        if self.state is State.SELF_TEST:
+            self._amplifier.arm()
+            self.state = State.RUNNING
+
+    def trip(self, reason: str, *, tick: int, t_ns: int, normal: bool = False) -> None:
+        """Decide for the safe state; later reasons do not replace the first."""
+        if self.trip_cause is None:
+            self.trip_cause = Trip(reason, tick, t_ns, normal)
+            self.state = State.SAFE_RAMP
+
+    def step(self) -> bool:
+        """One tick of the ramp; True once neutral is reached or has to be given up.
+
+        A transfer that fails is tried again on the next tick until the ramp's time is over; then the report
+        says that neutral could not be confirmed, and why.
+        """
+        if self.state is not State.SAFE_RAMP:
+            return self.state is State.SAFE
+        self._ramp_ticks += 1
+        try:
+            if self._amplifier.safe_step():
+                self.state, self.safe_reached, self.ramp_failure = State.SAFE, True, ""
+        except HalError as error:
+            self.ramp_failure = str(error)
+        if self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS:
+            self.state = State.SAFE
+            self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
+        return self.state is State.SAFE

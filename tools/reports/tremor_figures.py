@@ -1,0 +1,110 @@
+"""How much tremor is left at the tip: figures from the physical truth of a run.
+
+The truth is logged by the emulated world apart from anything that the firmware sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfiltfilt
+
+Array = NDArray[np.float64]
+AXES = ("x", "y", "z")
+TREMOR_BAND_HZ = (8.0, 12.0)
+VOLUNTARY_HZ = 1.0
+
+
+@dataclass(frozen=True)
+class BandFigures:
+    """rms in um, with the manipulator resting and with it working."""
+
+    uncompensated_rms_um: float
+    compensated_rms_um: float
+    reduction_percent: float
+
+
+@dataclass(frozen=True)
+class TremorFigures:
+    """Tip tremor in ``band_hz`` as a vector and per axis, and the error against the intended path, all bands."""
+
+    band_hz: tuple[float, float]
+    evaluated_s: tuple[float, float]
+    vector: BandFigures
+    per_axis: dict[str, BandFigures]
+    whole_band: BandFigures
+    voluntary_gain: float
+    voluntary_delay_ms: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The ``tremor`` and ``voluntary`` parts of the run's JSON."""
+        return {
+            "tremor": {
+                "band_hz": list(self.band_hz),
+                "evaluated_s": list(self.evaluated_s),
+                **asdict(self.vector),
+                "per_axis": {axis: asdict(figures) for axis, figures in self.per_axis.items()},
+                "whole_band_error": asdict(self.whole_band),
+            },
+            "voluntary": {"gain": self.voluntary_gain, "delay_ms": self.voluntary_delay_ms},
+        }
+
+
+def band_pass(x: Array, rate_hz: float, band_hz: tuple[float, float]) -> Array:
+    """``x`` (n, k) in ``band_hz``, without phase shift (fourth-order Butterworth, forwards and backwards)."""
+    sos = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
+    return np.asarray(sosfiltfilt(sos, x, axis=0))
+
+
+def _compare(before: Array, after: Array) -> BandFigures:
+    """rms of vectors (n, k): the root of the summed axis variances."""
+    rms_before, rms_after = (float(1e6 * np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (before, after))
+    reduction = 100.0 * (1.0 - rms_after / rms_before) if rms_before > 0 else float("nan")
+    return BandFigures(rms_before, rms_after, reduction)
+
+
+def tremor_figures(
+    truth: Mapping[str, Array], *, settle_s: float, band_hz: tuple[float, float] = TREMOR_BAND_HZ
+) -> TremorFigures | None:
+    """Figures over the truth after ``settle_s``; ``None`` when less than 2 s are left.
+
+    Filters run over the whole record, so that their own edges fall outside what is scored.
+    """
+    t_s = (truth["t_ns"] - truth["t_ns"][0]) * 1e-9
+    if t_s[-1] - settle_s < 2.0:
+        return None
+    rate_hz = (len(t_s) - 1) / t_s[-1]
+    edge_s = 0.25
+    keep = (t_s >= settle_s) & (t_s <= t_s[-1] - edge_s)
+    rigid, tip, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "tip_m", "intended_m"))
+    rigid_band, tip_band = (band_pass(x, rate_hz, band_hz)[keep] for x in (rigid, tip))
+    per_axis = {a: _compare(rigid_band[:, [i]], tip_band[:, [i]]) for i, a in enumerate(AXES)}
+    # the manipulator's own rest offset is no error of the path: means are taken out
+    errors = [x[keep] - intended[keep] for x in (rigid, tip)]
+    whole = _compare(*(e - e.mean(axis=0) for e in errors))
+    gain, delay_ms = _voluntary_response(rigid, tip, rate_hz, keep)
+    return TremorFigures(
+        band_hz,
+        (float(t_s[keep][0]), float(t_s[keep][-1])),
+        _compare(rigid_band, tip_band),
+        per_axis,
+        whole,
+        gain,
+        delay_ms,
+    )
+
+
+def _voluntary_response(rigid: Array, tip: Array, rate_hz: float, keep: NDArray[np.bool_]) -> tuple[float, float]:
+    """Gain and delay from the resting to the working tip below 1 Hz, by regression on path and velocity."""
+    sos = butter(4, VOLUNTARY_HZ, fs=rate_hz, output="sos")
+    slow_rigid, slow_tip = (np.asarray(sosfiltfilt(sos, x, axis=0)) for x in (rigid, tip))
+    velocity = np.gradient(slow_rigid, 1.0 / rate_hz, axis=0)[keep]
+    x, y = slow_rigid[keep], slow_tip[keep]
+    x, y = x - x.mean(axis=0), y - y.mean(axis=0)
+    design = np.column_stack([x.ravel(order="F"), velocity.ravel(order="F")])
+    (gain, slope), *_ = np.linalg.lstsq(design, y.ravel(order="F"), rcond=None)
+    return float(gain), float(-1e3 * slope / gain)
