@@ -191,9 +191,7 @@ def _channel_claims(description: BenchDescription, options: dict[str, Any]) -> l
         offered: tuple[int, ...] = getattr(options[parent], "channels", (0, 1, 2, 3))
         for channel in claims:
             if channel not in offered:
-                problems.append(
-                    f"[device.{name}] channel {channel} is not scanned by '{parent}' ({list(offered)})"
-                )
+                problems.append(f"[device.{name}] channel {channel} is not scanned by '{parent}' ({list(offered)})")
             if (parent, channel) in taken:
                 problems.append(
                     f"[device.{name}] channel {channel} of '{parent}' is taken by '{taken[parent, channel]}'"
@@ -212,13 +210,9 @@ def _rates(description: BenchDescription, options: dict[str, Any]) -> list[str]:
                 "make them equal"
             )
         if isinstance(option, Di4108Options) and (60_000_000 / option.rate_hz) % 1:
-            problems.append(
-                f"[device.{name}.rate_hz] {option.rate_hz:g} Hz is no whole divisor of the 60 MHz clock"
-            )
+            problems.append(f"[device.{name}.rate_hz] {option.rate_hz:g} Hz is no whole divisor of the 60 MHz clock")
         if isinstance(option, Ads1115Options) and tick_hz % option.rate_hz:
-            problems.append(
-                f"[device.{name}.rate_hz] {option.rate_hz:g} Hz does not divide the tick of {tick_hz} Hz"
-            )
+            problems.append(f"[device.{name}.rate_hz] {option.rate_hz:g} Hz does not divide the tick of {tick_hz} Hz")
     return problems
 
 

@@ -1,0 +1,50 @@
+"""Entry point: the list of commands, ``--version``, and nothing else."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from tools.cli import doctor, recordings, replay, run
+
+app = typer.Typer(
+    name="micron",
+    help="Firmware and bench of a handheld instrument that cancels tremor. Start with: micron run",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"micron {version('micron-bench')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    show_version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    """Firmware and bench of a handheld instrument that cancels tremor. Start with: micron run"""
+
+
+app.command("run")(run.run)
+app.command("replay")(replay.replay)
+app.command("doctor")(doctor.doctor)
+app.command("recover")(recordings.recover)
+app.command("export")(recordings.export)
+
+
+def main() -> None:
+    """What the ``micron`` script calls."""
+    app()
+
+
+if __name__ == "__main__":
+    main()

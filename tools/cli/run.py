@@ -1,0 +1,164 @@
+"""``micron run``: the instrument, closed loop, and what it did for the tip."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from firmware_py.app import RunRequest, run_in_process
+from rich.live import Live
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from hal.bench import load_bench
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json
+from tools.cli.common import write_text_atomic as write_text
+from tools.reports.run_report import html_page, picture, print_report, save_picture
+from tools.reports.tremor_figures import tremor_figures
+
+SETTLE_S = 2.0
+"""The estimator locks and the soft start ends within this time; figures are taken after it."""
+
+
+def run(
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="How long to run.")] = 10.0,
+    virtual: Annotated[bool, typer.Option("--virtual", help="Virtual time: deterministic, as fast as it can.")] = False,
+    hand: Annotated[
+        str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
+    ] = None,
+    scale: Annotated[
+        float | None,
+        typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
+    ] = None,
+    record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
+    json_file: JsonOption = None,
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = Path(
+        "out/run.png"
+    ),
+) -> None:
+    """Run the instrument in closed loop and report what was left of the tremor.
+
+    Example: micron run --virtual --seconds 20 --json -
+    """
+    with clear_errors():
+        check_writable(json_file, html, record)
+        if scale is not None and hand is None:
+            raise InputError("--scale belongs to --hand FILE; give both or neither")
+        request = RunRequest(
+            bench=bench_path(bench),
+            seconds=seconds,
+            virtual=virtual,
+            hand_file=hand,
+            hand_scale=scale,
+            record=record,
+            seed=seed,
+        )
+        load_bench(request.bench)
+        outcome, truth = _run_virtual(request) if virtual else _run_real(request)
+        result = complete_result(outcome, truth)
+        if truth is not None and result["tremor"]["reduction_percent"] is not None:
+            png = picture(truth, result)
+            save_picture(png, image)
+        else:
+            png = None
+        if html is not None:
+            write_text(html, html_page(result, png))
+        print_report(result, console())
+        if png is not None:
+            console().print(f"picture: {image}")
+        write_json(result, json_file)
+        if not result["safe_state"]["normal"]:
+            raise typer.Exit(Exit.FAILED)
+        if result["samples"]["lost"] or result["recorder"]["dropped"]:
+            raise typer.Exit(Exit.DATA_LOST)
+
+
+def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The outcome of the firmware plus the figures that need the truth."""
+    empty = {"uncompensated_rms_um": None, "compensated_rms_um": None, "reduction_percent": None}
+    figures: dict[str, Any] = {
+        "tremor": {
+            "band_hz": [8, 12],
+            **empty,
+            "per_axis": {a: dict(empty) for a in "xyz"},
+            "whole_band_error": empty,
+        },
+        "voluntary": {"gain": None, "delay_ms": None},
+    }
+    if truth is not None:
+        scored = tremor_figures(truth, settle_s=SETTLE_S)
+        if scored is not None:
+            figures = scored.to_json()
+    return {**outcome, **figures}
+
+
+def _run_virtual(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    with Progress(
+        TextColumn("virtual time"), BarColumn(), TextColumn("{task.fields[state]}"), TimeRemainingColumn(),
+        console=console(), transient=True,
+    ) as progress:  # fmt: skip
+        bar = progress.add_task("run", total=request.seconds, state="")
+
+        def show(status: dict[str, Any]) -> None:
+            progress.update(bar, completed=status["t_s"], state=status["state"])
+
+        return run_in_process(request, show)
+
+
+def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """The firmware in a process of its own: this one draws, and a busy thread beside the loop would cost ticks."""
+    with tempfile.TemporaryDirectory(prefix="micron-") as folder:
+        runtime_dir = Path(folder)
+        request_file = runtime_dir / "request.json"
+        request_file.write_text(request.to_json(runtime_dir))
+        process = subprocess.Popen(
+            [sys.executable, "-m", "firmware_py.app", str(request_file)], stdout=subprocess.PIPE, text=True
+        )
+        try:
+            _watch(process, request.seconds)
+        except KeyboardInterrupt:
+            # the firmware ramps to neutral and reports; a second interrupt is the operator's own choice
+            process.send_signal(signal.SIGINT)
+        process.wait()
+        outcome_file = runtime_dir / "outcome.json"
+        if process.returncode not in (0, None) or not outcome_file.exists():
+            raise typer.Exit(process.returncode if process.returncode and process.returncode > 0 else Exit.FAILED)
+        outcome = json.loads(outcome_file.read_text())
+        truth_file = runtime_dir / "truth.npz"
+        truth = None
+        if truth_file.exists():
+            with np.load(truth_file, allow_pickle=False) as archive:
+                truth = {name: archive[name] for name in archive.files}
+        return outcome, truth
+
+
+def _watch(process: subprocess.Popen[str], seconds: float) -> None:
+    """Draw the status lines of the firmware until it ends."""
+    assert process.stdout is not None
+    with Live(console=console(), refresh_per_second=8, transient=True) as live:
+        for line in process.stdout:
+            live.update(_status_table(json.loads(line), seconds))
+
+
+def _status_table(status: dict[str, Any], seconds: float) -> Table:
+    table = Table(title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}]", title_justify="left")
+    for column in ("", "x", "y", "z"):
+        table.add_column(column, justify="left" if not column else "right")
+    table.add_row("tremor amplitude (um)", *(f"{v:.1f}" for v in status["amplitude_um"]))
+    table.add_row("tremor frequency (Hz)", *(f"{v:.2f}" for v in status["frequency_hz"]))
+    table.add_row("command (V)", *(f"{v:.1f}" for v in status["command_V"]))
+    table.add_row("sample to command p50, p99 (us)", *(f"{v:.0f}" for v in status["latency_us"]), "")
+    table.add_row("samples lost, ticks skipped", str(status["lost"]), str(status["skipped"]), "")
+    return table
