@@ -3,59 +3,100 @@
 The mismatch engine proposes these, fits their parameters inside the simulator, and puts the accepted ones
 into a corrected twin. One effect per vocabulary name of the contract (recordings-and-mismatch.md, section 3);
 one family of shapes per effect.
+
+An effect has settings, nonlinear parameters and linear weights:
+
+settings   what is read off the data once and then frozen (thresholds, knots, event times); plain numbers, so
+           that they can be written to a twin file
+nonlinear  few, searched (a time constant, a frequency, a limit)
+weights    the coefficients of ``basis`` columns, solved exactly (kinds "add" and "feedback" only)
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Settings = Mapping[str, tuple[float, ...]]
+"""Frozen, data-derived numbers of one placed effect. Scalars are 1-tuples."""
 
 Stage = Literal["amplifier", "actuator", "mechanics", "mounting", "sensor", "acquisition", "environment"]
-ActsOn = Literal["input", "output", "feedback", "timebase"]
-"""Where the forward model sits in a twin.
+STAGES: tuple[Stage, ...] = (
+    "amplifier",
+    "actuator",
+    "mechanics",
+    "mounting",
+    "environment",
+    "sensor",
+    "acquisition",
+)
+"""The order in which a signal passes them."""
 
-input     replaces one input signal before the base physics
-output    replaces one output signal after the base physics (additive terms are outputs too)
-feedback  a force phi(position, velocity, t) inside the equation of motion
-timebase  re-times all inputs or all outputs of a record
+Kind = Literal["add", "linear", "nonlinear", "feedback"]
+"""How an effect acts on the signal that it sits on.
+
+add        x + basis(x, ...) @ weights
+linear     a linear operator on x (filter, delay, resampling): applied to every column of a design
+nonlinear  any other map of x
+feedback   a force phi(position, velocity) @ weights inside the equation of motion; ``x`` is position
 """
+
+Site = Literal["input", "output"]
 
 
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of an effect. Bounds are in ``unit``; ``log`` says that its size, not its value, is uncertain.
 
-    A ``unit`` may contain ``{in}`` and ``{out}``, the units of the signals that the effect sits on.
+    A ``unit`` may contain ``{in}`` and ``{out}``, the units of the signals before and after the base physics.
+    ``scale`` is a typical step for finite differences and for conditioning.
     """
 
     name: str
     unit: str
-    lo: float
-    hi: float
+    lo: float = -np.inf
+    hi: float = np.inf
     log: bool = False
+    scale: float = 1.0
 
 
 @dataclass(frozen=True)
 class Context:
     """What a forward model may look at besides the signal that it changes.
 
-    ``t`` seconds (n,), ``dt`` its step; ``signals`` every recorded input and context signal by the twin's name
-    (n,), in the units of the contract; ``target`` the signal that the effect sits on. ``starts`` are sample
-    indices where simulation starts afresh (0 first): memory is cleared there. ``t`` is time since the start of
-    the whole recording, so that warm-up keeps its age in a held-out block.
+    ``t`` seconds since the start of the whole recording (n,), so that warm-up keeps its age in a held-out
+    block; ``dt`` its step. ``signals``: every recorded input and context signal by the twin's name (n,), in
+    the units of the contract. ``target``: the signal that the effect sits on; ``output``: the output whose
+    residual is looked at; ``drive``: the name of the input that drives that output ("" when several do).
+    ``starts``: samples where simulation starts afresh (0 first); memory is cleared there. ``mask`` (n,):
+    where the residual may be looked at (None = everywhere); ``noise``: rms of the output's noise if known.
+    ``facts``: constants of the twin that some effects need (sensor positions, axis of a channel).
     """
 
     t: Array
     dt: float
     signals: Mapping[str, Array]
     target: str
+    output: str = ""
+    drive: str = ""
     starts: tuple[int, ...] = (0,)
+    mask: NDArray[np.bool_] | None = None
+    noise: float | None = None
+    facts: Mapping[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
+
+    @property
+    def keep(self) -> NDArray[np.bool_]:
+        """Mask with None resolved, (n,) bool."""
+        return np.ones(self.t.size, np.bool_) if self.mask is None else self.mask
+
+    def with_target(self, target: str) -> Context:
+        """The same context for another signal."""
+        return replace(self, target=target)
 
 
 @dataclass(frozen=True)
@@ -71,39 +112,83 @@ class Signature:
     note: str = ""
 
 
-Forward = Callable[[Array, Context, Array], Array]
-Basis = Callable[[Array, Context, Array], Array]
-Guess = Callable[[Array, Array, Context], Sequence[Array]]
-SignatureTest = Callable[[Array, Array, Context], Signature]
+@dataclass(frozen=True)
+class Human:
+    """A parameter for the report: ``value`` in ``unit``, derived from the fitted ones."""
+
+    name: str
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The two parameter lists of an effect for given settings: searched, and solved exactly."""
+
+    nonlinear: tuple[Parameter, ...] = ()
+    weights: tuple[Parameter, ...] = ()
+    penalty: Array | None = None
+    """(rows, weights): optional smoothness rows, in units of weight; scaled by the noise in the fit."""
+
+
+Prepare = Callable[[Array, Array, Context], Settings]
+Apply = Callable[[Array, Context, Array, Settings], Array]
+Basis = Callable[[Array, Context, Array, Settings], Array]
+Guess = Callable[[Array, Array, Context, Settings], Sequence[Sequence[float]]]
+Test = Callable[[Array, Array, Context], Signature]
+Report = Callable[[Array, Settings, float], Sequence[Human]]
+
+
+def no_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    """An effect that reads nothing off the data."""
+    return {}
+
+
+def no_start(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    """An effect without nonlinear parameters has one start: the empty one."""
+    return ((),)
 
 
 @dataclass(frozen=True)
 class Effect:
     """One effect of the vocabulary.
 
-    ``forward(x, ctx, p) -> y``: ``x`` (n,) the signal that it changes, ``p`` in the order of ``parameters``,
-    result (n,). Pure: same arguments, same answer; no state left behind.
-    For ``acts_on == "feedback"``, ``x`` is unused and ``feedback_kernel`` names the compiled term.
-    ``linear`` names the parameters in which the forward model is linear (additive terms): ``basis(x, ctx, p)``
-    then gives one column (n, k) for each of them, with ``forward = x + basis @ p[linear]``; the engine solves
-    these exactly instead of searching.
-    ``guess(x, residual, ctx)`` gives starting points; ``signature(x, residual, ctx)`` is the screening test.
+    ``prepare(x, residual, ctx) -> settings`` reads what must be frozen. ``parts(settings)`` lists the parameters.
+    ``apply(x, ctx, q, settings) -> (n,)`` for kinds linear and nonlinear; ``basis(x, ctx, q, settings) -> (n, k)``
+    for kinds add (columns are added to the signal) and feedback (``x`` is position, columns are forces, velocity
+    is ``ctx.signals["velocity"]``). ``q`` (len(parts.nonlinear),). Pure: same arguments, same answer.
+    ``guess(x, residual, ctx, settings)`` gives one or more starts for ``q``. ``probe(x, ctx, settings) -> (n, k)``
+    gives the directions in which a weak effect would move the signal: what the score test projects on; None
+    means ``basis`` at each guess. ``test`` replaces the score test where columns cannot say it (lines, bursts,
+    steps, grids). ``report(p, settings, scale)`` gives human parameters from ``p`` (nonlinear, then weights);
+    ``scale`` is the base twin's sensitivity at that place, in output per input unit.
     ``equation`` is TeX; ``source`` paper and equation, or standard text.
+    ``driven``: depends on the signal it sits on (False: an addition from outside, such as hum).
+    ``needs``: context or input signals without which it cannot be proposed; ``shared``: one set of weights for
+    several outputs (field distortions, rigid-body terms): ``basis`` is called per output, same weights.
     """
 
     name: str
-    form: str
+    summary: str
+    kind: Kind
     stages: tuple[Stage, ...]
-    acts_on: ActsOn
-    parameters: tuple[Parameter, ...]
-    forward: Forward
-    guess: Guess
-    signature: SignatureTest
+    parts: Callable[[Settings], Parts]
     equation: str
     source: str
-    linear: tuple[str, ...] = ()
+    excitation: str
+    confusable_with: tuple[str, ...] = ()
+    prepare: Prepare = no_settings
+    guess: Guess = no_start
+    apply: Apply | None = None
     basis: Basis | None = None
+    probe: Callable[[Array, Context, Settings], Array] | None = None
+    test: Test | None = None
+    report: Report | None = None
+    driven: bool = True
+    sites: tuple[Site, ...] = ("input", "output")
     needs: tuple[str, ...] = ()
-    feedback_kernel: str = ""
-    excitation: str = ""
-    """What a recording must contain to show this effect, in words."""
+    shared: bool = False
+    twins: tuple[str, ...] = ()
+    """Twin kinds that can have it; empty: all."""
+    stochastic: bool = False
+    """Its course cannot be predicted on unseen data beyond its level at the start (random walk, spikes)."""

@@ -1,0 +1,87 @@
+"""Saturation: the output is limited, abruptly or gently, at two limits that need not be symmetric."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+
+
+@njit(cache=True)
+def limit(x, lo, hi, soft):
+    """Clip with rounded corners: identity far from the limits, ``soft`` is the width of the corner.
+
+    Softplus form: hi - w*log(1 + exp((hi - x)/w)), likewise below; w -> 0 is the hard clip.
+    """
+    y = np.empty_like(x)
+    for i in range(x.size):
+        v = x[i]
+        if soft <= 0.0:
+            y[i] = min(max(v, lo), hi)
+            continue
+        a = (hi - v) / soft
+        v = hi - soft * (a if a > 40.0 else np.log1p(np.exp(a)))
+        b = (v - lo) / soft
+        y[i] = lo + soft * (b if b > 40.0 else np.log1p(np.exp(b)))
+    return y
+
+
+def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    return {"range": (float(x[k].min()), float(x[k].max()))}
+
+
+def _parts(settings: Settings) -> Parts:
+    lo, hi = settings.get("range", (-1.0, 1.0))
+    span = hi - lo or 1.0
+    return Parts(
+        (
+            Parameter("lower_limit", "{in}", lo - 0.5 * span, lo + 0.7 * span, scale=0.1 * span),
+            Parameter("upper_limit", "{in}", hi - 0.7 * span, hi + 0.5 * span, scale=0.1 * span),
+            Parameter("corner", "{in}", 1e-4 * span, 0.5 * span, log=True, scale=0.05 * span),
+        )
+    )
+
+
+def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return limit(x, min(q[0], q[1]), max(q[0], q[1]), q[2])
+
+
+def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    lo, hi = settings["range"]
+    span = hi - lo
+    far = 0.5 * span
+    return (
+        (lo + 0.1 * span, hi - 0.1 * span, 0.01 * span),
+        (lo - far, hi - 0.15 * span, 0.01 * span),
+        (lo + 0.15 * span, hi + far, 0.01 * span),
+        (lo - 0.1 * span, hi + 0.1 * span, 0.3 * span),
+    )
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("lower_limit", float(p[0]), "{in}"),
+        Human("upper_limit", float(p[1]), "{in}"),
+        Human("corner", float(p[2]), "{in}"),
+    )
+
+
+SATURATION = Effect(
+    name="saturation",
+    summary="output limited, hard or soft, at unequal limits",
+    kind="nonlinear",
+    stages=("amplifier", "actuator", "sensor", "acquisition"),
+    parts=_parts,
+    equation=r"y = \mathrm{clip}_w(x;\, x_\mathrm{min}, x_\mathrm{max})",
+    source="H. K. Khalil, Nonlinear Systems, 3rd ed., section 1.2.7; corners by the softplus function",
+    excitation="amplitudes that reach the limits, and smaller ones for comparison",
+    confusable_with=("static_nonlinearity", "slew_limit"),
+    prepare=_prepare,
+    guess=_guess,
+    apply=_apply,
+    report=_report,
+)

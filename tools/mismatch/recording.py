@@ -1,0 +1,70 @@
+"""A recording beside a twin: what section 1 of the contract describes, loaded, converted and checked."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+class RecordingError(ValueError):
+    """Bad input. The message names file, key, line or sample, and what to do."""
+
+
+@dataclass(frozen=True)
+class Split:
+    """The optional ``[split]`` table: sample ranges (stop excluded) or another recording."""
+
+    fit: tuple[int, int] | Path | None = None
+    test: tuple[int, int] | Path | None = None
+    others: Mapping[str, tuple[int, int] | Path] = field(default_factory=dict[str, "tuple[int, int] | Path"])
+    initialization: int | None = None
+
+
+@dataclass(frozen=True)
+class TwinText:
+    """The ``[twin]`` table: kind, the engineer's parameters, effects of a corrected twin."""
+
+    kind: str
+    parameters: Mapping[str, Any]
+    effects: tuple[Mapping[str, Any], ...] = ()
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All columns float64 (n,), in the contract's units, uniformly sampled.
+
+    ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
+    signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
+    """
+
+    path: Path
+    title: str
+    t: Array
+    dt: float
+    inputs: Mapping[str, Array]
+    outputs: Mapping[str, Array]
+    context: Mapping[str, Array]
+    noise: Mapping[str, float | None]
+    unit: Mapping[str, str]
+    column: Mapping[str, str]
+    twin: TwinText
+    split: Split
+    declared_step: Mapping[str, float] = field(default_factory=dict[str, float])
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def n(self) -> int:
+        """Number of samples."""
+        return self.t.size
+
+    @property
+    def signals(self) -> dict[str, Array]:
+        """Inputs and context together: what an effect may look at."""
+        return {**self.context, **self.inputs}

@@ -1,0 +1,467 @@
+"""A twin with effects placed in its chain: parameters, simulation of a view, design columns for exact solving.
+
+Order of one pass: input effects by stage, base physics (with feedback effects inside), output effects by stage.
+On a static twin an additive effect sits at the output and is driven by the input of that output, so that its
+weights are in output units and linear: input or output placement is the same thing there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+
+from sim_devices.physics.effect import (
+    STAGES,
+    Array,
+    Context,
+    Effect,
+    Human,
+    Parameter,
+    Parts,
+    Settings,
+    Stage,
+)
+from tools.mismatch.recording import Recording
+from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
+
+MEMO_BYTES = 1 << 29  # what one view remembers of unchanged columns
+
+
+@dataclass(frozen=True)
+class Placed:
+    """One effect at one place of the chain.
+
+    ``site``: where in the flow; ``target``: the input or output signal there; ``outputs``: whose residual it may
+    change (several for shared effects); ``note`` lists places that the recording cannot tell from this one.
+    """
+
+    effect: Effect
+    site: Literal["input", "output", "feedback"]
+    target: str
+    stage: Stage
+    outputs: tuple[str, ...]
+    settings: Settings = field(default_factory=dict[str, tuple[float, ...]])
+    note: str = ""
+
+    @property
+    def parts(self) -> Parts:
+        """Its parameters."""
+        return self.effect.parts(self.settings)
+
+    @property
+    def label(self) -> str:
+        """Name for parameter lists and logs, e.g. ``creep[displacement]``."""
+        return f"{self.effect.name}[{self.target}]"
+
+
+@dataclass(frozen=True)
+class View:
+    """Sample ranges of a recording to compare on. ``init`` samples at each start may set the state and are
+    not scored where the twin restarts; ``memo`` remembers columns that do not change between calls."""
+
+    recording: Recording
+    ranges: tuple[tuple[int, int], ...]
+    init: int = 0
+    memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
+
+    @property
+    def index(self) -> np.ndarray:
+        """Samples of the view, concatenated ranges, int64 (m,)."""
+        return np.concatenate([np.arange(a, b) for a, b in self.ranges])
+
+    def scored(self, twin: Twin) -> np.ndarray:
+        """(m,) bool: samples that count (not used to set a state)."""
+        if self.init == 0:
+            return np.ones(sum(b - a for a, b in self.ranges), np.bool_)
+        first = 0 if twin.restart else self.init
+        out: list[np.ndarray] = []
+        for a, b in self.ranges:
+            i = np.arange(a, b)
+            out.append(i >= a + self.init if twin.restart else i >= first)
+        return np.concatenate(out)
+
+    def measured(self, output: str) -> Array:
+        """(m,) the recorded output on the view."""
+        return self.recording.outputs[output][self.index]
+
+    @staticmethod
+    def whole(recording: Recording, init: int = 0) -> View:
+        """Everything."""
+        return View(recording, ((0, recording.n),), init)
+
+
+@dataclass(frozen=True)
+class Free:
+    """One entry of the parameter vector."""
+
+    name: str
+    unit: str
+    lo: float
+    hi: float
+    log: bool
+    scale: float
+    linear: bool
+    placed: int
+    """-1 for base parameters, else the index of the placed effect."""
+
+
+@dataclass(frozen=True)
+class Design:
+    """Outputs on a view as ``constant + columns @ theta[linear]`` for the nonlinear parameters given.
+
+    ``columns[output]`` (m, len(linear[output])): only the parameters that this output sees.
+    ``penalty`` (rows, len(model.linear)): smoothness rows over all linear parameters, in ``model.linear`` order.
+    """
+
+    constant: Mapping[str, Array]
+    columns: Mapping[str, Array]
+    linear: Mapping[str, tuple[int, ...]]
+    penalty: Array
+
+
+class Model:
+    """A twin with placed effects (kept in chain order as far as stages order them, then as given)."""
+
+    def __init__(self, twin: Twin, placed: Sequence[Placed] = ()) -> None:
+        self.twin = twin
+        self.placed = tuple(placed)
+        free: list[Free] = []
+        self._slices: list[tuple[slice, slice]] = []
+        base = [_free(p, twin.units, "", "", "", -1) for p in twin.parameters]
+        free.extend(base)
+        for k, pl in enumerate(self.placed):
+            parts = pl.parts
+            a = len(free)
+            b = a + len(parts.nonlinear)
+            c = b + len(parts.weights)
+            u_out = twin.units.get(pl.outputs[0], "")
+            u_in = twin.units.get(twin.drive(pl.outputs[0]) or pl.target, "")
+            u_tgt = twin.units.get(pl.target, "")
+            if pl.site == "input":
+                u_in = u_tgt
+            for p in (*parts.nonlinear, *parts.weights):
+                free.append(_free(p, twin.units, u_in, u_out, pl.label + ".", k))
+            self._slices.append((slice(a, b), slice(b, c)))
+        self.order = sorted(range(len(self.placed)), key=lambda k: STAGES.index(self.placed[k].stage))
+        self._free = tuple(free)
+        survived = self._find_linear()
+        self.parameters = tuple(replace(f, linear=i in survived) for i, f in enumerate(free))
+        self.linear = tuple(i for i, f in enumerate(self.parameters) if f.linear)
+        self.nonlinear = tuple(i for i, f in enumerate(self.parameters) if not f.linear)
+
+    # -- parameters ---------------------------------------------------------------------------------
+
+    @property
+    def n_base(self) -> int:
+        """Number of base parameters; they come first in theta."""
+        return len(self.twin.parameters)
+
+    def slices(self, k: int) -> tuple[slice, slice]:
+        """Where the nonlinear parameters and the weights of placed effect ``k`` sit in theta."""
+        return self._slices[k]
+
+    def start(self, recording: Recording) -> Array:
+        """Theta with the base as given, effects absent as far as that is expressible (weights zero, nonlinear
+        parameters in the middle of their bounds)."""
+        theta = np.zeros(len(self.parameters))
+        theta[: self.n_base] = self.twin.start(recording)
+        for k, pl in enumerate(self.placed):
+            s, _ = self._slices[k]
+            theta[s] = [_middle(p) for p in pl.parts.nonlinear]
+        return theta
+
+    def carry(self, other: Model, theta: Array, recording: Recording) -> Array:
+        """Theta of ``other`` (a model with a subset of these effects) as a start for this one, by effect."""
+        mine = self.start(recording)
+        mine[: self.n_base] = theta[: other.n_base]
+        left = list(range(len(other.placed)))
+        for k, pl in enumerate(self.placed):
+            hit = next((j for j in left if other.placed[j] == pl or other.placed[j] is pl), None)
+            if hit is not None:
+                left.remove(hit)
+                for a, b in zip(self._slices[k], other.slices(hit), strict=True):
+                    mine[a] = theta[b]
+        return mine
+
+    def starts(self, k: int, view: View, theta: Array) -> list[Array]:
+        """Theta with placed effect ``k`` at each of its guesses (others kept), from the residual at ``theta``
+        without effect ``k``."""
+        pl = self.placed[k]
+        rest = Model(self.twin, [p for j, p in enumerate(self.placed) if j != k])
+        without = rest.carry(self, theta, view.recording)
+        output = pl.outputs[0]
+        residual = full_residual(rest, view, without)[output]
+        x, ctx = probe_signals(rest, view, without, pl, output)
+        out: list[Array] = []
+        for q in pl.effect.guess(x, residual, ctx, pl.settings):
+            th = theta.copy()
+            th[self._slices[k][0]] = q
+            out.append(th)
+        return out
+
+    def human(self, theta: Array) -> dict[str, list[Human]]:
+        """Parameters for the report: key "base" and each effect's label."""
+        out: dict[str, list[Human]] = {"base": list(self.twin.human(theta[: self.n_base]))}
+        for k, pl in enumerate(self.placed):
+            a, b = self._slices[k]
+            p = np.concatenate([theta[a], theta[b]])
+            g = self.twin.sensitivity(pl.outputs[0], theta[: self.n_base])
+            if pl.effect.report is not None:
+                out[pl.label] = list(pl.effect.report(p, pl.settings, g))
+            else:
+                names = self.parameters[a.start : b.stop]
+                out[pl.label] = [
+                    Human(f.name.rsplit(".", 1)[-1], float(v), f.unit) for f, v in zip(names, p, strict=True)
+                ]
+        return out
+
+    # -- simulation ---------------------------------------------------------------------------------
+
+    def simulate(self, view: View, theta: Array) -> dict[str, Array]:
+        """Every output of the twin on the view, (m,) each: free-run, no measured output but for start states."""
+        index = view.index
+        return {o: s.value[index] for o, s in self._flow(view_run(self.twin, view), theta, True).items()}
+
+    def residual(self, view: View, theta: Array) -> dict[str, Array]:
+        """Measured minus simulated on the view."""
+        return {o: view.measured(o) - y for o, y in self.simulate(view, theta).items()}
+
+    def design(self, view: View, theta: Array) -> Design:
+        """The affine structure at the nonlinear parameters of ``theta``; linear entries are ignored."""
+        index = view.index
+        flow = self._flow(view_run(self.twin, view), theta, False)
+        keep = set(self.linear)
+        constant: dict[str, Array] = {}
+        columns: dict[str, Array] = {}
+        linear: dict[str, tuple[int, ...]] = {}
+        for o, s in flow.items():
+            value = s.value[index]
+            js = sorted(j for j in s.columns if j in keep)
+            for j in s.columns:
+                if j not in keep:
+                    value = value + theta[j] * s.columns[j][index]
+            constant[o] = value
+            linear[o] = tuple(js)
+            matrix = np.empty((index.size, len(js)), order="F")
+            for i, j in enumerate(js):
+                matrix[:, i] = s.columns[j][index]
+            columns[o] = matrix
+        return Design(constant, columns, linear, self._penalty())
+
+    def _penalty(self) -> Array:
+        at = {j: i for i, j in enumerate(self.linear)}
+        rows: list[Array] = []
+        for k, pl in enumerate(self.placed):
+            penalty = pl.parts.penalty
+            w = self._slices[k][1]
+            if penalty is None or any(j not in at for j in range(w.start, w.stop)):
+                continue
+            block = np.zeros((penalty.shape[0], len(self.linear)))
+            block[:, [at[j] for j in range(w.start, w.stop)]] = penalty
+            rows.append(block)
+        return np.concatenate(rows) if rows else np.zeros((0, len(self.linear)))
+
+    def _flow(self, run: Run, theta: Array, join: bool, folded: set[int] | None = None) -> dict[str, Signal]:
+        theta = np.asarray(theta, np.float64)
+        inputs = {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
+        for k in self.order:
+            pl = self.placed[k]
+            if pl.site == "input":
+                inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
+        forces = [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
+        if folded is not None and forces:
+            for f in forces:
+                folded.update(range(f.first_weight, f.first_weight + f.weights.size))
+        outputs = self.twin.respond(run, inputs, theta, forces, join)
+        if forces and folded is not None:
+            folded.update(j for s in inputs.values() for j in s.columns)
+        for k in self.order:
+            pl = self.placed[k]
+            if pl.site != "output":
+                continue
+            for o in pl.outputs:
+                if o not in outputs:
+                    continue
+                drive = self.twin.drive(o)
+                by = inputs[drive] if self.twin.static and drive else None
+                outputs[o] = self._pass(run, k, outputs[o], by, o, theta, join, folded)
+        return outputs
+
+    def _force(self, k: int, theta: Array) -> Force:
+        pl = self.placed[k]
+        a, b = self._slices[k]
+        return Force(pl.effect, pl.settings, theta[a], theta[b], b.start)
+
+    def _pass(
+        self,
+        run: Run,
+        k: int,
+        x: Signal,
+        by: Signal | None,
+        output: str,
+        theta: Array,
+        join: bool,
+        folded: set[int] | None,
+    ) -> Signal:
+        pl, effect = self.placed[k], self.placed[k].effect
+        a, b = self._slices[k]
+        q = theta[a]
+        ctx = make_context(self.twin, run, pl.target if pl.site == "input" else output, output)
+        key = (effect.name, pl.target, output, q.tobytes(), _frozen(pl.settings))
+
+        def collapse(s: Signal) -> Signal:
+            if folded is not None:
+                folded.update(s.columns)
+            return fold(s, theta)
+
+        if effect.kind == "linear":
+            apply = effect.apply
+            assert apply is not None
+            return x.map(lambda v: apply(v, ctx, q, pl.settings), key)
+        if effect.kind == "nonlinear":
+            apply = effect.apply
+            assert apply is not None
+            s = collapse(x)
+            value = remember(run, (key, s.token), lambda: apply(s.value, ctx, q, pl.settings))
+            return Signal(value, {}, (*s.token, key))
+        basis = effect.basis
+        assert basis is not None
+        if effect.driven:
+            s = collapse(by if by is not None else x)
+            if s is not x and by is None:
+                x = s
+        else:
+            s = Signal(x.value, {}, ("undriven",))
+        columns = remember(run, (key, s.token), lambda: np.asfortranarray(basis(s.value, ctx, q, pl.settings)))
+        if join:
+            return Signal(x.value + columns @ theta[b], x.columns, (*x.token, key, theta[b].tobytes()))
+        return x.plus({b.start + i: columns[:, i] for i in range(columns.shape[1])}, key)
+
+    def _find_linear(self) -> set[int]:
+        """Which parameters stay linear, found by one pass over a short made-up stretch."""
+        n = 64
+        t = np.arange(n) * 1e-2
+        wave = np.sin(2 * np.pi * t / t[-1])
+        names = {*self.twin.inputs, *(s for pl in self.placed for s in pl.effect.needs)}
+        run = Run(
+            t,
+            1e-2,
+            dict.fromkeys(names, wave),
+            self.twin.inputs,
+            dict.fromkeys(self.twin.outputs, wave),
+            (0,),
+            0,
+            {},
+        )
+        theta = np.array([_middle(f) for f in self._free])
+        folded: set[int] = set()
+        with np.errstate(all="ignore"):
+            flow = self._flow(run, theta, False, folded)
+        found = {j for s in flow.values() for j in s.columns}
+        return found - folded
+
+
+def view_run(twin: Twin, view: View) -> Run:
+    """The stretch that a view needs: the whole past, since inputs before a block are known and set its memory.
+
+    A twin that restarts does so at every range; others start at sample 0 and run through.
+    """
+    rec = view.recording
+    starts = tuple(dict.fromkeys((0, *(a for a, _ in view.ranges)))) if twin.restart else (0,)
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, view.init, view.memo)
+
+
+def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
+    """What an effect sees on this run."""
+    return Context(
+        run.t,
+        run.dt,
+        run.signals,
+        target,
+        output,
+        twin.drive(output),
+        (0,),
+        None,
+        None,
+        twin.facts(output),
+    )
+
+
+def remember(run: Run, key: object, make: object) -> Array:
+    """``make()`` once per key and view; old entries go when the store is full."""
+    found = run.memo.get(key)
+    if found is not None:
+        return found  # type: ignore[return-value]
+    value: Array = make()  # type: ignore[operator]
+    size = run.memo.get("bytes", 0)
+    assert isinstance(size, int)
+    if size + value.nbytes > MEMO_BYTES:
+        run.memo.clear()
+        size = 0
+    run.memo[key] = value
+    run.memo["bytes"] = size + value.nbytes
+    return value
+
+
+def full_residual(model: Model, view: View, theta: Array) -> dict[str, Array]:
+    """Measured minus simulated over the whole recording (n,), zero outside the view."""
+    out: dict[str, Array] = {}
+    index = view.index
+    for o, r in model.residual(view, theta).items():
+        full = np.zeros(view.recording.n)
+        full[index] = r
+        out[o] = full
+    return out
+
+
+def view_mask(view: View) -> np.ndarray:
+    """(n,) bool: samples of the recording that are in the view."""
+    mask = np.zeros(view.recording.n, np.bool_)
+    mask[view.index] = True
+    return mask
+
+
+def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
+    """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
+    the view as mask and the declared noise."""
+    run = view_run(model.twin, view)
+    ctx = make_context(model.twin, run, pl.target if pl.site == "input" else output, output)
+    ctx = replace(ctx, mask=view_mask(view), noise=view.recording.noise.get(output))
+    twin = model.twin
+    if pl.site == "input":
+        return run.signals[pl.target], ctx
+    if pl.site == "feedback":
+        return run.measured[output], ctx
+    drive = twin.drive(output)
+    if twin.static and drive and pl.effect.kind == "add":
+        return run.signals[drive], ctx
+    return model._flow(run, theta, True)[output].value, ctx
+
+
+def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
+    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view."""
+    output = pl.outputs[0]
+    x, ctx = probe_signals(model, view, theta, pl, output)
+    residual = full_residual(model, view, theta)[output]
+    return replace(pl, settings=pl.effect.prepare(x, residual, ctx))
+
+
+def _frozen(settings: Settings) -> tuple[object, ...]:
+    return tuple(sorted(settings.items()))
+
+
+def _middle(p: Parameter | Free) -> float:
+    lo, hi = p.lo, p.hi
+    if p.log and lo > 0 and np.isfinite(hi):
+        return float(np.sqrt(lo * hi))
+    if np.isfinite(lo) and np.isfinite(hi):
+        return 0.5 * (lo + hi)
+    return float(min(max(p.scale, lo), hi))
+
+
+def _free(p: Parameter, units: Mapping[str, str], u_in: str, u_out: str, prefix: str, k: int) -> Free:
+    unit = p.unit.replace("{in}", u_in).replace("{out}", u_out)
+    return Free(prefix + p.name, unit, p.lo, p.hi, p.log, p.scale, False, k)

@@ -1,0 +1,132 @@
+"""What a twin is: an ordered chain of stages around base physics with a flat list of base parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
+from tools.mismatch.recording import Recording
+
+
+@dataclass(frozen=True)
+class Signal:
+    """A signal that is affine in the linear parameters: ``value + sum(theta[j] * columns[j])``.
+
+    ``token`` names how it came about; equal tokens mean equal arrays, so that work can be remembered.
+    """
+
+    value: Array
+    columns: Mapping[int, Array] = field(default_factory=dict[int, Array])
+    token: tuple[object, ...] = ()
+
+    def map(self, f: Callable[[Array], Array], token: object) -> Signal:
+        """A linear operator on the value and on every column."""
+        return Signal(f(self.value), {j: f(c) for j, c in self.columns.items()}, (*self.token, token))
+
+    def plus(self, columns: Mapping[int, Array], token: object) -> Signal:
+        """More columns (added to those with the same index)."""
+        merged = dict(self.columns)
+        for j, c in columns.items():
+            merged[j] = merged[j] + c if j in merged else c
+        return replace(self, columns=merged, token=(*self.token, token))
+
+
+@dataclass(frozen=True)
+class Force:
+    """A feedback effect as the base physics meets it: ``basis(pos, vel) @ weights`` is added to the force."""
+
+    effect: Effect
+    settings: Settings
+    q: Array
+    weights: Array
+    first_weight: int
+    """Index of its first weight in theta."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """The stretch of a recording that is simulated, and from where.
+
+    ``starts``: samples of the stretch where the base physics starts afresh. ``init``: samples of measured output
+    after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,).
+    """
+
+    t: Array
+    dt: float
+    signals: Mapping[str, Array]
+    inputs: tuple[str, ...]
+    measured: Mapping[str, Array]
+    starts: tuple[int, ...]
+    init: int
+    memo: dict[object, object]
+
+
+class Twin(Protocol):
+    """The simulator before anything is added. Frozen; ``theta`` are the base parameters, in order."""
+
+    kind: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    chain: tuple[Stage, ...]
+    parameters: tuple[Parameter, ...]
+    static: bool
+    """Output depends on the present input alone: additive effects then sit at the output, driven by the input."""
+    restart: bool
+    """Free-run drifts (an integrator, a slow pole): each range of a view starts from a state set by data."""
+    feedback_on: str
+    """The output that feedback effects act on ("" when the twin has no equation of motion)."""
+
+    def start(self, recording: Recording) -> Array:
+        """Base parameters as the engineer gave them; what is missing is estimated from the data."""
+        ...
+
+    def drive(self, output: str) -> str:
+        """The input signal that this output mainly follows ("" if several do)."""
+        ...
+
+    def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
+        """Constants that effects may need: axis, location."""
+        ...
+
+    def sensitivity(self, output: str, theta: Array) -> float:
+        """Output per unit of its driving input, for human parameters."""
+        ...
+
+    def respond(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """Outputs for inputs. Linear base parameters appear as columns; ``join`` folds them into the value.
+
+        Columns of the inputs pass through when the base physics is linear in its input.
+        """
+        ...
+
+    def human(self, theta: Array) -> Sequence[Human]:
+        """Base parameters under the contract's names."""
+        ...
+
+    def to_text(self, theta: Array) -> dict[str, object]:
+        """``[twin.parameters]`` for a corrected twin."""
+        ...
+
+
+def fold(signal: Signal, theta: Array) -> Signal:
+    """The value at ``theta``, without columns."""
+    if not signal.columns:
+        return signal
+    value = signal.value.copy()
+    for j, c in signal.columns.items():
+        value += theta[j] * c
+    key = tuple((j, float(theta[j])) for j in signal.columns)
+    return Signal(value, {}, (*signal.token, key))
+
+
+def keep_all(n: int) -> NDArray[np.bool_]:
+    """A mask that keeps everything."""
+    return np.ones(n, np.bool_)

@@ -1,0 +1,159 @@
+"""Twins without memory: each output is an offset plus scaled inputs. Piezo stack, accelerometer, magnetometer."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.base import Force, Run, Signal, fold
+
+
+@dataclass(frozen=True)
+class StaticTwin:
+    """``y_o = offset_o + scale_o * x_drive(o)``; theta = all offsets, then all scales.
+
+    ``names`` are the contract's (offset, scale). ``given`` (outputs, 2) holds the engineer's numbers, NaN where
+    missing: those are estimated by least squares.
+    """
+
+    kind: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    chain: tuple[Stage, ...]
+    parameters: tuple[Parameter, ...]
+    drives: Mapping[str, str]
+    names: tuple[str, str]
+    given: tuple[tuple[float, float], ...]
+    static: bool = True
+    restart: bool = False
+    feedback_on: str = ""
+
+    def start(self, recording: Recording) -> Array:
+        """See Twin."""
+        m = len(self.outputs)
+        theta = np.empty(2 * m)
+        for i, o in enumerate(self.outputs):
+            offset, scale = self.given[i]
+            x, y = recording.inputs[self.drives[o]], recording.outputs[o]
+            if np.isnan(scale):
+                dx = x - x.mean()
+                if np.isnan(offset):
+                    scale = float(dx @ y / (dx @ dx))
+                else:
+                    scale = float(x @ (y - offset) / (x @ x))
+            if np.isnan(offset):
+                offset = float(np.mean(y - scale * x))
+            theta[i], theta[m + i] = offset, scale
+        return theta
+
+    def drive(self, output: str) -> str:
+        """See Twin."""
+        return self.drives[output]
+
+    def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
+        """See Twin."""
+        return {"axis": ("xyz".find(output[-1]),)} if "_" in output else {}
+
+    def sensitivity(self, output: str, theta: Array) -> float:
+        """See Twin."""
+        return float(theta[len(self.outputs) + self.outputs.index(output)])
+
+    def respond(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """See Twin. A scaled input with columns of its own is folded: its scale is a parameter too."""
+        m = len(self.outputs)
+        out: dict[str, Signal] = {}
+        for i, o in enumerate(self.outputs):
+            x = fold(inputs[self.drives[o]], theta)
+            one = np.ones_like(x.value)
+            key = (*x.token, "static", o)
+            if join:
+                out[o] = Signal(theta[i] + theta[m + i] * x.value, {}, (*key, theta[i], theta[m + i]))
+            else:
+                out[o] = Signal(np.zeros_like(x.value), {i: one, m + i: x.value}, key)
+        return out
+
+    def human(self, theta: Array) -> Sequence[Human]:
+        """See Twin."""
+        m = len(self.outputs)
+        return [Human(p.name, float(theta[i]), p.unit) for i, p in enumerate(self.parameters[: 2 * m])]
+
+    def to_text(self, theta: Array) -> dict[str, object]:
+        """See Twin."""
+        m = len(self.outputs)
+        offsets, scales = theta[:m].tolist(), theta[m : 2 * m].tolist()
+        if m == 1:
+            return {self.names[0]: offsets[0], self.names[1]: scales[0]}
+        return {
+            self.names[0]: dict(zip(self.outputs, offsets, strict=True)),
+            self.names[1]: dict(zip(self.outputs, scales, strict=True)),
+        }
+
+
+_KINDS: dict[str, tuple[str, str, tuple[Stage, ...]]] = {
+    "piezo_stack": ("offset_um", "gain_um_per_V", ("amplifier", "actuator", "mechanics", "sensor", "acquisition")),
+    "accelerometer": ("bias_V", "scale_V_per_g", ("mounting", "sensor", "environment", "acquisition")),
+    "magnetometer": ("bias_V", "scale_V_per_uT", ("mounting", "environment", "sensor", "acquisition")),
+}
+
+
+def static_twin(recording: Recording) -> StaticTwin:
+    """The twin that a recording names, restricted to the axes that were recorded."""
+    kind = recording.twin.kind
+    offset, scale, chain = _KINDS[kind]
+    inputs = tuple(recording.inputs)
+    outputs = tuple(recording.outputs)
+    drives: dict[str, str] = {}
+    for o in outputs:
+        drive = inputs[0] if kind == "piezo_stack" else next((s for s in inputs if s[-2:] == o[-2:]), "")
+        if not drive:
+            raise RecordingError(
+                f"{recording.path}: output '{o}' has no input of its own axis; record or leave out both"
+            )
+        drives[o] = drive
+    text = recording.twin.parameters
+    known = {offset, scale}
+    for key in text:
+        if key not in known:
+            raise RecordingError(
+                f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {sorted(known)}"
+            )
+    given = tuple(
+        (_one(recording, text.get(offset), offset, o, i), _one(recording, text.get(scale), scale, o, i))
+        for i, o in enumerate(outputs)
+    )
+    many = len(outputs) > 1
+    parameters: list[Parameter] = []
+    for name, unit in ((offset, "{out}"), (scale, "")):
+        for o, (b, s) in zip(outputs, given, strict=True):
+            u = recording.unit[o] if unit else f"{recording.unit[o]}/{recording.unit[drives[o]]}"
+            typical = s if unit == "" and np.isfinite(s) and s else 1.0
+            if unit and np.isfinite(b) and b:
+                typical = b
+            parameters.append(Parameter(f"{name}[{o}]" if many else name, u, scale=abs(typical)))
+    return StaticTwin(kind, inputs, outputs, recording.unit, chain, tuple(parameters), drives, (offset, scale), given)
+
+
+def _one(recording: Recording, value: object, name: str, output: str, i: int) -> float:
+    if value is None:
+        return float("nan")
+    if isinstance(value, Mapping):
+        value = value.get(output, value.get(output[-1], float("nan")))
+    elif isinstance(value, Sequence) and not isinstance(value, str):
+        if len(value) != len(recording.outputs):
+            raise RecordingError(
+                f"{recording.path}: [twin.parameters] {name} has {len(value)} entries,"
+                f" expected one or {len(recording.outputs)}"
+            )
+        value = value[i]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        if isinstance(value, float) and np.isnan(value):
+            return float("nan")
+        raise RecordingError(f"{recording.path}: [twin.parameters] {name} must be a finite number, got {value!r}")
+    return float(value)
