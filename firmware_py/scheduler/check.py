@@ -1,0 +1,81 @@
+"""The static check: the promises of a task table must fit every tick before anything runs.
+
+ArduPilot finds out in flight (AP_Scheduler, pull request 12324); a table of fixed dividers can be checked once,
+over the least common multiple of the dividers (the hyperperiod).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from firmware_py.scheduler.task import BackgroundSpec, TaskSpec
+from hal.errors import BenchError
+
+MAX_HYPERPERIOD_TICKS = 10_000
+
+
+def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec], period_ns: int) -> int:
+    """Refuse a table that cannot keep its promises; return the hyperperiod in ticks.
+
+    Raises ``BenchError`` with the arithmetic: which tick, which tasks, which sum.
+    """
+    if not tasks:
+        raise BenchError("the task table is empty: nothing to schedule")
+    _refuse_duplicates([t.name for t in tasks] + [b.name for b in background])
+    hyperperiod = math.lcm(*(t.divider for t in tasks))
+    if hyperperiod > MAX_HYPERPERIOD_TICKS:
+        dividers = ", ".join(f"{t.name} {t.divider}" for t in tasks)
+        raise BenchError(
+            f"the dividers repeat only after {hyperperiod} ticks ({dividers}); "
+            f"choose dividers with a common multiple of at most {MAX_HYPERPERIOD_TICKS}"
+        )
+    ordered = in_order(tasks)
+    load_ns = np.zeros(hyperperiod, dtype=np.int64)
+    for task in ordered:
+        due = load_ns[task.phase :: task.divider]
+        due += task.budget_ns
+        worst = task.phase + task.divider * int(np.argmax(due))
+        if load_ns[worst] > task.deadline_ns:
+            raise BenchError(
+                f"task {task.name!r} cannot meet its deadline of {task.deadline_us:g} us in tick {worst} "
+                f"of {hyperperiod}: {_sum_text(ordered, worst, upto=task)}. Shorten a budget, move a phase or an order"
+            )
+    worst = int(np.argmax(load_ns))
+    if load_ns[worst] > period_ns:
+        raise BenchError(
+            f"the budgets do not fit tick {worst} of {hyperperiod}: {_sum_text(ordered, worst)} "
+            f"> {period_ns / 1000:g} us. Shorten a budget or move a phase"
+        )
+    slack_ns = period_ns - int(load_ns.min())
+    for item in background:
+        if item.worst_step_ns > slack_ns:
+            raise BenchError(
+                f"background task {item.name!r} would never run: a step takes up to {item.worst_step_us:g} us and "
+                f"the emptiest tick leaves {slack_ns / 1000:g} us. Make its steps shorter"
+            )
+    return hyperperiod
+
+
+def in_order(tasks: Sequence[TaskSpec]) -> list[TaskSpec]:
+    """The order of execution within a tick: by ``order``, then as written."""
+    return sorted(tasks, key=lambda t: t.order)
+
+
+def _sum_text(ordered: Sequence[TaskSpec], tick: int, upto: TaskSpec | None = None) -> str:
+    due: list[TaskSpec] = []
+    for task in ordered:
+        if tick % task.divider == task.phase:
+            due.append(task)
+        if task is upto:
+            break
+    terms = " + ".join(f"{t.name} {t.budget_us:g}" for t in due)
+    return f"{terms} = {sum(t.budget_ns for t in due) / 1000:g} us"
+
+
+def _refuse_duplicates(names: Sequence[str]) -> None:
+    for name in names:
+        if names.count(name) > 1:
+            raise BenchError(f"two tasks are called {name!r}: give each its own name")

@@ -1,0 +1,131 @@
+"""A log2 histogram of durations: integer operations only, no allocation after construction."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass
+
+import numpy as np
+
+_SUB_BITS = 4  # 16 linear buckets per octave: half a bucket is at most 1/32 = 3.1 % of the value
+_SUB = 1 << _SUB_BITS
+_LAST_NS = (1 << 36) - 1  # 68 s; the 32 octaves above 16 ns
+_N_BUCKETS = (_LAST_NS.bit_length() - _SUB_BITS) * _SUB + _SUB
+
+
+def bucket_of(value_ns: int) -> int:
+    """Index of the bucket that counts ``value_ns`` (0 .. 68 s; larger values share the last bucket)."""
+    if value_ns > _LAST_NS:
+        return _N_BUCKETS - 1
+    octave = value_ns.bit_length() - _SUB_BITS - 1
+    return (octave << _SUB_BITS) + (value_ns >> octave) if octave > 0 else value_ns
+
+
+def bucket_bounds_ns(index: int) -> tuple[int, int]:
+    """Smallest value and width of bucket ``index``, in ns."""
+    if index < 2 * _SUB:
+        return index, 1
+    octave = (index >> _SUB_BITS) - 1
+    return (_SUB + (index & (_SUB - 1))) << octave, 1 << octave
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """What a histogram says, in us. Quantiles are good to 3.2 %; mean, smallest and largest are exact.
+
+    ``max_tick`` is the tick of the largest value. All zero (and ``max_tick`` -1) when ``n`` is 0.
+    """
+
+    n: int
+    min_us: float
+    mean_us: float
+    p50_us: float
+    p99_us: float
+    p99_9_us: float
+    max_us: float
+    max_tick: int
+
+    def as_dict(self) -> dict[str, float]:
+        """The form of the ``micron run`` JSON."""
+        return {
+            "n": self.n,
+            "p50": self.p50_us,
+            "p99": self.p99_us,
+            "p99_9": self.p99_9_us,
+            "max": self.max_us,
+        }
+
+
+class DurationHistogram:
+    """Counts durations in ns. A negative one (a due time in the future) counts as zero."""
+
+    __slots__ = ("_counts", "max_ns", "max_tick", "min_ns", "n", "total_ns")
+
+    def __init__(self) -> None:
+        self._counts = array("q", bytes(8 * _N_BUCKETS))
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget everything."""
+        for i in range(_N_BUCKETS):
+            self._counts[i] = 0
+        self.n = 0
+        self.total_ns = 0
+        self.min_ns = 0
+        self.max_ns = 0
+        self.max_tick = -1
+
+    def add(self, value_ns: int, tick: int) -> None:
+        """Count one value, seen at ``tick``."""
+        if value_ns < 16:  # below one octave a bucket is one nanosecond
+            value_ns = max(value_ns, 0)
+            index = value_ns
+        elif value_ns <= _LAST_NS:
+            octave = value_ns.bit_length() - 5
+            index = (octave << 4) + (value_ns >> octave)
+        else:
+            index = _N_BUCKETS - 1
+        self._counts[index] += 1
+        if value_ns > self.max_ns or self.n == 0:
+            self.max_ns = value_ns
+            self.max_tick = tick
+        if value_ns < self.min_ns or self.n == 0:
+            self.min_ns = value_ns
+        self.n += 1
+        self.total_ns += value_ns
+
+    def counts(self) -> np.ndarray:
+        """A copy of the bucket counts, int64."""
+        return np.frombuffer(self._counts, dtype=np.int64).copy()
+
+    def quantile_ns(self, q: float) -> float:
+        """The value below which a share ``q`` of the counted values lies; 0 when nothing was counted."""
+        if self.n == 0:
+            return 0.0
+        return self._quantile_ns(q, np.cumsum(self.counts()))
+
+    def _quantile_ns(self, q: float, cumulated: np.ndarray) -> float:
+        rank = max(1, int(np.ceil(q * self.n)))
+        index = int(np.searchsorted(cumulated, rank))
+        below = int(cumulated[index - 1]) if index else 0
+        lo_ns, width_ns = bucket_bounds_ns(index)
+        share = (rank - below - 0.5) / (int(cumulated[index]) - below)
+        value_ns = lo_ns + share * (width_ns - 1)
+        return min(max(value_ns, float(self.min_ns)), float(self.max_ns))
+
+    def distribution(self) -> Distribution:
+        """Percentiles and extremes; changes nothing."""
+        if self.n == 0:
+            return Distribution(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1)
+        cumulated = np.cumsum(self.counts())
+        p50, p99, p99_9 = (self._quantile_ns(q, cumulated) * 1e-3 for q in (0.5, 0.99, 0.999))
+        return Distribution(
+            n=self.n,
+            min_us=self.min_ns * 1e-3,
+            mean_us=self.total_ns / self.n * 1e-3,
+            p50_us=p50,
+            p99_us=p99,
+            p99_9_us=p99_9,
+            max_us=self.max_ns * 1e-3,
+            max_tick=self.max_tick,
+        )

@@ -1,0 +1,145 @@
+"""Real-time settings of the loop's process: each is tried, reported as data, and undone.
+
+A machine that permits none of them still runs the loop; the report says what it ran with. Effects measured in
+design/algorithms.md section F: SCHED_FIFO takes the 99th percentile of lateness from milliseconds to 0.1 ms.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import os
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+
+_MCL_CURRENT, _MCL_FUTURE = 1, 2  # sys/mman.h, Linux
+_PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
+
+
+@dataclass(frozen=True, slots=True)
+class RealtimeConfig:
+    """What to ask for; ``None`` or False leaves a setting alone.
+
+    ``priority`` is SCHED_FIFO's 1..99 (the policy is not inherited by child processes), ``cpu`` the
+    processor to stay on. Child processes started while pinned inherit the pinning: start them before.
+    """
+
+    priority: int | None = 50
+    lock_memory: bool = True
+    cpu: int | None = None
+    timer_slack_ns: int | None = 1
+    freeze_gc: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One setting: whether it took, and if not why."""
+
+    name: str
+    wanted: str
+    done: bool
+    detail: str = ""
+
+
+@dataclass(slots=True)
+class RealtimeReport:
+    """All settings asked for, in order."""
+
+    settings: list[Setting] = field(default_factory=list)
+
+    def __getitem__(self, name: str) -> Setting:
+        return next(s for s in self.settings if s.name == name)
+
+    def as_dict(self) -> dict[str, dict[str, object]]:
+        return {s.name: {"wanted": s.wanted, "done": s.done, "detail": s.detail} for s in self.settings}
+
+
+@contextmanager
+def realtime(config: RealtimeConfig) -> Iterator[RealtimeReport]:
+    """Apply ``config`` to the calling thread's process for the length of the ``with`` block. Never raises
+    because something is not permitted or not there; undoes in reverse order what it did."""
+    report = RealtimeReport()
+    with ExitStack() as undo:
+
+        def attempt(name: str, wanted: str, apply: Callable[[], Callable[[], object]]) -> None:
+            try:
+                undo.callback(_quietly, apply())
+            except (OSError, AttributeError, ValueError) as error:
+                report.settings.append(Setting(name, wanted, False, _why(error)))
+            else:
+                report.settings.append(Setting(name, wanted, True))
+
+        cpu, priority, slack_ns = config.cpu, config.priority, config.timer_slack_ns
+        if cpu is not None:
+            attempt("cpu", f"cpu {cpu}", lambda: _pin(cpu))
+        if slack_ns is not None:
+            attempt("timer_slack", f"{slack_ns} ns", lambda: _timer_slack(slack_ns))
+        if config.lock_memory:
+            attempt("lock_memory", "mlockall", _lock_memory)
+        if config.freeze_gc:
+            attempt("gc", "frozen and off", _freeze_gc)
+        if priority is not None:  # last: what precedes may take long
+            attempt("priority", f"SCHED_FIFO {priority}", lambda: _fifo(priority))
+        yield report
+
+
+def _pin(cpu: int) -> Callable[[], object]:
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {cpu})
+    return lambda: os.sched_setaffinity(0, before)
+
+
+def _fifo(priority: int) -> Callable[[], object]:
+    policy, param = os.sched_getscheduler(0), os.sched_getparam(0)
+    os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+    return lambda: os.sched_setscheduler(0, policy, param)
+
+
+def _lock_memory() -> Callable[[], object]:
+    libc = ctypes.CDLL(None, use_errno=True)
+    _check(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
+    return libc.munlockall
+
+
+def _timer_slack(slack_ns: int) -> Callable[[], object]:
+    libc = ctypes.CDLL(None, use_errno=True)
+    before = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    _check(libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(slack_ns), 0, 0, 0))
+    return lambda: libc.prctl(_PR_SET_TIMERSLACK, ctypes.c_ulong(before), 0, 0, 0)
+
+
+def _freeze_gc() -> Callable[[], object]:
+    was_enabled = gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+
+    def thaw() -> None:
+        gc.unfreeze()
+        if was_enabled:
+            gc.enable()
+
+    return thaw
+
+
+def _check(result: int) -> None:
+    if result != 0:
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def _quietly(undo: Callable[[], object]) -> None:
+    """Leaving must not fail: a right that was taken away meanwhile is no reason to lose the run's report."""
+    try:
+        undo()
+    except OSError:
+        return
+
+
+def _why(error: Exception) -> str:
+    if isinstance(error, PermissionError):
+        return f"{error.strerror}: needs root, CAP_SYS_NICE or CAP_IPC_LOCK, or limits in /etc/security/limits.conf"
+    if isinstance(error, AttributeError):
+        return "not offered by this operating system"
+    return str(error)

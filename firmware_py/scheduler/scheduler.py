@@ -1,0 +1,278 @@
+"""A cooperative scheduler: tasks run to completion, in a fixed order, at dividers of one tick.
+
+Tick k is due at t0 + k*T; who drives ``tick`` (DAQ scans or the host clock) owns t0. After a stall whole periods
+are skipped, the phase of every task is kept, and what was skipped is counted per task and told to the tasks
+(FreeRTOS kernel issues 1339 and 1349). Promises per task as in ArduPilot AP_Scheduler, distributions instead of
+maxima.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from firmware_py.scheduler.background import Slack
+from firmware_py.scheduler.check import check_table, in_order
+from firmware_py.scheduler.histogram import DurationHistogram
+from firmware_py.scheduler.statistics import IgnoredSnapshot, SchedulerSnapshot, TaskSnapshot
+from firmware_py.scheduler.task import BackgroundSpec, TaskSpec, TickInfo
+from firmware_py.scheduler.ticker import Ticks
+from hal.contracts import Clock
+
+
+class _LiveTask:
+    """A task with its counters."""
+
+    __slots__ = (
+        "budget_ns", "catch_up", "cpu", "cpu_in", "deadline_ns", "duration", "errors", "fn", "ignored_runs",
+        "last_error", "lateness", "overruns", "runs", "skipped", "slips", "spec",
+    )  # fmt: skip
+
+    def __init__(self, spec: TaskSpec) -> None:
+        self.spec = spec
+        self.fn = spec.fn
+        self.catch_up = spec.catch_up
+        self.budget_ns = spec.budget_ns
+        self.deadline_ns = spec.deadline_ns
+        self.duration = DurationHistogram()
+        self.lateness = DurationHistogram()
+        self.cpu = DurationHistogram()
+        self.clear()
+
+    def clear(self) -> None:
+        self.runs = self.ignored_runs = self.skipped = self.overruns = self.slips = self.errors = 0
+        self.cpu_in = 0  # runs until the next one whose CPU time is taken
+        self.last_error = ""
+        for histogram in (self.duration, self.lateness, self.cpu):
+            histogram.clear()
+
+    def releases(self, first: int, stop: int) -> int:
+        """How often the task is due in the ticks first .. stop-1."""
+        divider, phase = self.spec.divider, self.spec.phase
+        return (stop - 1 - phase) // divider - (first - 1 - phase) // divider
+
+
+class _Ignored:
+    """Counters of one announced one-off."""
+
+    __slots__ = ("overruns", "skipped_ticks", "slips", "ticks", "worst_lateness_ns", "worst_tick_ns")
+
+    def __init__(self) -> None:
+        self.ticks = self.skipped_ticks = self.overruns = self.slips = 0
+        self.worst_tick_ns = self.worst_lateness_ns = 0
+
+
+class Scheduler:
+    """Runs a checked task table; ``tick`` and ``catch_up`` are called by whoever owns the time base.
+
+    ``BenchError`` at construction when the budgets or deadlines of any tick of the hyperperiod do not fit.
+    Thread CPU time is taken at every ``cpu_every``-th run of a task (a reading costs more than 1 us).
+    """
+
+    def __init__(
+        self,
+        tasks: Sequence[TaskSpec],
+        clock: Clock,
+        *,
+        period_ns: int = 1_000_000,
+        background: Sequence[BackgroundSpec] = (),
+        cpu_every: int = 16,
+        cpu_time_ns: Callable[[], int] = time.thread_time_ns,
+    ) -> None:
+        self._hyperperiod = check_table(tasks, background, period_ns)
+        self.period_ns = period_ns
+        self._now_ns = clock.now_ns
+        self._cpu_ns = cpu_time_ns
+        self._cpu_every = cpu_every
+        self._tasks = [_LiveTask(spec) for spec in in_order(tasks)]
+        self._slack = Slack(background, clock.now_ns)
+        self._due = [self._due_at(index, self._tasks) for index in range(self._hyperperiod)]
+        late = [task for task in self._tasks if task.catch_up]
+        self._due_late = [self._due_at(index, late) for index in range(self._hyperperiod)]
+        self._last_scan: int | None = None  # newest tick that the catch_up tasks have seen
+        self._last_full: int | None = None  # newest tick that all tasks have seen
+        self._tick_duration = DurationHistogram()
+        self._tick_lateness = DurationHistogram()
+        self._ticks = self._caught_up = self._skipped_ticks = 0
+        self._ignored: dict[str, _Ignored] = {}
+        self._ignoring: list[str] = []  # reasons of the ticks to come, the next one last
+
+    @staticmethod
+    def _due_at(index: int, tasks: Sequence[_LiveTask]) -> tuple[_LiveTask, ...]:
+        return tuple(task for task in tasks if index % task.spec.divider == task.spec.phase)
+
+    # -- running -----------------------------------------------------------------------------------------
+
+    def tick(self, due_ns: int, k: int) -> TickInfo:
+        """Run all tasks due at tick ``k``, which was due at ``due_ns``. ``k`` must grow; a gap is a skip.
+
+        An exception of a task is marked (``errors``, ``last_error``, a note that names task and tick) and
+        goes on to the caller; the tasks that were still to run count as skipped. The scheduler stays usable.
+        """
+        started_ns = self._now_ns()
+        lost = self._advance_scan(k)
+        last_full = k - 1 if self._last_full is None else self._last_full
+        self._last_full = k
+        if k - last_full > 1:
+            for task in self._tasks:
+                if not task.catch_up:
+                    task.skipped += task.releases(last_full + 1, k)
+        info = TickInfo(k, due_ns, started_ns, k - last_full - 1)
+        scan_info = info if info.skipped == lost else TickInfo(k, due_ns, started_ns, lost)
+        self._ticks += 1
+        self._run(self._due[k % self._hyperperiod], info, scan_info)
+        return info
+
+    def catch_up(self, due_ns: int, k: int) -> TickInfo:
+        """Run only the ``catch_up`` tasks for a scan that arrived late and is not the newest."""
+        started_ns = self._now_ns()
+        info = TickInfo(k, due_ns, started_ns, self._advance_scan(k))
+        self._caught_up += 1
+        self._run(self._due_late[k % self._hyperperiod], info, info)
+        return info
+
+    def run(self, ticks: Ticks) -> TickInfo:
+        """What a ``Ticker`` delivered: catch up through the older ticks, then run the newest in full."""
+        newest = ticks.n - 1
+        for i in range(newest):
+            self.catch_up(ticks.due_ns + i * ticks.dt_ns, ticks.k0 + i)
+        return self.tick(ticks.due_ns + newest * ticks.dt_ns, ticks.k0 + newest)
+
+    def run_slack(self, until_ns: int) -> int:
+        """Run background steps that fit before ``until_ns`` (when the next tick is due); how many ran."""
+        return self._slack.run(until_ns, -1 if self._last_scan is None else self._last_scan)
+
+    def _advance_scan(self, k: int) -> int:
+        """Note that tick ``k`` is being run; return how many were never run since the last one."""
+        last = k - 1 if self._last_scan is None else self._last_scan
+        if k <= last:
+            raise ValueError(f"tick {k} after tick {last}: ticks must grow")
+        self._last_scan = k
+        lost = k - last - 1
+        if lost:
+            self._skipped_ticks += lost
+            for task in self._tasks:
+                if task.catch_up:
+                    task.skipped += task.releases(last + 1, k)
+            if self._ignoring:
+                self._ignored[self._ignoring[-1]].skipped_ticks += lost
+        return lost
+
+    def _run(self, due: tuple[_LiveTask, ...], info: TickInfo, scan_info: TickInfo) -> None:
+        now_ns = self._now_ns
+        ignored = self._ignored[self._ignoring.pop()] if self._ignoring else None
+        due_ns, k = info.due_ns, info.k
+        done = 0
+        try:
+            for task in due:
+                task_info = scan_info if task.catch_up else info
+                task.runs += 1
+                if task.cpu_in or ignored:
+                    started_ns = now_ns()
+                    task.fn(task_info)
+                    ended_ns = now_ns()
+                    if task.cpu_in:
+                        task.cpu_in -= 1
+                else:
+                    cpu_ns = self._cpu_ns()
+                    started_ns = now_ns()
+                    task.fn(task_info)
+                    ended_ns = now_ns()
+                    task.cpu.add(self._cpu_ns() - cpu_ns, k)
+                    task.cpu_in = self._cpu_every - 1
+                duration_ns = ended_ns - started_ns
+                counters = task
+                if ignored:
+                    task.ignored_runs += 1
+                    counters = ignored
+                else:
+                    task.duration.add(duration_ns, k)
+                    task.lateness.add(started_ns - due_ns, k)
+                if duration_ns > task.budget_ns:
+                    counters.overruns += 1
+                if ended_ns - due_ns > task.deadline_ns:
+                    counters.slips += 1
+                done += 1
+        except BaseException as error:
+            self._mark(due, done, error, k)
+            raise
+        finally:
+            tick_ns = now_ns() - info.started_ns
+            lateness_ns = info.started_ns - due_ns
+            if ignored:
+                ignored.ticks += 1
+                ignored.worst_tick_ns = max(ignored.worst_tick_ns, tick_ns)
+                ignored.worst_lateness_ns = max(ignored.worst_lateness_ns, lateness_ns)
+            else:
+                self._tick_duration.add(tick_ns, k)
+                self._tick_lateness.add(lateness_ns, k)
+
+    @staticmethod
+    def _mark(due: tuple[_LiveTask, ...], done: int, error: BaseException, k: int) -> None:
+        failed = due[done]
+        failed.errors += 1
+        failed.last_error = f"tick {k}: {error!r}"
+        error.add_note(f"raised by task {failed.spec.name!r} in tick {k}")
+        for task in due[done + 1 :]:
+            task.skipped += 1
+
+    # -- statistics --------------------------------------------------------------------------------------
+
+    def ignore_next(self, reason: str, ticks: int = 1) -> None:
+        """Count the next ``ticks`` ticks apart, under ``reason``: an announced one-off (warm-up, gc)."""
+        self._ignored.setdefault(reason, _Ignored())
+        self._ignoring = [reason] * ticks + self._ignoring
+
+    def snapshot(self) -> SchedulerSnapshot:
+        """All counters and percentiles since the last ``reset``; changes nothing."""
+        tick_hz = 1e9 / self.period_ns
+        return SchedulerSnapshot(
+            period_us=self.period_ns / 1000,
+            ticks=self._ticks,
+            caught_up=self._caught_up,
+            skipped_ticks=self._skipped_ticks,
+            tick_duration=self._tick_duration.distribution(),
+            tick_lateness=self._tick_lateness.distribution(),
+            tasks=tuple(
+                TaskSnapshot(
+                    name=task.spec.name,
+                    rate_hz=tick_hz / task.spec.divider,
+                    budget_us=task.spec.budget_us,
+                    deadline_us=task.spec.deadline_us,
+                    runs=task.runs,
+                    ignored_runs=task.ignored_runs,
+                    skipped=task.skipped,
+                    overruns=task.overruns,
+                    slips=task.slips,
+                    errors=task.errors,
+                    last_error=task.last_error,
+                    duration=task.duration.distribution(),
+                    lateness=task.lateness.distribution(),
+                    cpu=task.cpu.distribution(),
+                )
+                for task in self._tasks
+            ),
+            background=self._slack.snapshot(),
+            ignored=tuple(
+                IgnoredSnapshot(
+                    reason=reason,
+                    ticks=counted.ticks,
+                    skipped_ticks=counted.skipped_ticks,
+                    overruns=counted.overruns,
+                    slips=counted.slips,
+                    worst_tick_us=counted.worst_tick_ns / 1000,
+                    worst_lateness_us=counted.worst_lateness_ns / 1000,
+                )
+                for reason, counted in self._ignored.items()
+            ),
+        )
+
+    def reset(self) -> None:
+        """Forget all counters and histograms; the tick number, the phases and pending ``ignore_next`` stay."""
+        for task in self._tasks:
+            task.clear()
+        self._slack.reset()
+        self._tick_duration.clear()
+        self._tick_lateness.clear()
+        self._ticks = self._caught_up = self._skipped_ticks = 0
+        self._ignored = {reason: _Ignored() for reason in self._ignoring}

@@ -1,0 +1,136 @@
+"""What the scheduler counted, as values that no longer change."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from firmware_py.scheduler.histogram import Distribution
+
+
+@dataclass(frozen=True, slots=True)
+class TaskSnapshot:
+    """One task since the last ``reset``.
+
+    ``skipped``: releases that never ran; ``overruns``: runs longer than the budget; ``slips``: runs that ended
+    after the deadline; ``errors``: runs that raised. ``ignored_runs`` belong to announced one-offs and are in
+    none of the figures except ``runs``. ``cpu`` is thread CPU time of a sample of the runs.
+    """
+
+    name: str
+    rate_hz: float
+    budget_us: float
+    deadline_us: float
+    runs: int
+    ignored_runs: int
+    skipped: int
+    overruns: int
+    slips: int
+    errors: int
+    last_error: str
+    duration: Distribution
+    lateness: Distribution
+    cpu: Distribution
+
+    def as_dict(self) -> dict[str, object]:
+        """The form of the ``micron run`` JSON."""
+        return {
+            "rate_hz": self.rate_hz,
+            "runs": self.runs,
+            "ignored_runs": self.ignored_runs,
+            "budget_us": self.budget_us,
+            "deadline_us": self.deadline_us,
+            "duration_us": self.duration.as_dict(),
+            "cpu_us": self.cpu.as_dict(),
+            "lateness_us": self.lateness.as_dict(),
+            "overruns": self.overruns,
+            "skipped": self.skipped,
+            "slips": self.slips,
+            "errors": self.errors,
+            "last_error": self.last_error,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class BackgroundSnapshot:
+    """One background task: ``overruns`` are steps longer than the declared worst step."""
+
+    name: str
+    worst_step_us: float
+    steps: int
+    overruns: int
+    finished: bool
+    last_error: str
+    duration: Distribution
+
+    def as_dict(self) -> dict[str, object]:
+        return {
+            "steps": self.steps,
+            "worst_step_us": self.worst_step_us,
+            "duration_us": self.duration.as_dict(),
+            "overruns": self.overruns,
+            "finished": self.finished,
+            "last_error": self.last_error,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class IgnoredSnapshot:
+    """Ticks of an announced one-off (``ignore_next``): apart, but not hidden."""
+
+    reason: str
+    ticks: int
+    skipped_ticks: int
+    overruns: int
+    slips: int
+    worst_tick_us: float
+    worst_lateness_us: float
+
+    def as_dict(self) -> dict[str, object]:
+        return {
+            "ticks": self.ticks,
+            "skipped_ticks": self.skipped_ticks,
+            "overruns": self.overruns,
+            "slips": self.slips,
+            "worst_tick_us": self.worst_tick_us,
+            "worst_lateness_us": self.worst_lateness_us,
+        }
+
+
+@dataclass(frozen=True, slots=True)
+class SchedulerSnapshot:
+    """The whole scheduler since the last ``reset``.
+
+    ``ticks`` ran for all tasks, ``caught_up`` ran late for the ``catch_up`` tasks only, ``skipped_ticks`` never
+    ran. ``tick_duration.max_tick`` is the number of the worst tick, ``tick_lateness.max_tick`` of the latest.
+    """
+
+    period_us: float
+    ticks: int
+    caught_up: int
+    skipped_ticks: int
+    tick_duration: Distribution
+    tick_lateness: Distribution
+    tasks: tuple[TaskSnapshot, ...]
+    background: tuple[BackgroundSnapshot, ...] = ()
+    ignored: tuple[IgnoredSnapshot, ...] = field(default=())
+
+    def task(self, name: str) -> TaskSnapshot:
+        """The task of that name; ``KeyError`` when there is none."""
+        for task in self.tasks:
+            if task.name == name:
+                return task
+        raise KeyError(name)
+
+    def as_dict(self) -> dict[str, object]:
+        """JSON-ready; ``["tasks"]`` is the ``tasks`` object of the ``micron run`` JSON."""
+        return {
+            "period_us": self.period_us,
+            "ticks": self.ticks,
+            "caught_up": self.caught_up,
+            "skipped_ticks": self.skipped_ticks,
+            "tick_us": {**self.tick_duration.as_dict(), "worst_tick": self.tick_duration.max_tick},
+            "tick_lateness_us": {**self.tick_lateness.as_dict(), "worst_tick": self.tick_lateness.max_tick},
+            "tasks": {t.name: t.as_dict() for t in self.tasks},
+            "background": {b.name: b.as_dict() for b in self.background},
+            "ignored": {i.reason: i.as_dict() for i in self.ignored},
+        }

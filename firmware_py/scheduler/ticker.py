@@ -1,0 +1,109 @@
+"""Where ticks come from: the DAQ's scans (device clock), or the host clock.
+
+Policy for scans that arrived late in one block: the ``catch_up`` tasks (sense) run for every scan, so that filters
+see all data; everything else (estimate, actuate) runs once, for the newest. See ``Scheduler.run``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from hal.contracts import Clock
+from hal.types import ScanBlock, TimeSource
+
+_ROUNDING_NS = 1000  # a timeout in float seconds may come back a little early
+
+
+class Ticks(NamedTuple):
+    """``n`` >= 1 consecutive ticks that are due now, the first one ``k0``, due at ``due_ns``, ``dt_ns`` apart.
+
+    ``source`` HOST means that no scan came with them.
+    """
+
+    k0: int
+    n: int
+    due_ns: int
+    dt_ns: int
+    source: TimeSource
+
+
+class Ticker(Protocol):
+    """A time base: ``wait`` returns when at least one tick is due. Tick numbers grow; a gap is a skip."""
+
+    def wait(self) -> Ticks: ...
+
+
+class HostTicker:
+    """Ticks at ``t0_ns + k * period_ns`` of the host clock. When whole periods have passed, the newest due
+    tick is delivered and the others are skipped: the phase is kept and nothing is made up for."""
+
+    def __init__(self, clock: Clock, period_ns: int, t0_ns: int, k0: int = 0) -> None:
+        self._clock = clock
+        self._period_ns = period_ns
+        self._t0_ns = t0_ns  # when tick 0 is due, whatever the first tick is
+        self._next = k0
+
+    def wait(self) -> Ticks:
+        """Sleep until the next tick is due; not at all when it is due already."""
+        self._clock.sleep_until_ns(self._t0_ns + self._next * self._period_ns)
+        newest = (self._clock.now_ns() - self._t0_ns) // self._period_ns
+        self._next = newest + 1
+        return Ticks(newest, 1, self._t0_ns + newest * self._period_ns, self._period_ns, TimeSource.HOST)
+
+
+class ScanTicker:
+    """Ticks are the scans of a device: tick number = its sequence number, counted from the first scan.
+
+    ``read(timeout_s)`` fills the owner's buffer and returns the block (row i of the buffer belongs to tick
+    ``k0 + i``). When no scan has come for ``silent_after_ns``, ticks come from the host clock, one per
+    period and numbered on, so that supervision goes on; scans that arrive afterwards for numbers already used
+    are numbered on as well (``rebased`` counts that) and carry their own sequence number in the data.
+    """
+
+    def __init__(self, read: Callable[[float], ScanBlock], clock: Clock, period_ns: int, silent_after_ns: int) -> None:
+        self._read = read
+        self._clock = clock
+        self._period_ns = period_ns
+        self._silent_after_ns = silent_after_ns
+        self._last_k = -1
+        self._last_due_ns: int | None = None
+        self._seq_of_tick0: int | None = None
+        self._silent = False
+        self.host_ticks = 0
+        self.rebased = 0
+
+    def wait(self) -> Ticks:
+        """The next block of scans, or a host tick when the device stays silent. Errors of ``read`` pass."""
+        if self._last_due_ns is None:
+            self._last_due_ns = self._clock.now_ns()
+        patience_ns = self._period_ns if self._silent else self._silent_after_ns
+        silent_at_ns = self._last_due_ns + patience_ns
+        while True:
+            left_ns = silent_at_ns - self._clock.now_ns()
+            block = self._read(max(0, left_ns) * 1e-9)
+            if block.n:
+                return self._scans(block)
+            if self._clock.now_ns() + _ROUNDING_NS >= silent_at_ns:
+                return self._host_tick(self._last_due_ns)
+
+    def _scans(self, block: ScanBlock) -> Ticks:
+        if self._seq_of_tick0 is None:
+            self._seq_of_tick0 = block.seq0 - (self._last_k + 1)
+        k0 = block.seq0 - self._seq_of_tick0
+        if k0 <= self._last_k:
+            self._seq_of_tick0 = block.seq0 - (self._last_k + 1)
+            self.rebased += 1
+            k0 = self._last_k + 1
+        self._last_k = k0 + block.n - 1
+        self._last_due_ns = block.t0_ns + (block.n - 1) * block.dt_ns
+        self._silent = False
+        return Ticks(k0, block.n, block.t0_ns, block.dt_ns, block.source)
+
+    def _host_tick(self, last_due_ns: int) -> Ticks:
+        periods = max(1, (self._clock.now_ns() + _ROUNDING_NS - last_due_ns) // self._period_ns)
+        self._last_k += periods
+        self._last_due_ns = last_due_ns + periods * self._period_ns
+        self._silent = True
+        self.host_ticks += 1
+        return Ticks(self._last_k, 1, self._last_due_ns, self._period_ns, TimeSource.HOST)
