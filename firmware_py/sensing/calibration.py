@@ -1,0 +1,131 @@
+"""Volts to physical quantities: six accelerometer axes, supply, temperature, magnetometer.
+
+The ADXL-203 is ratiometric (data sheet, "Ratiometricity"): bias and scale follow the supply. Its outputs sit
+behind the RC filter and the supply reading does not, so the supply passes the same filter here before it
+divides; a supply ripple then cancels instead of being traded for a phase error.
+"""
+
+from __future__ import annotations
+
+from math import exp
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.frame import (
+    ACCELEROMETER,
+    COUNTS,
+    MAGNETOMETER,
+    MAGNETOMETER_RAW,
+    SATURATED,
+    SUPPLY,
+    TEMPERATURE,
+    VOLTS,
+)
+from firmware_py.records import Record, new_record
+from firmware_py.sensing.config import SensingConfig
+
+TEMPERATURE_SMOOTHING_S = 1.0
+
+
+CALIBRATION = np.dtype(
+    [
+        ("lsb_V", "f8"),
+        ("channel", "i8", (6,)),
+        ("bias_V", "f8", (6,)),
+        ("scale_V", "f8", (6,)),  # per m/s^2
+        ("bias_V_per_C", "f8", (6,)),
+        ("scale_per_C", "f8", (6,)),
+        ("range", "f8"),  # m/s^2
+        ("supply_channel", "i8"),
+        ("supply_divider", "f8"),
+        ("nominal_supply_V", "f8"),
+        ("supply_smoothing", "f8"),
+        ("temperature_channel", "i8"),
+        ("temperature_offset_V", "f8"),
+        ("temperature_C_per_V", "f8"),
+        ("reference_C", "f8"),
+        ("temperature_smoothing", "f8"),
+        ("magnetometer_bias_V", "f8", (3,)),
+        ("magnetometer_uT_per_V", "f8", (3, 3)),  # misalignment included
+    ]
+)
+
+
+def calibration_params(config: SensingConfig) -> Record:
+    """The kernels' numbers (dtype ``CALIBRATION``) from the configuration."""
+    g = config.gravity_m_s2
+    dt = 1.0 / config.tick_hz
+    magnetometer_scale = np.array(config.magnetometer_scale_V_per_uT)
+    return new_record(
+        CALIBRATION,
+        lsb_V=config.lsb_V,
+        channel=config.channels,
+        bias_V=config.bias_V,
+        scale_V=np.array(config.scale_V_per_g) / g,
+        bias_V_per_C=config.bias_V_per_C,
+        scale_per_C=config.scale_per_C,
+        range=config.range_g * g,
+        supply_channel=config.supply_channel,
+        supply_divider=config.supply_divider,
+        nominal_supply_V=config.nominal_supply_V,
+        supply_smoothing=1.0 - exp(-config.cutoff_rad_s * dt),
+        temperature_channel=config.temperature_channel,
+        temperature_offset_V=config.temperature_offset_V,
+        temperature_C_per_V=1.0 / config.temperature_scale_V_per_C,
+        reference_C=config.reference_temperature_C,
+        temperature_smoothing=1.0 - exp(-dt / TEMPERATURE_SMOOTHING_S),
+        magnetometer_bias_V=config.magnetometer_bias_V,
+        # 000 (3.20): the rows of the inverted matrix are the sensing axes; scale first (ERRATA 33)
+        magnetometer_uT_per_V=np.linalg.inv(np.array(config.magnetometer_axes)) / magnetometer_scale,
+    )
+
+
+@kernel
+def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params: Record) -> int:
+    """Fill volts, supply, temperature and accelerometer columns; returns status bits, or -1 for a reading
+    that is not finite (nothing but ``volts`` is written then).
+
+    ``smoothed`` holds supply V and temperature degC; nan means not started.
+    """
+    for i in range(8):
+        frame[VOLTS + i] = frame[COUNTS + i] * params.lsb_V
+        if not np.isfinite(frame[VOLTS + i]):
+            return -1
+    supply = frame[VOLTS + params.supply_channel] * params.supply_divider
+    if supply < 0.2 * params.nominal_supply_V:
+        return -1
+    warm = (frame[VOLTS + params.temperature_channel] - params.temperature_offset_V) * params.temperature_C_per_V
+    if np.isnan(smoothed[0]):
+        smoothed[0] = supply
+        smoothed[1] = warm
+    else:
+        smoothed[0] += params.supply_smoothing * (supply - smoothed[0])
+        smoothed[1] += params.temperature_smoothing * (warm - smoothed[1])
+    frame[SUPPLY] = smoothed[0]
+    frame[TEMPERATURE] = smoothed[1]
+    ratio = params.nominal_supply_V / smoothed[0]
+    rise = smoothed[1] - params.reference_C
+    bits = 0
+    for i in range(6):
+        volts = frame[VOLTS + params.channel[i]] * ratio - params.bias_V[i] - params.bias_V_per_C[i] * rise
+        reading = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))
+        frame[ACCELEROMETER + i] = reading
+        if abs(reading) > params.range:
+            bits = SATURATED
+    return bits
+
+
+@kernel
+def calibrate_magnetometer(frame: NDArray[np.float64], params: Record) -> bool:
+    """Fill the magnetometer columns from its volts; False (and nothing written) when they are not finite."""
+    for i in range(3):
+        if not np.isfinite(frame[MAGNETOMETER_RAW + i]):
+            return False
+    for i in range(3):
+        field = 0.0
+        for j in range(3):
+            field += params.magnetometer_uT_per_V[i, j] * (frame[MAGNETOMETER_RAW + j] - params.magnetometer_bias_V[j])
+        frame[MAGNETOMETER + i] = field
+    return True

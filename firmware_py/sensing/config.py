@@ -1,0 +1,105 @@
+"""What the sensing stage needs to know of the instrument: [firmware.sensing] of the bench, sensor calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import pi
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hal.bench import validate_table
+
+Vector = tuple[float, float, float]
+Six = tuple[float, float, float, float, float, float]
+Positive = Annotated[float, Field(gt=0.0)]
+UNIT_AXES: tuple[Vector, ...] = (
+    (1.0, 0.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (0.0, 1.0, 0.0),
+    (0.0, 0.0, 1.0),
+    (1.0, 0.0, 0.0),
+    (0.0, 1.0, 0.0),
+)
+
+
+class SensingConfig(BaseModel):
+    """Sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tick_hz: Positive = 1000.0
+    lsb_V: Positive = 10.0 / 65536.0
+    channels: tuple[int, int, int, int, int, int] = (0, 1, 2, 3, 4, 5)
+    supply_channel: int = Field(default=6, ge=0, le=7)
+    temperature_channel: int = Field(default=7, ge=0, le=7)
+
+    # 000 (2.54), second: d1 = 20.2, d2 = 14.3, d3 = 116.0 mm; front sensor on the tool axis
+    positions_m: tuple[Vector, Vector, Vector] = ((0.0059, -0.0143, 0.0), (-0.0143, 0.0059, 0.0), (0.0, 0.0, 0.116))
+    axes: tuple[Vector, Vector, Vector, Vector, Vector, Vector] = UNIT_AXES  # pyright: ignore[reportAssignmentType]
+    tip_m: Vector = (0.0, 0.0, 0.155)
+    gravity_m_s2: Positive = 9.80131
+    noise_ug_per_rtHz: Six = (110.0,) * 6  # pyright: ignore[reportAssignmentType]
+    filter_ohm: Positive = 32_000.0  # ADXL-203 output resistance with the external capacitor, 000 sec. 3.2.1.7
+    filter_farad: Positive = 0.33e-6
+
+    nominal_supply_V: Positive = 5.0
+    supply_divider: Positive = 2.0
+    temperature_offset_V: float = 0.5  # TMP36
+    temperature_scale_V_per_C: Positive = 0.010
+    reference_temperature_C: float = 25.0
+    bias_V: Six = (2.5,) * 6  # pyright: ignore[reportAssignmentType]
+    scale_V_per_g: Six = (1.0,) * 6  # pyright: ignore[reportAssignmentType]
+    bias_V_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
+    scale_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
+    range_g: Positive = 1.7
+
+    magnetometer_bias_V: Vector = (2.5, 2.5, 2.5)
+    magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
+    magnetometer_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.3
+    attitude_start_hz: Positive = 1.0
+    attitude_hz: Positive = 0.1
+    attitude_lowpass_hz: Positive = 1.5
+    max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
+
+    @model_validator(mode="after")
+    def _check(self) -> SensingConfig:
+        used = (*self.channels, self.supply_channel, self.temperature_channel)
+        if len(set(used)) != len(used) or not all(0 <= channel <= 7 for channel in used):
+            raise ValueError(f"channels {used} must be different numbers from 0 to 7")
+        if any(scale == 0.0 for scale in self.scale_V_per_g + self.magnetometer_scale_V_per_uT):
+            raise ValueError("a scale factor is zero")
+        if any(not 0.9 < float(np.linalg.norm(axis)) < 1.1 for axis in self.axes):
+            raise ValueError("axes must be unit vectors")
+        condition = float(np.linalg.cond(self.observation()))
+        if not condition < 1e5:
+            raise ValueError(f"this sensor placement is singular (condition number {condition:.3g}); move a sensor")
+        return self
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.sensing]") -> SensingConfig:
+        """Checked configuration; ``BenchError`` names the wrong key."""
+        return validate_table(cls, table, where)
+
+    @property
+    def cutoff_rad_s(self) -> float:
+        """Corner of the RC filter behind every accelerometer axis (15.07 Hz, ERRATA 27)."""
+        return 1.0 / (self.filter_ohm * self.filter_farad)
+
+    @property
+    def cutoff_hz(self) -> float:
+        return self.cutoff_rad_s / (2.0 * pi)
+
+    def axis_positions(self) -> NDArray[np.float64]:
+        """Position of each of the six axes, shape (6, 3), m."""
+        return np.array(self.positions_m)[[0, 0, 1, 1, 2, 2]]
+
+    def observation(self) -> NDArray[np.float64]:
+        """The 6 x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""
+        from firmware_py.sensing.kinematics import observation_matrix
+
+        return observation_matrix(self.axis_positions(), np.array(self.axes))

@@ -1,0 +1,64 @@
+"""Six (or more) single-axis accelerometers on a rigid body -> specific force and angular acceleration.
+
+Axis i at r_i with unit direction s_i reads y_i = s_i.(f + alpha x r_i + omega x (omega x r_i)), f the specific
+force at the origin (000 (2.3) with ERRATA 2, 13, 30). With omega known this is linear in (f, alpha): all axes
+are solved at once, weighted by their noise; the three differences of 000 (2.14) are the special case N = 6.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record, new_record
+
+
+def kinematics_dtype(n: int) -> np.dtype[Any]:
+    """``solve`` (6, n) maps readings to (f, alpha); ``axes`` and ``positions`` are (n, 3), m."""
+    return np.dtype([("solve", "f8", (6, n)), ("axes", "f8", (n, 3)), ("positions", "f8", (n, 3))])
+
+
+def observation_matrix(positions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 6) matrix from (f, alpha) to readings at omega = 0: rows (s_i, r_i x s_i)."""
+    return np.hstack([axes, np.cross(positions, axes)])
+
+
+def kinematic_params(positions: NDArray[np.float64], axes: NDArray[np.float64], noise: NDArray[np.float64]) -> Record:
+    """Weighted least squares for N >= 6 axes: positions (N, 3) m, unit axes (N, 3), noise (N,) in any one unit.
+
+    Raises ValueError when the six unknowns cannot be told apart.
+    """
+    observe = observation_matrix(positions, axes)
+    if len(observe) < 6 or np.linalg.matrix_rank(observe) < 6:
+        raise ValueError(f"{len(observe)} axes at these positions do not determine six degrees of freedom")
+    weighted = observe / noise[:, None]
+    solve = np.linalg.pinv(weighted) / noise
+    return new_record(kinematics_dtype(len(axes)), solve=solve, axes=axes, positions=positions)
+
+
+@kernel
+def solve_motion(
+    readings: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    params: Record,
+    out: NDArray[np.float64],
+) -> None:
+    """``out[:6]`` = (f m/s^2, alpha rad/s^2) from readings (N,) m/s^2 and the body rate (3,) rad/s."""
+    wx, wy, wz = rate[0], rate[1], rate[2]
+    for k in range(6):
+        out[k] = 0.0
+    for i in range(len(readings)):
+        x, y, z = params.positions[i, 0], params.positions[i, 1], params.positions[i, 2]
+        along = wx * x + wy * y + wz * z
+        square = wx * wx + wy * wy + wz * wz
+        centripetal = (
+            params.axes[i, 0] * (wx * along - x * square)
+            + params.axes[i, 1] * (wy * along - y * square)
+            + params.axes[i, 2] * (wz * along - z * square)
+        )
+        tangential = readings[i] - centripetal
+        for k in range(6):
+            out[k] += params.solve[k, i] * tangential

@@ -1,0 +1,151 @@
+"""The sensing stage: raw counts -> readings -> motion -> attitude -> acceleration and displacement of the tip."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.frame import (
+    ACCELEROMETER,
+    ALIGNING,
+    ANGULAR_ACCELERATION,
+    INVALID,
+    MAGNETOMETER,
+    MAGNETOMETER_FRESH,
+    QUATERNION,
+    RATE,
+    RESTARTED,
+    SPECIFIC_FORCE,
+    STATUS,
+    TICK,
+    TIP_ACCELERATION,
+    TIP_DISPLACEMENT,
+)
+from firmware_py.records import Record, attributes, copy_record, new_record
+from firmware_py.sensing.attitude import (
+    ATTITUDE,
+    ATTITUDE_STATE,
+    align,
+    attitude_params,
+    propagate,
+    restart,
+)
+from firmware_py.sensing.calibration import (
+    CALIBRATION,
+    calibrate,
+    calibrate_magnetometer,
+    calibration_params,
+)
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
+from firmware_py.sensing.translation import (
+    TRANSLATION,
+    integrate_band,
+    tip_acceleration,
+    translation_params,
+)
+
+SENSE = np.dtype(
+    [
+        ("calibration", CALIBRATION),
+        ("kinematics", kinematics_dtype(6)),
+        ("attitude", ATTITUDE),
+        ("translation", TRANSLATION),
+        ("max_gap_ticks", "f8"),
+    ]
+)
+SENSE_STATE = np.dtype(
+    [
+        ("attitude", ATTITUDE_STATE),
+        ("smoothed", "f8", (2,)),  # supply V, temperature degC
+        ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
+        ("memory", "f8", (3, 2, 2)),  # band integrator
+        ("last_tick", "f8"),
+    ]
+)
+
+
+def sense_params(config: SensingConfig) -> Record:
+    """All numbers of the stage (dtype ``SENSE``)."""
+    return new_record(
+        SENSE,
+        calibration=calibration_params(config),
+        kinematics=kinematic_params(config.axis_positions(), np.array(config.axes), np.array(config.noise_ug_per_rtHz)),
+        attitude=attitude_params(config),
+        translation=translation_params(config),
+        max_gap_ticks=float(config.max_gap_ticks),
+    )
+
+
+def sense_state() -> Record:
+    """Before the first sample (dtype ``SENSE_STATE``)."""
+    state = new_record(SENSE_STATE, smoothed=np.nan, last_tick=np.nan)
+    restart(attributes(state)[0].attitude)
+    return state
+
+
+@kernel
+def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+    """Fill the columns from ``volts`` to ``tip_displacement``; adds its bits to ``status``.
+
+    A sample that is not finite leaves estimates as they were and sets INVALID. After lost scans the attitude
+    coasts over the gap; after more than ``max_gap`` it aligns anew.
+    """
+    state = states[0]
+    param = params[0]
+    status = int(frame[STATUS])
+    bits = calibrate(frame, state.smoothed, param.calibration)
+    if bits < 0:
+        frame[STATUS] = status | INVALID
+        return
+    status |= bits
+    steps = 1
+    tick = frame[TICK]
+    if not np.isnan(state.last_tick):
+        steps = max(1, int(tick - state.last_tick))
+    state.last_tick = tick
+    if steps > param.max_gap_ticks:
+        restart(state.attitude)
+        state.memory[:, :, :] = 0.0
+        status |= RESTARTED
+        steps = 1
+    fresh = frame[MAGNETOMETER_FRESH] != 0.0 and calibrate_magnetometer(frame, param.calibration)
+    attitude = state.attitude
+    motion = state.motion
+    solve_motion(frame[ACCELEROMETER : ACCELEROMETER + 6], attitude.rate, param.kinematics, motion)
+    field = frame[MAGNETOMETER : MAGNETOMETER + 3]
+    if attitude.aligned == 0.0:
+        status |= ALIGNING
+        align(attitude, param.attitude, motion, field, fresh)
+    else:
+        propagate(attitude, param.attitude, motion, field, fresh, steps)
+    tip = frame[TIP_ACCELERATION : TIP_ACCELERATION + 3]
+    if status & ALIGNING:
+        tip[:] = 0.0
+    else:
+        tip_acceleration(motion, attitude.bias, attitude.rate, attitude.matrix[2], param.translation, tip)
+    integrate_band(tip, state.memory, param.translation.sections, frame[TIP_DISPLACEMENT : TIP_DISPLACEMENT + 3])
+    for i in range(3):
+        frame[SPECIFIC_FORCE + i] = motion[i]
+        frame[ANGULAR_ACCELERATION + i] = motion[3 + i] - attitude.bias[i]
+        frame[RATE + i] = attitude.rate[i]
+    for i in range(4):
+        frame[QUATERNION + i] = attitude.quaternion[i]
+    frame[STATUS] = status
+
+
+class Sensing:
+    """The sensing stage with its state; ``step`` works on one frame."""
+
+    def __init__(self, config: SensingConfig) -> None:
+        self.config = config
+        self.params = sense_params(config)
+        self.state = sense_state()
+
+    def step(self, frame: NDArray[np.float64]) -> None:
+        sense_kernel(frame, self.state, self.params)
+
+    def reset(self) -> None:
+        """As before the first sample."""
+        copy_record(self.state, sense_state())

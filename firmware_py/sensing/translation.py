@@ -1,0 +1,100 @@
+"""Acceleration of the tip with gravity removed, and its displacement in the tremor band with known phase.
+
+Displacement is the acceleration through s^2 / (s^2 + 2 d w s + w^2)^2 with w = 2 pi 2 Hz: a double integral above
+the corner that forgets bias (zero at s = 0) and drift. What that and the RC filter do to amplitude and phase at
+any frequency is ``displacement_response``; nothing is compensated here.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import bilinear_zpk
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record, new_record
+from firmware_py.sensing.config import SensingConfig
+
+CORNER_HZ = 2.0
+DAMPING = 0.7
+
+
+TRANSLATION = np.dtype([("tip_m", "f8", (3,)), ("gravity", "f8"), ("sections", "f8", (2, 5))])
+
+
+def translation_params(config: SensingConfig) -> Record:
+    """Tip position, gravity m/s^2 and the integrator's biquads (rows b0 b1 b2 a1 a2)."""
+    return new_record(
+        TRANSLATION,
+        tip_m=config.tip_m,
+        gravity=config.gravity_m_s2,
+        sections=integrator_sections(config.tick_hz),
+    )
+
+
+def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray[np.float64]:
+    """Two biquads (2, 5) from m/s^2 to m: the first takes out bias, the second integrates twice."""
+    w = 2.0 * pi * corner_hz
+    poles = w * np.array([-DAMPING + 1j * (1 - DAMPING**2) ** 0.5, -DAMPING - 1j * (1 - DAMPING**2) ** 0.5])
+    rows = []
+    for zeros in (np.zeros(2), np.zeros(0)):
+        z, p, k = bilinear_zpk(zeros, poles, 1.0, tick_hz)
+        b, a = np.real(k * np.poly(z)), np.real(np.poly(p))
+        rows.append([*b, a[1], a[2]])
+    return np.array(rows)
+
+
+def displacement_response(
+    frequency_hz: NDArray[np.float64], tick_hz: float, cutoff_rad_s: float
+) -> NDArray[np.complex128]:
+    """Complex gain from true tip displacement to the ``tip_displacement`` column, RC filter included."""
+    s = 2j * pi * np.asarray(frequency_hz, dtype=np.float64)
+    z = np.exp(s / tick_hz)
+    gain = s**2 * cutoff_rad_s / (s + cutoff_rad_s)
+    for b0, b1, b2, a1, a2 in integrator_sections(tick_hz):
+        gain = gain * (b0 + b1 / z + b2 / z**2) / (1.0 + a1 / z + a2 / z**2)
+    return gain
+
+
+@kernel
+def tip_acceleration(
+    motion: NDArray[np.float64],
+    bias: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    up: NDArray[np.float64],
+    params: Record,
+    out: NDArray[np.float64],
+) -> None:
+    """``out`` (3,) = acceleration of the tip, body frame: f + alpha x r + omega x (omega x r) - g up.
+
+    ``motion`` is (f, alpha) of the origin, ``bias`` of alpha, ``up`` the third row of C_WB.
+    """
+    x, y, z = params.tip_m[0], params.tip_m[1], params.tip_m[2]
+    ax, ay, az = motion[3] - bias[0], motion[4] - bias[1], motion[5] - bias[2]
+    wx, wy, wz = rate[0], rate[1], rate[2]
+    along = wx * x + wy * y + wz * z
+    square = wx * wx + wy * wy + wz * wz
+    g = params.gravity
+    out[0] = motion[0] + ay * z - az * y + wx * along - x * square - g * up[0]
+    out[1] = motion[1] + az * x - ax * z + wy * along - y * square - g * up[1]
+    out[2] = motion[2] + ax * y - ay * x + wz * along - z * square - g * up[2]
+
+
+@kernel
+def integrate_band(
+    acceleration: NDArray[np.float64],
+    memory: NDArray[np.float64],
+    sections: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """``out`` (3,) = band displacement m; ``memory`` (3, 2, 2) of the biquads, direct form II transposed."""
+    for i in range(3):
+        x = acceleration[i]
+        for j in range(2):
+            y = sections[j, 0] * x + memory[i, j, 0]
+            memory[i, j, 0] = sections[j, 1] * x - sections[j, 3] * y + memory[i, j, 1]
+            memory[i, j, 1] = sections[j, 2] * x - sections[j, 4] * y
+            x = y
+        out[i] = x
