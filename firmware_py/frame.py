@@ -82,6 +82,7 @@ class FrameStatus(IntFlag):
     ALIGNING = 16  # attitude not initialised yet
     SETTLING = 32  # estimator not settled, nothing is commanded yet
     RESTARTED = 64  # a gap was too long to coast over: alignment starts again
+    COMMANDED = 128  # the newest scan of its tick, and the outputs were free to move: a command was computed
 
 
 class Clip(IntFlag):
