@@ -239,9 +239,10 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
     for name, spec in description.device.items():
         bus = description.bus.get(spec.bus or "")
         if isinstance(bus, I2cSpec):
-            # DAC: address + 3 commands of 3 bytes. ADC, per conversion: write 4 bytes, read 1 + 1 + 1 + 2 bytes.
+            # DAC: four times address + 3 bytes, each after a START of its own (AD5696R knows one word per
+            # address byte). ADC, per conversion: write 4 bytes, read 1 + 1 + 1 + 2 bytes.
             transfers = {
-                "dac_amplifier": (tick_hz, 10, 1),
+                "dac_amplifier": (tick_hz, 16, 4),
                 "ads1115": (3 * getattr(options[name], "rate_hz", 0), 9, 2),
             }.get(spec.driver)
             if transfers:

@@ -1,0 +1,96 @@
+"""ADS1115: 16-bit I2C converter, single-ended inputs, one conversion at a time.
+
+Source: Texas Instruments ADS1115 data sheet SBAS444, sections "Pointer register", "Conversion register",
+"Config register", "Single-shot mode" and the data-rate tolerance of the electrical characteristics.
+
+Split phase: ``start_conversion`` in one tick, ``collect`` in a later one. Nothing here waits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from hal.contracts import Clock, I2cBus
+from hal.errors import BenchError, WrongDevice
+from hal.types import ChannelInfo, I2cRead, I2cWrite
+
+POINTER_CONVERSION, POINTER_CONFIG = 0, 1
+OS_START = 0x8000  # written: start a conversion; read: no conversion is running
+MUX_SINGLE_ENDED = 0x4000  # plus channel << 12
+MODE_SINGLE_SHOT = 0x0100
+COMPARATOR_OFF = 0x0003
+PGA_CODES = {6.144: 0, 4.096: 1, 2.048: 2, 1.024: 3, 0.512: 4, 0.256: 5}
+RATE_CODES = {8: 0, 16: 1, 32: 2, 64: 3, 128: 4, 250: 5, 475: 6, 860: 7}
+WAKE_UP_NS = 50_000  # 25 us typical from power-down, doubled
+RATE_TOLERANCE = 0.10
+
+
+class Ads1115:
+    """One converter. ``full_scale_V`` is that of the amplifier, ``rate_sps`` the conversion rate."""
+
+    def __init__(
+        self,
+        bus: I2cBus,
+        clock: Clock,
+        address: int = 0x48,
+        *,
+        full_scale_V: float = 6.144,
+        rate_sps: int = 860,
+        name: str = "adc",
+    ) -> None:
+        if full_scale_V not in PGA_CODES:
+            raise BenchError(f"full_scale_V = {full_scale_V} is not one of {sorted(PGA_CODES)}", device=name)
+        if rate_sps not in RATE_CODES:
+            raise BenchError(f"rate_sps = {rate_sps} is not one of {sorted(RATE_CODES)}", device=name)
+        if not 0x48 <= address <= 0x4B:
+            raise BenchError(f"address 0x{address:02X} is not one of 0x48..0x4B", device=name)
+        self.name = name
+        self.lsb_V = full_scale_V / 32768.0
+        self.full_scale_V = full_scale_V
+        self.pending: int | None = None
+        self.conversions = 0
+        self._bus = bus
+        self._clock = clock
+        self._address = address
+        self._config = MODE_SINGLE_SHOT | PGA_CODES[full_scale_V] << 9 | RATE_CODES[rate_sps] << 5 | COMPARATOR_OFF
+        self.conversion_ns = WAKE_UP_NS + round(1e9 / rate_sps * (1.0 + RATE_TOLERANCE))
+        self._ready_ns = 0
+        start = OS_START | MUX_SINGLE_ENDED | self._config
+        self._start_ops = [
+            [I2cWrite(bytes((POINTER_CONFIG, (word := start | c << 12) >> 8, word & 0xFF)))] for c in range(4)
+        ]
+        self._read_ops = [I2cWrite(bytes((POINTER_CONVERSION,))), I2cRead(2)]
+
+    def probe(self) -> str:
+        """Write the configuration (no conversion) and read it back: the part has no identity register.
+
+        Raises ``WrongDevice`` when another value comes back and ``I2cNack`` when nobody is there.
+        """
+        word = MUX_SINGLE_ENDED | self._config
+        self._bus.transfer(self._address, [I2cWrite(bytes((POINTER_CONFIG, word >> 8, word & 0xFF)))])
+        answer = self._bus.transfer(self._address, [I2cWrite(bytes((POINTER_CONFIG,))), I2cRead(2)])
+        found = int.from_bytes(answer, "big")
+        if found & ~OS_START != word:
+            raise WrongDevice(
+                f"configuration 0x{word:04X} reads back as 0x{found:04X}: not an ADS1115", device=self.name
+            )
+        return f"ADS1115 at 0x{self._address:02X}, +-{self.full_scale_V} V"
+
+    def start_conversion(self, channel: int) -> None:
+        """Start to convert input ``channel`` (0..3) against ground. A pending conversion is given up."""
+        self.pending = None
+        self._bus.transfer(self._address, self._start_ops[channel])
+        self.pending = channel
+        self._ready_ns = self._clock.now_ns() + self.conversion_ns
+
+    def collect(self) -> float | None:
+        """Volts of the pending conversion, or ``None`` while it may still run (then the bus stays untouched)."""
+        if self.pending is None or self._clock.now_ns() < self._ready_ns:
+            return None
+        answer = self._bus.transfer(self._address, self._read_ops)
+        self.pending = None
+        self.conversions += 1
+        return int.from_bytes(answer, "big", signed=True) * self.lsb_V
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        return [ChannelInfo(f"ain{i}", "V", 0.0, self.full_scale_V, self.lsb_V) for i in range(4)]

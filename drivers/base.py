@@ -1,0 +1,26 @@
+"""Small things that several drivers need."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+from hal.contracts import Clock
+from hal.types import ChannelInfo
+
+
+class HasChannels(Protocol):
+    """Every driver says what it measures or moves."""
+
+    def channels(self) -> Sequence[ChannelInfo]: ...
+
+
+class DigitalOutput(Protocol):
+    """A few switch outputs, all set at once: bit i is output i."""
+
+    def write_digital(self, bits: int) -> None: ...
+
+
+def wait_s(clock: Clock, seconds: float) -> None:
+    """Let ``seconds`` pass on the bench clock. For start-up only, never in a tick."""
+    clock.sleep_until_ns(clock.now_ns() + round(seconds * 1e9))

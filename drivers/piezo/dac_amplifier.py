@@ -1,0 +1,161 @@
+"""Three-channel piezo amplifier behind an AD5696R: 16-bit quad I2C DAC, internal 2.5 V reference, gain pin high.
+
+Source: Analog Devices AD5696R data sheet rev. B: "Input shift register" (Tables 7 and 8), "Write operation",
+"Multiple DAC readback sequence", "Load DAC", "Internal reference setup". V_DAC = 2.5 V * 2 * code / 65536.
+
+One transfer per update: A, B, C into the input registers, then one update command, so that all outputs move at
+once. Segments are separated by repeated STARTs, because the data sheet knows one 24-bit word per address byte.
+The DAC has no watchdog: the safe state is the firmware's duty.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from drivers.base import wait_s
+from hal.contracts import Clock, Float64Array, I2cBus
+from hal.errors import BenchError, HalError, WrongDevice
+from hal.output_guard import OutputGuard
+from hal.types import ChannelInfo, I2cRead, I2cWrite, OutputLimit
+
+CHANNELS = 3
+WRITE_INPUT, UPDATE, POWER, LDAC_MASK, REFERENCE = 0x10, 0x20, 0x40, 0x50, 0x70
+ADDRESS_BITS = (0x1, 0x2, 0x4)  # DAC A, B, C
+SPARE = 0x8  # DAC D, not connected
+DAC_SPAN_V = 5.0
+CODES = 65536
+RAMP_TICK_S = 0.001
+
+
+class DacAmplifier:
+    """AnalogOutput of three stacks, in V at the stack. ``arm`` -> ``write`` ... -> ``safe_step``."""
+
+    def __init__(
+        self,
+        bus: I2cBus,
+        clock: Clock,
+        address: int = 0x0C,
+        *,
+        gain: float = 20.0,
+        lo_V: float = 0.0,
+        hi_V: float = 100.0,
+        neutral_V: float = 50.0,
+        slew_V_per_s: float = 20_000.0,
+        name: str = "piezo",
+    ) -> None:
+        full_V = DAC_SPAN_V * gain
+        if not 0x0C <= address <= 0x0F:
+            raise BenchError(f"address 0x{address:02X} is not one of 0x0C..0x0F", device=name)
+        if not (0.0 <= lo_V <= neutral_V <= hi_V <= full_V and neutral_V < full_V):
+            raise BenchError(
+                f"0 <= lo_V = {lo_V} <= neutral_V = {neutral_V} <= hi_V = {hi_V} <= {full_V} V does not hold",
+                device=name,
+            )
+        self.name = name
+        self.lsb_V = full_V / CODES
+        top_V = min(hi_V, full_V - self.lsb_V)  # the highest code is one step below full scale
+        self.limits = (OutputLimit(lo_V, top_V, slew_V_per_s, neutral_V),) * CHANNELS
+        self.guard = OutputGuard(name, self.limits, clock)
+        self._bus = bus
+        self._clock = clock
+        self._address = address
+        self._codes_per_V = CODES / full_V
+        self._update = I2cWrite(bytes((UPDATE | 0x7, 0, 0)))
+        self._read_abc = (I2cWrite(bytes((ADDRESS_BITS[0],))), I2cRead(2 * CHANNELS))
+        self._probed = False
+        self._position_known = False
+
+    def probe(self) -> str:
+        """Patterns through the input register of the unused DAC D: nothing moves, all 16 bits must hold.
+
+        Also switches the internal reference on, all outputs to normal operation, and lets only the update
+        command move them. Raises ``WrongDevice`` or ``I2cNack``.
+        """
+        for command in (
+            (REFERENCE, 0, 0),  # 0: internal reference on
+            (LDAC_MASK, 0, 0x0F),  # 1: the LDAC pin is ignored
+            (POWER, 0, 0),  # 00 per channel: normal operation
+        ):
+            self._bus.transfer(self._address, [I2cWrite(bytes(command))])
+        for pattern in (0x5AA5, 0xA55A, 0x0000):
+            self._bus.transfer(self._address, [I2cWrite(bytes((WRITE_INPUT | SPARE, pattern >> 8, pattern & 0xFF)))])
+            answer = self._bus.transfer(self._address, [I2cWrite(bytes((SPARE,))), I2cRead(2)])
+            found = int.from_bytes(answer, "big")
+            if found != pattern:
+                raise WrongDevice(
+                    f"wrote 0x{pattern:04X} to DAC D, read back 0x{found:04X}: not an AD5696R", device=self.name
+                )
+        self._probed = True
+        return f"AD5696R at 0x{self._address:02X}, {self.limits[0].lo_V:.0f} .. {self.limits[0].hi_V:.0f} V"
+
+    def arm(self) -> None:
+        """Self-test, ramp to neutral, verify it by readback; then ``write`` is allowed.
+
+        Takes about 20 ms of bench time. Raises ``SafetyTrip`` when the readback differs.
+        """
+        if not self._probed:
+            self.probe()
+        self._position_known = False
+        while not self.safe_step():
+            wait_s(self._clock, RAMP_TICK_S)
+        found = self._read_codes()
+        wanted = [self._code(limit.safe_V) for limit in self.limits]
+        self.guard.require(found == wanted, f"neutral codes {wanted} read back as {found}")
+        self.guard.armed = True
+
+    def write(self, values_V: Float64Array) -> int:
+        mask = self.guard.admit(values_V)
+        self._send()
+        return mask
+
+    def safe_step(self) -> bool:
+        if not self._position_known:
+            self.guard.start_from([float(v) for v in self.readback_V()])
+            self._position_known = True
+        done = self.guard.ramp()
+        self._send()
+        return done
+
+    def readback_V(self) -> Float64Array:
+        """Contents of the input registers, which equal the outputs after each update command."""
+        return np.array(self._read_codes(), dtype=np.float64) * self.lsb_V
+
+    def close(self) -> None:
+        """Ramp to neutral unless there; the bus belongs to the bench and stays open."""
+        if not self._position_known:
+            return  # nothing was ever moved
+        try:
+            while not self.guard.at_safe_state() and not self.safe_step():
+                wait_s(self._clock, RAMP_TICK_S)
+        except HalError as error:
+            raise type(error)(
+                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
+            ) from error
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        limit = self.limits[0]
+        return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, self.lsb_V) for i in range(CHANNELS)]
+
+    def _code(self, value_V: float) -> int:
+        return int(value_V * self._codes_per_V + 0.5)
+
+    def _send(self) -> None:
+        k = self._codes_per_V
+        a, b, c = self.guard.next_V
+        a, b, c = int(a * k + 0.5), int(b * k + 0.5), int(c * k + 0.5)
+        self._bus.transfer(
+            self._address,
+            (
+                I2cWrite(bytes((0x11, a >> 8, a & 0xFF))),
+                I2cWrite(bytes((0x12, b >> 8, b & 0xFF))),
+                I2cWrite(bytes((0x14, c >> 8, c & 0xFF))),
+                self._update,
+            ),
+        )
+        self.guard.sent()
+
+    def _read_codes(self) -> list[int]:
+        answer = self._bus.transfer(self._address, self._read_abc)
+        return [int.from_bytes(answer[2 * i : 2 * i + 2], "big") for i in range(CHANNELS)]

@@ -1,0 +1,94 @@
+"""I2cBus through a Unix stream socket: how the process of the emulated world offers its I2C devices.
+
+Request: u8 address, u8 number of segments, then per segment u8 kind (0 write, 1 read), u16 LE length and, for
+a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus error), u16 LE length, the bytes
+of all read segments. One request is one transfer.
+"""
+
+from __future__ import annotations
+
+import socket
+import struct
+from collections.abc import Sequence
+
+from hal.backends.i2c_checks import check_address
+from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, I2cNack, ProtocolError
+from hal.types import I2cOp, I2cWrite, PortInfo
+
+_HEAD = struct.Struct("<BB")
+_SEGMENT = struct.Struct("<BH")
+_REPLY = struct.Struct("<BH")
+
+
+class UnixI2c:
+    """Client of one emulated bus. ``timeout_s`` bounds one transfer."""
+
+    def __init__(self, path: str, speed_hz: int = 400_000, timeout_s: float = 0.5) -> None:
+        self._path = path
+        self._speed_hz = speed_hz
+        self._timeout_s = timeout_s
+        self._reply = memoryview(bytearray(1 << 16))
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._open = True
+        try:
+            self._socket.settimeout(timeout_s)
+            self._socket.connect(path)
+        except OSError as error:
+            self._socket.close()
+            raise DeviceNotFound(f"nobody serves this socket: {error}", device=path) from error
+
+    def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
+        check_address(address, self._path)
+        if not self._open:
+            raise Closed("the bus is closed", device=self._path)
+        parts = [_HEAD.pack(address, len(ops))]
+        for op in ops:
+            if isinstance(op, I2cWrite):
+                parts.append(_SEGMENT.pack(0, len(op.data)))
+                parts.append(op.data)
+            else:
+                parts.append(_SEGMENT.pack(1, op.n))
+        try:
+            self._socket.sendall(b"".join(parts))
+            n = self._receive_at_least(_REPLY.size, 0)
+            status, length = _REPLY.unpack_from(self._reply)
+            n = self._receive_at_least(_REPLY.size + length, n)
+        except OSError as error:
+            # half a reply may still be under way: this connection cannot be used any more
+            self.close()
+            what = f"no answer within {self._timeout_s} s" if isinstance(error, TimeoutError) else str(error)
+            raise Disconnected(f"the emulated bus has gone: {what}", device=self._path) from error
+        if n != _REPLY.size + length:
+            self.close()
+            raise ProtocolError(f"{n} bytes in a reply of {_REPLY.size + length}", device=self._path)
+        if status:
+            raise _error(status, address, self._path)
+        return self._reply[_REPLY.size : n].tobytes()
+
+    def _receive_at_least(self, wanted: int, have: int) -> int:
+        while have < wanted:
+            n = self._socket.recv_into(self._reply[have:])
+            if n == 0:
+                raise ConnectionResetError("connection closed")
+            have += n
+        return have
+
+    def info(self) -> PortInfo:
+        return PortInfo(
+            uri=f"unix-i2c://{self._path}",
+            description="I2C bus of the emulated world",
+            emulated=True,
+            details={"speed_hz": str(self._speed_hz)},
+        )
+
+    def close(self) -> None:
+        self._open = False
+        self._socket.close()
+
+
+def _error(status: int, address: int, device: str) -> BusError:
+    if status == 1:
+        return I2cNack(f"nobody answers at address 0x{address:02X}", device=device)
+    if status == 2:
+        return I2cNack(f"device 0x{address:02X} refused a data byte", kind=ErrorKind.NACK_DATA, device=device)
+    return BusError(f"bus error in a transfer with 0x{address:02X}", device=device)

@@ -1,0 +1,170 @@
+"""The I2C contract on the emulated world's socket and on the real smbus2 (its ioctl and its os.open replaced)."""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import os
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import smbus2
+import smbus2.smbus2
+
+from hal.backends import open_i2c
+from hal.contracts import I2cBus
+from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, ErrorKind, HalError, HalTimeout, I2cNack
+from hal.types import I2cRead, I2cWrite
+from tests.contract.i2c_contract import MEMORY, REFUSING, I2cContract, RegisterDevice
+
+
+def read_exactly(connection: socket.socket, n: int) -> bytes:
+    data = b""
+    while len(data) < n:
+        if not (part := connection.recv(n - len(data))):
+            raise EOFError
+        data += part
+    return data
+
+
+def serve(listener: socket.socket, device: RegisterDevice) -> None:
+    """The protocol in the docstring of unix_i2c, written a second time."""
+    connection, _ = listener.accept()
+    try:
+        while True:
+            address, count = read_exactly(connection, 2)
+            reply = b""
+            status = {MEMORY: 0, REFUSING: 2}.get(address, 1)
+            for _ in range(count):
+                kind, length = struct.unpack("<BH", read_exactly(connection, 3))
+                if kind == 0:
+                    data = read_exactly(connection, length)
+                    if status == 0:
+                        device.write(data)
+                elif status == 0:
+                    reply += device.read(length)
+            device.stop()
+            if address == 0x7F:
+                return
+            connection.sendall(struct.pack("<BH", status, len(reply)) + reply)
+    except EOFError:
+        pass
+    finally:
+        connection.close()
+
+
+class TestUnixSocket(I2cContract):
+    @pytest.fixture
+    def bus(self, tmp_path: Path) -> Iterator[I2cBus]:
+        path = tmp_path / "i2c0.sock"
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+            listener.bind(str(path))
+            listener.listen(1)
+            server = threading.Thread(target=serve, args=(listener, RegisterDevice()))
+            server.start()
+            bus = open_i2c(f"unix-i2c://{path}", 400_000)
+            yield bus
+            bus.close()
+            server.join()
+
+    def test_dead_world_is_a_disconnect(self, bus: I2cBus):
+        with pytest.raises(Disconnected, match="gone"):
+            bus.transfer(0x7F, [I2cRead(1)])
+
+
+class KernelBus:
+    """Level A of ecosystem.md section 5: the kernel side of /dev/i2c-N. Reads and writes the caller's structs."""
+
+    def __init__(self) -> None:
+        self.device = RegisterDevice()
+        self.error = 0
+
+    def ioctl(self, fd: int, request: int, argument: object) -> int:
+        if request == 0x0705:  # I2C_FUNCS: plain I2C and the SMBus emulation
+            assert isinstance(argument, ctypes.c_ulong)
+            argument.value = 0x0EFF0001
+            return 0
+        assert request == 0x0707  # I2C_RDWR
+        messages, count = struct.unpack_from("@PI", ctypes.string_at(ctypes.addressof(argument), 16))
+        if self.error:
+            raise OSError(self.error, os.strerror(self.error))
+        for i in range(count):
+            # struct i2c_msg { u16 addr; u16 flags; u16 len; u8 *buf; }
+            raw = ctypes.string_at(messages + 16 * i, 16)
+            address, flags, length, buffer = struct.unpack("@HHHxxP", raw)
+            if address != MEMORY:
+                code = errno.EREMOTEIO if address == REFUSING else errno.ENXIO
+                raise OSError(code, os.strerror(code))
+            if flags & 1:
+                ctypes.memmove(buffer, self.device.read(length), length)
+            else:
+                self.device.write(ctypes.string_at(buffer, length))
+        self.device.stop()
+        return 0
+
+
+@pytest.fixture
+def kernel(monkeypatch: pytest.MonkeyPatch) -> KernelBus:
+    kernel = KernelBus()
+    opened = SimpleNamespace(open=lambda path, flags: 99, close=lambda fd: None, O_RDWR=os.O_RDWR)
+    monkeypatch.setattr(smbus2.smbus2, "ioctl", kernel.ioctl)
+    monkeypatch.setattr(smbus2.smbus2, "os", opened)
+    return kernel
+
+
+class TestSmbus2(I2cContract):
+    tells_data_nack = False
+
+    @pytest.fixture
+    def bus(self, kernel: KernelBus) -> Iterator[I2cBus]:
+        bus = open_i2c("linux-i2c://1", 400_000)
+        yield bus
+        bus.close()
+
+    def test_one_stop_per_transfer(self, bus: I2cBus, kernel: KernelBus):
+        bus.transfer(MEMORY, [I2cWrite(b"\x00"), I2cRead(1), I2cRead(1)])
+        assert (kernel.device.starts, kernel.device.stops) == (3, 1)
+
+    @pytest.mark.parametrize(
+        ("code", "kind", "error_class"),
+        [
+            (errno.ENXIO, ErrorKind.NACK_ADDRESS, I2cNack),
+            (errno.EREMOTEIO, ErrorKind.NACK_ADDRESS, I2cNack),
+            (errno.EAGAIN, ErrorKind.ARBITRATION, BusError),
+            (errno.ETIMEDOUT, ErrorKind.TIMEOUT, HalTimeout),
+            (errno.ENODEV, ErrorKind.DISCONNECTED, Disconnected),
+            (errno.EBADMSG, ErrorKind.CRC, BusError),
+            (errno.EIO, ErrorKind.BUS, BusError),
+        ],
+    )
+    def test_kernel_fault_codes(
+        self, bus: I2cBus, kernel: KernelBus, code: int, kind: ErrorKind, error_class: type[HalError]
+    ):
+        kernel.error = code
+        with pytest.raises(error_class, match="0x50") as caught:
+            bus.transfer(MEMORY, [I2cRead(1)])
+        assert caught.value.kind is kind
+        assert isinstance(caught.value.__cause__, OSError)
+
+
+def test_no_i2c_on_this_machine_says_what_to_do():
+    with pytest.raises(DeviceNotFound, match="enable I2C"):
+        open_i2c("linux-i2c://97")
+
+
+def test_no_emulated_world(tmp_path: Path):
+    with pytest.raises(DeviceNotFound, match="nobody serves"):
+        open_i2c(f"unix-i2c://{tmp_path}/no.sock")
+
+
+@pytest.mark.parametrize(
+    "uri", ["i2c://1", "linux-i2c://one", "linux-i2c://", "unix-i2c://host/x", "linux-i2c://1?a=b"]
+)
+def test_uris_that_are_refused(uri: str):
+    with pytest.raises(BenchError):
+        open_i2c(uri)

@@ -1,0 +1,172 @@
+"""Piezo amplifier behind an AD5696R (data sheet rev. B, Tables 7 and 8): every byte of every transfer."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.piezo.dac_amplifier import DacAmplifier
+from hal.clock import VirtualClock
+from hal.errors import BenchError, I2cNack, SafetyTrip, WrongDevice
+from tests.wire.drivers.scripted_ports import ScriptedI2c
+
+MS = 1_000_000
+A = 0x0C
+PROBE = [
+    (A, [("w", b"\x70\x00\x00")]),  # internal reference on
+    (A, [("w", b"\x50\x00\x0f")]),  # LDAC pin ignored
+    (A, [("w", b"\x40\x00\x00")]),  # normal operation
+    (A, [("w", b"\x18\x5a\xa5")]),  # input register D
+    (A, [("w", b"\x08"), ("r", b"\x5a\xa5")]),
+    (A, [("w", b"\x18\xa5\x5a")]),
+    (A, [("w", b"\x08"), ("r", b"\xa5\x5a")]),
+    (A, [("w", b"\x18\x00\x00")]),
+    (A, [("w", b"\x08"), ("r", b"\x00\x00")]),
+]
+NEUTRAL = bytes.fromhex("800080008000")
+
+
+def update(a: int, b: int, c: int) -> tuple[int, object]:
+    words = [bytes((0x11 + (0, 1, 3)[i], v >> 8, v & 0xFF)) for i, v in enumerate((a, b, c))]
+    return (A, [*(("w", w) for w in words), ("w", b"\x27\x00\x00")])
+
+
+def readback(data: bytes) -> tuple[int, object]:
+    return (A, [("w", b"\x01"), ("r", data)])
+
+
+def make(*script: tuple[int, object], **options: float) -> tuple[DacAmplifier, ScriptedI2c, VirtualClock]:
+    clock = VirtualClock()
+    bus = ScriptedI2c(script)
+    return DacAmplifier(bus, clock, A, **options), bus, clock
+
+
+def armed(*script: tuple[int, object], **options: float) -> tuple[DacAmplifier, ScriptedI2c, VirtualClock]:
+    amplifier, bus, clock = make(
+        *PROBE,
+        readback(NEUTRAL),
+        update(0x8000, 0x8000, 0x8000),
+        readback(NEUTRAL),
+        *script,
+        **({"slew_V_per_s": 10_000.0} | options),
+    )
+    amplifier.arm()
+    clock.burn_ns(MS)
+    return amplifier, bus, clock
+
+
+def test_probe_moves_nothing():
+    amplifier, bus, _ = make(*PROBE)
+    assert amplifier.probe() == "AD5696R at 0x0C, 0 .. 100 V"
+    amplifier.close()
+    bus.done()
+
+
+def test_probe_refuses_a_12_bit_part():
+    amplifier, _, _ = make(*PROBE[:4], (A, [("w", b"\x08"), ("r", b"\x5a\xa0")]))
+    with pytest.raises(WrongDevice, match=r"0x5AA5.*0x5AA0"):
+        amplifier.probe()
+
+
+def test_arm_ramps_from_where_the_dac_is():
+    steps = [update(*([round(0x8000 * k / 20)] * 3)) for k in range(1, 21)]
+    amplifier, bus, clock = make(*PROBE, readback(bytes(6)), *steps, readback(NEUTRAL))
+    amplifier.arm()
+    assert clock.now_ns() == 19 * MS
+    bus.done()
+
+
+def test_arm_fails_when_the_readback_differs():
+    amplifier, _, _ = make(
+        *PROBE, readback(NEUTRAL), update(0x8000, 0x8000, 0x8000), readback(bytes.fromhex("800080007fff"))
+    )
+    with pytest.raises(SafetyTrip, match="self-test"):
+        amplifier.arm()
+    with pytest.raises(SafetyTrip, match="not armed"):
+        amplifier.write(np.full(3, 50.0))
+
+
+def test_all_three_in_one_transfer():
+    # 100 V / 65536 per code
+    amplifier, bus, _ = armed(update(0x8000 + 655, 0x8000 - 655, 0x8000 + 1))
+    assert amplifier.write(np.array([51.0, 49.0, 50.0015])) == 0
+    bus.done()
+
+
+def test_clipping_is_reported_and_counted():
+    amplifier, bus, _ = armed(update(0xFFFF, 0x0000, 0x8000), slew_V_per_s=1e9)
+    assert amplifier.write(np.array([100.0, -1.0, 50.0])) == 0b011
+    assert amplifier.guard.clipped == 2
+    bus.done()
+
+
+def test_slew_limit_follows_the_clock():
+    # 10 V/ms: one tick allows 10 V = 6553.6 codes
+    amplifier, bus, clock = armed(update(39322, 26214, 0x8000), update(0xFFFF, 0x0000, 0x8000))
+    assert amplifier.write(np.array([99.0, 1.0, 50.0])) == 0b011
+    assert amplifier.guard.slew_limited == 2
+    clock.burn_ns(4 * MS)
+    assert amplifier.write(np.array([99.9984, 0.0, 50.0])) == 0
+    bus.done()
+
+
+def test_a_stall_buys_no_large_step():
+    amplifier, bus, clock = armed(update(0x8000 + 3277, 0x8000, 0x8000), slew_V_per_s=1000.0)
+    clock.burn_ns(1000 * MS)
+    assert amplifier.write(np.array([99.0, 50.0, 50.0])) == 0b001  # 5 ms worth: 5 V
+    bus.done()
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_a_value_that_is_not_finite_trips(bad: float):
+    amplifier, bus, _ = armed()
+    with pytest.raises(SafetyTrip, match="channel 1"):
+        amplifier.write(np.array([50.0, bad, 50.0]))
+    bus.done()
+
+
+def test_safe_ramp_takes_twenty_steps_and_disarms():
+    far = update(0xFFFF, 0x0000, 0x8000)
+    ramp = [
+        update(*(round((v + (50.0 - v) * k / 20) * 655.36) for v in (100.0 - 100.0 / 65536, 0.0, 50.0)))
+        for k in range(1, 21)
+    ]
+    amplifier, bus, _ = armed(far, *ramp, slew_V_per_s=1e9)
+    amplifier.write(np.array([100.0, 0.0, 50.0]))
+    assert [amplifier.safe_step() for _ in range(20)] == [False] * 19 + [True]
+    bus.done()
+    with pytest.raises(SafetyTrip):
+        amplifier.write(np.full(3, 50.0))
+
+
+def test_a_failed_step_is_offered_again():
+    first = update(0x8000 + 6226, 0x8000, 0x8000)  # 59.5 V
+    amplifier, bus, _ = armed(update(0x8000 + 6554, 0x8000, 0x8000), (A, I2cNack("busy")), first, slew_V_per_s=1e9)
+    amplifier.write(np.array([60.0, 50.0, 50.0]))
+    with pytest.raises(I2cNack):
+        amplifier.safe_step()
+    assert amplifier.safe_step() is False
+    bus.done()
+
+
+def test_close_goes_to_neutral_first():
+    ramp = [update(0x8000 + round(655.36 * (20 - k) / 2), 0x8000, 0x8000) for k in range(1, 21)]
+    amplifier, bus, clock = armed(update(0x8000 + 6554, 0x8000, 0x8000), *ramp, slew_V_per_s=1e9)
+    amplifier.write(np.array([60.0, 50.0, 50.0]))
+    t0 = clock.now_ns()
+    amplifier.close()
+    assert clock.now_ns() - t0 < 20 * MS
+    amplifier.close()
+    bus.done()
+
+
+def test_readback_is_in_volts():
+    amplifier, bus, _ = make(readback(bytes.fromhex("00008000c000")))
+    assert amplifier.readback_V() == pytest.approx([0.0, 50.0, 75.0])
+    bus.done()
+
+
+@pytest.mark.parametrize("options", [{"neutral_V": 101.0}, {"neutral_V": -1.0}, {"lo_V": 60.0}, {"hi_V": 100.1}])
+def test_impossible_settings(options: dict[str, float]):
+    with pytest.raises(BenchError):
+        make(**options)
