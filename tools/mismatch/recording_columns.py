@@ -1,0 +1,151 @@
+"""Columns of a data file: csv, npz, mcap. Sizes are bounded; every fault names the file and the line or sample."""
+
+from __future__ import annotations
+
+import csv
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.recording import RecordingError
+
+Array = NDArray[np.float64]
+MAX_BYTES = 4 << 30
+MAX_SAMPLES = 50_000_000
+
+
+def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
+    """The named columns as float64 (n,). Raises RecordingError."""
+    if not path.is_file():
+        raise RecordingError(f"{path}: data file does not exist; 'data' in the descriptor is relative to its folder")
+    if path.stat().st_size > MAX_BYTES:
+        raise RecordingError(f"{path}: larger than {MAX_BYTES >> 30} GiB; cut the recording into parts")
+    readers = {".csv": _csv, ".npz": _npz, ".mcap": _mcap}
+    reader = readers.get(path.suffix.lower())
+    if reader is None:
+        raise RecordingError(f"{path}: data must be .csv, .npz or .mcap, not '{path.suffix}'")
+    columns = reader(path, names)
+    lengths = {k: v.size for k, v in columns.items()}
+    if len(set(lengths.values())) > 1:
+        shown = ", ".join(f"{k} {v}" for k, v in lengths.items())
+        raise RecordingError(f"{path}: columns differ in length ({shown}); every column needs one value per sample")
+    if max(lengths.values()) > MAX_SAMPLES:
+        raise RecordingError(f"{path}: more than {MAX_SAMPLES} samples; cut the recording into parts")
+    return columns
+
+
+def _missing(path: Path, name: str, have: list[str]) -> RecordingError:
+    shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
+    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
+
+
+def _csv(path: Path, names: list[str]) -> dict[str, Array]:
+    try:
+        with path.open(newline="", encoding="utf-8-sig") as f:
+            head = f.readline()
+            delimiter = next((d for d in ",;\t" if d in head), ",")
+            header = [h.strip() for h in next(csv.reader([head], delimiter=delimiter), [])]
+            for name in names:
+                if name not in header:
+                    raise _missing(path, name, header)
+                if header.count(name) > 1:
+                    raise RecordingError(f"{path}: line 1: column '{name}' appears twice; rename one")
+            use = [header.index(n) for n in names]
+            try:
+                data = np.loadtxt(
+                    f, delimiter=delimiter, usecols=use, ndmin=2, comments=None, quotechar='"', dtype=np.float64
+                )
+            except ValueError as error:
+                raise RecordingError(f"{path}: {_first_bad_line(path, delimiter, header, use) or error}") from None
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: not a UTF-8 text file ({error.reason}); save it as UTF-8 csv") from None
+    return {n: np.ascontiguousarray(data[:, i]) for i, n in enumerate(names)}
+
+
+def _first_bad_line(path: Path, delimiter: str, header: list[str], use: list[int]) -> str:
+    with path.open(newline="", encoding="utf-8-sig") as f:
+        rows = csv.reader(f, delimiter=delimiter)
+        next(rows, None)
+        for row in rows:
+            if not row:
+                continue
+            if len(row) <= max(use):
+                return f"line {rows.line_num}: {len(row)} values, the header names {len(header)}; complete the line"
+            for i in use:
+                try:
+                    float(row[i])
+                except ValueError:
+                    return f"line {rows.line_num}: column '{header[i]}': '{row[i]}' is not a number"
+    return ""
+
+
+def _npz(path: Path, names: list[str]) -> dict[str, Array]:
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            have = list(data.files)
+            out: dict[str, Array] = {}
+            for name in names:
+                if name not in have:
+                    raise _missing(path, name, have)
+                a = data[name]
+                if a.ndim != 1 or a.dtype.kind not in "fiub":
+                    raise RecordingError(
+                        f"{path}: column '{name}' is {a.dtype} of shape {a.shape}; needed: numbers, one dimension"
+                    )
+                out[name] = np.asarray(a, np.float64)
+    except (zipfile.BadZipFile, OSError, EOFError) as error:
+        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
+    except ValueError as error:
+        if isinstance(error, RecordingError):
+            raise
+        raise RecordingError(f"{path}: {error}; save plain numeric arrays (no pickled objects)") from None
+    return out
+
+
+def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
+    """JSON messages; a column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``."""
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    wanted = {n: n.rsplit(".", 1)[0] for n in names}
+    found: dict[str, list[float]] = {n: [] for n in names}
+    seen: set[str] = set()
+    number = 0
+    try:
+        with path.open("rb") as f:
+            for _schema, channel, message in make_reader(f).iter_messages():
+                number += 1
+                topic = channel.topic
+                if channel.message_encoding != "json":
+                    seen.add(f"{topic} ({channel.message_encoding})")
+                    continue
+                flat = _flatten(json.loads(message.data), topic)
+                flat[f"{topic}.log_time_s"] = message.log_time * 1e-9
+                seen.update(flat)
+                for n, owner in wanted.items():
+                    if n in flat:
+                        found[n].append(flat[n])
+                    elif owner == topic:
+                        raise RecordingError(f"{path}: message {number} of '{topic}' lacks '{n}'")
+    except McapError as error:
+        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: message {number}: not JSON ({error})") from None
+    for name, values in found.items():
+        if not values:
+            raise _missing(path, name, sorted(seen))
+    return {n: np.asarray(v, np.float64) for n, v in found.items()}
+
+
+def _flatten(value: object, prefix: str) -> dict[str, float]:
+    if isinstance(value, bool | int | float):
+        return {prefix: float(value)}
+    out: dict[str, float] = {}
+    items = value.items() if isinstance(value, Mapping) else enumerate(value) if isinstance(value, list) else ()
+    for key, item in items:
+        out.update(_flatten(item, f"{prefix}.{key}"))
+    return out

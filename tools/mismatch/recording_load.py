@@ -1,0 +1,312 @@
+"""From a descriptor to a Recording: contract section 1, with every fault named."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+
+from tools.mismatch import units
+from tools.mismatch.recording import Array, Recording, RecordingError, Split, TwinText
+from tools.mismatch.recording_columns import read_columns
+from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
+
+MIN_SAMPLES = 50
+_TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
+_CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution"}
+
+
+@dataclass(frozen=True)
+class _Channel:
+    column: str
+    role: Role
+    signal: str
+    unit: str
+    to: str
+    noise: float | None
+    step: float | None
+
+
+def load_recording(path: Path) -> Recording:
+    """See ``recording.load``."""
+    if path.is_dir():
+        path = path / "recording.toml"
+    text = _toml(path)
+    where = str(path)
+    if text.get("format") != 1:
+        raise RecordingError(f"{where}: format must be 1, got {text.get('format')!r}")
+    if "channels" not in text:
+        raise RecordingError(f"{where}: no [[channels]]; describe each column that is used")
+    data_name = text.get("data")
+    if not isinstance(data_name, str):
+        raise RecordingError(f"{where}: 'data' must name the data file (.csv, .npz, .mcap), got {data_name!r}")
+    twin, words = _twin(where, text.get("twin"))
+    notes = [f"key '{k}' is unknown and not used" for k in text if k not in _TOP]
+    channels = _channels(where, text["channels"], words, twin.kind, notes)
+    rate = _number(where, "rate_hz", text.get("rate_hz"))
+    time_column = text.get("time_column")
+    if rate is None and time_column is None:
+        raise RecordingError(f"{where}: neither 'rate_hz' nor 'time_column'; give one of them")
+    if rate is not None and rate <= 0:
+        raise RecordingError(f"{where}: rate_hz must be positive, got {rate}")
+    names = [c.column for c in channels]
+    if time_column is not None:
+        if not isinstance(time_column, str):
+            raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
+        if time_column not in names:
+            names.append(time_column)
+    data_path = path.parent / data_name
+    columns = read_columns(data_path, names)
+    n = columns[names[0]].size
+    if n < MIN_SAMPLES:
+        raise RecordingError(f"{data_path}: {n} samples; at least {MIN_SAMPLES} are needed to tell anything")
+    for name, values in columns.items():
+        bad = ~np.isfinite(values)
+        if bad.any():
+            i = int(np.argmax(bad))
+            line = f" (line {i + 2})" if data_path.suffix.lower() == ".csv" else ""
+            raise RecordingError(
+                f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; fill the gap or cut the recording there"
+            )
+    if time_column is not None:
+        dt = _step(data_path, time_column, columns[time_column], rate, notes)
+    else:
+        assert rate is not None
+        dt = 1.0 / rate
+    parts: dict[str, dict[str, Array]] = {"input": {}, "output": {}, "context": {}}
+    for c in channels:
+        values = units.convert(columns[c.column], c.unit, c.to)
+        if np.ptp(values) == 0.0:
+            if c.role == "output":
+                raise RecordingError(
+                    f"{data_path}: column '{c.column}' (output '{c.signal}') never changes from {values[0]}"
+                    " sample 0 to the end; a dead sensor or the wrong column"
+                )
+            notes.append(f"column '{c.column}' ({c.role} '{c.signal}') never changes")
+        parts[c.role][c.signal] = values
+    _same_data(data_path, channels, columns, notes)
+    return Recording(
+        path=path,
+        title=str(text.get("title", path.stem)),
+        t=np.arange(n) * dt,
+        dt=dt,
+        inputs=parts["input"],
+        outputs=parts["output"],
+        context=parts["context"],
+        noise={
+            c.signal: None if c.noise is None else units.convert_difference(c.noise, c.unit, c.to)
+            for c in channels
+            if c.role == "output"
+        },
+        unit={c.signal: c.to for c in channels},
+        column={c.signal: c.column for c in channels},
+        twin=twin,
+        split=_split(path, text.get("split"), n),
+        declared_step={
+            c.signal: units.convert_difference(c.step, c.unit, c.to) for c in channels if c.step is not None
+        },
+        warnings=tuple(notes),
+    )
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such recording; give a folder with recording.toml or a .toml file")
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise RecordingError(f"{path}: not valid TOML: {error}") from None
+    except UnicodeDecodeError as error:
+        raise RecordingError(f"{path}: not UTF-8 text ({error.reason})") from None
+
+
+def _number(where: str, key: str, value: object) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise RecordingError(f"{where}: {key} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
+    if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
+        raise RecordingError(f"{where}: no [twin] with a 'kind'; known kinds: {', '.join(KINDS)}")
+    kind = value["kind"]
+    words = vocabulary(kind)
+    if words is None:
+        known = ", ".join([*KINDS, *user_kinds()])
+        raise RecordingError(f"{where}: [twin] kind '{kind}' is unknown; known kinds: {known}")
+    parameters = value.get("parameters", {})
+    effects = value.get("effects", [])
+    if not isinstance(parameters, Mapping):
+        raise RecordingError(f"{where}: [twin.parameters] must be a table")
+    if not isinstance(effects, list) or not all(isinstance(e, Mapping) for e in effects):
+        raise RecordingError(f"{where}: [[twin.effects]] must be tables")
+    return TwinText(kind, dict(parameters), tuple(effects)), words
+
+
+def _channels(where: str, value: object, words: Vocabulary, kind: str, notes: list[str]) -> list[_Channel]:
+    if not isinstance(value, list) or not value:
+        raise RecordingError(f"{where}: [[channels]] must be a list of tables")
+    out: list[_Channel] = []
+    signals: dict[str, int] = {}
+    columns: dict[str, int] = {}
+    for i, entry in enumerate(value):
+        at = f"{where}: [[channels]] {i + 1}"
+        if not isinstance(entry, Mapping):
+            raise RecordingError(f"{at}: must be a table")
+        for key in ("column", "role", "signal"):
+            if not isinstance(entry.get(key), str) or not entry[key]:
+                raise RecordingError(f"{at}: '{key}' is missing or not a text")
+        column, role, signal = entry["column"], entry["role"], entry["signal"]
+        at += f" ('{column}')"
+        notes.extend(f"[[channels]] {i + 1}: key '{k}' is unknown and not used" for k in entry if k not in _CHANNEL)
+        if role not in get_args(Role):
+            raise RecordingError(f"{at}: role must be input, output or context, got '{role}'")
+        if signal in signals:
+            raise RecordingError(
+                f"{at}: signal '{signal}' is already taken by [[channels]] {signals[signal]}; one column per signal"
+            )
+        if column in columns:
+            raise RecordingError(f"{at}: column '{column}' is already used by [[channels]] {columns[column]}")
+        signals[signal], columns[column] = i + 1, i + 1
+        allowed = words.units(role, signal)
+        if allowed is None:
+            raise RecordingError(f"{at}: {kind} has no {role} '{signal}'; it has: {words.known(role)}")
+        unit, to = _unit(at, entry.get("unit"), allowed, signal, notes)
+        noise = _positive(at, "noise_rms", entry.get("noise_rms"))
+        step = _positive(at, "resolution", entry.get("resolution"))
+        if noise is not None and role != "output":
+            notes.append(f"[[channels]] {i + 1}: noise_rms of a channel that is no output is not used")
+        out.append(_Channel(column, role, signal, unit, to, noise, step))
+    if not any(c.role == "output" for c in out):
+        raise RecordingError(f"{where}: no channel with role = 'output': there is nothing to compare the twin with")
+    if not any(c.role == "input" for c in out):
+        raise RecordingError(f"{where}: no channel with role = 'input': the twin has nothing to run on")
+    _together(where, kind, out)
+    return out
+
+
+def _positive(at: str, key: str, value: object) -> float | None:
+    number = _number(at, key, value)
+    if number is not None and number <= 0:
+        raise RecordingError(f"{at}: {key} must be positive, got {number}; leave it out if it is unknown")
+    return number
+
+
+def _unit(at: str, value: object, allowed: tuple[str, ...], signal: str, notes: list[str]) -> tuple[str, str]:
+    if value is None:
+        to = allowed[0] if allowed else "1"
+        notes.append(f"{signal}: no unit given, taken as {to}")
+        return to, to
+    if not isinstance(value, str):
+        raise RecordingError(f"{at}: unit must be a text such as 'V', got {value!r}")
+    try:
+        parsed = units.parse(value)
+    except units.UnitError as error:
+        raise RecordingError(f"{at}: {error}; use SI or {', '.join(allowed) or 'V, um, deg/s, G, ...'}") from None
+    if not allowed:
+        return value, value
+    for to in allowed:
+        if units.parse(to).dimension == parsed.dimension:
+            return value, to
+    raise RecordingError(f"{at}: unit '{value}' is not of the dimension of {' or '.join(allowed)}")
+
+
+def _together(where: str, kind: str, channels: list[_Channel]) -> None:
+    """What one channel demands of the others."""
+    inputs = {c.signal for c in channels if c.role == "input"}
+    outputs = {c.signal: c for c in channels if c.role == "output"}
+    if kind in ("accelerometer", "magnetometer"):
+        prefix = "specific_force" if kind == "accelerometer" else "field"
+        for o in outputs:
+            if f"{prefix}_{o[-1]}" not in inputs:
+                raise RecordingError(f"{where}: output '{o}' needs the input '{prefix}_{o[-1]}'; add it or drop {o}")
+    if kind == "accelerometer_cluster":
+        for o in outputs:
+            if f"specific_force_{o[-1]}" not in inputs:
+                raise RecordingError(f"{where}: output '{o}' needs the input 'specific_force_{o[-1]}'")
+    if kind == "mechanical_axis":
+        if len(inputs) > 1:
+            raise RecordingError(f"{where}: mechanical_axis takes force or torque, not both")
+        angular = "torque" in inputs
+        for o, c in outputs.items():
+            if ("rad" in c.to) != angular:
+                raise RecordingError(f"{where}: {o} in {c.to} does not go with the input {', '.join(inputs)}")
+
+
+def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[str]) -> float:
+    """The step of a time column that must run forwards and be uniform to half a sample."""
+    d = np.diff(stamps)
+    back = d <= 0
+    if back.any():
+        i = int(np.argmax(back)) + 1
+        what = "stands still" if d[i - 1] == 0 else "runs backwards"
+        raise RecordingError(
+            f"{path}: time column '{name}' {what} at sample {i} ({stamps[i - 1]:g} then {stamps[i]:g} s); sort it"
+        )
+    dt = float(stamps[-1] - stamps[0]) / d.size
+    median = float(np.median(d))
+    gap = d > 1.5 * median
+    if gap.any():
+        i = int(np.argmax(gap)) + 1
+        raise RecordingError(
+            f"{path}: time column '{name}' jumps by {d[i - 1]:g} s at sample {i}, the usual step is {median:g} s;"
+            " resample to uniform steps or cut the recording there"
+        )
+    off = np.abs(stamps - (stamps[0] + dt * np.arange(stamps.size)))
+    if off.max() > 0.5 * dt:
+        i = int(np.argmax(off))
+        raise RecordingError(
+            f"{path}: time column '{name}' is not uniform: sample {i} is {off[i]:.3g} s off a grid of {dt:.6g} s;"
+            " resample to uniform steps"
+        )
+    if rate is not None and abs(rate * dt - 1) > 0.2:
+        raise RecordingError(f"{path}: rate_hz {rate:g} contradicts the time column '{name}' ({1 / dt:g} Hz)")
+    if rate is not None and abs(rate * dt - 1) > 1e-3:
+        notes.append(f"rate_hz {rate:g} differs from the time column ({1 / dt:.6g} Hz); the time column is used")
+    if off.max() > 0.01 * dt:
+        notes.append(f"time stamps scatter by up to {off.max() / dt:.2g} of a step; taken as uniform")
+    return dt
+
+
+def _same_data(path: Path, channels: list[_Channel], columns: dict[str, Array], notes: list[str]) -> None:
+    for i, a in enumerate(channels):
+        for b in channels[:i]:
+            if np.array_equal(columns[a.column], columns[b.column]) and np.ptp(columns[a.column]) > 0:
+                if "output" in (a.role, b.role) and a.role != b.role:
+                    raise RecordingError(
+                        f"{path}: columns '{b.column}' ({b.role}) and '{a.column}' ({a.role}) hold the same numbers;"
+                        " one of them is the wrong column"
+                    )
+                notes.append(f"columns '{b.column}' and '{a.column}' hold the same numbers")
+
+
+def _split(path: Path, value: object, n: int) -> Split:
+    if value is None:
+        return Split()
+    if not isinstance(value, Mapping):
+        raise RecordingError(f"{path}: [split] must be a table")
+    found: dict[str, tuple[int, int] | Path] = {}
+    initialization: int | None = None
+    for key, v in value.items():
+        at = f"{path}: [split] {key}"
+        if key == "initialization":
+            if isinstance(v, bool) or not isinstance(v, int) or not 0 <= v < n:
+                raise RecordingError(f"{at} must be a number of samples below {n}, got {v!r}")
+            initialization = v
+        elif isinstance(v, str) and re.search(r"\.toml$", v):
+            found[key] = path.parent / v
+        elif isinstance(v, list) and len(v) == 2 and all(isinstance(i, int) and not isinstance(i, bool) for i in v):
+            if not 0 <= v[0] < v[1] <= n:
+                raise RecordingError(f"{at}: [{v[0]}, {v[1]}] does not lie in the {n} samples of the recording")
+            found[key] = (v[0], v[1])
+        else:
+            raise RecordingError(f"{at} must be [start, stop] in samples or the name of another .toml, got {v!r}")
+    others = {k: v for k, v in found.items() if k not in ("fit", "test")}
+    return Split(found.get("fit"), found.get("test"), others, initialization)

@@ -1,0 +1,79 @@
+"""Signals and units of each twin kind (contract, section 2)."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from importlib.metadata import entry_points
+from types import MappingProxyType
+from typing import Literal
+
+Role = Literal["input", "output", "context"]
+ENTRY_POINTS = "micron.twins"
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Vocabulary:
+    """Patterns (full match) with the contract units that are allowed; ``open_ended`` kinds take any signal."""
+
+    inputs: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    outputs: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    open_ended: bool = False
+
+    def units(self, role: Role, signal: str) -> tuple[str, ...] | None:
+        """Allowed contract units; () means any unit, kept as declared; None: no such signal."""
+        if role == "context":
+            return CONTEXT_UNITS.get(signal, ())
+        if self.open_ended:
+            return ()
+        for pattern, units in self.inputs if role == "input" else self.outputs:
+            if re.fullmatch(pattern, signal):
+                return units
+        return None
+
+    def known(self, role: Role) -> str:
+        """The signals of a role, for messages."""
+        return ", ".join(p for p, _ in (self.inputs if role == "input" else self.outputs))
+
+
+CONTEXT_UNITS = MappingProxyType(
+    {
+        "temperature": ("degC",),
+        "supply": ("V",),
+        "load": ("N",),
+        "actuator_current": ("A",),
+        "current": ("A",),
+    }
+)
+
+KINDS = MappingProxyType(
+    {
+        "piezo_stack": Vocabulary((("command", ("V",)),), (("displacement", ("um",)),)),
+        "accelerometer": Vocabulary((("specific_force_[xyz]", ("g",)),), (("voltage_[xyz]", ("V",)),)),
+        "magnetometer": Vocabulary((("field_[xyz]", ("uT",)),), (("voltage_[xyz]", ("V",)),)),
+        "accelerometer_cluster": Vocabulary(
+            (("specific_force_[xyz]", ("m/s^2",)), ("angular_rate_[xyz]", ("rad/s",))),
+            ((r"accel_\w*[xyz]", ("m/s^2",)),),
+        ),
+        "mechanical_axis": Vocabulary(
+            (("force", ("N",)), ("torque", ("N m",))),
+            (("position", ("m", "rad")), ("velocity", ("m/s", "rad/s"))),
+        ),
+        "state_space": Vocabulary(open_ended=True),
+        "instrument": Vocabulary(open_ended=True),
+        "fmu": Vocabulary(open_ended=True),
+    }
+)
+
+
+def user_kinds() -> dict[str, object]:
+    """Twins that installed packages offer: kind -> entry point (not loaded)."""
+    return {e.name: e for e in entry_points(group=ENTRY_POINTS)}
+
+
+def vocabulary(kind: str) -> Vocabulary | None:
+    """The vocabulary of a kind, None if nobody knows it."""
+    if kind in KINDS:
+        return KINDS[kind]
+    return Vocabulary(open_ended=True) if kind in user_kinds() else None

@@ -1,0 +1,162 @@
+"""Units as people write them in a recording: symbol -> dimension, factor, offset; conversion between equals."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Dimension = tuple[int, ...]
+"""Exponents of metre, kilogram, second, ampere, kelvin, radian, count."""
+
+_NONE: Dimension = (0, 0, 0, 0, 0, 0, 0)
+STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
+
+
+class UnitError(ValueError):
+    """Unknown unit, or a unit of another dimension."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """``si = value * factor + offset``."""
+
+    text: str
+    dimension: Dimension
+    factor: float
+    offset: float = 0.0
+
+
+def _d(m: int = 0, kg: int = 0, s: int = 0, a: int = 0, k: int = 0, rad: int = 0, count: int = 0) -> Dimension:
+    return (m, kg, s, a, k, rad, count)
+
+
+# symbol: (dimension, factor to SI, offset, takes SI prefixes)
+_SYMBOLS = MappingProxyType(
+    {
+        "1": (_NONE, 1.0, 0.0, False),
+        "%": (_NONE, 1e-2, 0.0, False),
+        "ppm": (_NONE, 1e-6, 0.0, False),
+        "m": (_d(m=1), 1.0, 0.0, True),
+        "micron": (_d(m=1), 1e-6, 0.0, False),
+        "in": (_d(m=1), 0.0254, 0.0, False),
+        "s": (_d(s=1), 1.0, 0.0, True),
+        "sec": (_d(s=1), 1.0, 0.0, False),
+        "min": (_d(s=1), 60.0, 0.0, False),
+        "h": (_d(s=1), 3600.0, 0.0, False),
+        "Hz": (_d(s=-1), 1.0, 0.0, True),
+        "kg": (_d(kg=1), 1.0, 0.0, False),
+        "g": (_d(m=1, s=-2), STANDARD_GRAVITY, 0.0, True),
+        "g0": (_d(m=1, s=-2), STANDARD_GRAVITY, 0.0, False),
+        "gal": (_d(m=1, s=-2), 1e-2, 0.0, False),
+        "N": (_d(m=1, kg=1, s=-2), 1.0, 0.0, True),
+        "lbf": (_d(m=1, kg=1, s=-2), 4.4482216152605, 0.0, False),
+        "kgf": (_d(m=1, kg=1, s=-2), STANDARD_GRAVITY, 0.0, False),
+        "Nm": (_d(m=2, kg=1, s=-2), 1.0, 0.0, True),
+        "J": (_d(m=2, kg=1, s=-2), 1.0, 0.0, True),
+        "W": (_d(m=2, kg=1, s=-3), 1.0, 0.0, True),
+        "Pa": (_d(m=-1, kg=1, s=-2), 1.0, 0.0, True),
+        "bar": (_d(m=-1, kg=1, s=-2), 1e5, 0.0, True),
+        "A": (_d(a=1), 1.0, 0.0, True),
+        "C": (_d(s=1, a=1), 1.0, 0.0, True),
+        "V": (_d(m=2, kg=1, s=-3, a=-1), 1.0, 0.0, True),
+        "ohm": (_d(m=2, kg=1, s=-3, a=-2), 1.0, 0.0, True),
+        "T": (_d(kg=1, s=-2, a=-1), 1.0, 0.0, True),
+        "G": (_d(kg=1, s=-2, a=-1), 1e-4, 0.0, True),
+        "Gs": (_d(kg=1, s=-2, a=-1), 1e-4, 0.0, True),
+        "gauss": (_d(kg=1, s=-2, a=-1), 1e-4, 0.0, True),
+        "K": (_d(k=1), 1.0, 0.0, True),
+        "degC": (_d(k=1), 1.0, 273.15, False),
+        "°C": (_d(k=1), 1.0, 273.15, False),
+        "degF": (_d(k=1), 5.0 / 9.0, 273.15 - 32.0 * 5.0 / 9.0, False),
+        "°F": (_d(k=1), 5.0 / 9.0, 273.15 - 32.0 * 5.0 / 9.0, False),
+        "rad": (_d(rad=1), 1.0, 0.0, True),
+        "deg": (_d(rad=1), math.pi / 180, 0.0, True),
+        "°": (_d(rad=1), math.pi / 180, 0.0, False),
+        "dps": (_d(s=-1, rad=1), math.pi / 180, 0.0, True),
+        "arcmin": (_d(rad=1), math.pi / 10800, 0.0, False),
+        "arcsec": (_d(rad=1), math.pi / 648000, 0.0, False),
+        "rev": (_d(rad=1), 2 * math.pi, 0.0, False),
+        "turn": (_d(rad=1), 2 * math.pi, 0.0, False),
+        "rpm": (_d(s=-1, rad=1), 2 * math.pi / 60, 0.0, False),
+        "count": (_d(count=1), 1.0, 0.0, False),
+        "counts": (_d(count=1), 1.0, 0.0, False),
+        "tick": (_d(count=1), 1.0, 0.0, False),
+        "ticks": (_d(count=1), 1.0, 0.0, False),
+        "LSB": (_d(count=1), 1.0, 0.0, False),
+        "lsb": (_d(count=1), 1.0, 0.0, False),
+    }
+)
+_PREFIXES = MappingProxyType(
+    {"f": 1e-15, "p": 1e-12, "n": 1e-9, "u": 1e-6, "µ": 1e-6, "μ": 1e-6, "m": 1e-3, "c": 1e-2, "d": 1e-1}
+    | {"k": 1e3, "M": 1e6, "G": 1e9}
+)
+_TERM = re.compile(r"^(?P<symbol>1|[^\d^+\-\s]+?)(?:\^?(?P<power>[+-]?\d+))?$")
+_SUPERSCRIPTS = str.maketrans("²³⁻¹", "23-1")
+
+
+def parse(text: str) -> Unit:
+    """A unit such as ``um/V``, ``m/s^2``, ``deg/s``, ``N m``, ``mg`` (milli-gravity), ``G`` (gauss).
+
+    Raises UnitError naming the symbol that is unknown.
+    """
+    cleaned = text.strip().translate(_SUPERSCRIPTS)
+    if cleaned in ("", "-"):
+        return Unit(text, _NONE, 1.0)
+    factor, dimension = 1.0, list(_NONE)
+    sides = cleaned.split("/")
+    for side, group in enumerate(sides):
+        terms = [w for w in re.split(r"[\s*·]+", group.strip().strip("()")) if w]
+        if not terms:
+            raise UnitError(f"unit '{text}' has an empty part")
+        for term in terms:
+            match = _TERM.match(term)
+            if match is None:
+                raise UnitError(f"unknown unit '{text}' (cannot read '{term}')")
+            dim, f, offset = _symbol(match["symbol"], text)
+            power = int(match["power"] or 1)
+            if len(sides) == 1 and len(terms) == 1 and power == 1:
+                return Unit(text, dim, f, offset)
+            sign = power if side == 0 else -power
+            factor *= f**sign
+            dimension = [a + sign * b for a, b in zip(dimension, dim, strict=True)]
+    return Unit(text, tuple(dimension), factor)
+
+
+def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
+    direct = _SYMBOLS.get(symbol)
+    if direct is not None:
+        return direct[0], direct[1], direct[2]
+    prefix, rest = symbol[:1], symbol[1:]
+    entry = _SYMBOLS.get(rest)
+    if prefix in _PREFIXES and entry is not None and entry[3]:
+        return entry[0], entry[1] * _PREFIXES[prefix], 0.0
+    raise UnitError(f"unknown unit '{text}'" + (f" (symbol '{symbol}')" if symbol != text else ""))
+
+
+def same_dimension(a: str, b: str) -> bool:
+    """Whether values in ``a`` can be converted to ``b``."""
+    return parse(a).dimension == parse(b).dimension
+
+
+def convert(values: Array, unit: str, to: str) -> Array:
+    """Values in ``unit`` as values in ``to``. Raises UnitError if the dimensions differ."""
+    a, b = parse(unit), parse(to)
+    if a.dimension != b.dimension:
+        raise UnitError(f"unit '{unit}' is not of the dimension of '{to}'")
+    if a.text == b.text or (a.factor == b.factor and a.offset == b.offset):
+        return values
+    return (values * a.factor + (a.offset - b.offset)) / b.factor
+
+
+def convert_difference(value: float, unit: str, to: str) -> float:
+    """A difference (noise, resolution) in ``unit`` as a difference in ``to``: offsets do not count."""
+    a, b = parse(unit), parse(to)
+    if a.dimension != b.dimension:
+        raise UnitError(f"unit '{unit}' is not of the dimension of '{to}'")
+    return value * a.factor / b.factor
