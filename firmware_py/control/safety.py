@@ -9,6 +9,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
+from pydantic import BaseModel, ConfigDict
+
 from hal.contracts import AnalogOutput
 from hal.errors import HalError
 
@@ -26,9 +28,10 @@ class State(IntEnum):
     SAFE = 4
 
 
-@dataclass(frozen=True)
-class SafetyLimits:
+class SafetyLimits(BaseModel):
     """When data count as stale, what is too hot, how long an axis may sit at its limit."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     stale_ms: float = 5.0
     temperature_C: tuple[float, float] = (0.0, 60.0)

@@ -13,7 +13,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from enum import IntEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,17 +20,8 @@ import numpy as np
 import typer
 from rich.console import Console
 
-from hal.errors import BenchError, DeviceNotFound, HalError, OpenFailed
-
-
-class Exit(IntEnum):
-    """Exit codes of every command."""
-
-    DONE = 0
-    FAILED = 1
-    BAD_INPUT = 2
-    DATA_LOST = 3
-    DEVICE_MISSING = 4
+from firmware_py.exit_codes import Exit, exit_code_of
+from hal.errors import HalError
 
 
 class InputError(ValueError):
@@ -114,12 +104,10 @@ def clear_errors() -> Iterator[None]:
         yield
     except typer.Exit:
         raise
-    except (BenchError, InputError) as error:
+    except InputError as error:
         _fail(error, Exit.BAD_INPUT)
-    except (DeviceNotFound, OpenFailed) as error:
-        _fail(error, Exit.DEVICE_MISSING)
     except HalError as error:
-        _fail(error, Exit.FAILED)
+        _fail(error, exit_code_of(error))
 
 
 def _fail(error: Exception, code: Exit) -> None:

@@ -1,0 +1,236 @@
+"""The firmware as a program: open the bench, run the loop, report what happened.
+
+``run_in_process`` is the whole of it; ``python -m firmware_py.app REQUEST.json`` is the same in a process of
+its own, for real time, with status lines on standard output that are dropped rather than waited for.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from firmware_py.control.config import FirmwareConfig, load_firmware_config
+from firmware_py.control.loop import InstrumentLoop
+from firmware_py.control.stages import StageConfigs, Stages
+from firmware_py.control.wiring import Devices, open_devices
+from firmware_py.exit_codes import exit_code_of
+from firmware_py.frame import LAYOUT
+from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
+from firmware_py.recording.revision import git_revision
+from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
+from hal.bench import BenchFile, OpenBench, load_bench, open_bench
+from hal.errors import HalError
+
+StatusSink = Callable[[dict[str, Any]], None]
+LOOP_PRIORITY = 80
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What to run. ``hand_file`` may carry a part (``FILE#id``), which is why it is text."""
+
+    bench: Path
+    seconds: float
+    virtual: bool = False
+    hand_file: str | None = None
+    hand_scale: float | None = None
+    record: Path | None = None
+    seed: int | None = None
+
+    def to_json(self, runtime_dir: Path) -> str:
+        """For the firmware's own process."""
+        table = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+        return json.dumps({**table, "runtime_dir": str(runtime_dir)})
+
+
+def run_in_process(
+    request: RunRequest, on_status: StatusSink | None = None, runtime_dir: Path | None = None
+) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """Run the instrument; returns the outcome (JSON values) and, from an emulated world, the truth.
+
+    Raises ``HalError`` when the bench cannot be opened. What goes wrong later is in the outcome's
+    ``safe_state``.
+    """
+    bench = load_bench(request.bench)
+    load_firmware_config(bench, {})
+    with contextlib.ExitStack() as stack:
+        folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
+        opened = stack.enter_context(
+            open_bench(
+                bench,
+                virtual=request.virtual,
+                runtime_dir=folder,
+                hand_file=Path(request.hand_file) if request.hand_file else None,
+                hand_scale=request.hand_scale,
+                seed=request.seed,
+            )
+        )
+        devices = open_devices(opened)
+        config, configs = load_firmware_config(bench, _wired(devices))
+        stages = Stages(configs)
+        stages.warm_up()
+        recorder = _recorder(request, bench, configs, opened)
+        loop = InstrumentLoop(
+            devices,
+            stages,
+            config,
+            opened.clock,
+            tick_hz=bench.description.clock.tick_hz,
+            recorder=recorder,
+            on_status=on_status,
+        )
+        report = RealtimeReport()
+        summary: RecordingSummary | None = None
+        try:
+            with _scheduling(request.virtual) as report:
+                loop.run(request.seconds)
+        finally:
+            if recorder is not None:
+                summary = recorder.stop(loop.scheduler.snapshot().as_dict())
+        outcome = make_outcome(request, bench, devices, loop, config, report, summary)
+        truth = None
+        if opened.world is not None:
+            opened.world.stop()
+            truth = opened.world.truth()
+        return outcome, truth
+
+
+def _wired(devices: Devices) -> dict[str, Any]:
+    """What opening the devices has taught about the sensors."""
+    return devices.sensing_table
+
+
+@contextlib.contextmanager
+def _scheduling(virtual: bool) -> Iterator[RealtimeReport]:
+    if virtual:
+        yield RealtimeReport()
+        return
+    with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
+        yield report
+
+
+def _recorder(
+    request: RunRequest, bench: BenchFile, configs: StageConfigs, opened: OpenBench
+) -> RecorderProcess | None:
+    if request.record is None:
+        return None
+    metadata = {
+        "bench": bench.text,
+        "bench_name": bench.description.name,
+        "stages": json.dumps(configs.as_dict()),
+        "git_revision": git_revision(),
+        "clock": "virtual" if opened.virtual else "real",
+        "tick_hz": str(bench.description.clock.tick_hz),
+    }
+    columns = list(zip(LAYOUT.scalar_names(), LAYOUT.scalar_units(), strict=True))
+    return RecorderProcess.start(request.record, columns, metadata)
+
+
+def make_outcome(
+    request: RunRequest,
+    bench: BenchFile,
+    devices: Devices,
+    loop: InstrumentLoop,
+    config: FirmwareConfig,
+    report: RealtimeReport,
+    recording: RecordingSummary | None,
+) -> dict[str, Any]:
+    """The part of the run's JSON that the firmware itself knows."""
+    snapshot = loop.scheduler.snapshot()
+    supervisor, counts = loop.supervisor, loop.counts
+    trip = supervisor.trip_cause
+    reason = trip.reason if trip is not None else "never left the boot state"
+    if supervisor.ramp_failure:
+        reason += f"; neutral NOT confirmed ({supervisor.ramp_failure}): switch the amplifier off"
+    return {
+        "format": 1,
+        "bench": bench.description.name,
+        "clock": "virtual" if request.virtual else "real",
+        "seconds": request.seconds,
+        "devices": devices.identities,
+        "tasks": {task.name: task.as_dict() for task in snapshot.tasks},
+        "ticks": {
+            "run": snapshot.ticks,
+            "caught_up": snapshot.caught_up,
+            "skipped": snapshot.skipped_ticks,
+            "duration_us": snapshot.tick_duration.as_dict(),
+            "lateness_us": snapshot.tick_lateness.as_dict(),
+            "announced": {item.reason: item.as_dict() for item in snapshot.ignored},
+        },
+        "latency": {"sample_to_command_us": counts.latency.distribution().as_dict()},
+        "samples": {"expected": counts.expected, "received": counts.received, "lost": counts.lost},
+        "commands": {"sent": counts.commands, "clipped": counts.clipped},
+        "magnetometer_errors": counts.magnetometer_errors,
+        "safe_state": {
+            "reached": supervisor.safe_reached,
+            "reason": reason,
+            "normal": trip is not None and trip.normal and supervisor.safe_reached,
+            "tick": trip.tick if trip is not None else -1,
+        },
+        "estimator": loop.stages.configs.tremor.method,
+        "realtime": describe_scheduling(report, request.virtual),
+        "recording": str(recording.path) if recording is not None else None,
+        "recorder": {
+            "ticks": recording.ticks if recording is not None else 0,
+            "dropped": recording.dropped if recording is not None else 0,
+        },
+    }
+
+
+def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
+    """Which real-time settings the loop ran with, in words."""
+    if virtual:
+        return "virtual time"
+    return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
+
+
+# -- own process ------------------------------------------------------------------------------------------
+
+
+def _die_with_parent() -> None:
+    """SIGTERM to this process when the one that started it dies: the loop then ramps to neutral."""
+    with contextlib.suppress(AttributeError, OSError):
+        ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
+
+
+def _status_pipe() -> StatusSink:
+    """Status lines to standard output; a reader that does not read costs lines, never time."""
+    descriptor = sys.stdout.fileno()
+    os.set_blocking(descriptor, False)
+
+    def send(status: Mapping[str, Any]) -> None:
+        with contextlib.suppress(BlockingIOError, BrokenPipeError):
+            os.write(descriptor, (json.dumps(status) + "\n").encode())
+
+    return send
+
+
+def main(arguments: list[str]) -> int:
+    """``python -m firmware_py.app REQUEST.json``: writes ``outcome.json`` beside the request."""
+    _die_with_parent()
+    table = json.loads(Path(arguments[0]).read_text())
+    runtime_dir = Path(table.pop("runtime_dir"))
+    record = table.pop("record")
+    request = RunRequest(
+        **{**table, "bench": Path(table["bench"]), "record": Path(record) if record is not None else None}
+    )
+    try:
+        outcome, _ = run_in_process(request, _status_pipe(), runtime_dir)
+    except HalError as error:
+        sys.stderr.write(f"micron: {error}\n")
+        return int(exit_code_of(error))
+    (runtime_dir / "outcome.json").write_text(json.dumps(outcome))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,70 @@
+"""[firmware] of a bench file: stages, safety limits, task budgets; calibration files laid over them."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.control.safety import SafetyLimits
+from firmware_py.control.stages import StageConfigs
+from hal.bench import BenchFile, validate_table
+from hal.errors import BenchError
+
+STAGES = ("sensing", "tremor", "actuation")
+
+
+class SelfTestLimits(BaseModel):
+    """How long the sensors are watched before anything may move, and by when they must have answered."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    watch_ms: float = Field(default=500.0, ge=50.0, le=10_000.0)
+    limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)
+
+
+class FirmwareConfig(BaseModel):
+    """The checked [firmware] table. ``stages`` holds the tables of the three stages, calibration merged in."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    safety: SafetyLimits = SafetyLimits()
+    self_test: SelfTestLimits = SelfTestLimits()
+    budget_us: dict[str, float] = Field(default_factory=dict[str, float])
+    calibration: tuple[str, ...] = ()
+    sensing: dict[str, Any] = Field(default_factory=dict[str, Any])
+    tremor: dict[str, Any] = Field(default_factory=dict[str, Any])
+    actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
+
+
+def load_firmware_config(bench: BenchFile, wired: Mapping[str, Any]) -> tuple[FirmwareConfig, StageConfigs]:
+    """Bench table, then calibration files over it (in order), then what the wiring decides.
+
+    Raises ``BenchError`` naming file and key.
+    """
+    where = str(bench.path)
+    config = validate_table(FirmwareConfig, bench.description.firmware, f"{where}: firmware")
+    tables: dict[str, dict[str, Any]] = {name: dict(getattr(config, name)) for name in STAGES}
+    for name in config.calibration:
+        for stage, table in _calibration(bench, name).items():
+            tables[stage].update(table)
+    tables["sensing"].update(wired)
+    return config, StageConfigs.from_dict(tables, where)
+
+
+def _calibration(bench: BenchFile, name: str) -> dict[str, dict[str, Any]]:
+    path = bench.resolve(name)
+    try:
+        table = tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise BenchError(f"{bench.path}: [firmware.calibration] {path} cannot be read: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise BenchError(f"{path}: not a calibration file: {error}") from error
+    stages = {key: value for key, value in table.items() if key in STAGES}
+    unknown = sorted(set(table) - set(STAGES) - {"format", "title", "made_by", "report"})
+    if unknown or table.get("format") != 1:
+        detail = f"unknown table [{unknown[0]}]" if unknown else "format = 1 is missing"
+        raise BenchError(f"{path}: {detail}; a calibration has format = 1 and any of {', '.join(STAGES)}")
+    return stages

@@ -1,0 +1,386 @@
+"""The instrument's loop: scans in, commands out, one pass a tick, with a supervisor that may stop it.
+
+A tick is due when its scan was taken (device clock). Order within a tick: sense, estimate, actuate, then
+everything that can wait. Nothing here knows whether the bench is real.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.safety import State, Supervisor
+from firmware_py.control.stages import Stages
+from firmware_py.control.wiring import Devices
+from firmware_py.frame import (
+    COMMAND,
+    COUNTS,
+    MAGNETOMETER_FRESH,
+    MAGNETOMETER_RAW,
+    STATUS,
+    SUPPLY,
+    TEMPERATURE,
+    TICK,
+    TIME,
+    TREMOR_AMPLITUDE,
+    TREMOR_FREQUENCY,
+    FrameStatus,
+)
+from firmware_py.scheduler.histogram import DurationHistogram
+from firmware_py.scheduler.scheduler import Scheduler
+from firmware_py.scheduler.task import BackgroundSpec, TaskSpec, TickInfo
+from firmware_py.scheduler.ticker import ScanTicker, Ticks
+from hal.contracts import Clock
+from hal.errors import HalError
+from hal.types import ScanBlock, TimeSource
+
+MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
+BUDGETS_US = {
+    "sense": 60.0,
+    "estimate": 60.0,
+    "actuate": 480.0,
+    "publish": 30.0,
+    "magnetometer": 290.0,
+    "supervise": 40.0,
+    "telemetry": 40.0,
+}
+
+
+class Recorder(Protocol):
+    """Where finished frames go; never blocks, counts what it drops."""
+
+    def push(self, frame: NDArray[np.float64]) -> bool: ...
+    def event(self, event: dict[str, object]) -> bool: ...
+
+
+@dataclass
+class LoopCounts:
+    """What the loop counted besides the scheduler's figures."""
+
+    expected: int = 0
+    received: int = 0
+    lost: int = 0
+    commands: int = 0
+    clipped: int = 0
+    magnetometer_errors: int = 0
+    latency: DurationHistogram = field(default_factory=DurationHistogram)
+
+
+class InstrumentLoop:
+    """Runs the opened devices. ``on_status`` gets a small dict now and then and must not block."""
+
+    def __init__(
+        self,
+        devices: Devices,
+        stages: Stages,
+        config: FirmwareConfig,
+        clock: Clock,
+        *,
+        tick_hz: int,
+        recorder: Recorder | None = None,
+        on_status: Callable[[dict[str, object]], None] | None = None,
+    ) -> None:
+        self._devices = devices
+        self.stages = stages
+        self._frame = stages.frame
+        self._config = config
+        self._clock = clock
+        self._period_ns = 1_000_000_000 // tick_hz
+        self._recorder = recorder
+        self._on_status = on_status
+        self._rows = np.zeros((MAX_BLOCK, len(devices.scan.channels)), dtype=np.int16)
+        self._block: ScanBlock | None = None
+        self._ticks: Ticks | None = None
+        self._field_V = np.zeros(3)
+        self._field_fresh = False
+        self._started_ns = 0
+        self._bad_since: dict[str, int] = {}
+        self._interrupted = ""
+        self.supervisor = Supervisor(devices.amplifier)
+        self.counts = LoopCounts()
+        self.error: HalError | None = None
+        self.scheduler = Scheduler(
+            self._task_table(tick_hz),
+            clock,
+            period_ns=self._period_ns,
+            background=[BackgroundSpec("status", self._report_status, 150.0)] if on_status else [],
+        )
+
+    # -- tables -------------------------------------------------------------------------------------------
+
+    def _task_table(self, tick_hz: int) -> list[TaskSpec]:
+        budget = {**BUDGETS_US, **self._config.budget_us}
+        period_us = 1e6 / tick_hz
+
+        def task(
+            name: str,
+            fn: Callable[[TickInfo], object],
+            order: int,
+            divider: int = 1,
+            phase: int = 0,
+            *,
+            catch_up: bool = False,
+            budget_of: str = "",
+        ) -> TaskSpec:
+            return TaskSpec(name, fn, divider, phase, order, budget[budget_of or name], period_us, catch_up)
+
+        table = [
+            task("sense", self._sense, 0, catch_up=True),
+            task("estimate", self._estimate, 1, catch_up=True),
+            task("actuate", self._actuate, 2),
+            task("publish", self._publish, 3, catch_up=True),
+            task("supervise", self._supervise, 5, 10, 2),
+        ]
+        if self._devices.magnetometer is not None:
+            for axis, phase in zip("xyz", (0, 3, 6), strict=True):
+                table.append(
+                    task(f"magnetometer_{axis}", self._poll_magnetometer, 4, 10, phase, budget_of="magnetometer")
+                )
+        if self._devices.telemetry is not None:
+            table.append(task("telemetry", self._send_telemetry, 6, 20, 5))
+        return table
+
+    # -- running ------------------------------------------------------------------------------------------
+
+    def run(self, seconds: float) -> None:
+        """Self-test, arm, run for ``seconds`` after arming, ramp to neutral. Always ends in the safe state.
+
+        A hardware error becomes the reason of the trip and is kept in ``error``; anything else is raised
+        again after the ramp.
+        """
+        previous = self._catch_signals()
+        try:
+            self._start()
+            self._run_ticks(seconds)
+        except HalError as error:
+            self.error = error
+            self._trip(f"{error}")
+        except BaseException as error:
+            self._trip(f"{type(error).__name__}: {error}")
+            raise
+        finally:
+            self._ramp_without_scans()
+            self._stop()
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+    def _catch_signals(self) -> dict[signal.Signals, object]:
+        def interrupt(number: int, _frame: object) -> None:
+            self._interrupted = signal.Signals(number).name
+
+        try:
+            return {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+        except ValueError:  # not the main thread: whoever started the loop there handles signals
+            return {}
+
+    def _start(self) -> None:
+        self.supervisor.begin_self_test()
+        magnetometer = self._devices.magnetometer
+        if magnetometer is not None:
+            for _ in magnetometer.measure_offset():
+                self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
+        self._started_ns = self._clock.now_ns()
+        self._devices.daq.start()
+
+    def _run_ticks(self, seconds: float) -> None:
+        limits = self._config.safety
+        ticker = ScanTicker(
+            self._read,
+            self._clock,
+            self._period_ns,
+            silent_after_ns=round(limits.stale_ms * 1e6),
+        )
+        end_ns: int | None = None
+        while self.supervisor.state is not State.SAFE:
+            ticks = ticker.wait()
+            self._ticks = ticks
+            newest_ns = ticks.due_ns + (ticks.n - 1) * ticks.dt_ns
+            if ticks.source is TimeSource.HOST:
+                self._trip(f"{self._devices.daq.name}: no new scan for {limits.stale_ms:g} ms; check its link")
+            elif self._interrupted:
+                self._trip(f"stopped by the operator ({self._interrupted})", normal=True)
+            elif end_ns is not None and newest_ns >= end_ns:
+                self._trip("run finished", normal=True)
+            self.scheduler.run(ticks)
+            if self.supervisor.state is State.SELF_TEST and self._self_test_passed(newest_ns):
+                self.scheduler.ignore_next("arming")
+                self.supervisor.arm()
+                end_ns = self._clock.now_ns() + round(seconds * 1e9)
+            self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
+
+    def _read(self, timeout_s: float) -> ScanBlock:
+        block = self._devices.daq.read_scans(self._rows, timeout_s)
+        self._block = block
+        self.counts.received += block.n
+        self.counts.lost += block.lost
+        self.counts.expected += block.n + block.lost
+        return block
+
+    def _ramp_without_scans(self) -> None:
+        """Finish the ramp on the host clock: the loop, or what drove it, is gone."""
+        while self.supervisor.state is State.SAFE_RAMP:
+            due_ns = self._clock.now_ns() + self._period_ns
+            self.supervisor.step()
+            self._clock.sleep_until_ns(due_ns)
+
+    def _stop(self) -> None:
+        for close in (self._devices.daq.stop, self._devices.amplifier.close):
+            try:
+                close()
+            except HalError as error:
+                # the link may be what failed: the first error is the one to tell
+                self.error = self.error or (None if self.supervisor.safe_reached else error)
+
+    def _trip(self, reason: str, *, normal: bool = False) -> None:
+        if self.supervisor.trip_cause is not None:
+            return
+        tick = self._ticks.k0 if self._ticks is not None else -1
+        t_ns = self._clock.now_ns()
+        self.supervisor.trip(reason, tick=tick, t_ns=t_ns, normal=normal)
+        if self._recorder is not None:
+            self._recorder.event({"t_ns": t_ns, "tick": tick, "event": "safe state", "reason": reason})
+
+    # -- tasks --------------------------------------------------------------------------------------------
+
+    def _sense(self, info: TickInfo) -> None:
+        frame, block, ticks = self._frame, self._block, self._ticks
+        assert block is not None
+        assert ticks is not None
+        frame[TICK] = info.k
+        frame[TIME] = (info.due_ns - self._started_ns) * 1e-9
+        if block.n == 0:
+            frame[STATUS] = FrameStatus.STALE
+        else:
+            row = info.k - ticks.k0
+            frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
+            frame[COUNTS : COUNTS + self._rows.shape[1]] = self._rows[row]
+        frame[MAGNETOMETER_FRESH] = float(self._field_fresh)
+        if self._field_fresh:
+            frame[MAGNETOMETER_RAW : MAGNETOMETER_RAW + 3] = self._field_V
+            self._field_fresh = False
+        self.stages.sense()
+
+    def _estimate(self, info: TickInfo) -> None:
+        self.stages.estimate()
+
+    def _actuate(self, info: TickInfo) -> None:
+        if self.supervisor.may_move:
+            self.stages.actuate()
+            clipped = self._devices.amplifier.write(self.stages.command_V)
+            self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
+            self.counts.commands += 1
+            self.counts.clipped += clipped != 0
+        else:
+            self.supervisor.step()
+
+    def _publish(self, info: TickInfo) -> None:
+        if self._recorder is not None:
+            self._recorder.push(self._frame)
+
+    def _poll_magnetometer(self, info: TickInfo) -> None:
+        magnetometer = self._devices.magnetometer
+        assert magnetometer is not None
+        try:
+            if magnetometer.poll():
+                self._field_V[:] = magnetometer.volts
+                self._field_fresh = True
+            self._bad_since.pop("magnetometer", None)
+        except HalError as error:
+            # heading may coast for a while; a dead magnetometer is a fault
+            self.counts.magnetometer_errors += 1
+            self._bad_for("magnetometer", True, info.due_ns, 500.0, str(error))
+
+    def _supervise(self, info: TickInfo) -> None:
+        """100 Hz: everything that may end the run and is not seen by the task that needs it."""
+        frame, limits = self._frame, self._config.safety
+        status = int(frame[STATUS])
+        t_ns = info.due_ns
+        if status & FrameStatus.INVALID:
+            self._trip("a reading or estimate is not a number; see the recording")
+        self._bad_for(
+            "saturation",
+            bool(status & FrameStatus.SATURATED),
+            t_ns,
+            limits.saturated_ms,
+            f"an accelerometer has been beyond its range for {limits.saturated_ms:g} ms; is the instrument falling?",
+        )
+        for name, value, unit, (lo, hi) in (
+            ("temperature", frame[TEMPERATURE], "degC", limits.temperature_C),
+            ("supply", frame[SUPPLY], "V", limits.supply_V),
+        ):
+            outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
+            self._bad_for(name, outside, t_ns, 100.0, f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}")
+        telemetry = self._devices.telemetry
+        if telemetry is not None:
+            telemetry.poll()
+            if telemetry.stop_pressed:
+                self._trip("stop button pressed")
+            silence_ms = telemetry.stop_button_silence_ns(t_ns) * 1e-6
+            if silence_ms > limits.stop_button_silence_ms:
+                self._trip(
+                    f"{telemetry.name}: the stop button has been silent for {silence_ms:.0f} ms; check the CAN bus"
+                )
+
+    def _bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
+        """Trip when ``bad`` has held for ``limit_ms``."""
+        if not bad:
+            self._bad_since.pop(what, None)
+        elif (t_ns - self._bad_since.setdefault(what, t_ns)) * 1e-6 >= limit_ms:
+            self._trip(reason)
+
+    def _send_telemetry(self, info: TickInfo) -> None:
+        telemetry = self._devices.telemetry
+        assert telemetry is not None
+        telemetry.send(self.stages.frame, int(self.supervisor.state), self.counts.lost)
+
+    def _self_test_passed(self, now_ns: int) -> bool:
+        """Sensors have been watched long enough and are sane; trips when that takes too long."""
+        limits = self._config.self_test
+        watched_ms = (now_ns - self._started_ns) * 1e-6
+        status = int(self._frame[STATUS])
+        waiting = [
+            name
+            for name, wrong in (
+                ("attitude is not aligned", status & FrameStatus.ALIGNING),
+                ("an accelerometer is out of range", status & FrameStatus.SATURATED),
+                ("a reading is not a number", status & FrameStatus.INVALID),
+            )
+            if wrong
+        ]
+        if not waiting:
+            return watched_ms >= limits.watch_ms
+        if watched_ms > limits.limit_ms:
+            self._trip(f"self-test: {', '.join(waiting)} after {limits.limit_ms:g} ms")
+        return False
+
+    def _report_status(self) -> Generator[bool, None, None]:
+        assert self._on_status is not None
+        every = 200_000_000 // self._period_ns
+        next_k = 0
+        while True:
+            k = self._ticks.k0 if self._ticks is not None else 0
+            if k >= next_k:
+                next_k = k + every
+                self._on_status(self.status())
+            yield False
+
+    def status(self) -> dict[str, object]:
+        """A few numbers for the eye."""
+        frame = self._frame
+        latency = self.counts.latency.distribution()
+        return {
+            "t_s": float(frame[TIME]),
+            "state": self.supervisor.state.name.lower().replace("_", " "),
+            "amplitude_um": [1e6 * float(v) for v in frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]],
+            "frequency_hz": [float(v) for v in frame[TREMOR_FREQUENCY : TREMOR_FREQUENCY + 3]],
+            "command_V": [float(v) for v in frame[COMMAND : COMMAND + 3]],
+            "latency_us": [latency.p50_us, latency.p99_us],
+            "lost": self.counts.lost,
+            "skipped": 0,
+        }

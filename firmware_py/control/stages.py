@@ -1,0 +1,82 @@
+"""The three compiled stages in the order in which a sample passes: sense, estimate, actuate.
+
+One implementation for the live loop and for replay: whoever fills the frame's input columns gets the same
+estimates and commands.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.actuation.config import ActuationConfig
+from firmware_py.actuation.stage import Actuation
+from firmware_py.frame import COMMAND, LAYOUT, STATUS, FrameStatus
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.stage import Sensing
+from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.stage import Tremor
+
+Frame = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StageConfigs:
+    """Everything that the stages compute with; kept in recordings, so that a replay is the same firmware."""
+
+    sensing: SensingConfig
+    tremor: TremorConfig
+    actuation: ActuationConfig
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain JSON values."""
+        return {name: getattr(self, name).model_dump(mode="json") for name in ("sensing", "tremor", "actuation")}
+
+    @classmethod
+    def from_dict(cls, tables: Mapping[str, Mapping[str, Any]], where: str) -> StageConfigs:
+        """From the tables of a bench or the metadata of a recording. ``BenchError`` names the wrong key."""
+        return cls(
+            SensingConfig.from_dict(tables.get("sensing", {}), where=f"{where}: firmware.sensing"),
+            TremorConfig.from_dict(tables.get("tremor", {}), where=f"{where}: firmware.tremor"),
+            ActuationConfig.from_dict(tables.get("actuation", {}), where=f"{where}: firmware.actuation"),
+        )
+
+
+class Stages:
+    """The stages with their state and the frame that they fill."""
+
+    def __init__(self, configs: StageConfigs) -> None:
+        self.configs = configs
+        self.frame: Frame = LAYOUT.new_frame()
+        self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
+        self.sensing = Sensing(configs.sensing)
+        self.tremor = Tremor(configs.tremor)
+        self.actuation = Actuation(configs.actuation)
+
+    def sense(self) -> None:
+        self.sensing.step(self.frame)
+
+    def estimate(self) -> None:
+        self.tremor.step(self.frame)
+
+    def actuate(self) -> None:
+        """Compute the command for the newest scan and mark the frame as one that was commanded."""
+        self.frame[STATUS] = int(self.frame[STATUS]) | FrameStatus.COMMANDED
+        self.actuation.step(self.frame)
+
+    def warm_up(self) -> None:
+        """Compile or load every kernel, then forget what that did. A cold start takes seconds, a tick may not."""
+        self.sense()
+        self.estimate()
+        self.actuate()
+        self.reset()
+
+    def reset(self) -> None:
+        """As before the first sample."""
+        for stage in (self.sensing, self.tremor, self.actuation):
+            stage.reset()
+        self.frame[:] = 0.0

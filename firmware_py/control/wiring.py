@@ -1,0 +1,160 @@
+"""From a bench description to opened, probed devices: the only place that joins drivers to buses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from drivers.adc.ads1115 import Ads1115
+from drivers.can_telemetry import CanTelemetry
+from drivers.daq.di4108 import Di4108
+from drivers.hmc2003 import Hmc2003
+from drivers.piezo.can_amplifier import CanAmplifier
+from drivers.piezo.dac_amplifier import DacAmplifier
+from drivers.piezo.e727 import E727
+from drivers.specs import (
+    Ads1115Options,
+    CanAmplifierOptions,
+    DacAmplifierOptions,
+    Di4108Options,
+    E727Options,
+    Hmc2003Options,
+    check_devices,
+)
+from hal.bench import DeviceSpec, OpenBench
+from hal.contracts import AnalogOutput
+from hal.errors import BenchError, HalError, OpenFailed
+from hal.types import ScanConfig, ScanInfo
+
+ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))
+"""Devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
+
+
+@dataclass
+class Devices:
+    """The instrument's devices, configured and not yet running. ``identities`` is what each probe found."""
+
+    daq: Di4108
+    scan: ScanInfo
+    amplifier: AnalogOutput
+    magnetometer: Hmc2003 | None
+    telemetry: CanTelemetry | None
+    sensing_table: dict[str, Any]
+    identities: dict[str, str] = field(default_factory=dict[str, str])
+
+
+def open_devices(bench: OpenBench) -> Devices:
+    """Make and probe every device of the bench.
+
+    Raises ``BenchError`` when the description cannot be this instrument, ``OpenFailed`` with every probe that
+    did not answer.
+    """
+    where = str(bench.file.path)
+    description = bench.file.description
+    options = check_devices(description, where)
+    daq_name = _only(description.devices_with("di4108"), "DAQ (driver di4108)", where)
+    piezo_name = _only(description.devices_with("dac_amplifier", "e727", "can_amplifier"), "piezo output", where)
+    identities: dict[str, str] = {}
+    failures: list[HalError] = []
+
+    def probe(name: str, ask: Callable[[], str]) -> None:
+        try:
+            identities[name] = ask()
+        except HalError as error:
+            failures.append(error)
+
+    daq = Di4108(bench.serial(_bus(description.device[daq_name])), bench.clock, name=daq_name)
+    probe(daq_name, daq.probe)
+    amplifier = _amplifier(bench, piezo_name, options[piezo_name])
+    probe(piezo_name, amplifier.probe)
+    magnetometer = None
+    for name, spec in description.devices_with("hmc2003").items():
+        magnetometer_options: Hmc2003Options = options[name]
+        adc_name = spec.adc or ""
+        adc_options: Ads1115Options = options[adc_name]
+        adc_spec = description.device[adc_name]
+        adc = Ads1115(
+            bench.i2c(_bus(adc_spec)),
+            bench.clock,
+            adc_spec.address or 0x48,
+            range_V=adc_options.full_scale_V,
+            name=adc_name,
+        )
+        probe(adc_name, adc.probe)
+        magnetometer = Hmc2003(adc, daq, bench.clock, magnetometer_options.channels, name=name)
+    telemetry = None
+    for name, spec in description.devices_with("can_telemetry").items():
+        telemetry = CanTelemetry(bench.can(_bus(spec)), bench.clock, name=name)
+    if failures:
+        raise failures[0] if len(failures) == 1 else OpenFailed(failures)
+    daq_options: Di4108Options = options[daq_name]
+    scan = daq.configure(
+        ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
+    )
+    return Devices(daq, scan, amplifier, magnetometer, telemetry, _sensing_table(options, scan, where), identities)
+
+
+def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:
+    if len(found) != 1:
+        raise BenchError(f"{where}: [device] the instrument needs exactly one {what}, this bench has {len(found)}")
+    return next(iter(found))
+
+
+def _bus(spec: DeviceSpec) -> str:
+    assert spec.bus is not None  # checked by drivers.specs
+    return spec.bus
+
+
+def _amplifier(bench: OpenBench, name: str, options: Any) -> DacAmplifier | E727 | CanAmplifier:
+    spec = bench.file.description.device[name]
+    match options:
+        case DacAmplifierOptions():
+            return DacAmplifier(
+                bench.i2c(_bus(spec)),
+                bench.clock,
+                spec.address or 0x0C,
+                gain=options.gain,
+                neutral_V=options.neutral_V,
+                slew_V_per_s=options.slew_V_per_s,
+                name=name,
+            )
+        case E727Options():
+            return E727(
+                bench.serial(_bus(spec)),
+                bench.clock,
+                neutral_V=options.neutral_V,
+                slew_V_per_s=options.slew_V_per_s,
+                rate_hz=options.rate_hz,
+                name=name,
+            )
+        case CanAmplifierOptions():
+            return CanAmplifier(
+                bench.can(_bus(spec)),
+                bench.clock,
+                neutral_V=options.neutral_V,
+                slew_V_per_s=options.slew_V_per_s,
+                name=name,
+            )
+        case _:
+            raise BenchError(f"{bench.file.path}: [device.{name}] no piezo driver for these options")
+
+
+def _sensing_table(options: Mapping[str, Any], scan: ScanInfo, where: str) -> dict[str, Any]:
+    """Which column of a scan carries which sensor: the part of [firmware.sensing] that the wiring decides."""
+    position = {channel: column for column, channel in enumerate(scan.channels)}
+    try:
+        accelerometers = [position[options[device].channels[axis]] for device, axis in ACCELEROMETERS]
+        supply, temperature = (position[options[name].channel] for name in ("supply", "temperature"))
+    except KeyError as error:
+        raise BenchError(
+            f"{where}: [device] {error} is missing: the instrument needs acc1 (x, z), acc2 (y, z), acc3 (x, y), "
+            "supply and temperature"
+        ) from error
+    return {
+        "tick_hz": scan.rate_hz,
+        "lsb_V": scan.lsb_V[0],
+        "channels": accelerometers,
+        "supply_channel": supply,
+        "temperature_channel": temperature,
+    }

@@ -1,0 +1,40 @@
+"""Options of the hardware tests: which bench, and how much they may disturb it."""
+
+from pathlib import Path
+
+import pytest
+
+DEFAULT_BENCH = Path(__file__).parents[1] / "benches" / "micron.toml"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--bench", default=None, help="bench file of the hardware tests; default: the emulated bench")
+    parser.addoption(
+        "--max-effect",
+        type=int,
+        default=None,
+        help="0 reads, 1 configures, 2 small output, 3 full range, 4 motion; default 1, on the emulated bench 4",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out tests that disturb more than allowed; say so in the count, not silently."""
+    chosen = config.getoption("--bench")
+    limit = config.getoption("--max-effect")
+    limit = limit if limit is not None else (4 if chosen is None else 1)
+    kept, left_out = [], []
+    for item in items:
+        marker = item.get_closest_marker("effect")
+        (left_out if marker is not None and marker.args[0] > limit else kept).append(item)
+    if left_out:
+        config.hook.pytest_deselected(items=left_out)
+        items[:] = kept
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The real recordings beside the project; tests that need them are skipped where they are not."""
+    folder = Path(__file__).parents[2] / "shared" / "data"
+    if not folder.is_dir():
+        pytest.skip(f"the recordings are not here: {folder}")
+    return folder
