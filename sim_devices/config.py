@@ -1,0 +1,227 @@
+"""What the ``[emulation]`` table of a bench may say: one unit of the instrument, its hand and its room.
+
+Every value has a default, so ``provider`` and ``seed`` alone describe a complete instrument. Spreads are
+standard deviations from which the seed draws one physical unit: the same seed is the same unit everywhere
+(bench, calibration recordings, tests). "000" is the instrument's dissertation (2004) with its errata.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Vector = tuple[float, float, float]
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class HandConfig(_Table):
+    """The surgeon. Sources and reasons: docstring of ``sim_devices.plant.hand``."""
+
+    tilt_deg: float = 40.0
+    """Instrument axis away from straight down."""
+    azimuth_deg: float = 25.0
+    """Direction of that tilt, from magnetic north toward west."""
+    roll_deg: float = 15.0
+    """Turn about the instrument's own axis."""
+
+    voluntary_range_um: NotNegative = 300.0
+    """Reach targets of the tip lie within +- this, per axis."""
+    voluntary_angle_deg: NotNegative = 2.0
+    """Attitude targets lie within +- this, per axis."""
+    reach_s: tuple[Positive, Positive] = (1.2, 3.0)
+    """Shortest and longest duration of one reach (minimum jerk: below 1 Hz)."""
+    hold_s: tuple[NotNegative, NotNegative] = (0.3, 1.5)
+
+    tremor_pp_um: NotNegative = 50.0
+    """Typical peak to peak per axis at the tip (000 sec. 6.1.1); rms = p-p / (2 sqrt 2)."""
+    tremor_frequency_hz: Positive = 9.6
+    tremor_frequency_spread_hz: NotNegative = 0.4
+    """Between people (seeds); the person's mean stays within 8.5 to 11.5 Hz unless the mean itself does not."""
+    frequency_wander_hz: NotNegative = 0.4
+    """Standard deviation of the slow wander of one person's frequency."""
+    frequency_wander_s: Positive = 2.0
+    """Its correlation time (1/e)."""
+    envelope_s: Positive = 0.6
+    """Correlation time (1/e) of the complex Gaussian envelope: a line of 0.78 Hz between half-power points."""
+    amplitude_depth: NotNegative = 0.3
+    """Standard deviation of the logarithm of the slow common gain (effort, grip)."""
+    amplitude_s: Positive = 4.0
+    """Correlation time (1/e) of that gain."""
+    axis_correlation: Annotated[float, Field(ge=0, lt=1)] = 0.4
+    rotation_share: Annotated[float, Field(ge=0, le=1)] = 0.6
+    """Part of the lateral tip tremor that comes from turning about the grip."""
+    grip_to_tip_mm: Positive = 90.0
+    roll_tremor_mrad: NotNegative = 0.3
+    """rms of the tremor about the instrument's axis."""
+
+    drift_rms_um: NotNegative = 30.0
+    drift_s: Positive = 6.0
+    """Correlation time (1/e)."""
+    unsteadiness_rms_um: NotNegative = 6.0
+    """Broadband involuntary motion between drift and tremor."""
+    unsteadiness_s: Positive = 0.4
+    jerk_interval_s: Positive = 20.0
+    """Mean time between myoclonic jerks."""
+    jerk_um: NotNegative = 80.0
+    """Typical (rms) peak of one."""
+
+    recorded_band_hz: tuple[Positive, Positive] = (4.0, 20.0)
+    """Band that is kept of a recorded hand: below it, integrated acceleration is tilt and noise."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> HandConfig:
+        for name in ("reach_s", "hold_s", "recorded_band_hz"):
+            low, high = getattr(self, name)
+            if low > high or (name == "recorded_band_hz" and low == high):
+                raise ValueError(f"{name} = [{low}, {high}]: the first value must be the smaller one")
+        return self
+
+
+class InstrumentConfig(_Table):
+    """Geometry in the body frame {B}: base of the back suite, z toward the tip (000 (2.54), errata no. 23).
+
+    Only the differences d1 = 20.2, d2 = 14.3, d3 = 116.0 mm are published. Here the back suite is centred on the
+    axis: {1} and {2} then fit the 26 mm box and {3} the handle.
+    """
+
+    positions_mm: tuple[Vector, Vector, Vector] = ((10.1, -10.1, 0.0), (-10.1, 10.1, 0.0), (4.2, 4.2, 116.0))
+    """{1} senses x and z, {2} y and z, {3} x and y."""
+    position_spread_mm: NotNegative = 0.2
+    tip_mm: Vector = (0.0, 0.0, 155.0)
+    """Tool tip with the manipulator at neutral."""
+
+
+class SensorConfig(_Table):
+    """ADXL-203, TMP36, HMC-2003 and the DAQ's analog side; sizes from their data sheets (ADXL-203 rev. D, table 1)."""
+
+    noise_ug_per_rtHz: NotNegative = 110.0
+    """ADXL-203, white before the RC (errata no. 25)."""
+    range_g: Positive = 1.7
+    rc_ohm: Positive = 32e3
+    rc_farad: Positive = 0.33e-6
+    rc_spread: NotNegative = 0.03
+    """The data sheet allows 24 to 40 kOhm for the internal resistor; one lot is much closer."""
+    bias_spread_V: NotNegative = 0.025
+    scale_spread: NotNegative = 0.012
+    misalignment_deg: NotNegative = 0.5
+    cross_quadratic_V_per_g2: NotNegative = 0.003
+    """Bias that follows the square of another axis (000 (3.8), (3.10); form published, size ours)."""
+    cross_linear_V_per_g: NotNegative = 0.004
+    scale_variation_per_g: NotNegative = 0.002
+    """Sensitivity that follows the out-of-plane axis (000 (3.12))."""
+    bias_temperature_mg_per_K: NotNegative = 0.1
+    scale_temperature_per_K: NotNegative = 5e-5
+
+    supply_V: Positive = 5.0
+    supply_spread: NotNegative = 0.004
+    supply_wander_mV: NotNegative = 1.0
+    divider_spread: NotNegative = 0.001
+    temperature_offset_K: NotNegative = 0.7
+
+    magnetometer_noise_uG: NotNegative = 40.0
+    """rms per sample, HMC-2003 1 kHz bandwidth (its resolution)."""
+    magnetometer_offset_V: NotNegative = 0.01
+    """Bridge and amplifier offset: does not change sign with the strap."""
+    magnetometer_scale_spread: NotNegative = 0.01
+    magnetometer_misalignment_deg: NotNegative = 1.0
+    hard_iron_mG: NotNegative = 5.0
+    soft_iron: NotNegative = 0.005
+    piezo_coupling_G_per_A: NotNegative = 0.1
+
+    daq_noise_uV: NotNegative = 150.0
+    """rms per sample at the +-5 V range, before quantisation."""
+    daq_offset_uV: NotNegative = 300.0
+    daq_gain_spread: NotNegative = 2e-4
+
+
+class StackConfig(_Table):
+    """P-885.50-like stack: generalised Maxwell slip with viscous slip (``sim_devices.plant.stack``)."""
+
+    stroke_um_at_100_V: Positive = 15.0
+    """Quasi-static, 0 to 100 V and back."""
+    stroke_spread: NotNegative = 0.03
+    slip_weight_per_V: NotNegative = 0.0122
+    """Density of the slip elements over their thresholds; sets the loop (000 Tables 7.1, 7.2)."""
+    slip_spread: NotNegative = 0.06
+    slip_limit_V: Positive = 46.0
+    """Largest threshold."""
+    slip_bias: NotNegative = 0.12
+    """Relative fall of the thresholds from 50 to 100 V, rise to 0 V: minor loops are not congruent."""
+    slip_viscous_ms: NotNegative = 0.35
+    """Median viscous time of the slip: the loop opens with the rate."""
+    curvature: float = -0.05
+    """Static curvature, c of x = y + c (y^2 - y), y = 0..1."""
+    creep_per_decade: NotNegative = 0.011
+    resonance_hz: Positive = 650.0
+    """Stack with lever and shaft."""
+    damping: Positive = 0.04
+    resonance_spread: NotNegative = 0.03
+    expansion_um_per_K: float = -0.07
+    """18 mm of poled ceramic."""
+
+
+class AmplifierConfig(_Table):
+    bandwidth_hz: Positive = 2000.0
+    slew_V_per_ms: Positive = 40.0
+    low_V: float = 0.0
+    high_V: float = 100.0
+    output_ohm: Positive = 10.0
+    stack_farad: Positive = 1.5e-6
+    neutral_V: float = 50.0
+    """Where it rests when nobody commands."""
+
+    @model_validator(mode="after")
+    def _within(self) -> AmplifierConfig:
+        if not self.low_V <= self.neutral_V <= self.high_V:
+            raise ValueError(f"neutral_V = {self.neutral_V} is outside [{self.low_V}, {self.high_V}] V")
+        return self
+
+
+class ManipulatorConfig(_Table):
+    """000 ch. 6, errata nos. 58 to 71: values that are not published are ours.
+
+    With R = r = 5 mm and 120 um of ball travel, > 1000 um of total travel in x and y needs a shaft of at least
+    36.1 mm; 40 mm gives 1280 x 1108 x 120 um.
+    """
+
+    circle_mm: Positive = 5.0
+    """R = r: pin and ball circle."""
+    shaft_mm: Positive = 40.0
+    lever_gain: Positive = 8.0
+    lever_spread: NotNegative = 0.02
+    mount_spread_deg: NotNegative = 0.5
+    """Turn of the manipulator frame against the body about z."""
+
+
+class EnvironmentConfig(_Table):
+    gravity_m_s2: Positive = 9.80131
+    field_uT: Positive = 48.0
+    dip_deg: float = 66.0
+    """Below the horizon toward north."""
+    ambient_C: float = 22.0
+    ambient_wander_K: NotNegative = 0.2
+    warm_up_K: float = 6.0
+    """Rise of the sensor board above ambient (000 Fig. 3.11: steady after about 7 h)."""
+    warm_up_s: Positive = 6300.0
+    on_since_s: NotNegative = 900.0
+    """How long the instrument has been switched on when the run starts."""
+
+
+class EmulationConfig(_Table):
+    """The whole ``[emulation]`` table."""
+
+    provider: str = "sim_devices.register:provider"
+    seed: Annotated[int, Field(ge=0)] = 1
+    hand: HandConfig = HandConfig()
+    instrument: InstrumentConfig = InstrumentConfig()
+    sensors: SensorConfig = SensorConfig()
+    stack: StackConfig = StackConfig()
+    amplifier: AmplifierConfig = AmplifierConfig()
+    manipulator: ManipulatorConfig = ManipulatorConfig()
+    environment: EnvironmentConfig = EnvironmentConfig()

@@ -1,0 +1,157 @@
+"""The physical instrument in a hand: demands in, voltages and truth out. Time starts at 0 ns and never goes back."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.config import EmulationConfig
+from sim_devices.plant.hand import Hand
+from sim_devices.plant.kernel import (
+    NOISES,
+    SLOW_NOISES,
+    STEP_NS,
+    STEPS_PER_MS,
+    TRUTH,
+    TRUTH_COLUMNS,
+    advance,
+    begin,
+    outputs,
+    truth_row,
+)
+from sim_devices.plant.streams import stream
+from sim_devices.plant.unit import build_unit, plant_arrays
+
+Array = NDArray[np.float64]
+
+BLOCK_MS = 16
+_BLOCK_STEPS = BLOCK_MS * STEPS_PER_MS
+_CHUNK_ROWS = 256 * BLOCK_MS
+
+
+class Instrument:
+    """One instrument, one hand, one run.
+
+    ``seed`` draws the physical unit and its noise; ``hand`` must be fresh. ``quiet`` leaves all sensor, DAQ and room
+    noise out (a twin for arrays). Steps are 1/8 ms: between steps demands count from their own instant on, and
+    outputs follow their RC filters. Truth is recorded each millisecond, the first row at 0.
+    """
+
+    def __init__(self, config: EmulationConfig, seed: int, hand: Hand, *, quiet: bool = False) -> None:
+        self.unit = build_unit(config, seed)
+        self._plant, self._state = plant_arrays(config, self.unit, hand.frame)
+        self._hand, self._quiet = hand, quiet
+        self._rng = stream(seed, "instrument.noise")
+        self._nodes, self._parts = np.zeros((BLOCK_MS + 1, 18)), np.zeros((BLOCK_MS, 6))
+        self._noise, self._slow = np.zeros((_BLOCK_STEPS, NOISES)), np.zeros((BLOCK_MS, SLOW_NOISES))
+        self._part = np.zeros(6)
+        self._chunks: list[Array] = []
+        self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 1
+        hand.start(self._nodes[-1], self._part)
+        begin(self._plant, self._state, self._nodes[-1], self._part, self._chunk[0])
+        self._steps, self._in_block = 0, _BLOCK_STEPS
+        self._t_ns = 0
+        s = self._state[0]
+        self._demand_V, self._demand_fix_V = s["demand_V"], s["demand_fix_V"]
+        self._daq_V, self._magnetometer_V = s["daq_V"], s["magnetometer_V"]
+        self._between_V = np.zeros(8), np.zeros(3)
+
+    @property
+    def now_ns(self) -> int:
+        """How far the world has come."""
+        return self._t_ns
+
+    def advance_to(self, t_ns: int) -> None:
+        """Let the world run to ``t_ns``; a time in the past does nothing."""
+        if t_ns <= self._t_ns:
+            return
+        self._t_ns = t_ns
+        steps = t_ns // STEP_NS - self._steps
+        while steps > 0:
+            if self._in_block == _BLOCK_STEPS:
+                self._next_block()
+            stop = min(self._in_block + steps, _BLOCK_STEPS)
+            steps -= stop - self._in_block
+            self._steps += stop - self._in_block
+            self._row = advance(
+                self._plant,
+                self._state,
+                self._nodes,
+                self._parts,
+                self._noise,
+                self._slow,
+                self._in_block,
+                stop,
+                self._chunk,
+                self._row,
+            )
+            self._in_block = stop
+
+    def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None:
+        """Amplifier ``channel`` (0, 1, 2) is asked for ``volts`` from ``t_ns`` on (from now, if that has passed).
+
+        Not limited here: the amplifier limits itself.
+        """
+        self.advance_to(t_ns)
+        left = ((self._steps + 1) * STEP_NS - max(t_ns, self._steps * STEP_NS)) / STEP_NS
+        # the running step sees the mean of its demands
+        self._demand_fix_V[channel] += (1.0 - left) * (self._demand_V[channel] - volts)
+        self._demand_V[channel] = volts
+
+    @property
+    def analog_V(self) -> Array:
+        """(8,) at the DAQ inputs now: a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36. Changes as time goes on."""
+        return self._outputs()[0]
+
+    @property
+    def magnetometer_V(self) -> Array:
+        """(3,) HMC-2003 outputs now. Changes as time goes on."""
+        return self._outputs()[1]
+
+    def strap(self, pulse: Literal["set", "reset"]) -> None:
+        """A pulse on the magnetometer's set/reset strap: ``reset`` turns the sign of its sensitivity."""
+        if pulse not in ("set", "reset"):
+            raise ValueError(f"strap pulse {pulse!r}: it is 'set' or 'reset'")
+        self._state[0]["strap"] = 1.0 if pulse == "set" else -1.0
+        outputs(self._plant[0], self._state[0], 0.0, self._daq_V, self._magnetometer_V)
+
+    @property
+    def clipped(self) -> NDArray[np.int64]:
+        """(6,) steps of 1/8 ms in which an accelerometer was out of range."""
+        return self._state[0]["clipped"].copy()
+
+    def truth_row(self) -> dict[str, Array]:
+        """Truth at the last step, by the names of ``truth``; intended and tremor are those of the last millisecond."""
+        row = np.zeros(TRUTH_COLUMNS)
+        part = self._parts[(self._in_block // STEPS_PER_MS) - 1] if self._in_block >= STEPS_PER_MS else self._part
+        truth_row(self._plant[0], self._state[0], part, row)
+        return {name: row[at : at + n] for name, at, n in TRUTH}
+
+    def truth(self) -> dict[str, NDArray]:
+        """Columns, one row per millisecond: ``t_ns`` (n,) int64, ``tip_m`` (n, 3) and so on (kernel.TRUTH)."""
+        rows = np.concatenate([*self._chunks, self._chunk[: self._row]])
+        columns: dict[str, NDArray] = {"t_ns": np.arange(len(rows), dtype=np.int64) * 1_000_000}
+        for name, at, n in TRUTH:
+            columns[name] = rows[:, at] if n == 1 else rows[:, at : at + n]
+        return columns
+
+    def _outputs(self) -> tuple[Array, Array]:
+        later_ns = self._t_ns - self._steps * STEP_NS
+        if later_ns == 0:
+            return self._daq_V, self._magnetometer_V
+        outputs(self._plant[0], self._state[0], later_ns * 1e-9, *self._between_V)
+        return self._between_V
+
+    def _next_block(self) -> None:
+        if self._row + BLOCK_MS > _CHUNK_ROWS:
+            self._chunks.append(self._chunk[: self._row])
+            self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 0
+        self._nodes[0] = self._nodes[-1]
+        self._part[:] = self._parts[-1] if self._steps else self._part
+        self._hand.fill(self._nodes[1:], self._parts)
+        if not self._quiet:
+            self._rng.standard_normal(out=self._noise)
+            self._rng.standard_normal(out=self._slow)
+        self._in_block = 0
