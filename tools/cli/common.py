@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
@@ -111,5 +112,5 @@ def clear_errors() -> Iterator[None]:
 
 
 def _fail(error: Exception, code: Exit) -> None:
-    console().print(f"[bold red]micron:[/] {error}", soft_wrap=True, markup=True)
+    console().print(f"[bold red]micron:[/] {escape(str(error))}", soft_wrap=True)
     raise typer.Exit(code)

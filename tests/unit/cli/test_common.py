@@ -1,0 +1,50 @@
+"""JSON output and errors of all commands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import typer
+
+from hal.errors import BenchError, DeviceNotFound, HalTimeout
+from tools.cli.common import Exit, InputError, check_writable, clear_errors, write_json
+
+
+def test_json_is_plain_and_whole(tmp_path: Path):
+    target = tmp_path / "r.json"
+    write_json({"a": np.float64(1.5), "b": np.arange(3), "c": float("nan"), "d": Path("x")}, str(target))
+    assert json.loads(target.read_text()) == {"a": 1.5, "b": [0, 1, 2], "c": None, "d": "x"}
+    assert [p.name for p in tmp_path.iterdir()] == ["r.json"]
+
+
+def test_json_to_standard_output(capsys: pytest.CaptureFixture[str]):
+    write_json({"x": 1}, "-")
+    assert json.loads(capsys.readouterr().out) == {"x": 1}
+
+
+def test_a_missing_folder_is_refused_before_work(tmp_path: Path):
+    with pytest.raises(InputError, match="does not exist; create it first"):
+        check_writable("-", None, tmp_path / "no" / "r.json")
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (InputError("x"), Exit.BAD_INPUT),
+        (BenchError("x"), Exit.BAD_INPUT),
+        (DeviceNotFound("x"), Exit.DEVICE_MISSING),
+        (HalTimeout("x"), Exit.FAILED),
+    ],
+)
+def test_exit_codes(error: Exception, code: Exit, capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(typer.Exit) as caught, clear_errors():
+        raise error
+    assert caught.value.exit_code == code
+    assert capsys.readouterr().err.startswith("micron: ")
+
+
+def test_keys_in_brackets_reach_the_reader(capsys: pytest.CaptureFixture[str]):
+    with pytest.raises(typer.Exit), clear_errors():
+        raise BenchError("bench.toml: [device.daq.bus] no such bus")
+    assert "[device.daq.bus]" in capsys.readouterr().err
