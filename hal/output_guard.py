@@ -43,6 +43,7 @@ class OutputGuard:
         self._sent_ns = clock.now_ns()
         self._ramp_step = 0
         self._ramp_from = list(self.last_V)
+        self._bounds = [(limit.lo_V, limit.hi_V, limit.slew_V_per_s) for limit in limits]
 
     def admit(self, values_V: Float64Array) -> int:
         """Fill ``next_V`` from the wish; returns the mask of channels that were clipped or slew limited.
@@ -53,23 +54,40 @@ class OutputGuard:
             raise SafetyTrip("outputs are not armed: call arm() first", device=self.device)
         if len(values_V) != len(self.limits):
             raise SafetyTrip(f"{len(values_V)} values for {len(self.limits)} output channels", device=self.device)
-        gap_s = min((self._clock.now_ns() - self._sent_ns) * 1e-9, self._longest_gap_s)
+        gap_s = (self._clock.now_ns() - self._sent_ns) * 1e-9
+        if gap_s > self._longest_gap_s:
+            gap_s = self._longest_gap_s
         mask = 0
-        for i, limit in enumerate(self.limits):
-            wish = float(values_V[i])
-            if not math.isfinite(wish):
-                raise SafetyTrip(f"channel {i} was commanded to {wish} V", device=self.device)
-            value = min(max(wish, limit.lo_V), limit.hi_V)
-            if value != wish:
+        bit = 1
+        next_V: list[float] = []
+        wishes: list[float] = values_V.tolist()
+        for wish, last, (lo_V, hi_V, slew) in zip(wishes, self.last_V, self._bounds, strict=True):
+            value = wish
+            # written so that NaN and infinities fall through to the last branch
+            if lo_V <= wish <= hi_V:
+                pass
+            elif -math.inf < wish < lo_V:
+                value = lo_V
                 self.clipped += 1
-                mask |= 1 << i
-            step = limit.slew_V_per_s * gap_s
-            last = self.last_V[i]
-            if abs(value - last) > step:
-                value = last + math.copysign(step, value - last)
+                mask |= bit
+            elif hi_V < wish < math.inf:
+                value = hi_V
+                self.clipped += 1
+                mask |= bit
+            else:
+                raise SafetyTrip(f"channel {len(next_V)} was commanded to {wish} V", device=self.device)
+            step = slew * gap_s
+            if value - last > step:
+                value = last + step
                 self.slew_limited += 1
-                mask |= 1 << i
-            self.next_V[i] = value
+                mask |= bit
+            elif last - value > step:
+                value = last - step
+                self.slew_limited += 1
+                mask |= bit
+            next_V.append(value)
+            bit <<= 1
+        self.next_V = next_V
         self._ramp_step = 0
         return mask
 

@@ -48,7 +48,7 @@ def test_default_bench_is_valid():
         ('driver = "hmc2003"', 'driver = "hmc2004"', ["no driver 'hmc2004'", "hmc2003"]),
         ("rate_hz = 1000", "rate_hz = 900", ["make them equal"]),
         ("rate_hz = 100\n", "rate_hz = 130\n", ["[device.mag_adc.rate_hz]", "does not divide"]),
-        ("speed_hz = 400_000", "speed_hz = 100_000", ["[bus.i2c0]", "% of its time", "1000 Hz x 93 bit"]),
+        ("speed_hz = 400_000", "speed_hz = 100_000", ["[bus.i2c0]", "% of its time", "1000 Hz x 156 bit"]),
         ('provider = "sim_devices.register:provider"\n', "", ["[emulation.provider] is missing"]),
         ("[clock]", "[clock", ["not valid TOML", "line"]),
     ],
@@ -67,12 +67,10 @@ def test_missing_file_says_what_to_do(tmp_path: Path):
 
 
 def test_bus_time_by_hand():
-    """AD5696R: start, address and nine bytes, stop = 10 x 9 + 3 bits, a thousand times a second."""
+    """AD5696R: four times start, address and three bytes, stop = 16 x 9 + 4 x 3 bits, a thousand times a second."""
     bench = load_bench(DEFAULT)
-    loads = {
-        load.device: load.share for load in bus_loads(bench.description, check_devices(bench.description, ""))
-    }
-    assert loads["piezo"] == pytest.approx(1000 * 93 / 400_000)
+    loads = {load.device: load.share for load in bus_loads(bench.description, check_devices(bench.description, ""))}
+    assert loads["piezo"] == pytest.approx(1000 * 156 / 400_000)
 
 
 def test_virtual_time_refuses_real_buses(tmp_path: Path):
