@@ -1,0 +1,31 @@
+"""Makes the plant that a bench description asks for."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pydantic import ValidationError
+
+from hal.bench import describe_validation_error
+from hal.errors import BenchError
+from sim_devices.config import EmulationConfig
+from sim_devices.plant.hand import SyntheticHand
+from sim_devices.plant.instrument import Instrument
+from sim_devices.world import Plant
+
+
+def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
+    """The checked ``[emulation]`` table; ``BenchError`` names each wrong key."""
+    try:
+        return EmulationConfig.model_validate(description["emulation"])
+    except ValidationError as error:
+        raise BenchError(describe_validation_error(error, "[emulation]")) from error
+
+
+def make_plant(description: Mapping[str, Any], hand_file: str | None, hand_scale: float | None) -> Plant:
+    """An ``Instrument`` in somebody's hand: synthetic, or recorded in ``hand_file``."""
+    config = emulation_config(description)
+    if hand_file is not None:
+        raise BenchError("recorded hands are not supported")
+    return Instrument(config, config.seed, SyntheticHand(config.hand, config.seed))

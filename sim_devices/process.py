@@ -1,0 +1,208 @@
+"""The emulated world as a process of its own, in real time: ``python -m sim_devices.process JOB.json``.
+
+The job file (written by ``sim_devices.register``) holds the bench description and where to put things. The
+process serves each serial bus on a pty, each I2C bus on a Unix socket, each CAN bus on UDP multicast, writes
+their URIs to ``endpoints.json`` when it is ready, obeys fault commands on ``control.sock`` and, on SIGTERM or
+when its parent is gone, writes ``truth.npz`` and ends.
+
+One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
+millisecond. Device clocks never stretch: after a stall every scan that was due is made up, a few at a time so
+that a host that does read is not blamed for our lateness; ``world.json`` tells the worst lateness.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import gc
+import importlib
+import json
+import os
+import select
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hal.clock import MonotonicClock
+from sim_devices.faults import UnknownFault, inject
+from sim_devices.transports.can_multicast import CanMulticast, free_udp_port
+from sim_devices.transports.i2c_socket import I2cSocketServer
+from sim_devices.transports.pty_carrier import PtyCarrier
+from sim_devices.world import Plant, World
+
+POLL_NS = 1_000_000
+CATCH_UP_NS = 8_000_000
+PARENT_CHECK_NS = 100_000_000
+PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
+PR_SET_PDEATHSIG = 1
+
+
+class WorldProcess:
+    """The loop and everything it serves."""
+
+    def __init__(self, job: dict[str, Any]) -> None:
+        self._runtime_dir = Path(job["runtime_dir"])
+        sockets = Path(job["socket_dir"])
+        self._parent = int(job["parent"])
+        description = job["description"]
+        self._clock = MonotonicClock()
+        make_plant = load_factory(job["plant"])
+        warm_up(make_plant(description, job["hand_file"], job["hand_scale"]))
+        plant = make_plant(description, job["hand_file"], job["hand_scale"])
+        self.world = World(description, plant, epoch_ns=self._clock.now_ns())
+        self._bus_of = {n: d["bus"] for n, d in description["device"].items() if d.get("bus")}
+        self._ptys = {name: PtyCarrier(face) for name, face in self.world.buses.serial.items()}
+        self._i2c = {
+            name: I2cSocketServer(line, sockets / f"{name}.sock") for name, line in self.world.buses.i2c.items()
+        }
+        self._can = {name: CanMulticast(hub, free_udp_port()) for name, hub in self.world.buses.can.items()}
+        for server in self._i2c.values():
+            self.world.add_timed(server)
+        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._control.bind(str(sockets / "control.sock"))
+        self._control.setblocking(False)
+        self._stop = False
+        self._worst_late_ns = 0
+        self._turns = 0
+        self._now_ns = self.world.epoch_ns
+
+    def request_stop(self, *_: object) -> None:
+        self._stop = True
+
+    def endpoints(self) -> dict[str, str]:
+        """URI of each bus for the ordinary adapters of hal."""
+        uris = {name: f"serial://{pty.path}" for name, pty in self._ptys.items()}
+        uris |= {name: f"unix-i2c://{server.path}" for name, server in self._i2c.items()}
+        return uris | {name: can.uri for name, can in self._can.items()}
+
+    def run(self) -> None:
+        """Serve until asked to stop, then write what happened."""
+        check_ns = 0
+        while not self._stop:
+            for fileno in self._wait():
+                self._on_readable(fileno)
+            self._turn()
+            if self._now_ns >= check_ns:
+                check_ns = self._now_ns + PARENT_CHECK_NS
+                if os.getppid() != self._parent:
+                    break
+        self._finish()
+
+    def _wait(self) -> list[int]:
+        now_ns = self._clock.now_ns()
+        deadline_ns = min(self.world.next_event_ns() or now_ns + POLL_NS, now_ns + POLL_NS)
+        watched = [pty.fileno() for pty in self._ptys.values() if pty.fileno() >= 0]
+        for server in self._i2c.values():
+            watched += server.filenos()
+        watched += [can.fileno() for can in self._can.values()]
+        watched.append(self._control.fileno())
+        # select, not epoll: its timeout has a resolution of 1 us instead of 1 ms
+        return select.select(watched, (), (), max(0, deadline_ns - now_ns) * 1e-9)[0]
+
+    def _turn(self) -> None:
+        """Bring world and transports to the present."""
+        self._turns += 1
+        while True:
+            for pty in self._ptys.values():
+                pty.refresh()
+            due_ns = self.world.next_event_ns()
+            now_ns = self._clock.now_ns()
+            late_ns = 0 if due_ns is None else max(0, now_ns - due_ns)
+            self._worst_late_ns = max(self._worst_late_ns, late_ns)
+            self._now_ns = now_ns if due_ns is None else min(now_ns, due_ns + CATCH_UP_NS)
+            self.world.advance_to(self._now_ns)
+            for pty in self._ptys.values():
+                pty.pump(self._now_ns)
+            for can in self._can.values():
+                can.pump(self._now_ns)
+            if late_ns <= CATCH_UP_NS:
+                self.world.keep_up(self._now_ns)
+                return
+            time.sleep(0.0001)  # let the host drain what it was late for through no fault of its own
+
+    def _on_readable(self, fileno: int) -> None:
+        for server in self._i2c.values():
+            if fileno in server.filenos():
+                self._turn()  # what was due before this request happens before it
+                server.on_readable(fileno, self._now_ns)
+                return
+        if fileno == self._control.fileno():
+            self._obey()
+
+    def _obey(self) -> None:
+        message, sender = self._control.recvfrom(4096)
+        try:
+            order = json.loads(message)
+            unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in self._ptys.items()}
+            inject(self.world, str(order["fault"]), str(order.get("target", "")), unplug, self._bus_of)
+            answer = {"ok": True}
+        except (ValueError, KeyError, TypeError, UnknownFault) as error:
+            answer = {"ok": False, "error": str(error)}
+        if sender:
+            self._control.sendto(json.dumps(answer).encode(), sender)
+
+    def _finish(self) -> None:
+        truth = self.world.truth(max(self._now_ns, self.world.epoch_ns))
+        partial = self._runtime_dir / "truth.partial.npz"
+        np.savez(partial, **truth)  # type: ignore[arg-type]
+        partial.rename(self._runtime_dir / "truth.npz")
+        facts = {"worst_late_us": self._worst_late_ns / 1000, "turns": self._turns}
+        (self._runtime_dir / "world.json").write_text(json.dumps(facts), encoding="utf-8")
+        for pty in self._ptys.values():
+            pty.unplug()
+        for server in (*self._i2c.values(), *self._can.values()):
+            server.close()
+        self._control.close()
+
+
+def load_factory(target: str) -> Callable[[dict[str, Any], str | None, float | None], Plant]:
+    """``module:function`` that makes the plant."""
+    module, _, name = target.partition(":")
+    return getattr(importlib.import_module(module), name)
+
+
+def warm_up(plant: Plant) -> None:
+    """Use every face of a plant once, so that compiled kernels are loaded before anybody waits for them."""
+    for t_ns in range(0, 40_000_000, 333_333):
+        plant.advance_to(t_ns)
+        plant.set_demand_V(0, 50.0, t_ns)
+        _ = plant.analog_V, plant.magnetometer_V
+    plant.strap("set")
+    plant.truth()
+
+
+def prefer_real_time() -> str:
+    """Ask for SCHED_FIFO; says what was granted."""
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    except (PermissionError, OSError):
+        return "SCHED_OTHER"
+    return f"SCHED_FIFO {PRIORITY}"
+
+
+def main(argv: list[str]) -> int:
+    job_path = Path(argv[0])
+    job = json.loads(job_path.read_text(encoding="utf-8"))
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the firmware; it ends us when it is done
+    process = WorldProcess(job)
+    signal.signal(signal.SIGTERM, process.request_stop)
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    policy = prefer_real_time()
+    ready = {"endpoints": process.endpoints(), "scheduling": policy, "pid": os.getpid()}
+    partial = job_path.with_name("endpoints.partial")
+    partial.write_text(json.dumps(ready), encoding="utf-8")
+    partial.rename(job_path.with_name("endpoints.json"))
+    process.run()
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

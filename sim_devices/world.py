@@ -1,0 +1,210 @@
+"""The emulated world: one plant, the devices that sense and move it, and the buses they hang on.
+
+Built from a bench description: every bus whose URI is ``sim://`` gets the devices that the description puts on it.
+The world itself knows no clock and no transport. Somebody moves it with ``advance_to``; inside, everything
+happens in order of time. Plant time starts at zero; ``epoch_ns`` is the bench time of that zero.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.errors import BenchError
+from sim_devices.devices.ad5696r import Ad5696r
+from sim_devices.devices.ads1115 import Ads1115
+from sim_devices.devices.can_piezo_node import CanPiezoNode
+from sim_devices.devices.can_stop_button import CanStopButton
+from sim_devices.devices.can_telemetry_listener import CanTelemetryListener
+from sim_devices.devices.di4108 import Di4108
+from sim_devices.devices.e727 import E727
+from sim_devices.devices.faces import ByteFace, TimedFace, Volts
+from sim_devices.transports.can_hub import CanHub
+from sim_devices.transports.i2c_line import I2cLine
+
+SIM_SCHEME = "sim://"
+AMPLIFIER_GAIN = 20.0  # the emulated amplifier's own; what the firmware believes is in its device table
+STRAP_SET, STRAP_RESET = 1, 2  # digital outputs 0 and 1 of the DAQ
+Truth = dict[str, NDArray[np.float64] | NDArray[np.int64]]
+
+
+class Plant(Protocol):
+    """What the world needs of ``sim_devices.plant.instrument.Instrument``. Times are plant time in ns."""
+
+    @property
+    def analog_V(self) -> Volts: ...
+    @property
+    def magnetometer_V(self) -> Volts: ...
+    def advance_to(self, t_ns: int) -> None: ...
+    def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None: ...
+    def strap(self, pulse: Literal["set", "reset"]) -> None: ...
+    def truth(self) -> Truth: ...
+
+
+@dataclass
+class EmulatedBuses:
+    """The far ends of the ``sim://`` buses, by bus name; serial buses carry one device each."""
+
+    serial: dict[str, ByteFace] = field(default_factory=dict[str, ByteFace])
+    i2c: dict[str, I2cLine] = field(default_factory=dict[str, I2cLine])
+    can: dict[str, CanHub] = field(default_factory=dict[str, CanHub])
+
+
+class World:
+    """Plant and devices. ``devices`` are the wire faces by device name, for tests and fault injection."""
+
+    def __init__(self, description: Mapping[str, Any], plant: Plant, *, epoch_ns: int = 0) -> None:
+        self.plant = plant
+        self.epoch_ns = epoch_ns
+        self.devices: dict[str, Any] = {}
+        self.buses = EmulatedBuses()
+        self._timed: list[TimedFace] = []
+        self._adc_wiring = np.zeros(4, dtype=np.intp)
+        self._adc_volts = np.zeros(4)
+        self._build(description)
+
+    # ------------------------------------------------------------------ time
+
+    def next_event_ns(self) -> int | None:
+        """When some device acts by itself next."""
+        nearest: int | None = None
+        for face in self._timed:
+            due = face.next_event_ns()
+            if due is not None and (nearest is None or due < nearest):
+                nearest = due
+        return nearest
+
+    def advance_to(self, t_ns: int) -> None:
+        """Let everything happen that is due up to ``t_ns``, in order of time."""
+        while True:
+            due_ns = self.next_event_ns()
+            if due_ns is None or due_ns > t_ns:
+                return
+            for face in self._timed:
+                mine = face.next_event_ns()
+                if mine is not None and mine <= due_ns:
+                    face.advance_to(due_ns)
+
+    def keep_up(self, t_ns: int) -> None:
+        """Bring the plant to ``t_ns`` even if nothing looks at it, so that no later look has to wait for it."""
+        self.plant.advance_to(t_ns - self.epoch_ns)
+
+    def add_timed(self, face: TimedFace) -> None:
+        """A transport that acts in bench time (for example a transfer under way)."""
+        self._timed.append(face)
+
+    def truth(self, t_ns: int) -> Truth:
+        """Physical truth up to ``t_ns``; ``t_ns`` column on the bench clock."""
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        truth = dict(self.plant.truth())
+        truth["t_ns"] = np.asarray(truth["t_ns"], dtype=np.int64) + self.epoch_ns
+        return truth
+
+    # ------------------------------------------------------------------ wiring between devices and plant
+
+    def _analog_V(self, t_ns: int) -> Volts:
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        return self.plant.analog_V
+
+    def _magnetometer_V(self, t_ns: int) -> Volts:
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        self._adc_volts[self._adc_wiring[:3]] = self.plant.magnetometer_V
+        return self._adc_volts
+
+    def _amplifier_input(self, channel: int, volts: float, t_ns: int) -> None:
+        if channel < 3:
+            self.plant.set_demand_V(channel, volts * AMPLIFIER_GAIN, t_ns - self.epoch_ns)
+
+    def _piezo_demand(self, channel: int, volts: float, t_ns: int) -> None:
+        if channel < 3:
+            self.plant.set_demand_V(channel, volts, t_ns - self.epoch_ns)
+
+    def _strap_switch(self, switches: int, t_ns: int) -> None:
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        if switches & STRAP_SET:
+            self.plant.strap("set")
+        elif switches & STRAP_RESET:
+            self.plant.strap("reset")
+
+    # ------------------------------------------------------------------ construction
+
+    def _build(self, description: Mapping[str, Any]) -> None:
+        makers: dict[str, Callable[[str, Mapping[str, Any]], None]] = {
+            "di4108": self._add_di4108,
+            "ads1115": self._add_ads1115,
+            "dac_amplifier": self._add_dac,
+            "e727": self._add_e727,
+            "can_amplifier": self._add_can_amplifier,
+            "can_telemetry": self._add_can_telemetry,
+        }
+        for name, bus in description["bus"].items():
+            if not str(bus["uri"]).startswith(SIM_SCHEME):
+                continue
+            if bus["kind"] == "i2c":
+                self.buses.i2c[name] = I2cLine(bus.get("speed_hz", 400_000))
+            elif bus["kind"] == "can":
+                self.buses.can[name] = CanHub(bus.get("bitrate", 500_000))
+                self._timed.append(self.buses.can[name])
+        for name, device in description["device"].items():
+            bus = description["bus"].get(device.get("bus") or "", {})
+            if not str(bus.get("uri", "")).startswith(SIM_SCHEME):
+                continue
+            if device["driver"] not in makers:
+                raise BenchError(
+                    f"[device.{name}.driver] there is no emulated '{device['driver']}'; "
+                    f"emulated are {', '.join(makers)}, or give its bus a real URI"
+                )
+            makers[device["driver"]](name, device)
+            if device["driver"] == "ads1115":
+                self._wire_magnetometer(name, description)
+        for name, bus in description["bus"].items():
+            if bus["kind"] == "serial" and str(bus["uri"]).startswith(SIM_SCHEME) and name not in self.buses.serial:
+                raise BenchError(f"[bus.{name}] is emulated but no device is on it; remove it or add a device")
+
+    def _add_serial(self, name: str, bus: str, face: Any) -> None:
+        if bus in self.buses.serial:
+            raise BenchError(f"[device.{name}.bus] '{bus}' already has a device; a serial line carries one")
+        self.buses.serial[bus] = face
+        self.devices[name] = face
+        self._timed.append(face)
+
+    def _add_di4108(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_serial(name, device["bus"], Di4108(self._analog_V, on_switches=self._strap_switch))
+
+    def _add_e727(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_serial(name, device["bus"], E727(on_output=self._piezo_demand))
+
+    def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
+        self.devices[name] = face
+        self._timed.append(face)
+
+    def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_i2c(name, device, Ads1115(self._magnetometer_V))
+
+    def _add_dac(self, name: str, device: Mapping[str, Any]) -> None:
+        dac = Ad5696r(on_output=self._amplifier_input)
+        self._add_i2c(name, device, dac)
+        for channel in range(3):
+            self._amplifier_input(channel, dac.output_V[channel], self.epoch_ns)
+
+    def _add_can(self, name: str, device: Mapping[str, Any], node: Any) -> None:
+        self.buses.can[device["bus"]].attach(node)
+        self.devices[name] = node
+
+    def _add_can_amplifier(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_can(name, device, CanPiezoNode(on_output=self._piezo_demand, start_ns=self.epoch_ns))
+
+    def _add_can_telemetry(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_can(name, device, CanTelemetryListener())
+        self._add_can(f"{name}.stop_button", device, CanStopButton(start_ns=self.epoch_ns))
+
+    def _wire_magnetometer(self, adc: str, description: Mapping[str, Any]) -> None:
+        """Bridge outputs x, y, z go to the inputs that the bench file names."""
+        for device in description["device"].values():
+            if device["driver"] == "hmc2003" and device.get("adc") == adc:
+                self._adc_wiring[:3] = device.get("channels", (0, 1, 2))
