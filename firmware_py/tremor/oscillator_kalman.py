@@ -1,0 +1,186 @@
+"""Tremor by a stationary Kalman filter that knows the sensor's RC filter.
+
+Model per axis, continuous time: tremor displacement x = sum of modes; each mode is an oscillator driven by a
+second, equal oscillator, which is driven by white noise. One oscillator alone would leave white noise in the
+acceleration that is measured; two in a row have the steep skirts of a modulated tone (measured on held-out
+synthetic records: residual 14 % against 24 %). The measured acceleration is the mode accelerations plus drift
+(a slow Gauss-Markov process: attitude error, bias, voluntary motion, which the double derivative makes small)
+plus white noise, all through the RC filter. The filter's state is part of the model, so its phase is undone
+by the estimate; the prediction over the loop's delay is the model's free motion.
+
+The model is linear and constant, hence so is the gain: all of it is designed once, a step costs a few dozen
+multiplications.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are, solve_discrete_lyapunov
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record, new_record
+from firmware_py.tremor.config import TremorConfig
+
+Matrix = NDArray[np.float64]
+ORDER = 4  # states of a mode: x, v, u, du/dt
+
+
+@dataclass(frozen=True)
+class OscillatorModel:
+    """Discrete filter in balanced states s: s <- F s, then s += K (y - C s).
+
+    ``now``, ``ahead`` and ``velocity`` are rows that give tremor x(t), x(t + loop delay) in m and dx/dt in m/s.
+    """
+
+    transition: Matrix
+    gain: Matrix
+    observe: Matrix
+    now: Matrix
+    ahead: Matrix
+    velocity: Matrix
+    error_rms_m: float  # of x(t), when the model is true
+    n_modes: int
+
+
+def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Matrix, Matrix]:
+    """Continuous (A, Q) of one mode whose displacement has ``variance`` m^2."""
+    w = 2.0 * np.pi * frequency_hz
+    single = np.array([[0.0, 1.0], [-w * w, -2.0 * np.pi * bandwidth_hz]])
+    a = np.zeros((ORDER, ORDER))
+    a[:2, :2] = single
+    a[1, 2] = 1.0
+    a[2:, 2:] = single
+    q = np.zeros((ORDER, ORDER))
+    q[3, 3] = 1.0
+    covariance = solve_continuous_lyapunov(a, -q)
+    return a, q * (variance / covariance[0, 0])
+
+
+def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
+    """Exact transition and noise covariance over ``dt`` (Van Loan 1978)."""
+    n = len(a)
+    block = np.zeros((2 * n, 2 * n))
+    block[:n, :n] = -a
+    block[:n, n:] = q
+    block[n:, n:] = a.T
+    e = expm(block * dt)
+    transition = e[n:, n:].T
+    return transition, transition @ e[:n, n:]
+
+
+def design_oscillators(config: TremorConfig) -> OscillatorModel:
+    """The stationary filter for ``config``; raises LinAlgError when the Riccati equation has no solution."""
+    k = config.kalman
+    m = len(k.frequencies_hz)
+    n = ORDER * m + 2
+    cutoff = config.filter_cutoff_rad_s
+    a = np.zeros((n, n))
+    q = np.zeros((n, n))
+    displacement = np.zeros(n)
+    velocity = np.zeros(n)
+    acceleration = np.zeros(n)
+    for i, frequency in enumerate(k.frequencies_hz):
+        span = slice(ORDER * i, ORDER * (i + 1))
+        a[span, span], q[span, span] = _mode(frequency, k.bandwidth_hz, k.tremor_rms_m**2 / m)
+        displacement[ORDER * i] = 1.0
+        velocity[ORDER * i + 1] = 1.0
+        acceleration += a[ORDER * i + 1]
+    drift, rc = n - 2, n - 1
+    a[drift, drift] = -1.0 / k.drift_s
+    q[drift, drift] = 2.0 * k.drift_m_s2**2 / k.drift_s
+    a[rc] += cutoff * acceleration
+    a[rc, drift] += cutoff
+    a[rc, rc] -= cutoff
+    q[rc, rc] = cutoff**2 * k.sensor_noise_m_s2_rtHz**2 / 2.0  # two-sided density is half the one-sided square
+    transition, noise = _discretise(a, q, 1.0 / config.tick_hz)
+    # states differ by 1e6 in size: balance by their stationary deviations before the Riccati equation
+    scale = np.sqrt(np.diag(solve_discrete_lyapunov(transition, noise)))
+    f = transition * scale[None, :] / scale[:, None]
+    w = noise / scale[:, None] / scale[None, :]
+    c = np.zeros((1, n))
+    c[0, rc] = scale[rc]
+    r = np.array([[k.reading_noise_m_s2**2]])
+    prior = solve_discrete_are(f.T, c.T, 0.5 * (w + w.T), r)
+    innovation = (c @ prior @ c.T + r)[0, 0]
+    gain = prior @ c[0] / innovation
+    posterior = prior - np.outer(gain, c[0] @ prior)
+    now = displacement * scale
+    ahead = displacement @ expm(a * config.loop_delay_s) * scale
+    return OscillatorModel(
+        f, gain, c[0], now, ahead, velocity * scale, float(np.sqrt(now @ posterior @ now)), m
+    )
+
+
+def kalman_dtype(n_modes: int) -> np.dtype[Any]:
+    """Parameters for ``n_modes``: the transition is block diagonal but for its last row, and kept so."""
+    n = ORDER * n_modes + 2
+    return np.dtype(
+        [
+            ("blocks", "f8", (n_modes, ORDER, ORDER)),
+            ("drift", "f8"),
+            ("last_row", "f8", (n,)),
+            ("gain", "f8", (n,)),
+            ("observe", "f8"),
+            ("now", "f8", (n,)),
+            ("ahead", "f8", (n,)),
+            ("velocity", "f8", (n,)),
+        ]
+    )
+
+
+def kalman_params(config: TremorConfig) -> Record:
+    """The kernel's numbers (dtype ``kalman_dtype``)."""
+    model = design_oscillators(config)
+    blocks = [
+        model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)
+    ]
+    return new_record(
+        kalman_dtype(model.n_modes),
+        blocks=blocks,
+        drift=model.transition[-2, -2],
+        last_row=model.transition[-1],
+        gain=model.gain,
+        observe=model.observe[-1],
+        now=model.now,
+        ahead=model.ahead,
+        velocity=model.velocity,
+    )
+
+
+@kernel
+def kalman_predict(state: NDArray[np.float64], params: Record) -> None:
+    """s <- F s for one axis, one tick; ``state`` (4 m + 2,)."""
+    n = len(state)
+    last = 0.0
+    for i in range(n):
+        last += params.last_row[i] * state[i]
+    for m in range(len(params.blocks)):
+        block = params.blocks[m]
+        j = 4 * m
+        s0, s1, s2, s3 = state[j], state[j + 1], state[j + 2], state[j + 3]
+        for r in range(4):
+            state[j + r] = block[r, 0] * s0 + block[r, 1] * s1 + block[r, 2] * s2 + block[r, 3] * s3
+    state[n - 2] *= params.drift
+    state[n - 1] = last
+
+
+@kernel
+def kalman_correct(state: NDArray[np.float64], measured: float, params: Record) -> None:
+    """s += K (y - C s): ``measured`` is the tip's acceleration m/s^2, behind the RC filter."""
+    n = len(state)
+    innovation = measured - params.observe * state[n - 1]
+    for i in range(n):
+        state[i] += params.gain[i] * innovation
+
+
+@kernel
+def combine(state: NDArray[np.float64], row: NDArray[np.float64]) -> float:
+    """row . state"""
+    total = 0.0
+    for i in range(len(state)):
+        total += row[i] * state[i]
+    return total

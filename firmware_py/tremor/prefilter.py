@@ -1,0 +1,56 @@
+"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (000, 5.2.1; ERRATA 56).
+
+Ripple and attenuation are not printed there; they are parameters here. Its response is known exactly at any
+frequency, so whoever uses its output can undo phase and gain.
+"""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import ellip
+
+from firmware_py.compiled import kernel
+from firmware_py.tremor.config import WflcConfig
+
+PROTOTYPE_ORDER = 3  # a band-pass doubles it
+
+
+def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64]:
+    """Three second-order sections (3, 5): b0 b1 b2 a1 a2."""
+    sos = np.asarray(
+        ellip(
+            PROTOTYPE_ORDER,
+            config.ripple_dB,
+            config.attenuation_dB,
+            [config.low_hz, config.high_hz],
+            btype="bandpass",
+            output="sos",
+            fs=tick_hz,
+        )
+    )
+    return np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
+
+
+def prefilter_response(
+    sections: NDArray[np.float64], frequency_hz: NDArray[np.float64], tick_hz: float
+) -> NDArray[np.complex128]:
+    """Complex gain at the given frequencies, from the coefficients."""
+    delay = np.exp(-2j * pi * np.asarray(frequency_hz, dtype=np.float64) / tick_hz)
+    gain = np.ones_like(delay)
+    for b0, b1, b2, a1, a2 in sections:
+        gain = gain * (b0 + b1 * delay + b2 * delay**2) / (1.0 + a1 * delay + a2 * delay**2)
+    return gain
+
+
+@kernel
+def prefilter_step(x: float, memory: NDArray[np.float64], sections: NDArray[np.float64]) -> float:
+    """One sample through the sections; ``memory`` (n, 2), direct form II transposed."""
+    for j in range(len(sections)):
+        y = sections[j, 0] * x + memory[j, 0]
+        memory[j, 0] = sections[j, 1] * x - sections[j, 3] * y + memory[j, 1]
+        memory[j, 1] = sections[j, 2] * x - sections[j, 4] * y
+        x = y
+    return x

@@ -1,0 +1,83 @@
+"""Weighted-frequency Fourier linear combiner (000 (5.6)-(5.10), ERRATA 51-56): tracks the tremor's frequency.
+
+The input is divided by the square root of its own smoothed power, so the gains hold for 5 um and for 500 um.
+Frequency is limited to the band, amplitude weights leak a little towards zero.
+"""
+
+from __future__ import annotations
+
+from math import cos, exp, pi, sin, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record, new_record
+from firmware_py.tremor.config import WflcConfig
+
+WFLC = np.dtype(
+    [
+        ("start", "f8"),  # rad per sample, as the two limits
+        ("low", "f8"),
+        ("high", "f8"),
+        ("frequency_gain", "f8"),
+        ("weight_gain", "f8"),
+        ("keep", "f8"),  # 1 - leakage
+        ("power_smoothing", "f8"),
+    ]
+)
+WFLC_STATE = np.dtype(
+    [
+        ("omega", "f8"),  # rad per sample
+        ("phase", "f8"),  # running sum of omega, rad, within 2 pi
+        ("sine", "f8"),
+        ("cosine", "f8"),
+        ("power", "f8"),
+    ]
+)
+
+
+def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
+    """The kernel's numbers (dtype ``WFLC``)."""
+    per_sample = 2.0 * pi / tick_hz
+    return new_record(
+        WFLC,
+        start=config.start_hz * per_sample,
+        low=config.low_hz * per_sample,
+        high=config.high_hz * per_sample,
+        frequency_gain=config.frequency_gain,
+        weight_gain=config.weight_gain,
+        keep=1.0 - config.leakage,
+        power_smoothing=1.0 - exp(-1.0 / (config.power_s * tick_hz)),
+    )
+
+
+@kernel
+def wflc_restart(state: Record, params: Record) -> None:
+    """Start frequency, no amplitude."""
+    state.omega = params.start
+    state.phase = 0.0
+    state.sine = 0.0
+    state.cosine = 0.0
+    state.power = 0.0
+
+
+@kernel
+def wflc_step(signal: float, state: Record, params: Record) -> None:
+    """One sample of the band-passed signal, any unit: advances phase, weights and frequency.
+
+    The frequency step follows -d(error^2)/d(omega) with the phase as a running sum (ERRATA 53).
+    """
+    state.phase = (state.phase + state.omega) % (2.0 * pi)
+    state.power += params.power_smoothing * (signal * signal - state.power)
+    if state.power <= 0.0:
+        return
+    s = sin(state.phase)
+    c = cos(state.phase)
+    # a transient far above the smoothed power must not throw the frequency
+    normal = max(-3.0, min(3.0, signal / sqrt(state.power)))
+    error = normal - state.sine * s - state.cosine * c
+    omega = state.omega + 2.0 * params.frequency_gain * error * (state.sine * c - state.cosine * s)
+    state.omega = max(params.low, min(params.high, omega))
+    state.sine = params.keep * state.sine + 2.0 * params.weight_gain * s * error
+    state.cosine = params.keep * state.cosine + 2.0 * params.weight_gain * c * error
