@@ -1,0 +1,122 @@
+"""The blind self-proof: draw, seal, diagnose, open, score."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.mismatch.prove import draw, seal
+from tools.mismatch.prove.disk import write
+from tools.mismatch.prove.runner import Diagnose, diagnose_all, tool
+from tools.mismatch.prove.score import score, summary
+
+
+@dataclass(frozen=True)
+class ProofResult:
+    """Rows per case and their summary; ``folder`` holds the recordings, answers and reports."""
+
+    seed: int
+    digest: str
+    rows: tuple[dict[str, Any], ...]
+    summary: dict[str, Any]
+    seconds: float
+    folder: Path
+
+    def to_json(self) -> dict[str, Any]:
+        """What `micron mismatch prove --json` writes."""
+        return {
+            "format": 1,
+            "seed": self.seed,
+            "answers_sha256": self.digest,
+            "seconds": round(self.seconds, 1),
+            "folder": str(self.folder),
+            "summary": self.summary,
+            "cases": list(self.rows),
+        }
+
+
+def _generate(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[str, dict[str, Any], str] | None:
+    seed, index, plan, folder, max_samples, noise_kind = job
+    try:
+        case = draw.make([seed, index], plan, max_samples, noise_kind)
+    except draw.NotVisible:
+        return None
+    name = f"r{index:03d}"
+    path = write(case, folder / name, f"recording {index}", np.random.default_rng([seed, index, 99]))
+    return name, seal.answer(case), str(path)
+
+
+def generate(
+    seed: int,
+    plans: Sequence[draw.Plan],
+    folder: Path,
+    *,
+    jobs: int = 1,
+    max_samples: int = 24_000,
+    noise_kinds: Sequence[str] | None = None,
+) -> tuple[dict[str, Path], dict[str, dict[str, Any]]]:
+    """Write the recordings of these plans; (paths, answers). A plan that no scene shows is left out."""
+    work = [
+        (seed, i, p, folder, max_samples, noise_kinds[i % len(noise_kinds)] if noise_kinds else None)
+        for i, p in enumerate(plans)
+    ]
+    if jobs > 1:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+            done = list(pool.map(_generate, work))
+    else:
+        done = [_generate(w) for w in work]
+    kept = [d for d in done if d is not None]
+    return {n: Path(p) for n, _, p in kept}, {n: a for n, a, _ in kept}
+
+
+def prove(
+    cases: int = 40,
+    seed: int | None = None,
+    jobs: int = 2,
+    folder: Path | None = None,
+    *,
+    only: tuple[str, str, float] | None = None,
+    max_samples: int = 24_000,
+    diagnose: Diagnose = tool,
+    progress: Any = None,
+) -> ProofResult:
+    """Draw ``cases`` cases, seal the answers, run the tool on each, open the seal, score.
+
+    ``seed`` None draws a fresh one from the clock; it is printed. ``folder`` keeps everything (a temporary
+    folder otherwise). ``only`` = (twin, effect, severity) restricts the single effects. ``progress`` is called
+    with one line of text per event; standard error by default.
+    """
+    start = time.perf_counter()
+    say = progress or (lambda text: print(text, file=sys.stderr, flush=True))
+    seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
+    folder = Path(tempfile.mkdtemp(prefix="micron-prove-")) if folder is None else folder
+    say(f"seed {seed}, {cases} cases, folder {folder}")
+    paths, answers = generate(
+        seed, draw.plans(seed, cases, only), folder / "recordings", jobs=jobs, max_samples=max_samples
+    )
+    digest = seal.close(answers, folder / "sealed")
+    missing = "" if len(answers) == cases else f" ({cases - len(answers)} could not be drawn)"
+    say(f"{len(answers)} recordings written{missing}; answers sealed, sha256 {digest}")
+    del answers
+    reports: dict[str, tuple[dict[str, Any], float]] = {}
+    (folder / "reports").mkdir(exist_ok=True)
+    for name, report, seconds in diagnose_all(paths, jobs, diagnose):
+        reports[name] = (report, seconds)
+        (folder / "reports" / f"{name}.json").write_text(json.dumps(report, indent=1))
+        say(f"{len(reports)}/{len(paths)}  {name}  {seconds:.1f} s")
+    opened = seal.opened(folder / "sealed", digest)
+    rows: list[dict[str, Any]] = []
+    for name in sorted(reports):
+        report, seconds = reports[name]
+        rows.append({"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report)})
+    return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder)

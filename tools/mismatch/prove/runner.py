@@ -1,0 +1,65 @@
+"""Runs the tool under test on recordings, in processes. The only place that touches it."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+Diagnose = Callable[[Path], dict[str, Any]]
+
+
+def tool(path: Path) -> dict[str, Any]:
+    """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
+    from tools.mismatch.engine.diagnose import diagnose
+    from tools.mismatch.recording import load
+
+    report = diagnose(load(path), jobs=1, seed=0)
+    return as_plain(report)
+
+
+def as_plain(report: Any) -> dict[str, Any]:
+    """The report as parsed JSON, whatever object carries it."""
+    if isinstance(report, dict):
+        return json.loads(json.dumps(report, default=float))
+    for name in ("to_json", "as_dict", "to_dict", "json", "model_dump"):
+        if hasattr(report, name):
+            out = getattr(report, name)()
+            return json.loads(out) if isinstance(out, str) else json.loads(json.dumps(out, default=float))
+    raise TypeError(f"cannot read a report of type {type(report).__name__}")
+
+
+def timed(job: tuple[str, Path, Diagnose]) -> tuple[str, dict[str, Any], float]:
+    """One diagnosis; an exception becomes a report with the verdict 'error'."""
+    name, path, diagnose = job
+    start = time.perf_counter()
+    try:
+        report = diagnose(path)
+    except Exception as e:  # a crash of the tool is a result to be counted, not ours to raise
+        last = traceback.extract_tb(e.__traceback__)[-1]
+        report = {
+            "verdict": "error",
+            "error": f"{type(e).__name__}: {e} ({Path(last.filename).name}:{last.lineno})",
+        }
+    return name, report, time.perf_counter() - start
+
+
+def diagnose_all(
+    paths: dict[str, Path], jobs: int, diagnose: Diagnose = tool
+) -> Iterator[tuple[str, dict[str, Any], float]]:
+    """(name, report, seconds) as they finish; ``jobs`` processes, in this one if 1."""
+    work: Sequence[tuple[str, Path, Diagnose]] = [(k, p, diagnose) for k, p in paths.items()]
+    if jobs <= 1:
+        yield from map(timed, work)
+        return
+    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(key, "1")
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(timed, w) for w in work]):
+            yield done.result()

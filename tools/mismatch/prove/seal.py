@@ -1,0 +1,46 @@
+"""The sealed answers: written apart from the recordings, hash first, opened when every diagnosis is done."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from tools.mismatch.prove.draw import Case
+
+
+def answer(case: Case) -> dict[str, Any]:
+    """What is known of a case, as plain JSON."""
+    return {
+        "kind": case.plan.kind,
+        "twin": case.plan.twin,
+        "severity": case.plan.severity,
+        "excitation": case.scene.excitation,
+        "rate_hz": 1.0 / case.scene.dt,
+        "samples": case.scene.keep,
+        "effects": [asdict(t) for t in case.truths],
+        "noise_kind": case.noise_kind,
+        "noise_rms": case.noise_rms,
+        "noise_declared": case.declared,
+        "parameters": case.scene.parameters,
+        "given_is_true": case.given_is_true,
+        "decoys": list(case.decoys),
+    }
+
+
+def close(answers: dict[str, dict[str, Any]], folder: Path) -> str:
+    """Write the answers; their SHA-256."""
+    folder.mkdir(parents=True, exist_ok=True)
+    data = json.dumps(answers, indent=1, sort_keys=True).encode()
+    (folder / "answers.json").write_bytes(data)
+    return hashlib.sha256(data).hexdigest()
+
+
+def opened(folder: Path, digest: str) -> dict[str, dict[str, Any]]:
+    """Read the answers back. ValueError when they are not the ones that were sealed."""
+    data = (folder / "answers.json").read_bytes()
+    if hashlib.sha256(data).hexdigest() != digest:
+        raise ValueError(f"{folder / 'answers.json'}: not the answers that were sealed ({digest})")
+    return json.loads(data)
