@@ -226,7 +226,7 @@ class Di4108:
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
 
     def _read_ended_inside_a_packet(self) -> None:
-        if self._buf[max(0, self._end - len(OVERFLOW_TAIL)) : self._end] == OVERFLOW_TAIL:
+        if self._view[: self._end].tobytes().endswith(OVERFLOW_TAIL):
             self._overflowed = True
             self._scanning = False
             self._end -= len(OVERFLOW_TAIL)
