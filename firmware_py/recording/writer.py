@@ -1,0 +1,188 @@
+"""Writes recordings: every finished block is a chunk of its own in the file, safe from the death of any process."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zlib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from mcap.data_stream import RecordBuilder
+from mcap.records import Chunk, Message, Metadata
+from mcap.writer import CompressionType, Writer
+
+from firmware_py.recording import format as fmt
+from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.format import Float64Array
+
+
+class _Output:
+    """An unbuffered file that writes everything or raises, and knows where the last whole part ended.
+
+    A raw file may write less than asked without an error; ``mcap`` does not look at the count.
+    """
+
+    def __init__(self, path: Path, overwrite: bool) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_TRUNC if overwrite else os.O_EXCL)
+        try:
+            self._fd = os.open(path, flags, 0o644)
+        except FileExistsError as error:
+            raise RecordingError(f"{path} exists already: choose another name or remove it") from error
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        self._position = 0
+        self.good_end = 0
+
+    def write(self, data: bytes) -> int:
+        left = memoryview(data)
+        while left:
+            n = os.write(self._fd, left)
+            left = left[n:]
+            self._position += n
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def keep(self) -> None:
+        """What has been written so far is whole."""
+        self.good_end = self._position
+
+    def back_to_good(self) -> None:
+        """Cut off a part that could not be written to its end."""
+        os.ftruncate(self._fd, self.good_end)
+        os.lseek(self._fd, self.good_end, os.SEEK_SET)
+        self._position = self.good_end
+
+    def sync(self) -> None:
+        os.fdatasync(self._fd)
+
+    def close(self) -> None:
+        os.close(self._fd)
+
+
+class RecordingWriter:
+    """One recording being written. ``OSError`` of the file system passes through; then call ``give_up``.
+
+    ``metadata`` is stored at the start: texts as they are, other values as JSON. Times in the file are bench time
+    since the start of the run, taken from the column ``t``.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        columns: Sequence[tuple[str, str]],
+        metadata: Mapping[str, Any],
+        *,
+        overwrite: bool = False,
+    ) -> None:
+        self.columns = fmt.check_columns(columns)
+        self._crc = fmt.layout_crc(self.columns)
+        names = [c.name for c in self.columns]
+        self._time_column = names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in names else None
+        self._now_ns = 0
+        self.rows = self.blocks = self.events = 0
+        self._output = _Output(path, overwrite)
+        self._mcap = Writer(
+            self._output,  # type: ignore[arg-type]  # it uses write, tell and flush only
+            chunk_size=fmt.CHUNK_BYTES,
+            compression=CompressionType.ZSTD,
+        )
+        self._mcap.start(profile=fmt.PROFILE)
+        self._mcap.add_metadata(fmt.LAYOUT_METADATA, fmt.encode_metadata(fmt.layout_text(self.columns)))
+        for name, value in metadata.items():
+            self._mcap.add_metadata(name, fmt.encode_metadata(value))
+        self._output.keep()
+        schema = self._mcap.register_schema(fmt.TICKS_SCHEMA, "jsonschema", fmt.ticks_schema(self.columns))
+        self._mcap.register_channel(fmt.TICKS_TOPIC, fmt.TICKS_ENCODING, schema)
+        schema = self._mcap.register_schema(fmt.EVENTS_SCHEMA, "jsonschema", fmt.events_schema())
+        self._mcap.register_channel(fmt.EVENTS_TOPIC, fmt.EVENTS_ENCODING, schema)
+
+    def write_block(self, row0: int, rows: Float64Array) -> None:
+        """Write ``rows[n, n_columns]``, numbered on from ``row0``, as a chunk of its own with the events before it.
+
+        In the file ``publish_time`` is the time of the first row, ``log_time`` that of the last one.
+        """
+        first_ns = self._time_ns(rows[0])
+        self._now_ns = self._time_ns(rows[-1])
+        message = fmt.encode_block(row0, rows, self._crc)
+        self._mcap.add_message(fmt.TICKS_CHANNEL, self._now_ns, message, first_ns, self.blocks)
+        self.flush()
+        self.blocks += 1
+        self.rows += len(rows)
+
+    def write_event(self, number: int, event: Mapping[str, Any]) -> None:
+        """Add event ``number``, stamped with the time of the last block; in the file after the next ``flush``."""
+        text = json.dumps(fmt.plain(event), ensure_ascii=False).encode()
+        self._mcap.add_message(fmt.EVENTS_CHANNEL, self._now_ns, text, self._now_ns, number)
+        self.events += 1
+
+    def write_metadata(self, name: str, value: object) -> None:
+        """Store one more text or JSON value."""
+        self.flush()
+        self._mcap.add_metadata(name, fmt.encode_metadata(value))
+        self._output.keep()
+
+    def flush(self) -> None:
+        """Hand everything to the operating system."""
+        self._mcap.flush()
+        self._output.keep()
+
+    def sync(self) -> None:
+        """Wait until it is on the disk."""
+        self._output.sync()
+
+    def finish(self, end: Mapping[str, Any]) -> int:
+        """Write ``end`` (what the recording should hold, why it ended) and the index, and close.
+
+        Returns the size of the file in bytes.
+        """
+        self.write_metadata(fmt.END_METADATA, end)
+        self._mcap.finish()
+        self._output.keep()
+        self._output.sync()
+        self._output.close()
+        return self._output.good_end
+
+    def give_up(self, event: tuple[int, Mapping[str, Any]], end: Mapping[str, Any]) -> int:
+        """After an ``OSError``: cut off what was not finished, add a last event and ``end`` if they fit, close.
+
+        The file has no index then; everything finished stays readable. Returns its size in bytes.
+        """
+        number, content = event
+        text = json.dumps(fmt.plain(content), ensure_ascii=False).encode()
+        try:
+            self._output.back_to_good()
+            for record in (
+                _chunk_of(Message(fmt.EVENTS_CHANNEL, self._now_ns, text, self._now_ns, number)),
+                Metadata(name=fmt.END_METADATA, metadata=fmt.encode_metadata(end)),
+            ):
+                # not through the writer: it has lost the part that could not be written
+                self._output.write(_bytes_of(record))
+                self._output.keep()
+        except OSError:
+            self._output.back_to_good()
+        finally:
+            self._output.close()
+        return self._output.good_end
+
+    def _time_ns(self, row: Float64Array) -> int:
+        t_s = float(row[self._time_column]) if self._time_column is not None else math.nan
+        return round(t_s * 1e9) if 0.0 <= t_s < 1e9 else self._now_ns
+
+
+def _chunk_of(message: Message) -> Chunk:
+    data = _bytes_of(message)
+    return Chunk("", data, message.log_time, message.log_time, zlib.crc32(data), len(data))
+
+
+def _bytes_of(record: Message | Chunk | Metadata) -> bytes:
+    builder = RecordBuilder()
+    record.write(builder)
+    return builder.end()
