@@ -146,14 +146,14 @@ class StackConfig(_Table):
     stroke_um_at_100_V: Positive = 15.0
     """Quasi-static, 0 to 100 V and back."""
     stroke_spread: NotNegative = 0.03
-    slip_weight_per_V: NotNegative = 0.0122
-    """Density of the slip elements over their thresholds; sets the loop (000 Tables 7.1, 7.2)."""
-    slip_spread: NotNegative = 0.06
+    slip_sum: Annotated[float, Field(ge=0, lt=1)] = 0.52
+    """Sum of the slip weights: 1 - slip_sum is the small-signal part; sets the loop (000 Tables 7.1, 7.2)."""
+    slip_spread: NotNegative = 0.03
     slip_limit_V: Positive = 46.0
     """Largest threshold."""
     slip_bias: NotNegative = 0.12
     """Relative fall of the thresholds from 50 to 100 V, rise to 0 V: minor loops are not congruent."""
-    slip_viscous_ms: NotNegative = 0.35
+    slip_viscous_ms: Positive = 0.6
     """Median viscous time of the slip: the loop opens with the rate."""
     curvature: float = -0.05
     """Static curvature, c of x = y + c (y^2 - y), y = 0..1."""

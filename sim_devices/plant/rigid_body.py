@@ -29,7 +29,7 @@ def attitude(frame, angles, c):
 
 @njit(cache=True)
 def body_rates(angles, rates, accelerations, omega, alpha):
-    """Body rate ``omega`` (rad/s) and its derivative ``alpha`` from the angles of ``attitude`` and their derivatives."""
+    """Body rate ``omega``, rad/s, and its derivative ``alpha``, from ``attitude``'s angles and their derivatives."""
     sx, cx = math.sin(angles[0]), math.cos(angles[0])
     sy, cy = math.sin(angles[1]), math.cos(angles[1])
     x1, y1, z1 = rates[0], rates[1], rates[2]

@@ -1,8 +1,8 @@
 """One set of sensors: what the seed drew, and what they put out.
 
-ADXL-203 (data sheet rev. D: ratiometric, 1 V/g and 2.5 V at 5 V, 110 ug/rtHz, internal 32 kOhm against 0.33 uF), TMP36
-(0.5 V + 10 mV/degC), supply through a 2:1 divider, HMC-2003 (1 V/gauss, 2.5 V at zero field), DAQ inputs. Cross-axis terms
-have the form of 000 (3.8), (3.10), (3.12). Not simulated: the accelerometer's own resonance (5.5 kHz), 1/f noise.
+ADXL-203 (data sheet: ratiometric, 1 V/g and 2.5 V at 5 V, 110 ug/rtHz, internal 32 kOhm against 0.33 uF), TMP36
+(0.5 V + 10 mV/degC), supply through a 2:1 divider, HMC-2003 (1 V/gauss, 2.5 V at zero field), DAQ inputs. Cross-axis
+terms have the form of 000 (3.8), (3.10), (3.12). Not simulated: the accelerometer's resonance (5.5 kHz), 1/f noise.
 """
 
 from __future__ import annotations

@@ -93,12 +93,16 @@ def stack_unit(config: StackConfig, seed: int, axis: int) -> StackUnit:
     rng = stream(seed, f"stack.{axis}")
     draw = rng.standard_normal(4)
     width_V = config.slip_limit_V / SLIPS
-    edges = (np.arange(SLIPS) + 0.5 + 0.2 * rng.uniform(-1.0, 1.0, SLIPS)) * width_V
-    weight = config.slip_weight_per_V * width_V * (1.0 + config.slip_spread * draw[0])
+    threshold_V = (np.arange(SLIPS) + 0.5 + 0.2 * rng.uniform(-1.0, 1.0, SLIPS)) * width_V
+    # part of the elements evenly over the thresholds (Rayleigh's law for small loops), part around the coercive drive
+    place = (np.arange(SLIPS) + 0.5) / SLIPS
+    weight = 0.4 + 0.6 * 2.0 * np.minimum(place / 0.45, (1.0 - place) / 0.55)
+    weight *= (1.0 + 0.1 * rng.standard_normal(SLIPS)) / SLIPS
+    weight *= config.slip_sum * (1.0 + config.slip_spread * draw[0]) / weight.sum()
     return StackUnit(
         stroke_m=config.stroke_um_at_100_V * 1e-6 * (1.0 + config.stroke_spread * draw[1]),
-        threshold_V=edges,
-        weight=np.full(SLIPS, weight) * (1.0 + 0.1 * rng.standard_normal(SLIPS)),
+        threshold_V=threshold_V,
+        weight=weight,
         slip_time_s=config.slip_viscous_ms * 1e-3 * np.exp(0.7 * rng.standard_normal(SLIPS)),
         slip_bias=config.slip_bias,
         curvature=config.curvature * (1.0 + 0.2 * draw[2]),
