@@ -6,6 +6,9 @@ band and the error passes a further low-pass: in the tremor band attitude is the
 alone, behind the same RC filter as the specific force, so that the tilt part of gravity cancels with the right
 phase (it equals a lever of g / omega^2 = 2.5 mm at 10 Hz). The corner starts high and falls as 1/t, which
 shortens the start the way a Kalman gain would.
+
+Without a magnetometer the last known field stays where it was in the body: heading is then held on average,
+which keeps the rate about the vertical bounded.
 """
 
 from __future__ import annotations
@@ -38,7 +41,7 @@ ATTITUDE_STATE = np.dtype(
         ("bias", "f8", (3,)),  # of the angular acceleration
         ("error", "f8", (3,)),  # low-passed attitude error, body frame, rad
         ("previous", "f8", (3,)),  # angular acceleration of the last tick
-        ("heading", "f8"),  # last heading error, rad
+        ("field", "f8", (3,)),  # last magnetic field, body frame
         ("time_s", "f8"),  # since the start of alignment
         ("aligned", "i8"),
         ("samples", "f8"),
@@ -68,7 +71,7 @@ def restart(state: Record) -> None:
     state.bias[:] = 0.0
     state.error[:] = 0.0
     state.previous[:] = 0.0
-    state.heading = 0.0
+    state.field[:] = 0.0
     state.time_s = 0.0
     state.aligned = 0
     state.samples = 0.0
@@ -93,8 +96,10 @@ def align(
     state.samples += 1.0
     if state.samples < params.align_samples:
         return False
-    triad(state.sums[0], state.sums[2], state.matrix)
+    found = triad(state.sums[0], state.sums[2], state.matrix)
     from_matrix(state.matrix, state.quaternion)
+    for i in range(3):
+        state.field[i] = state.sums[2, i] if found else state.matrix[0, i]
     for i in range(3):
         # at rest on average, so the mean angular acceleration is bias
         state.bias[i] = state.sums[1, i] / state.samples
@@ -127,10 +132,11 @@ def propagate(
     ey = (fz * ux - fx * uz) / norm
     ez = (fx * uy - fy * ux) / norm
     if fresh:
-        north = c[0, 0] * field[0] + c[0, 1] * field[1] + c[0, 2] * field[2]
-        west = c[1, 0] * field[0] + c[1, 1] * field[1] + c[1, 2] * field[2]
-        state.heading = -atan2(west, north)
-    heading = state.heading
+        state.field[:] = field
+    b = state.field
+    north = c[0, 0] * b[0] + c[0, 1] * b[1] + c[0, 2] * b[2]
+    west = c[1, 0] * b[0] + c[1, 1] * b[1] + c[1, 2] * b[2]
+    heading = -atan2(west, north)
     ex += heading * ux
     ey += heading * uy
     ez += heading * uz

@@ -46,6 +46,8 @@ from firmware_py.sensing.translation import (
     translation_params,
 )
 
+MAX_RATE_RAD_S = 20.0
+
 SENSE = np.dtype(
     [
         ("calibration", CALIBRATION),
@@ -86,11 +88,18 @@ def sense_state() -> Record:
 
 
 @kernel
+def _plausible(rate: NDArray[np.float64]) -> bool:
+    """No hand turns faster; written so that nan is not plausible either."""
+    return rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2 < MAX_RATE_RAD_S**2
+
+
+@kernel
 def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
     """Fill the columns from ``volts`` to ``tip_displacement``; adds its bits to ``status``.
 
     A sample that is not finite leaves estimates as they were and sets INVALID. After lost scans the attitude
-    coasts over the gap; after more than ``max_gap`` it aligns anew.
+    coasts over the gap; after more than ``max_gap_ticks``, or with an
+    impossible rate, it aligns anew.
     """
     state = states[0]
     param = params[0]
@@ -105,7 +114,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     if not np.isnan(state.last_tick):
         steps = max(1, int(tick - state.last_tick))
     state.last_tick = tick
-    if steps > param.max_gap_ticks:
+    if steps > param.max_gap_ticks or not _plausible(state.attitude.rate):
         restart(state.attitude)
         state.memory[:, :, :] = 0.0
         status |= RESTARTED

@@ -11,7 +11,6 @@ from __future__ import annotations
 from math import atan2, cos, sin, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record

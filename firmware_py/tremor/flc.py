@@ -11,9 +11,7 @@ from firmware_py.compiled import kernel
 
 
 @kernel
-def flc_step(
-    signal: float, phase: float, weights: NDArray[np.float64], weight_gain: float, bias_gain: float
-) -> None:
+def flc_step(signal: float, phase: float, weights: NDArray[np.float64], weight_gain: float, bias_gain: float) -> None:
     """One LMS step of ``weights`` (sine, cosine, bias) on ``signal``, in the signal's unit.
 
     The weights settle with 1 / weight_gain samples (ERRATA 52).

@@ -110,9 +110,7 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     posterior = prior - np.outer(gain, c[0] @ prior)
     now = displacement * scale
     ahead = displacement @ expm(a * config.loop_delay_s) * scale
-    return OscillatorModel(
-        f, gain, c[0], now, ahead, velocity * scale, float(np.sqrt(now @ posterior @ now)), m
-    )
+    return OscillatorModel(f, gain, c[0], now, ahead, velocity * scale, float(np.sqrt(now @ posterior @ now)), m)
 
 
 def kalman_dtype(n_modes: int) -> np.dtype[Any]:
@@ -135,9 +133,7 @@ def kalman_dtype(n_modes: int) -> np.dtype[Any]:
 def kalman_params(config: TremorConfig) -> Record:
     """The kernel's numbers (dtype ``kalman_dtype``)."""
     model = design_oscillators(config)
-    blocks = [
-        model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)
-    ]
+    blocks = [model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)]
     return new_record(
         kalman_dtype(model.n_modes),
         blocks=blocks,

@@ -9,7 +9,6 @@ from __future__ import annotations
 from math import cos, exp, pi, sin, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record

@@ -1,0 +1,82 @@
+"""What the actuation stage needs to know: [firmware.actuation] of the bench, piezo calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from hal.bench import validate_table
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class StackConfig(BaseModel):
+    """Modified Prandtl-Ishlinskii model of one stack, 000 (7.9): weights in um per V, thresholds in V and um.
+
+    The default is a P-885.50 by its data sheet shape: 15 um at 100 V on the first way up, a small-signal slope
+    of 70 % of that. ``micron calibrate piezo`` replaces it by the stack's own.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    play_thresholds_V: tuple[float, ...] = (0.0, 4.0, 8.0, 12.0, 16.0, 20.0, 25.0, 31.0, 38.0, 45.0)
+    play_weights_um_per_V: tuple[float, ...] = (
+        0.1050, 0.0100, 0.0090, 0.0080, 0.0070, 0.0060, 0.0060, 0.0060, 0.0050, 0.0040,
+    )  # fmt: skip
+    dead_zone_thresholds_um: tuple[float, ...] = (0.0,)
+    dead_zone_weights: tuple[float, ...] = (1.0,)
+    offset_um: float = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> StackConfig:
+        for name, thresholds, weights in (
+            ("play", self.play_thresholds_V, self.play_weights_um_per_V),
+            ("dead_zone", self.dead_zone_thresholds_um, self.dead_zone_weights),
+        ):
+            if len(thresholds) != len(weights) or not thresholds:
+                raise ValueError(f"{name}: as many thresholds as weights are needed")
+            if thresholds[0] != 0.0 or np.any(np.diff(thresholds) <= 0.0):
+                raise ValueError(f"{name}: thresholds must start at 0 and increase")
+            # ERRATA 74: the inverse exists when every partial sum is positive; single weights may be negative
+            if np.any(np.cumsum(weights) <= 0.0):
+                raise ValueError(f"{name}: every partial sum of the weights must be positive, or there is no inverse")
+        return self
+
+
+class ActuationConfig(BaseModel):
+    """Manipulator geometry, stacks, limits and how compensation comes on."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    tick_hz: Positive = 1000.0
+    gain: Annotated[float, Field(ge=0.0, le=2.0)] = 1.0
+    ramp_s: Positive = 0.5
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
+
+    ball_circle_m: Positive = 0.005  # R = r, 000 (6.11)
+    shaft_m: Positive = 0.040  # ball plane to tip
+    lever_gain: Positive = 8.0
+    mounting: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+    low_V: float = 0.0
+    high_V: float = 100.0
+    neutral_V: float = 50.0
+    slew_V_per_s: Positive = 20_000.0
+    stacks: tuple[StackConfig, StackConfig, StackConfig] = (StackConfig(), StackConfig(), StackConfig())
+
+    @model_validator(mode="after")
+    def _check(self) -> ActuationConfig:
+        if not self.low_V < self.neutral_V < self.high_V:
+            raise ValueError("low_V < neutral_V < high_V is needed")
+        rotation = np.array(self.mounting)
+        if rotation.shape != (3, 3) or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-6):
+            raise ValueError("mounting must be a 3 x 3 rotation: rows are the manipulator's axes in the body frame")
+        return self
+
+    @classmethod
+    def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.actuation]") -> ActuationConfig:
+        """Checked configuration; ``BenchError`` names the wrong key."""
+        return validate_table(cls, table, where)
