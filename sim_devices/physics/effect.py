@@ -190,5 +190,7 @@ class Effect:
     shared: bool = False
     twins: tuple[str, ...] = ()
     """Twin kinds that can have it; empty: all."""
+    fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
+    """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
     """Its course cannot be predicted on unseen data beyond its level at the start (random walk, spikes)."""

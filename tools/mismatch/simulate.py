@@ -25,9 +25,7 @@ from sim_devices.physics.effect import (
     Stage,
 )
 from tools.mismatch.recording import Recording
-from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
-
-MEMO_BYTES = 1 << 29  # what one view remembers of unchanged columns
+from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
 
 
 @dataclass(frozen=True)
@@ -59,12 +57,17 @@ class Placed:
 
 @dataclass(frozen=True)
 class View:
-    """Sample ranges of a recording to compare on. ``init`` samples at each start may set the state and are
-    not scored where the twin restarts; ``memo`` remembers columns that do not change between calls."""
+    """Sample ranges of a recording to compare on.
+
+    ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
+    and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
+    ``memo`` remembers columns that do not change between calls; do not share it between processes.
+    """
 
     recording: Recording
     ranges: tuple[tuple[int, int], ...]
     init: int = 0
+    lead: int = 0
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
 
     @property
@@ -312,10 +315,12 @@ class Model:
         ctx = make_context(self.twin, run, pl.target if pl.site == "input" else output, output)
         key = (effect.name, pl.target, output, q.tobytes(), _frozen(pl.settings))
 
+        gain = self.twin.input_gain(pl.target, theta) if pl.site == "input" else 1.0
+
         def collapse(s: Signal) -> Signal:
             if folded is not None:
                 folded.update(s.columns)
-            return fold(s, theta)
+            return fold(s, theta, gain)
 
         if effect.kind == "linear":
             apply = effect.apply
@@ -325,7 +330,7 @@ class Model:
             apply = effect.apply
             assert apply is not None
             s = collapse(x)
-            value = remember(run, (key, s.token), lambda: apply(s.value, ctx, q, pl.settings))
+            value = remember(run.memo, (key, s.token), lambda: apply(s.value, ctx, q, pl.settings))
             return Signal(value, {}, (*s.token, key))
         basis = effect.basis
         assert basis is not None
@@ -335,8 +340,8 @@ class Model:
                 x = s
         else:
             s = Signal(x.value, {}, ("undriven",))
-        columns = remember(run, (key, s.token), lambda: np.asfortranarray(basis(s.value, ctx, q, pl.settings)))
-        if join:
+        columns = remember(run.memo, (key, s.token), lambda: np.asfortranarray(basis(s.value, ctx, q, pl.settings)))
+        if join and pl.site == "output":
             return Signal(x.value + columns @ theta[b], x.columns, (*x.token, key, theta[b].tobytes()))
         return x.plus({b.start + i: columns[:, i] for i in range(columns.shape[1])}, key)
 
@@ -370,8 +375,11 @@ def view_run(twin: Twin, view: View) -> Run:
     A twin that restarts does so at every range; others start at sample 0 and run through.
     """
     rec = view.recording
-    starts = tuple(dict.fromkeys((0, *(a for a, _ in view.ranges)))) if twin.restart else (0,)
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, view.init, view.memo)
+    starts, window = (0,), view.init
+    if twin.restart:
+        starts = tuple(dict.fromkeys((0, *(max(0, a - view.lead) for a, _ in view.ranges))))
+        window += view.lead
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo)
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
@@ -388,22 +396,6 @@ def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
         None,
         twin.facts(output),
     )
-
-
-def remember(run: Run, key: object, make: object) -> Array:
-    """``make()`` once per key and view; old entries go when the store is full."""
-    found = run.memo.get(key)
-    if found is not None:
-        return found  # type: ignore[return-value]
-    value: Array = make()  # type: ignore[operator]
-    size = run.memo.get("bytes", 0)
-    assert isinstance(size, int)
-    if size + value.nbytes > MEMO_BYTES:
-        run.memo.clear()
-        size = 0
-    run.memo[key] = value
-    run.memo["bytes"] = size + value.nbytes
-    return value
 
 
 def full_residual(model: Model, view: View, theta: Array) -> dict[str, Array]:

@@ -52,7 +52,7 @@ class Force:
 class Run:
     """The stretch of a recording that is simulated, and from where.
 
-    ``starts``: samples of the stretch where the base physics starts afresh. ``init``: samples of measured output
+    ``starts``: samples of the stretch where the base physics starts afresh. ``window``: samples of measured output
     after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,).
     """
 
@@ -62,7 +62,7 @@ class Run:
     inputs: tuple[str, ...]
     measured: Mapping[str, Array]
     starts: tuple[int, ...]
-    init: int
+    window: int
     memo: dict[object, object]
 
 
@@ -98,6 +98,11 @@ class Twin(Protocol):
         """Output per unit of its driving input, for human parameters."""
         ...
 
+    def input_gain(self, signal: str, theta: Array) -> float:
+        """What weights of effects on this input are multiplied by before the base physics; 1.0 where they are
+        in input units. (A single gain behind the input is a linear parameter only if weights carry it.)"""
+        ...
+
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
@@ -116,17 +121,36 @@ class Twin(Protocol):
         ...
 
 
-def fold(signal: Signal, theta: Array) -> Signal:
-    """The value at ``theta``, without columns."""
+def fold(signal: Signal, theta: Array, gain: float = 1.0) -> Signal:
+    """The value at ``theta``, without columns; ``gain``: what the weights carry (``Twin.input_gain``)."""
     if not signal.columns:
         return signal
     value = signal.value.copy()
     for j, c in signal.columns.items():
-        value += theta[j] * c
-    key = tuple((j, float(theta[j])) for j in signal.columns)
+        value += theta[j] / gain * c
+    key = tuple((j, float(theta[j] / gain)) for j in signal.columns)
     return Signal(value, {}, (*signal.token, key))
 
 
 def keep_all(n: int) -> NDArray[np.bool_]:
     """A mask that keeps everything."""
     return np.ones(n, np.bool_)
+
+
+MEMO_BYTES = 1 << 29  # what one view remembers of unchanged columns
+
+
+def remember(memo: dict[object, object], key: object, make: Callable[[], Array]) -> Array:
+    """``make()`` once per key; everything goes when the store is full."""
+    found = memo.get(key)
+    if isinstance(found, np.ndarray):
+        return found
+    value = make()
+    size = memo.get("bytes", 0)
+    assert isinstance(size, int)
+    if size + value.nbytes > MEMO_BYTES:
+        memo.clear()
+        size = 0
+    memo[key] = value
+    memo["bytes"] = size + value.nbytes
+    return value

@@ -3,13 +3,38 @@
 from __future__ import annotations
 
 from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.axis import axis_twin
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.cluster import cluster_twin
+from tools.mismatch.twins.opaque import fmu_twin, user_twin
+from tools.mismatch.twins.state_space import state_space_twin
 from tools.mismatch.twins.static import static_twin
+from tools.mismatch.twins.vocabulary import user_kinds
 
 
 def make(recording: Recording) -> Twin:
-    """The twin of a recording. Unknown kinds and parameters are RecordingErrors."""
+    """The twin of a recording, without the effects of a corrected twin (``simulate_text.restore`` adds those).
+
+    Unknown kinds and parameters are RecordingErrors.
+    """
     kind = recording.twin.kind
-    if kind in ("piezo_stack", "accelerometer", "magnetometer"):
-        return static_twin(recording)
-    raise RecordingError(f"{recording.path}: [twin] kind '{kind}' is unknown")
+    match kind:
+        case "piezo_stack" | "accelerometer" | "magnetometer":
+            return static_twin(recording)
+        case "accelerometer_cluster":
+            return cluster_twin(recording)
+        case "mechanical_axis":
+            return axis_twin(recording)
+        case "state_space":
+            return state_space_twin(recording)
+        case "fmu":
+            return fmu_twin(recording)
+        case "instrument":
+            from tools.mismatch.twins.instrument import instrument_twin
+
+            return instrument_twin(recording)
+        case _:
+            entry = user_kinds().get(kind)
+            if entry is None:
+                raise RecordingError(f"{recording.path}: [twin] kind '{kind}' is unknown")
+            return user_twin(recording, entry)

@@ -63,6 +63,10 @@ class StaticTwin:
         """See Twin."""
         return float(theta[len(self.outputs) + self.outputs.index(output)])
 
+    def input_gain(self, signal: str, theta: Array) -> float:
+        """See Twin."""
+        return 1.0
+
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:

@@ -1,0 +1,38 @@
+"""Forces inside an equation of motion, as scalar compiled functions: friction, spring, cogging, memory.
+
+One packed row of numbers per family, so that one compiled loop serves every combination; a row of zeros is
+"absent". The effects of ``friction.py`` and ``spring.py`` fill the rows; twins integrate them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, unused
+SPRING = 2  # cubic, quadratic
+COGGING = 5  # period, sin1, cos1, sin2, cos2
+
+
+@njit(cache=True)
+def friction_limit(v, sign, row):
+    """Largest friction at speed v in the direction of motion ``sign``: Coulomb, its asymmetry, Stribeck's extra.
+
+    F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3.
+    """
+    f = row[0] + sign * row[1]
+    if row[2] != 0.0 and row[3] > 0.0:
+        r = v / row[3]
+        f += row[2] * np.exp(-r * r)
+    return f
+
+
+@njit(cache=True)
+def smooth_force(p, v, spring, cogging, friction):
+    """Forces that are continuous in position p and velocity v: spring curvature, cogging, unequal viscosity."""
+    f = -spring[0] * p * p * p - spring[1] * p * p - friction[4] * abs(v)
+    if cogging[0] > 0.0:
+        a = 2.0 * np.pi * p / cogging[0]
+        f += cogging[1] * np.sin(a) + cogging[2] * np.cos(a)
+        f += cogging[3] * np.sin(2.0 * a) + cogging[4] * np.cos(2.0 * a)
+    return f

@@ -1,0 +1,145 @@
+"""Mechanical axis: m x'' + c x' + k x = F + offset, for one translation or rotation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.signal import cont2discrete, lfilter
+
+from sim_devices.physics.effect import Array, Human, Parameter
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
+
+_NAMES = ("mass", "damping", "stiffness", "offset_force", "hold")
+
+
+def axis_twin(recording: Recording) -> DynamicTwin:
+    """theta = damping/mass, [stiffness/mass if the axis has a spring], 1/mass, offset/mass."""
+    text = recording.twin.parameters
+    for key in text:
+        if key not in _NAMES:
+            raise RecordingError(
+                f"{recording.path}: [twin.parameters] '{key}' is not a parameter of mechanical_axis;"
+                f" known: {', '.join(_NAMES)}"
+            )
+    hold = text.get("hold", "linear")
+    if hold not in ("zero", "linear"):
+        raise RecordingError(f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {hold!r}")
+    given = {k: _number(recording, k, text.get(k)) for k in _NAMES[:4]}
+    if given["mass"] is not None and given["mass"] <= 0:
+        raise RecordingError(f"{recording.path}: [twin.parameters] mass must be positive, got {given['mass']}")
+    sprung = bool(given["stiffness"])
+    mass, damping, stiffness, offset = _begin(recording, given, sprung)
+    source = next(iter(recording.inputs))
+    position_unit = recording.unit[next(iter(recording.outputs))].removesuffix("/s")
+    f = recording.unit[source]
+    outputs = tuple(recording.outputs)
+    row = {"position": 0, "velocity": 1}
+    dm = max(damping / mass, 1e-6)
+    parameters = [Parameter("damping_per_mass", "1/s", 0.0, np.inf, scale=dm)]
+    begin = [damping / mass]
+    if sprung:
+        parameters.append(Parameter("stiffness_per_mass", "1/s^2", 0.0, np.inf, scale=stiffness / mass))
+        begin.append(stiffness / mass)
+    k = len(parameters)
+    typical = float(np.std(recording.inputs[source])) or 1.0
+    parameters.append(Parameter("inverse_mass", f"{position_unit}/(s^2 {f})", scale=1 / mass))
+    parameters.append(Parameter("offset_per_mass", f"{position_unit}/s^2", scale=0.01 * typical / mass))
+    begin += [1 / mass, offset / mass]
+    links = [Link(k, o, source, row[o]) for o in outputs] + [Link(k + 1, o, CONSTANT, row[o]) for o in outputs]
+
+    def plant_of(theta: Array) -> Plant:
+        stiff = theta[1] if sprung else 0.0
+        return Plant(np.array([[0.0, 1.0], [-stiff, -theta[0]]]), np.array([0.0, 1.0]))
+
+    per = f"{f} s/{position_unit}"
+
+    def human_of(theta: Array) -> Sequence[Human]:
+        m = 1.0 / theta[k]
+        out = [Human("mass", m, f"{f} s^2/{position_unit}"), Human("damping", theta[0] * m, per)]
+        if sprung:
+            out.append(Human("stiffness", theta[1] * m, f"{f}/{position_unit}"))
+        return [*out, Human("offset_force", theta[k + 1] * m, f)]
+
+    def text_of(theta: Array) -> dict[str, object]:
+        out: dict[str, object] = {h.name: float(h.value) for h in human_of(theta)}
+        if "hold" in text:
+            out["hold"] = hold
+        return out
+
+    rates = np.roots([1.0, damping / mass, stiffness / mass])
+    span = recording.n * recording.dt
+    return DynamicTwin(
+        kind="mechanical_axis",
+        inputs=(source,),
+        outputs=outputs,
+        units=recording.unit,
+        chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
+        parameters=tuple(parameters),
+        hold=hold,
+        links=tuple(links),
+        groups=({o: row[o] for o in outputs},),
+        begin=np.array(begin),
+        plant_of=plant_of,
+        fixed_free=None,
+        human_of=human_of,
+        text_of=text_of,
+        restart=bool(np.min(-rates.real) * span < 20.0),
+        feedback_on="position" if "position" in outputs else "velocity",
+        fastest_per_s=float(np.max(np.abs(rates))) if sprung else float(damping / mass),
+    )
+
+
+def _number(recording: Recording, key: str, value: object) -> float | None:
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+        raise RecordingError(f"{recording.path}: [twin.parameters] {key} must be a finite number, got {value!r}")
+    return float(value)
+
+
+def _begin(recording: Recording, given: dict[str, float | None], sprung: bool) -> tuple[float, float, float, float]:
+    """Given values; missing ones by regression on filtered derivatives (state variable filter)."""
+    known = {k: v for k, v in given.items() if v is not None}
+    if not sprung:
+        known["stiffness"] = 0.0
+    missing = [k for k in ("mass", "damping", "stiffness", "offset_force") if k not in known]
+    if missing:
+        y = recording.outputs.get("position")
+        derivative = y is None
+        signal = next(iter(recording.outputs.values())) if y is None else y
+        u = next(iter(recording.inputs.values()))
+        terms = _filtered(u, signal, derivative, recording.dt)
+        names = ("mass", "damping", "stiffness", "offset_force")
+        left = terms[:, 4].copy()
+        for k, v in known.items():
+            left -= v * terms[:, names.index(k)]
+        found = np.linalg.lstsq(terms[:, [names.index(k) for k in missing]], left, rcond=None)[0]
+        known.update(zip(missing, found.tolist(), strict=True))
+        if known["mass"] <= 0:
+            known["mass"] = float(abs(known["mass"])) or 1.0
+        known["damping"] = max(known["damping"], 0.0)
+    return known["mass"], known["damping"], known["stiffness"], known["offset_force"]
+
+
+def _filtered(u: Array, y: Array, velocity: bool, dt: float) -> Array:
+    """Columns acceleration, velocity, position, -1, force, all through the same third-order low-pass."""
+    spectrum = np.abs(np.fft.rfft(u - u.mean())) ** 2
+    cut = np.searchsorted(np.cumsum(spectrum), 0.98 * spectrum.sum())
+    corner = 2 * np.pi * min(max(cut / (u.size * dt), 5 / (u.size * dt)), 0.1 / dt)
+    den = np.polymul(np.polymul([1 / corner, 1.0], [1 / corner, 1.0]), [1 / corner, 1.0])
+    cols: list[Array] = []
+    for order in (2, 1, 0):
+        power = order - 1 if velocity else order
+        if power < 0:
+            cols.append(np.cumsum(cols[-1]) * dt)
+            continue
+        num = [1.0] + [0.0] * power
+        b, a, _ = cont2discrete((num, den), dt, method="bilinear")
+        cols.append(lfilter(np.ravel(b), a, y - y[0]))
+    cols.append(-np.ones(u.size))
+    b, a, _ = cont2discrete(([1.0], den), dt, method="bilinear")
+    cols.append(lfilter(np.ravel(b), a, u))
+    skip = min(u.size // 4, int(10 / (corner * dt)))
+    return np.stack(cols, axis=1)[skip:]

@@ -1,0 +1,252 @@
+"""What mechanical axes and state-space twins share: linear response, columns, start states, feedback forces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from tools.mismatch.twins.base import Force, Run, Signal, remember
+from tools.mismatch.twins.feedback import pack, run_feedback
+from tools.mismatch.twins.linear import Discrete, Hold, StartState, discretise, run_states, start_state
+
+CONSTANT = ""  # the input "1"
+LEAST_WINDOW = 20  # samples that set a state when nothing else is said
+
+
+@dataclass(frozen=True)
+class Link:
+    """Linear parameter ``j`` times state ``row`` of the companion driven by ``source`` adds to ``output``.
+
+    ``row`` -1: the input itself; ``source`` "" with row -2: a constant offset of the output.
+    """
+
+    j: int
+    output: str
+    source: str
+    row: int
+
+
+@dataclass(frozen=True)
+class Plant:
+    """Continuous (or discrete) ``x' = a x + b w`` at given nonlinear parameters."""
+
+    a: Array
+    b: Array
+
+
+@dataclass(frozen=True)
+class DynamicTwin:
+    """Common part; ``plant_of(theta)`` builds the plant from the nonlinear base parameters.
+
+    ``groups``: outputs that share one state, with their state rows. ``fixed_free(n)`` is the response to the
+    engineer's own start state, used when no sample may set it.
+    """
+
+    kind: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    chain: tuple[Stage, ...]
+    parameters: tuple[Parameter, ...]
+    hold: Hold
+    links: tuple[Link, ...]
+    groups: tuple[Mapping[str, int], ...]
+    begin: Array
+    plant_of: Callable[[Array], Plant]
+    fixed_free: Callable[[int], Mapping[str, Array]] | None
+    human_of: Callable[[Array], Sequence[Human]]
+    text_of: Callable[[Array], dict[str, object]]
+    restart: bool
+    feedback_on: str
+    fastest_per_s: float
+    static: bool = False
+
+    def start(self, recording: object) -> Array:
+        """See Twin."""
+        return self.begin.copy()
+
+    def drive(self, output: str) -> str:
+        """See Twin."""
+        return self.inputs[0] if len(self.inputs) == 1 else ""
+
+    def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
+        """See Twin."""
+        return {}
+
+    def sensitivity(self, output: str, theta: Array) -> float:
+        """See Twin: the gain that weights of input and feedback effects carry."""
+        return self.input_gain(self.inputs[0], theta)
+
+    def input_gain(self, signal: str, theta: Array) -> float:
+        """See Twin."""
+        j = self._gain_index(signal)
+        return float(theta[j]) if j >= 0 else 1.0
+
+    def human(self, theta: Array) -> Sequence[Human]:
+        """See Twin."""
+        return self.human_of(theta)
+
+    def to_text(self, theta: Array) -> dict[str, object]:
+        """See Twin."""
+        return self.text_of(theta)
+
+    def _gain_index(self, signal: str) -> int:
+        js = {link.j for link in self.links if link.source == signal}
+        return js.pop() if len(js) == 1 else -1
+
+    # -- response -----------------------------------------------------------------------------------
+
+    def respond(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """See Twin."""
+        if forces:
+            return self._with_forces(run, inputs, theta, forces)
+        n = run.t.size
+        plant = self.plant_of(theta)
+        d = discretise(plant.a, plant.b, run.dt, self.hold)
+        tag = (d.ad.tobytes(), run.starts)
+        value: dict[str, Array] = {o: np.zeros(n) for o in self.outputs}
+        columns: dict[int, dict[str, Array]] = {}
+
+        def states(u: Array, token: object) -> Array:
+            key = ("states", token, tag)
+            return remember(run.memo, key, lambda: _states(d, u, run.starts))
+
+        def add(j: int, output: str, column: Array) -> None:
+            if join:
+                value[output] = value[output] + theta[j] * column
+            else:
+                entry = columns.setdefault(j, {})
+                entry[output] = entry[output] + column if output in entry else column
+
+        one = np.ones(n)
+        for source in {link.source: None for link in self.links}:
+            links = [link for link in self.links if link.source == source]
+            drive = Signal(one, {}, (CONSTANT,)) if source == CONSTANT else inputs[source]
+            normal = self._gain_index(source) >= 0
+            parts: list[tuple[int, Array, object]] = [(-1, drive.value, drive.token)]
+            if drive.columns and normal:
+                if join:
+                    g = self.input_gain(source, theta)
+                    total = drive.value + sum(theta[j] / g * c for j, c in drive.columns.items())
+                    keys = tuple(theta[j] / g for j in drive.columns)
+                    parts = [(-1, np.asarray(total), (*drive.token, keys))]
+                else:
+                    parts += [(j, c, (*drive.token, j)) for j, c in drive.columns.items()]
+            elif drive.columns:
+                total = drive.value + sum(theta[j] * c for j, c in drive.columns.items())
+                keys = tuple(theta[j] for j in drive.columns)
+                parts = [(-1, np.asarray(total), (*drive.token, keys))]
+            for j, u, token in parts:
+                x = states(u, token) if any(link.row >= 0 for link in links) else np.zeros((0, 0))
+                for link in links:
+                    column = u if link.row < 0 else x[:, link.row]
+                    add(link.j if j < 0 else j, link.output, column)
+        return self._settle(run, d.ad, value, columns)
+
+    def _settle(
+        self, run: Run, ad: Array, value: dict[str, Array], columns: dict[int, dict[str, Array]]
+    ) -> dict[str, Signal]:
+        """Add the free response of the start states: the engineer's, or what the first samples say."""
+        n = run.t.size
+        zero = np.zeros(n)
+        if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
+            for o, y in self.fixed_free(n).items():
+                value[o] = value[o] + y
+        else:
+            for group in self.groups:
+                # a value and its columns are settled alike: the start state is an affine function of them
+                ss = self._start_state(run, ad, group)
+                x0 = ss.states({o: run.measured[o] - value[o] for o in group})
+                for o in group:
+                    value[o] = value[o] + ss.response(x0, o, n)
+                for entry in columns.values():
+                    if not any(o in entry for o in group):
+                        continue
+                    x0 = ss.states({o: -entry.get(o, zero) for o in group})
+                    for o in group:
+                        entry[o] = entry.get(o, zero) + ss.response(x0, o, n)
+        return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}) for o in self.outputs}
+
+    def _start_state(self, run: Run, ad: Array, group: Mapping[str, int]) -> StartState:
+        rows: dict[str, Array] = {}
+        for o, r in group.items():
+            c = np.zeros(ad.shape[0])
+            c[r] = 1.0
+            rows[o] = c
+        window = max(run.window, min(LEAST_WINDOW, run.t.size))
+        return start_state(ad, rows, run.measured, run.starts, run.t.size, window, run.memo)
+
+    def _with_forces(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
+    ) -> dict[str, Signal]:
+        source = self.inputs[0]
+        plant = self.plant_of(theta)
+        sub = max(1, int(np.ceil(run.dt * self.fastest_per_s / 0.25))) if self.hold != "discrete" else 1
+        d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
+        g = self.input_gain(source, theta)
+        drive = inputs[source]
+        u = g * drive.value
+        scale = 1.0 if self._gain_index(source) >= 0 else g
+        for j, c in drive.columns.items():
+            u = u + scale * theta[j] * c
+        rows: dict[str, Array] = {o: np.zeros(plant.a.shape[0]) for o in self.outputs}
+        extra: dict[str, Array] = {o: np.zeros(run.t.size) for o in self.outputs}
+        normal = self._gain_index(source) >= 0
+        for link in self.links:
+            if link.row == -2:
+                extra[link.output] = extra[link.output] + theta[link.j]
+            elif link.source == CONSTANT:
+                u = u + theta[link.j]
+            elif link.row == -1:
+                extra[link.output] = extra[link.output] + theta[link.j] * drive.value
+            else:
+                rows[link.output][link.row] = 1.0 if normal else theta[link.j]
+        u = _once(u)
+        cp = rows[self.feedback_on]
+        if self.hold == "discrete":
+            cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
+        else:
+            cv = cp @ plant.a if abs(cp @ plant.b) < 1e-12 * (np.abs(cp) @ np.abs(plant.b) + 1e-300) else cp
+        if "velocity" in self.outputs and self.feedback_on == "position":
+            cv = rows["velocity"]
+        packed = pack(forces)
+        starts = np.array(run.starts, np.int64)
+        ends = np.array((*run.starts[1:], run.t.size), np.int64)
+        held = self.hold != "linear"
+        dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0
+
+        def go(x0: Array, stop: Array) -> Array:
+            return run_feedback(
+                d.ad, d.g0, d.g1, cp, cv, u, held, sub, x0, starts, stop,
+                packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,
+            )  # fmt: skip
+
+        window = max(run.window, min(LEAST_WINDOW, run.t.size))
+        if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
+            free = self.fixed_free(run.t.size)
+            x = go(np.zeros((1, plant.a.shape[0])), ends)
+            return {o: Signal(x @ rows[o] + extra[o] + free[o]) for o in self.outputs}
+        full = np.linalg.matrix_power(d.ad, sub)
+        ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo)
+        x0 = np.zeros((starts.size, plant.a.shape[0]))
+        stop = np.minimum(starts + window, ends)
+        for _ in range(3):
+            x = go(x0, stop)
+            x0 = x0 + ss.states({o: run.measured[o] - extra[o] - x @ rows[o] for o in self.outputs})
+        x = go(x0, ends)
+        return {o: Signal(x @ rows[o] + extra[o]) for o in self.outputs}
+
+
+def _states(d: Discrete, u: Array, starts: tuple[int, ...]) -> Array:
+    s = d.ad.shape[0]
+    at = np.array(starts, np.int64)
+    return run_states(d.ad, d.g0, d.g1, _once(u), np.zeros((at.size, s)), at)
+
+
+def _once(u: Array) -> Array:
+    return np.ascontiguousarray(u, np.float64)

@@ -1,0 +1,149 @@
+"""A linear plant with forces that depend on its own position and velocity, integrated in free run."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from sim_devices.physics.effect import Array
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING, friction_limit, smooth_force
+from tools.mismatch.twins.base import Force
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Packed parameters of all feedback effects of a model."""
+
+    friction: Array
+    spring: Array
+    cogging: Array
+    thresholds: Array
+    memory: Array
+
+
+def pack(forces: Sequence[Force]) -> Rows:
+    """The sum of the placed effects, each through its own ``fill`` of the packed rows."""
+    friction, spring, cogging = np.zeros(FRICTION), np.zeros(SPRING), np.zeros(COGGING)
+    thresholds: list[Array] = []
+    memory: list[Array] = []
+    for f in forces:
+        fill = f.effect.fill
+        assert fill is not None
+        rows = fill(f.q, f.weights, f.settings)
+        for name, row in rows.items():
+            match name:
+                case "friction":
+                    speed = max(friction[3], row[3])
+                    friction += row
+                    friction[3] = speed
+                case "spring":
+                    spring += row
+                case "cogging":
+                    period = row[0]
+                    cogging += row
+                    cogging[0] = period
+                case "thresholds":
+                    thresholds.append(row)
+                case _:
+                    memory.append(row)
+    empty = np.zeros(0)
+    return Rows(
+        friction,
+        spring,
+        cogging,
+        np.concatenate(thresholds) if thresholds else empty,
+        np.concatenate(memory) if memory else empty,
+    )
+
+
+@njit(cache=True)
+def run_feedback(
+    ad, g0, g1, cp, cv, u, held, sub, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
+):
+    """States (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
+
+    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces run linearly over the step,
+    predicted and corrected once (second order). Dry friction is set-valued and implicit: it takes from the velocity
+    what its limit allows, and no more than brings it to rest (time stepping; Acary, Brogliato, Numerical Methods for
+    Nonsmooth Dynamical Systems, 2008, section 1.4). ``cp``, ``cv``: rows of position and velocity. ``stop`` (starts,)
+    ends each stretch early (the rest keeps the last state).
+    """
+    n, s = u.size, ad.shape[0]
+    out = np.zeros((n, s))
+    x = np.zeros(s)
+    z = np.zeros(s)
+    e = np.empty(thresholds.size)
+    gv = 0.0
+    for i in range(s):
+        gv += cv[i] * (g0[i] + g1[i])
+    any_smooth = np.any(spring != 0.0) or np.any(cogging != 0.0) or friction[4] != 0.0
+    at = 0
+    end = n
+    for k in range(n):
+        if at < starts.size and k == starts[at]:
+            p = 0.0
+            for i in range(s):
+                x[i] = x0[at, i]
+                p += cp[i] * x[i]
+            for j in range(e.size):
+                e[j] = p
+            end = stop[at]
+            at += 1
+        elif k < end:
+            ua = u[k - 1]
+            du = 0.0 if held else (u[k] - ua) / sub
+            for m in range(sub):
+                w0 = ua + m * du
+                w1 = w0 if held else w0 + du
+                p = 0.0
+                v = 0.0
+                for i in range(s):
+                    p += cp[i] * x[i]
+                    v += cv[i] * x[i]
+                f0 = 0.0
+                if any_smooth:
+                    f0 = smooth_force(p, v, spring, cogging, friction)
+                for j in range(e.size):
+                    r = thresholds[j]
+                    if e[j] < p - r:
+                        e[j] = p - r
+                    elif e[j] > p + r:
+                        e[j] = p + r
+                    f0 -= memory[j] * (p - e[j])
+                f1 = f0
+                passes = 2 if any_smooth else 1
+                for turn in range(passes):
+                    for i in range(s):
+                        a = g0[i] * (w0 + f0) + g1[i] * (w1 + f1)
+                        for j in range(s):
+                            a += ad[i, j] * x[j]
+                        z[i] = a
+                    if turn == 0 and any_smooth:
+                        pn = 0.0
+                        vn = 0.0
+                        for i in range(s):
+                            pn += cp[i] * z[i]
+                            vn += cv[i] * z[i]
+                        f1 = (
+                            smooth_force(pn, vn, spring, cogging, friction)
+                            + f0
+                            - smooth_force(p, v, spring, cogging, friction)
+                        )
+                if dry:
+                    vn = 0.0
+                    for i in range(s):
+                        vn += cv[i] * z[i]
+                    sign = 1.0 if vn > 0.0 else -1.0
+                    limit = max(friction_limit(v, sign, friction), 0.0)
+                    if limit > 0.0:
+                        f = -sign * limit if abs(vn) > limit * gv else -vn / gv
+                        for i in range(s):
+                            z[i] += (g0[i] + g1[i]) * f
+                for i in range(s):
+                    x[i] = z[i]
+        for i in range(s):
+            out[k, i] = x[i]
+    return out

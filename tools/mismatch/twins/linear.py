@@ -1,0 +1,170 @@
+"""Linear time-invariant plants: exact discretisation, compiled runs, and start states set by measured samples."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numba import njit
+from scipy.linalg import expm
+
+from sim_devices.physics.effect import Array
+
+Hold = Literal["zero", "linear", "discrete"]
+
+
+@dataclass(frozen=True)
+class Discrete:
+    """``x[k+1] = ad x[k] + g0 u[k] + g1 u[k+1]`` for one input; ad (s, s), g0 and g1 (s,)."""
+
+    ad: Array
+    g0: Array
+    g1: Array
+
+
+def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
+    """Exact for an input that is held or runs linearly between samples.
+
+    Van Loan, IEEE Trans. Automatic Control 23 (1978) 395: blocks of one matrix exponential. ``discrete``: a and b
+    are already those of the difference equation.
+    """
+    s = a.shape[0]
+    if hold == "discrete":
+        return Discrete(np.ascontiguousarray(a), np.ascontiguousarray(b), np.zeros(s))
+    m = np.zeros((s + 2, s + 2))
+    m[:s, :s] = a * dt
+    m[:s, s] = b * dt
+    m[s, s + 1] = 1.0
+    e = expm(m)
+    held, ramp = e[:s, s], e[:s, s + 1]
+    ad = np.ascontiguousarray(e[:s, :s])
+    if hold == "zero":
+        return Discrete(ad, np.ascontiguousarray(held), np.zeros(s))
+    return Discrete(ad, np.ascontiguousarray(held - ramp), np.ascontiguousarray(ramp))
+
+
+@njit(cache=True, fastmath=False)
+def run_states(ad, g0, g1, u, x0, starts):
+    """States (n, s) for one input (n,); the state is ``x0[i]`` (starts, s) at the i-th start."""
+    n, s = u.size, ad.shape[0]
+    out = np.empty((n, s))
+    x = np.zeros(s)
+    y = np.zeros(s)
+    at = 0
+    for k in range(n):
+        if at < starts.size and k == starts[at]:
+            for i in range(s):
+                x[i] = x0[at, i]
+            at += 1
+        else:
+            for i in range(s):
+                v = g0[i] * u[k - 1] + g1[i] * u[k]
+                for j in range(s):
+                    v += ad[i, j] * x[j]
+                y[i] = v
+            for i in range(s):
+                x[i] = y[i]
+        for i in range(s):
+            out[k, i] = x[i]
+    return out
+
+
+@njit(cache=True)
+def run_output(ad, g0, g1, c, u, starts):
+    """``c @ x`` (n,) for one input (n,) and one output row c (s,), from zero state at each start."""
+    n, s = u.size, ad.shape[0]
+    out = np.empty(n)
+    x = np.zeros(s)
+    y = np.zeros(s)
+    at = 0
+    for k in range(n):
+        if at < starts.size and k == starts[at]:
+            for i in range(s):
+                x[i] = 0.0
+            at += 1
+        else:
+            for i in range(s):
+                v = g0[i] * u[k - 1] + g1[i] * u[k]
+                for j in range(s):
+                    v += ad[i, j] * x[j]
+                y[i] = v
+            for i in range(s):
+                x[i] = y[i]
+        w = 0.0
+        for i in range(s):
+            w += c[i] * x[i]
+        out[k] = w
+    return out
+
+
+def free_response(ad: Array, c: Array, length: int) -> Array:
+    """``c @ ad^k`` for k = 0..length-1, (length, s): the output for each unit start state."""
+    s = ad.shape[0]
+    x0 = np.eye(s)
+    zero = np.zeros(length)
+    nothing = np.zeros(s)
+    start = np.zeros(1, np.int64)
+    out = np.empty((length, s))
+    for i in range(s):
+        out[:, i] = run_states(ad, nothing, nothing, zero, x0[i : i + 1], start) @ c
+    return out
+
+
+@dataclass(frozen=True)
+class StartState:
+    """Sets the state at each start by least squares over the first measured samples, for every column alike.
+
+    ``free[o]`` (longest, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
+    free responses over the window.
+    """
+
+    outputs: tuple[str, ...]
+    free: dict[str, Array]
+    weight: dict[str, float]
+    spans: tuple[tuple[int, int], ...]
+    solvers: dict[int, Array]
+    windows: tuple[int, ...]
+
+    def states(self, need: dict[str, Array]) -> Array:
+        """(starts, s): start states whose free response meets ``need`` (n,) per output over the windows."""
+        rows: list[Array] = []
+        for (a, _), w in zip(self.spans, self.windows, strict=True):
+            stacked = np.concatenate([need[o][a : a + w] * self.weight[o] for o in self.outputs])
+            rows.append(self.solvers[w] @ stacked)
+        return np.stack(rows)
+
+    def response(self, states: Array, output: str, n: int) -> Array:
+        """Free response (n,) of one output for states (starts, s)."""
+        y = np.zeros(n)
+        for (a, b), x0 in zip(self.spans, states, strict=True):
+            y[a:b] = self.free[output][: b - a] @ x0
+        return y
+
+
+def start_state(
+    ad: Array,
+    rows: dict[str, Array],
+    measured: dict[str, Array],
+    starts: tuple[int, ...],
+    n: int,
+    window: int,
+    memo: dict[object, object],
+) -> StartState:
+    """Prepare the least squares for output rows c (s,) of the outputs that may set the state."""
+    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, window)
+    found = memo.get(key)
+    if isinstance(found, StartState):
+        return found
+    spans = tuple(zip(starts, (*starts[1:], n), strict=True))
+    longest = max(b - a for a, b in spans)
+    free = {o: free_response(ad, c, longest) for o, c in rows.items()}
+    weight = {o: 1.0 / (float(np.std(measured[o])) or 1.0) for o in rows}
+    windows = tuple(min(window, b - a) for a, b in spans)
+    solvers: dict[int, Array] = {}
+    for w in set(windows):
+        stacked = np.concatenate([free[o][:w] * weight[o] for o in rows])
+        solvers[w] = np.linalg.pinv(stacked, rcond=1e-9)
+    made = StartState(tuple(rows), free, weight, spans, solvers, windows)
+    memo[key] = made
+    return made

@@ -1,0 +1,203 @@
+"""Twins that are somebody else's program: a Python object from an entry point, an FMU, the emulated instrument.
+
+Nothing is known of the inside: effects sit at inputs and outputs only, base parameters are the numbers in
+``[twin.parameters]``, all searched (none is known to be linear).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol, cast
+
+import numpy as np
+
+from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.base import Force, Run, Signal, fold, remember
+
+
+class UserTwin(Protocol):
+    """What an entry point of group ``micron.twins`` must give: an object (or class) with this method.
+
+    ``inputs``: each input (n,) by name, and ``t`` in seconds (n,). ``parameters``: the ``[twin.parameters]`` table.
+    Result: each output (n,) by name.
+    """
+
+    def simulate(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        """One free run."""
+        ...
+
+
+Simulate = Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]]
+
+
+@dataclass(frozen=True)
+class OpaqueTwin:
+    """A twin around a function. ``free``: parameters that may be re-fitted, ``fixed``: the others."""
+
+    kind: str
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    call: Simulate
+    free: tuple[str, ...]
+    given: Mapping[str, Any]
+    parameters: tuple[Parameter, ...]
+    chain: tuple[Stage, ...] = STAGES
+    static: bool = False
+    restart: bool = False
+    feedback_on: str = ""
+    source: str = field(default="", compare=False)
+
+    def start(self, recording: Recording) -> Array:
+        """See Twin."""
+        return np.array([float(self.given[k]) for k in self.free])
+
+    def drive(self, output: str) -> str:
+        """See Twin."""
+        return self.inputs[0] if len(self.inputs) == 1 else ""
+
+    def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
+        """See Twin."""
+        return {}
+
+    def sensitivity(self, output: str, theta: Array) -> float:
+        """See Twin: unknown."""
+        return 1.0
+
+    def input_gain(self, signal: str, theta: Array) -> float:
+        """See Twin."""
+        return 1.0
+
+    def respond(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """See Twin."""
+        used = {s: fold(x, theta) for s, x in inputs.items()}
+        values = dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=False)}
+        key = ("opaque", tuple(x.token for x in used.values()), tuple(values[k] for k in self.free))
+
+        def make() -> Array:
+            found = self.call({s: x.value for s, x in used.items()} | {"t": run.t}, values)
+            rows: list[Array] = []
+            for o in self.outputs:
+                if o not in found:
+                    raise RecordingError(f"twin '{self.kind}' ({self.source}) returned no output '{o}'")
+                y = np.asarray(found[o], np.float64)
+                if y.shape != run.t.shape or not np.all(np.isfinite(y)):
+                    raise RecordingError(
+                        f"twin '{self.kind}' ({self.source}): output '{o}' has shape {y.shape} or is not finite,"
+                        f" expected {run.t.shape}"
+                    )
+                rows.append(y)
+            return np.stack(rows)
+
+        stacked = remember(run.memo, key, make)
+        return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
+
+    def human(self, theta: Array) -> Sequence[Human]:
+        """See Twin."""
+        return [Human(k, float(v), "") for k, v in zip(self.free, theta, strict=True)]
+
+    def to_text(self, theta: Array) -> dict[str, object]:
+        """See Twin."""
+        return dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=True)}
+
+
+def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:
+    """Every number in ``[twin.parameters]`` may be re-fitted, except names in ``fixed``."""
+    given = recording.twin.parameters
+    free = tuple(
+        k for k, v in given.items() if isinstance(v, int | float) and not isinstance(v, bool) and k not in fixed
+    )
+    parameters = tuple(Parameter(k, "", scale=0.01 * abs(float(given[k])) or 1e-3) for k in free)
+    return OpaqueTwin(
+        recording.twin.kind,
+        tuple(recording.inputs),
+        tuple(recording.outputs),
+        recording.unit,
+        call,
+        free,
+        given,
+        parameters,
+        source=source,
+    )
+
+
+def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
+    """From an entry point: loads it, makes an instance of a class."""
+    try:
+        loaded = entry.load()
+        thing = cast(UserTwin, loaded() if isinstance(loaded, type) else loaded)
+    except Exception as error:
+        raise RecordingError(
+            f"{recording.path}: [twin] kind '{recording.twin.kind}' cannot be loaded from {entry.value}: {error}"
+        ) from error
+    if not callable(getattr(thing, "simulate", None)):
+        raise RecordingError(
+            f"{recording.path}: [twin] kind '{recording.twin.kind}' ({entry.value}) has no simulate(inputs, parameters)"
+        )
+
+    def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        try:
+            return thing.simulate(inputs, parameters)
+        except Exception as error:
+            raise RecordingError(f"twin '{recording.twin.kind}' ({entry.value}) failed: {error!r}") from error
+
+    return opaque_twin(recording, call, str(entry.value))
+
+
+def fmu_twin(recording: Recording) -> OpaqueTwin:
+    """An FMI 2 or 3 co-simulation FMU; ``[twin.parameters] path`` names it beside the descriptor."""
+    where = f"{recording.path}: [twin.parameters]"
+    name = recording.twin.parameters.get("path")
+    if not isinstance(name, str):
+        raise RecordingError(f"{where} path must name the .fmu file, got {name!r}")
+    path = (recording.path.parent / name).resolve()
+    if not path.is_file():
+        raise RecordingError(f"{where} path: {path} does not exist")
+    return opaque_twin(recording, _fmu_call(recording, path), str(path), fixed=("path",))
+
+
+def _fmu_call(recording: Recording, path: Path) -> Simulate:
+    try:
+        import fmpy  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise RecordingError(
+            f"{recording.path}: [twin] kind 'fmu' needs FMPy: install this package with its extra 'fmu'"
+        ) from None
+    fm = cast(Any, fmpy)
+    description = fm.read_model_description(str(path))
+    if description.coSimulation is None:
+        raise RecordingError(f"{path}: not a co-simulation FMU; export it again for co-simulation")
+    names = {v.name for v in description.modelVariables}
+    lost = [s for s in (*recording.inputs, *recording.outputs) if s not in names]
+    lost += [k for k in recording.twin.parameters if k != "path" and k not in names]
+    if lost:
+        raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
+    unpacked = fm.extract(str(path))
+    instance = fm.instantiate_fmu(unpacked, description, "CoSimulation")
+
+    def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        t = inputs["t"]
+        table = np.zeros(t.size, [("time", float), *((s, float) for s in recording.inputs)])
+        table["time"] = t
+        for s in recording.inputs:
+            table[s] = inputs[s]
+        instance.reset()
+        result = fm.simulate_fmu(
+            unpacked,
+            model_description=description,
+            fmu_instance=instance,
+            start_time=float(t[0]),
+            stop_time=float(t[-1]),
+            output_interval=recording.dt,
+            start_values={k: v for k, v in parameters.items() if k != "path"},
+            input=table,
+            output=list(recording.outputs),
+        )
+        return {o: np.interp(t, result["time"], result[o]) for o in recording.outputs}
+
+    return call
