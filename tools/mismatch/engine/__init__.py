@@ -1,0 +1,1 @@
+"""The decision engine: where a simulation and a recording differ, which physics is missing, and how sure that is."""

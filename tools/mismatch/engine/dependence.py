@@ -1,0 +1,133 @@
+"""Does a residual follow a signal? Curves regressed with coloured errors, each test honest about autocorrelation.
+
+Residual and curve pass the same whitening filter (generalised least squares; Cochrane and Orcutt, JASA 44, 1949), so the
+F statistic counts independent innovations and not the samples of a slow wander. The filter is estimated on the
+residual as it is, which books part of a true dependence as colour: conservative, never the other way.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import f as f_distribution
+
+from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
+from tools.mismatch.engine.features import Feature
+
+Array = NDArray[np.float64]
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Dependence:
+    """``p_value`` that the residual does not follow the feature; ``strength`` the cross-fitted share of its
+    variance, 0..1, that a curve of the feature predicts on blocks that the curve has not seen.
+    """
+
+    signal: str
+    feature: str
+    p_value: float
+    strength: float
+    memory: bool
+
+
+def whitened_f(e_white: Array, columns_white: Array) -> float:
+    """p-value of the F test that ``columns_white`` (m, k) and a constant explain nothing of ``e_white`` (m,)."""
+    m, k = columns_white.shape
+    if m < 4 * (k + 1):
+        return 1.0
+    x = columns_white - columns_white.mean(axis=0)
+    e = e_white - e_white.mean()
+    q, r = np.linalg.qr(x)
+    keep = np.abs(np.diag(r)) > 1e-9 * max(float(np.abs(np.diag(r)).max()), 1e-300)
+    gain = float(np.sum((q[:, keep].T @ e) ** 2))
+    rest = float(e @ e) - gain
+    rank = int(keep.sum())
+    if rank == 0 or rest <= 0:
+        return 1.0 if rank == 0 else 0.0
+    # heavy tails cost some of the F statistic's exactness; excess kurtosis enters by k/m only
+    return float(f_distribution.sf(gain / rank / (rest / (m - rank - 1)), rank, m - rank - 1))
+
+
+def cross_fitted_share(e: Array, columns: Array, blocks: list[Span]) -> float:
+    """Share of the variance of ``e`` (n,) that a curve fitted on the other half of the blocks predicts."""
+    mask = np.zeros((2, e.size), bool)
+    for i, (a, b) in enumerate(blocks):
+        mask[i % 2, a:b] = True
+    lost = total = 0.0
+    design = np.column_stack([np.ones(e.size), columns])
+    for held in (0, 1):
+        train, test = mask[1 - held], mask[held]
+        if train.sum() < 3 * design.shape[1] or not test.any():
+            return 0.0
+        a = design[train]
+        gram = a.T @ a
+        gram[np.diag_indices_from(gram)] *= 1 + 1e-6
+        weight = np.linalg.lstsq(gram, a.T @ e[train], rcond=None)[0]
+        lost += float(np.sum((e[test] - design[test] @ weight) ** 2))
+        total += float(np.sum((e[test] - e[train].mean()) ** 2))
+    return float(np.clip(1 - lost / total, 0.0, 1.0)) if total > 0 else 0.0
+
+
+def dependences(
+    e: Array,
+    features: list[Feature],
+    *,
+    stretches: list[Span] | None = None,
+    blocks: list[Span] | None = None,
+    whitener: Whitener | None = None,
+) -> list[Dependence]:
+    """Every feature tested against the residual ``e`` (n,); p-values Holm-corrected; strongest first."""
+    stretches = stretches or [(0, e.size)]
+    if blocks is None:
+        edges = np.linspace(0, e.size, 25).astype(int)
+        blocks = [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+    model = whitener or fit_whitener(e, stretches=stretches)
+    white = whiten(model, e, stretches)
+    limit = 8.0 * float(np.median(np.abs(white))) * 1.4826
+    if limit > 0:
+        white = np.clip(white, -limit, limit)
+    found: list[Dependence] = []
+    for feature in features:
+        p = whitened_f(white, whiten(model, feature.columns, stretches))
+        share = cross_fitted_share(e, feature.columns, blocks)
+        found.append(Dependence(feature.signal, feature.kind, p, share, feature.memory))
+    order = np.argsort([d.p_value for d in found])
+    corrected = np.ones(len(found))
+    running = 0.0
+    for rank, i in enumerate(order):
+        running = max(running, found[i].p_value * (len(found) - rank))
+        corrected[i] = min(running, 1.0)
+    out = [
+        Dependence(d.signal, d.feature, float(p), d.strength, d.memory) for d, p in zip(found, corrected, strict=True)
+    ]
+    return sorted(out, key=lambda d: (-d.strength, d.p_value))
+
+
+def needs_memory(
+    e: Array, present: list[Feature], past: list[Feature], *, stretches: list[Span] | None = None
+) -> float:
+    """p-value that the past adds nothing to the present: small means a missing state, not a missing function.
+
+    ``present``: features of values and rates now; ``past``: features with memory (Hooker and Ellner, Annals of
+    Applied Statistics 9, 2015: a forcing that its state does not explain but its history does).
+    """
+    stretches = stretches or [(0, e.size)]
+    if not past:
+        return 1.0
+    model = fit_whitener(e, stretches=stretches)
+    now = whiten(model, np.column_stack([f.columns for f in present]), stretches) if present else None
+    then = whiten(model, np.column_stack([f.columns for f in past]), stretches)
+    white = whiten(model, e, stretches)
+    if now is not None and now.size:
+        basis = np.column_stack([np.ones(now.shape[0]), now])
+        basis = basis / np.maximum(np.linalg.norm(basis, axis=0), 1e-300)
+        q, r = np.linalg.qr(basis)
+        q = q[:, np.abs(np.diag(r)) > 1e-7]
+        white = white - q @ (q.T @ white)
+        then = then - q @ (q.T @ then)
+        scale = np.linalg.norm(then, axis=0)
+        then = then[:, scale > 1e-6 * scale.max()] if scale.max() > 0 else then[:, :0]
+    return whitened_f(white, then) if then.shape[1] else 1.0

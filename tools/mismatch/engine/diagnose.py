@@ -1,0 +1,96 @@
+"""From a recording to a report: the whole chain of decisions in order."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.assemble import assemble
+from tools.mismatch.engine.fit import Fit, fit_base, residuals
+from tools.mismatch.engine.noise import noise_floor
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import Report
+from tools.mismatch.engine.score import misfit
+from tools.mismatch.engine.select import Rule, search
+from tools.mismatch.engine.split import Split, given_split, own_split
+from tools.mismatch.engine.unexplained import leftover
+from tools.mismatch.recording import Recording
+from tools.mismatch.twins.make import make
+
+Progress = Callable[[str, int, int], None]
+
+
+def make_split(recording: Recording, held_out: float, seed: int) -> Split:
+    """The recording's own split when it brings one, else ours."""
+    given = recording.split
+    if isinstance(given.test, tuple):
+        fit_span = given.fit if isinstance(given.fit, tuple) else (0, given.test[0])
+        return given_split(recording.n, fit_span, given.test, initialization=given.initialization or 0)
+    signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
+    return own_split(signals, held_out=held_out, seed=seed, guard=max(4, recording.n // 2000))
+
+
+def as_given(problem: Problem) -> Fit:
+    """The twin as the engineer believes it to be."""
+    model = problem.base()
+    theta = model.start(problem.recording)
+    return Fit(model, theta, residuals(problem, model, theta), np.nan, (), 1)
+
+
+def set_floors(problem: Problem, base: Fit) -> Problem:
+    """Noise floors from the recalibrated residual."""
+    rec = problem.recording
+    inputs = np.column_stack([*rec.inputs.values()]) if rec.inputs else np.empty((rec.n, 0))
+    floors = {}
+    for o in problem.twin.outputs:
+        y = rec.outputs[o]
+        longest = max(problem.fit_spans + problem.held_spans, key=lambda s: s[1] - s[0])
+        full = base.residual[o]
+        r = full if full.size == rec.n else full[longest[0] : longest[1]]
+        floors[o] = noise_floor(y, r, 1 / rec.dt, declared=rec.noise.get(o), inputs=inputs)
+    return problem.with_floors(floors)
+
+
+def diagnose(
+    recording: Recording,
+    *,
+    held_out: float = 0.3,
+    seed: int = 0,
+    jobs: int = 2,
+    progress: Progress | None = None,
+    effects: Iterable[Effect] | None = None,
+    rule: Rule | None = None,
+) -> Report:
+    """Locate the mismatch between a recording and its twin, name the physics, fit it, and say how sure that is.
+
+    ``held_out`` share of the record that no fit sees; ``jobs`` processes. Same recording and seed: same report
+    (but for ``seconds``).
+    """
+    began = time.perf_counter()
+    rule = rule or Rule()
+    catalogue = tuple(effects if effects is not None else EFFECTS.values())
+    twin = make(recording)
+    split = make_split(recording, held_out, seed)
+    init = recording.split.initialization or 0
+    problem = Problem(recording, twin, split, init, seed)
+    raw = as_given(problem)
+    rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
+    problem = problem.with_floors(
+        {o: noise_floor(problem.measured[o], raw.residual[o], 1 / recording.dt, declared=rough[o]) for o in rough}
+    )
+    base = fit_base(problem)
+    problem = set_floors(problem, base)
+    base = fit_base(problem)
+    stride = max(1, problem.fit_rows.size // 12000)
+    selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
+    left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
+    report = assemble(problem, raw, base, selection, left, catalogue, rule)
+    return replace(report, seconds=time.perf_counter() - began)
+
+
+__all__ = ["diagnose", "misfit"]

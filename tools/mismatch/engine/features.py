@@ -1,0 +1,134 @@
+"""What a residual may follow: features of every recorded signal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Feature:
+    """``columns`` (n, k): a flexible curve of the feature is a linear combination of them.
+
+    ``memory`` says that the feature needs more than the present value and rate of recorded signals.
+    """
+
+    signal: str
+    kind: str
+    columns: Array
+    memory: bool = False
+
+
+def curve(x: Array, knots: int = 7) -> Array:
+    """Columns (n, k) that span piecewise linear curves of ``x`` (n,): the value and hinges at its quantiles."""
+    spread = float(np.std(x))
+    if spread <= 1e-12 * max(float(np.max(np.abs(x))), 1e-300):
+        return np.empty((x.size, 0))
+    z = (x - x.mean()) / spread
+    levels = np.unique(np.round(z[:: max(1, z.size // 5000)], 9))
+    if levels.size <= 8:
+        return np.column_stack([(np.abs(z - v) < 1e-6) for v in levels[1:]]).astype(float)
+    spots = np.unique(np.quantile(z, np.linspace(0.08, 0.92, knots)))
+    columns = [z, *(np.maximum(z - s, 0.0) for s in spots[:-1])]
+    return np.column_stack(columns)
+
+
+def rate_of(x: Array, dt: float, width: int = 1) -> Array:
+    """Rate (n,) of ``x`` by differences over ``width`` samples either way."""
+    if width <= 1:
+        return np.gradient(x, dt)
+    padded = np.concatenate([np.full(width, x[0]), x, np.full(width, x[-1])])
+    return (padded[2 * width :] - padded[: -2 * width]) / (2 * width * dt)
+
+
+def recent_mean(x: Array, seconds: float, dt: float) -> Array:
+    """Exponentially fading mean (n,) of the past of ``x``, starting in equilibrium."""
+    a = float(np.exp(-dt / seconds))
+    return lfilter([1 - a], [1, -a], x, zi=np.array([a * x[0]]))[0]
+
+
+def last_reversal(x: Array, band: float) -> Array:
+    """Value (n,) of ``x`` at its last reversal of more than ``band``: what a loop remembers."""
+    out = np.empty_like(x)
+    extreme = x[0]
+    held = x[0]
+    direction = 0.0
+    for i, v in enumerate(x.tolist()):
+        if direction >= 0 and v > extreme:
+            extreme = v
+        elif direction <= 0 and v < extreme:
+            extreme = v
+        if direction >= 0 and v < extreme - band:
+            held, extreme, direction = extreme, v, -1.0
+        elif direction <= 0 and v > extreme + band:
+            held, extreme, direction = extreme, v, 1.0
+        out[i] = held
+    return out
+
+
+def envelope(x: Array, seconds: float, dt: float) -> Array:
+    """Slow amplitude (n,) of ``x``: fading rms about its fading mean."""
+    fluctuation = x - recent_mean(x, 3 * seconds, dt)
+    return np.sqrt(np.maximum(recent_mean(fluctuation**2, seconds, dt), 0.0))
+
+
+def local_frequency(x: Array, seconds: float, dt: float) -> Array:
+    """Local centre frequency (n,), Hz: fading rms of the rate over that of the value."""
+    rate = rate_of(x, dt)
+    return envelope(rate, seconds, dt) / (2 * np.pi * np.maximum(envelope(x, seconds, dt), 1e-12 * np.std(x) + 1e-300))
+
+
+def _moves(x: Array) -> bool:
+    return bool(np.std(x) > 1e-9 * max(float(np.max(np.abs(x))), 1e-300))
+
+
+def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True) -> list[Feature]:
+    """Every feature tested: per signal its value, rate, acceleration, sign of rate, square, last reversal, recent
+    history, amplitude and frequency; products of two signals; time itself. ``signals`` (n,) each.
+    """
+    out: list[Feature] = []
+    names = [k for k, v in signals.items() if _moves(v)]
+    n = next(iter(signals.values())).size if signals else 0
+    duration = n * dt
+    for name in names:
+        x = signals[name]
+        z = (x - x.mean()) / np.std(x)
+        rate = rate_of(z, dt)
+        out.append(Feature(name, "value", curve(z)))
+        out.append(Feature(name, "square", (z**2)[:, None]))
+        if np.mean(np.abs(rate) > 1e-9) > 0.02:
+            scale = np.std(rate)
+            out.append(Feature(name, "rate", curve(rate)))
+            out.append(Feature(name, "sign of rate", np.tanh(rate / (0.1 * scale))[:, None]))
+            out.append(Feature(name, "acceleration", curve(rate_of(rate, dt), 4)))
+            out.append(Feature(name, "running extremum", curve(last_reversal(z, 0.05), 4), memory=True))
+        history = [z - recent_mean(z, s, dt) for s in _times(dt, duration)]
+        out.append(Feature(name, "recent history", np.column_stack(history), memory=True))
+        slow = max(20 * dt, duration / 60)
+        out.append(Feature(name, "amplitude", curve(envelope(z, slow, dt), 4), memory=True))
+        out.append(Feature(name, "frequency", curve(local_frequency(z, slow, dt), 4), memory=True))
+    if pairs:
+        for i, a in enumerate(names):
+            for b in names[i + 1 :]:
+                za = (signals[a] - signals[a].mean()) / np.std(signals[a])
+                zb = (signals[b] - signals[b].mean()) / np.std(signals[b])
+                out.append(Feature(f"{a}*{b}", "cross product", (za * zb)[:, None]))
+    if n:
+        phase = np.linspace(0, 1, n)
+        out.append(Feature("time", "time itself", np.column_stack([np.cos(np.pi * k * phase) for k in range(1, 7)])))
+    return [f for f in out if f.columns.shape[1] > 0 and np.all(np.isfinite(f.columns))]
+
+
+def _times(dt: float, duration: float) -> list[float]:
+    times: list[float] = []
+    s = 4 * dt
+    while s < duration / 6:
+        times.append(s)
+        s *= 6
+    return times or [2 * dt]

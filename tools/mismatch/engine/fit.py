@@ -1,0 +1,327 @@
+"""Output-error fits inside the simulator: what is linear solved exactly, what is not searched within bounds.
+
+Variable projection (Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973) with a damped Gauss-Newton search over
+the nonlinear parameters, noise-weighted over outputs, outliers bounded by Huber's weights. Base parameters are
+always free. Intervals come from the block-clustered sandwich, so coloured residuals do not make them too narrow.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.simulate import Free, Model
+
+Array = NDArray[np.float64]
+
+HUBER = 4.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted model. ``theta`` all parameters; ``residual[output]`` (m,) on the problem's view, measured minus
+    simulated; ``cost`` the weighted sum of squares on fit rows; ``at_bound`` names of parameters stuck there.
+    """
+
+    model: Model
+    theta: Array
+    residual: dict[str, Array] = field(repr=False)
+    cost: float
+    at_bound: tuple[str, ...]
+    evaluations: int
+    ok: bool = True
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(p.effect.name for p in self.model.placed)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        return tuple(p.label for p in self.model.placed)
+
+
+def huber_weights(z: Array) -> Array:
+    """Huber's weights of residuals in units of their robust scale."""
+    return np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-12))
+
+
+def robust_scale(r: Array, floor: float) -> float:
+    """Scale of a residual that outliers do not own, never below ``floor``."""
+    return max(1.4826 * float(np.median(np.abs(r - np.median(r)))), floor, 1e-300)
+
+
+class _Projected:
+    """Residuals as a function of the nonlinear parameters alone."""
+
+    def __init__(self, problem: Problem, model: Model, theta: Array, stride: int, fixed_base: bool = False) -> None:
+        self.problem = problem
+        self.model = model
+        self.view = problem.view
+        self.rows = problem.fit_rows[:: max(1, stride)]
+        self.theta = theta.copy()
+        self.free = [i for i in model.nonlinear if not (fixed_base and i < model.n_base)]
+        self.linear = np.array(model.linear, int)
+        self.position = {j: i for i, j in enumerate(model.linear)}
+        self.outputs = problem.twin.outputs
+        self.weight = {o: np.full(self.rows.size, 1.0 / problem.sigma(o)) for o in self.outputs}
+        self.evaluations = 0
+
+    def reweight(self, residual: dict[str, Array]) -> None:
+        for o in self.outputs:
+            r = residual[o][self.rows]
+            s = robust_scale(r, self.problem.sigma(o))
+            self.weight[o] = np.sqrt(huber_weights((r - np.median(r)) / s)) / self.problem.sigma(o)
+
+    def evaluate(self, theta: Array) -> tuple[Array, Array]:
+        """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
+        self.evaluations += 1
+        theta = theta.copy()
+        design = self.model.design(self.view, theta)
+        if self.linear.size == 0:
+            parts = [
+                (self.problem.measured[o][self.rows] - design.constant[o][self.rows]) * self.weight[o]
+                for o in self.outputs
+            ]
+            return np.concatenate(parts), theta
+        k = self.linear.size
+        gram = np.zeros((k, k))
+        cross = np.zeros(k)
+        kept: list[tuple[str, Array, Array, NDArray[np.int64]]] = []
+        for o in self.outputs:
+            w = self.weight[o]
+            at = np.array([self.position[j] for j in design.linear[o]], int)
+            a = design.columns[o][self.rows] * w[:, None]
+            b = (self.problem.measured[o][self.rows] - design.constant[o][self.rows]) * w
+            gram[np.ix_(at, at)] += a.T @ a
+            cross[at] += a.T @ b
+            kept.append((o, a, b, at))
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        scaled = gram / np.outer(size, size)
+        if design.penalty.size:
+            # rows are in units of weight; weak against what the data see
+            rows = design.penalty * (0.02 * np.median(size[np.any(design.penalty != 0, axis=0)]))
+            scaled = scaled + (rows.T @ rows) / np.outer(size, size)
+        scaled[np.diag_indices(k)] += 1e-11
+        try:
+            solution = np.linalg.solve(scaled, cross / size) / size
+        except np.linalg.LinAlgError:
+            solution = np.linalg.lstsq(scaled, cross / size, rcond=1e-10)[0] / size
+        lo = np.array([self.model.parameters[j].lo for j in self.linear])
+        hi = np.array([self.model.parameters[j].hi for j in self.linear])
+        solution = np.clip(solution, lo, hi)
+        theta[self.linear] = solution
+        return np.concatenate([b - a @ solution[at] for _, a, b, at in kept]), theta
+
+
+def _inside(p: Free, v: float) -> float:
+    return float(min(max(v, p.lo), p.hi))
+
+
+def _forward(p: Free, v: float) -> float:
+    return float(np.log(max(v, 1e-300))) if p.log and p.lo > 0 else v
+
+
+def _backward(p: Free, v: float) -> float:
+    return _inside(p, float(np.exp(min(v, 700.0))) if p.log and p.lo > 0 else v)
+
+
+def _step_size(p: Free, v: float) -> float:
+    if p.log and p.lo > 0:
+        return 1e-3
+    wide = p.hi - p.lo
+    typical = max(abs(v) * 1e-3, abs(p.scale) * 1e-3)
+    return min(typical, 0.01 * wide) if np.isfinite(wide) else typical
+
+
+def _search(projected: _Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
+    """Damped Gauss-Newton with bounds; returns theta and the cost."""
+    model = projected.model
+    free = projected.free
+    residual, theta = projected.evaluate(theta)
+    cost = float(residual @ residual)
+    if not free or not np.isfinite(cost):
+        return theta, cost
+    parameters = [model.parameters[i] for i in free]
+    damping = 1e-2
+    for _ in range(iterations):
+        z = np.array([_forward(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
+        jacobian = np.empty((residual.size, len(free)))
+        for c, (p, i) in enumerate(zip(parameters, free, strict=True)):
+            h = _step_size(p, theta[i])
+            shifted = theta.copy()
+            shifted[i] = _backward(p, z[c] + h)
+            if shifted[i] == theta[i]:
+                h = -h
+                shifted[i] = _backward(p, z[c] + h)
+            moved = _forward(p, shifted[i]) - z[c]
+            if moved == 0.0:
+                jacobian[:, c] = 0.0
+                continue
+            other, _t = projected.evaluate(shifted)
+            jacobian[:, c] = (other - residual) / moved
+        if not np.all(np.isfinite(jacobian)):
+            break
+        gradient = jacobian.T @ residual
+        hessian = jacobian.T @ jacobian
+        scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+        improved = False
+        for _try in range(6):
+            system = hessian / np.outer(scale, scale) + damping * np.eye(len(free))
+            step = -np.linalg.lstsq(system, gradient / scale, rcond=1e-12)[0] / scale
+            for c, p in enumerate(parameters):
+                if p.log and p.lo > 0:
+                    step[c] = float(np.clip(step[c], -1.6, 1.6))
+            candidate = theta.copy()
+            for c, (p, i) in enumerate(zip(parameters, free, strict=True)):
+                candidate[i] = _backward(p, z[c] + step[c])
+            if np.array_equal(candidate, theta):
+                break
+            trial, solved = projected.evaluate(candidate)
+            new = float(trial @ trial)
+            if np.isfinite(new) and new < cost:
+                gain = (cost - new) / max(cost, 1e-300)
+                theta, residual, cost = solved, trial, new
+                damping = max(damping / 6, 1e-8)
+                improved = gain > tolerance
+                break
+            damping *= 8
+        if not improved:
+            break
+    return theta, cost
+
+
+def residuals(problem: Problem, model: Model, theta: Array) -> dict[str, Array]:
+    """Measured minus simulated on the problem's view; not finite becomes very large."""
+    out = model.residual(problem.view, theta)
+    return {o: np.nan_to_num(out[o], nan=1e12, posinf=1e12, neginf=-1e12) for o in problem.twin.outputs}
+
+
+def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
+    stuck: list[str] = []
+    for i, p in enumerate(model.parameters):
+        if i < model.n_base or not np.isfinite(p.hi - p.lo):
+            continue
+        z, lo, hi = _forward(p, theta[i]), _forward(p, p.lo), _forward(p, p.hi)
+        if z - lo < 1e-3 * (hi - lo) or hi - z < 1e-3 * (hi - lo):
+            stuck.append(p.name)
+    return tuple(stuck)
+
+
+def fit(
+    problem: Problem,
+    model: Model,
+    starts: list[Array],
+    *,
+    stride: int | None = None,
+    iterations: int = 25,
+    rounds: int = 2,
+    tolerance: float = 1e-5,
+    tries: int = 4,
+) -> Fit:
+    """Best fit over ``starts``. Each start is tried coarsely on thinned rows; the best two are refined.
+
+    ``stride`` thins the fit rows (the simulation itself keeps every sample).
+    """
+    coarse = max(problem.stride, stride or 1)
+    evaluations = 0
+    ranked: list[tuple[float, int, Array]] = []
+    if len(starts) > 1 and model.nonlinear:
+        for i, theta in enumerate(starts[: 3 * tries]):
+            projected = _Projected(problem, model, theta, 3 * coarse)
+            residual, solved = projected.evaluate(theta)
+            cost = float(residual @ residual)
+            ranked.append((cost if np.isfinite(cost) else np.inf, i, solved))
+            evaluations += projected.evaluations
+        ranked.sort(key=lambda r: (r[0], r[1]))
+        tried: list[tuple[float, int, Array]] = []
+        for cost, i, theta in ranked[:tries]:
+            projected = _Projected(problem, model, theta, 3 * coarse)
+            theta, cost = _search(projected, theta, 6, 1e-3)
+            tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
+            evaluations += projected.evaluations
+        tried.sort(key=lambda r: (r[0], r[1]))
+        best = [t[2] for t in tried[:2]]
+        if len(tried) > 1 and tried[1][0] > 1.2 * tried[0][0]:
+            best = best[:1]
+    else:
+        best = starts[:1]
+    found: tuple[float, Array, dict[str, Array]] | None = None
+    for theta in best:
+        projected = _Projected(problem, model, theta, coarse)
+        cost = np.inf
+        for round_ in range(rounds):
+            theta, cost = _search(projected, theta, iterations if round_ == 0 else 6, tolerance)
+            if not np.isfinite(cost):
+                break
+            if round_ + 1 < rounds:
+                projected.reweight(residuals(problem, model, theta))
+        evaluations += projected.evaluations
+        if found is None or (np.isfinite(cost) and cost < found[0]):
+            found = (cost, theta, residuals(problem, model, theta))
+    assert found is not None
+    cost, theta, residual = found
+    ok = bool(np.isfinite(cost)) and all(np.all(np.abs(r) < 1e11) for r in residual.values())
+    return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
+
+
+def fit_base(problem: Problem) -> Fit:
+    """The base parameters alone, from where the engineer believes them to be."""
+    model = problem.base()
+    return fit(problem, model, [model.start(problem.recording)])
+
+
+def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
+    """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters)."""
+    model, theta = fitted.model, fitted.theta
+    rows = problem.fit_rows[:: max(1, stride)]
+    design = model.design(problem.view, theta)
+    outputs = problem.twin.outputs
+    sensitivity = {o: np.zeros((rows.size, theta.size)) for o in outputs}
+    for o in outputs:
+        for i, j in enumerate(design.linear[o]):
+            sensitivity[o][:, j] = design.columns[o][rows, i]
+    here = model.simulate(problem.view, theta) if model.nonlinear else {}
+    for i in model.nonlinear:
+        p = model.parameters[i]
+        h = _step_size(p, theta[i])
+        shifted = theta.copy()
+        shifted[i] = _backward(p, _forward(p, theta[i]) + h)
+        if shifted[i] == theta[i]:
+            shifted[i] = _backward(p, _forward(p, theta[i]) - h)
+        moved = shifted[i] - theta[i]
+        if moved == 0.0:
+            continue
+        there = model.simulate(problem.view, shifted)
+        for o in outputs:
+            sensitivity[o][:, i] = (there[o][rows] - here[o][rows]) / moved
+    return np.concatenate([sensitivity[o] / problem.sigma(o) for o in outputs])
+
+
+def covariance(problem: Problem, fitted: Fit) -> Array:
+    """Block-clustered sandwich covariance of theta (Liang and Zeger, Biometrika 73, 1986), never below the one
+    that white residuals would give.
+    """
+    stride = max(1, problem.fit_rows.size * len(problem.twin.outputs) // 200_000)
+    j = jacobian(problem, fitted, stride)
+    rows = problem.fit_rows[::stride]
+    r = np.concatenate([fitted.residual[o][rows] / problem.sigma(o) for o in problem.twin.outputs])
+    limit = HUBER * robust_scale(r, 0.0)
+    r = np.clip(r, -limit, limit)
+    size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
+    js = j / size
+    bread = np.linalg.pinv(js.T @ js, rcond=1e-12)
+    block = np.zeros(rows.size, int)
+    for b, (start, stop) in enumerate(problem.fit_blocks):
+        block[(rows >= start) & (rows < stop)] = b
+    blocks = np.tile(block, len(problem.twin.outputs))
+    scores = np.zeros((len(problem.fit_blocks), j.shape[1]))
+    np.add.at(scores, blocks, js * r[:, None])
+    meat = scores.T @ scores * (len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
+    sandwich = bread @ meat @ bread
+    plain = bread * float(np.mean(r * r))
+    inflate = np.sqrt(np.maximum(np.diag(plain), 1e-300) / np.maximum(np.diag(sandwich), 1e-300))
+    sandwich = sandwich * np.outer(np.maximum(inflate, 1.0), np.maximum(inflate, 1.0))
+    return sandwich / np.outer(size, size)

@@ -1,0 +1,114 @@
+"""Where a mismatch sits: outputs, windows, regime, and which recorded signal it follows."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.dependence import Dependence, dependences, needs_memory
+from tools.mismatch.engine.features import Feature, envelope, features_of, local_frequency, rate_of
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.windows import bad_windows
+
+Array = NDArray[np.float64]
+
+
+def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> tuple[Array, dict[str, Array], float]:
+    """Residual, recorded signals and step on the view's samples, block-averaged to ``limit`` samples."""
+    index = problem.index
+    k = max(1, int(np.ceil(index.size / limit)))
+    m = index.size // k
+
+    def mean(x: Array) -> Array:
+        return x[: m * k].reshape(m, k).mean(axis=1) if k > 1 else x
+
+    signals = {s: mean(x[index]) for s, x in problem.recording.signals.items()}
+    return mean(fitted.residual[output]), signals, problem.recording.dt * k
+
+
+def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
+    """What the residual of one output follows, strongest first, and the p-value that history adds nothing."""
+    e, signals, dt = thinned(problem, fitted, output)
+    features = features_of(signals, dt)
+    found = dependences(e, features)
+    present = [f for f in features if not f.memory and f.kind in ("value", "rate")]
+    past = [f for f in features if f.memory and f.kind in ("running extremum", "recent history")]
+    return found, needs_memory(e, present, past)
+
+
+def regime(problem: Problem, fitted: Fit, output: str) -> str:
+    """In words, where the residual is worst: the regime variable whose upper and lower parts differ most."""
+    e, signals, dt = thinned(problem, fitted, output)
+    blocks = min(120, max(12, e.size // 50))
+    edges = np.linspace(0, e.size, blocks + 1).astype(int)
+
+    def per_block(x: Array) -> Array:
+        return np.array([x[a:b].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+
+    energy = np.sqrt(per_block(e**2))
+    seconds = max(20 * dt, e.size * dt / 60)
+    choices: list[tuple[float, str]] = []
+    for name, x in signals.items():
+        if np.std(x) <= 1e-12 * (np.max(np.abs(x)) + 1e-300):
+            continue
+        variables = {
+            f"large {name}": x,
+            f"large swings of {name}": envelope(x, seconds, dt),
+            f"fast {name}": np.abs(rate_of(x, dt)),
+            f"high frequency of {name}": local_frequency(x, seconds, dt),
+        }
+        for words, v in variables.items():
+            value = per_block(v)
+            order = np.argsort(value)
+            third = max(2, blocks // 3)
+            low = float(np.sqrt(np.mean(energy[order[:third]] ** 2)))
+            high = float(np.sqrt(np.mean(energy[order[-third:]] ** 2)))
+            if min(low, high) <= 0:
+                continue
+            opposite = words.replace("large ", "small ").replace("fast ", "slow ").replace("high ", "low ")
+            ratio = high / low
+            choices.append(
+                (abs(np.log(ratio)), f"{words if ratio > 1 else opposite} ({max(ratio, 1 / ratio):.1f} times)")
+            )
+    half = max(2, blocks // 3)
+    early = float(np.sqrt(np.mean(energy[:half] ** 2)))
+    late = float(np.sqrt(np.mean(energy[-half:] ** 2)))
+    if min(early, late) > 0:
+        ratio = late / early
+        choices.append(
+            (
+                abs(np.log(ratio)),
+                f"{'late' if ratio > 1 else 'early'} in the record ({max(ratio, 1 / ratio):.1f} times)",
+            )
+        )
+    if not choices:
+        return "everywhere alike"
+    best = max(choices)
+    return f"worst at {best[1]}" if best[0] > np.log(1.25) else "everywhere alike"
+
+
+def windows(problem: Problem, fitted: Fit, outputs: list[str]) -> list[tuple[float, float]]:
+    """Time windows in which any of ``outputs`` stands above its noise, seconds of the recording."""
+    t = problem.recording.t[problem.index] - problem.recording.t[0]
+    found: list[tuple[float, float]] = []
+    for o in outputs:
+        for a, b in bad_windows(fitted.residual[o], problem.sigma(o), 1.0):
+            i, j = min(int(a), t.size - 1), min(int(b), t.size) - 1
+            found.append((float(t[i]), float(t[j]) + problem.recording.dt))
+    found.sort()
+    joined: list[tuple[float, float]] = []
+    for a, b in found:
+        if joined and a <= joined[-1][1] + 1e-9:
+            joined[-1] = (joined[-1][0], max(b, joined[-1][1]))
+        else:
+            joined.append((a, b))
+    return joined
+
+
+def excess_share(e: Array, noise_rms: float) -> float:
+    """How far a residual stands above its noise: mean square over noise variance."""
+    return float(np.mean(e**2) / noise_rms**2) if noise_rms > 0 else np.inf
+
+
+__all__ = ["Feature", "excess_share", "follow", "regime", "windows"]

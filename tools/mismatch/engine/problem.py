@@ -1,0 +1,123 @@
+"""One recording under diagnosis: twin, split, views and the noise that residuals are measured against."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.noise import NoiseFloor
+from tools.mismatch.engine.split import Span, Split
+from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model, View
+from tools.mismatch.twins.base import Twin
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What every step of a diagnosis shares. ``view`` covers fit and held-out samples, ``fit_view`` the fit alone:
+    only the latter is shown to whatever chooses settings, starting points or parameters.
+    """
+
+    recording: Recording
+    twin: Twin
+    split: Split
+    init: int
+    seed: int
+    floors: Mapping[str, NoiseFloor] = field(default_factory=dict[str, NoiseFloor])
+    stride: int = 1
+
+    def __getstate__(self) -> dict[str, object]:
+        """Fields alone: what is derived (and what views remember) is rebuilt in a worker process."""
+        return {f.name: getattr(self, f.name) for f in fields(self)}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state)
+
+    def fresh(self) -> Problem:
+        """The same problem with empty memories."""
+        return replace(self)
+
+    @cached_property
+    def view(self) -> View:
+        ranges = tuple(sorted((*self.split.fit, *_with_init(self.split.held_out, self.init, self.twin, self.split))))
+        return View(self.recording, ranges, self.init)
+
+    @cached_property
+    def fit_view(self) -> View:
+        return View(self.recording, self.split.fit, self.init)
+
+    @cached_property
+    def index(self) -> NDArray[np.int64]:
+        return self.view.index
+
+    @cached_property
+    def fit_rows(self) -> NDArray[np.int64]:
+        """Rows of the view that may be fitted."""
+        mask = self.split.fit_mask()[self.index] & self.view.scored(self.twin)
+        return np.nonzero(mask)[0]
+
+    @cached_property
+    def held_rows(self) -> NDArray[np.int64]:
+        mask = self.split.held_out_mask()[self.index] & self.view.scored(self.twin)
+        return np.nonzero(mask)[0]
+
+    @cached_property
+    def row_of_sample(self) -> NDArray[np.int64]:
+        """Row of each sample of the recording (-1: not in the view)."""
+        row = np.full(self.recording.n, -1)
+        row[self.index] = np.arange(self.index.size)
+        return row
+
+    def rows(self, spans: tuple[Span, ...]) -> list[Span]:
+        """Spans of samples as spans of rows of the view; spans that fall outside are left out."""
+        out: list[Span] = []
+        scored = self.view.scored(self.twin)
+        for a, b in spans:
+            inside = self.row_of_sample[a:b]
+            inside = inside[inside >= 0]
+            inside = inside[scored[inside]]
+            if inside.size:
+                out.append((int(inside[0]), int(inside[-1]) + 1))
+        return out
+
+    @cached_property
+    def held_blocks(self) -> list[Span]:
+        return self.rows(self.split.blocks)
+
+    @cached_property
+    def fit_blocks(self) -> list[Span]:
+        return self.rows(self.split.fit_blocks)
+
+    @cached_property
+    def held_spans(self) -> list[Span]:
+        return self.rows(self.split.held_out)
+
+    @cached_property
+    def fit_spans(self) -> list[Span]:
+        return self.rows(self.split.fit)
+
+    @cached_property
+    def measured(self) -> dict[str, Array]:
+        return {o: self.view.measured(o) for o in self.twin.outputs}
+
+    def sigma(self, output: str) -> float:
+        return self.floors[output].rms if output in self.floors else 1.0
+
+    def with_floors(self, floors: Mapping[str, NoiseFloor]) -> Problem:
+        return replace(self, floors=dict(floors))
+
+    def base(self) -> Model:
+        return Model(self.twin)
+
+
+def _with_init(held: tuple[Span, ...], init: int, twin: Twin, split: Split) -> tuple[Span, ...]:
+    """Held-out spans with the samples in front that set the state (their outputs are not scored)."""
+    if init <= 0 or split.own or not twin.restart:
+        return held
+    return tuple((max(0, a - init), b) for a, b in held)

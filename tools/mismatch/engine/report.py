@@ -1,0 +1,180 @@
+"""The answer: frozen records that mirror section 5 of the contract, and the arrays that pictures are made of."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
+
+
+@dataclass(frozen=True)
+class Window:
+    start_s: float
+    stop_s: float
+
+
+@dataclass(frozen=True)
+class DependsOn:
+    """``strength``: share of the residual's variance that follows; ``memory``: history helps beyond the present."""
+
+    signal: str
+    feature: str
+    strength: float
+    p_value: float = 0.0
+    memory: bool = False
+
+
+@dataclass(frozen=True)
+class Location:
+    outputs: tuple[str, ...]
+    stage: str
+    windows: tuple[Window, ...]
+    regime: str
+    depends_on: tuple[DependsOn, ...]
+
+
+@dataclass(frozen=True)
+class ParameterValue:
+    value: float
+    unit: str
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class PhysicsFound:
+    """One accepted effect. ``site``, ``target``, ``outputs``, ``settings`` and ``raw`` are what ``apply`` needs."""
+
+    name: str
+    output: str
+    stage: str
+    confidence: float
+    parameters: Mapping[str, ParameterValue]
+    equation: str
+    source: str
+    residual_rms_before: float
+    residual_rms_after: float
+    site: str
+    target: str
+    outputs: tuple[str, ...]
+    settings: Mapping[str, tuple[float, ...]]
+    raw: Mapping[str, float]
+    note: str = ""
+    at_bound: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Alternative:
+    name: str
+    output: str
+    residual_rms_after: float
+    why_not: str
+
+
+@dataclass(frozen=True)
+class Equivalent:
+    names: tuple[str, ...]
+    tell_apart_by: str
+
+
+@dataclass(frozen=True)
+class BaseShift:
+    """A base parameter as given, re-fitted alone, and re-fitted beside the effects."""
+
+    name: str
+    unit: str
+    given: float
+    alone: float
+    with_effects: float
+    ci95: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FitSummary:
+    unit: Mapping[str, str]
+    held_out: bool
+    base_rms: Mapping[str, float]
+    recalibrated_rms: Mapping[str, float]
+    fitted_rms: Mapping[str, float]
+    noise_floor_rms: Mapping[str, float]
+    noise_method: Mapping[str, str]
+    fit_spans: tuple[tuple[int, int], ...]
+    held_out_spans: tuple[tuple[int, int], ...]
+    base_parameters: tuple[BaseShift, ...]
+
+
+@dataclass(frozen=True)
+class Checks:
+    residual_white_before: bool
+    residual_white_after: bool
+    false_alarm_p_value: float
+    messages: tuple[str, ...] = ()
+    memory_p_value: float = 1.0
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """Arrays for the report: time (m,), inputs and, per output, measured, as given, recalibrated, fitted (m,);
+    ``held_out`` (m,) bool. Not part of the JSON."""
+
+    t: Array
+    held_out: NDArray[np.bool_]
+    measured: Mapping[str, Array]
+    as_given: Mapping[str, Array]
+    recalibrated: Mapping[str, Array]
+    fitted: Mapping[str, Array]
+    signals: Mapping[str, Array]
+
+
+@dataclass(frozen=True)
+class Report:
+    """What ``diagnose`` says. ``chain``: the twin's stages in order."""
+
+    recording: str
+    twin: str
+    verdict: Verdict
+    summary: str
+    location: Location
+    physics: tuple[PhysicsFound, ...]
+    alternatives: tuple[Alternative, ...]
+    equivalent: tuple[Equivalent, ...]
+    detection_limit: Mapping[str, Mapping[str, float | None]]
+    cannot_show: Mapping[str, str]
+    fit: FitSummary
+    checks: Checks
+    seconds: float
+    seed: int
+    chain: tuple[str, ...]
+    corrected_base: Mapping[str, Any]
+    tested: tuple[Mapping[str, Any], ...] = ()
+    pictures: Pictures | None = field(default=None, repr=False, compare=False)
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the contract, with optional keys beside; numbers finite or null."""
+        body = asdict(
+            Report(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, "pictures": None})  # noqa: RUF005
+        )
+        body.pop("pictures")
+        return _plain({"format": 1, **body})
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return [_plain(v) for v in value.tolist()]
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    if isinstance(value, int | np.integer):
+        return int(value)
+    if isinstance(value, float | np.floating):
+        return float(value) if math.isfinite(float(value)) else None
+    return value

@@ -1,0 +1,137 @@
+"""Is one model better than another on data that neither has seen, and by how much."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
+from tools.mismatch.engine.fit import Fit, robust_scale
+from tools.mismatch.engine.problem import Problem
+
+Array = NDArray[np.float64]
+Span = tuple[int, int]
+
+CLIP = 6.0
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A larger model against a smaller one on held-out samples.
+
+    ``z``: whitened correlation of what the larger model changes with what the smaller one leaves, standard normal
+    when nothing is missing (the direction was learned on other data, so there is no optimism in it). ``gain``:
+    share of the smaller model's mean square that goes; ``excess_gain``: the same of its part above the noise
+    floor; ``wins``: paired t of block scores; ``effect_rms``: what the larger model changes, per output.
+    """
+
+    z: float
+    gain: float
+    excess_gain: float
+    wins: float
+    effect_rms: dict[str, float]
+
+    @property
+    def log_p(self) -> float:
+        """Natural logarithm of the one-sided p-value of ``z`` (30 degrees of freedom at most matter not here)."""
+        from scipy.stats import norm
+
+        return float(norm.logsf(self.z))
+
+
+def winsorised(r: Array, floor: float) -> Array:
+    """Residual with outliers pulled in to six robust scales."""
+    limit = CLIP * robust_scale(r, floor)
+    return np.clip(r, -limit, limit)
+
+
+def held_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
+    """Rms of the residual per output on held-out samples."""
+    rows = problem.held_rows
+    return {o: float(np.sqrt(np.mean(r[rows] ** 2))) for o, r in fitted.residual.items()}
+
+
+def fit_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
+    """Rms of the residual per output on fitted samples."""
+    rows = problem.fit_rows
+    return {o: float(np.sqrt(np.mean(r[rows] ** 2))) for o, r in fitted.residual.items()}
+
+
+def block_energy(problem: Problem, fitted: Fit, blocks: list[Span]) -> Array:
+    """Mean square over noise variance per block (blocks, outputs), outliers pulled in."""
+    out = np.empty((len(blocks), len(problem.twin.outputs)))
+    for j, o in enumerate(problem.twin.outputs):
+        r = winsorised(fitted.residual[o], problem.sigma(o)) / problem.sigma(o)
+        for i, (a, b) in enumerate(blocks):
+            out[i, j] = float(np.mean(r[a:b] ** 2)) if b > a else 0.0
+    return out
+
+
+def misfit(problem: Problem, fitted: Fit) -> float:
+    """Mean square over noise variance on held-out samples, averaged over outputs; 1 is perfect."""
+    rows = problem.held_rows
+    total = 0.0
+    for o in problem.twin.outputs:
+        s = problem.sigma(o)
+        total += float(np.mean((winsorised(fitted.residual[o][rows], s) / s) ** 2))
+    return total / len(problem.twin.outputs)
+
+
+def paired_t(a: Array, b: Array) -> float:
+    """Paired t of block energies: positive when ``b`` is lower (better). ``a``, ``b`` (blocks, outputs)."""
+    d = np.sum(a - b, axis=1)
+    spread = float(np.std(d, ddof=1)) if d.size > 1 else 0.0
+    return float(np.mean(d) / (spread / np.sqrt(d.size))) if spread > 0 else 0.0
+
+
+def paired_p(t: float, blocks: int) -> float:
+    """One-sided p-value of a paired t."""
+    return float(student.sf(t, max(blocks - 1, 1)))
+
+
+def whiteners(problem: Problem, fitted: Fit) -> dict[str, Whitener]:
+    """Whitening filters of a model's residual, from held-out samples: no fit has flattened those."""
+    spans = problem.held_spans
+    return {o: fit_whitener(r, stretches=spans) for o, r in fitted.residual.items()}
+
+
+def direction_z(
+    problem: Problem, small: Fit, change: dict[str, Array], filters: dict[str, Whitener], spans: list[Span]
+) -> float:
+    """Whitened correlation of ``change`` (what a larger model would take away) with the residual of ``small``."""
+    top = bottom = 0.0
+    for o in problem.twin.outputs:
+        r, d = small.residual[o], change[o]
+        if not np.any(d):
+            continue
+        f = filters[o]
+        usable = [s for s in spans if s[1] - s[0] > f.warm_up + 4]
+        if not usable:
+            f = Whitener(np.ones(1), float(np.std(r)))
+            usable = spans
+        white = whiten(f, r, usable)
+        moved = whiten(f, d, usable)
+        s = 1.4826 * float(np.median(np.abs(white))) or 1.0
+        white = np.clip(white / s, -CLIP, CLIP)
+        spread = max(float(np.std(white)), 1.0)
+        top += float(white @ moved) / (s * spread)
+        bottom += float(moved @ moved) / s**2
+    return top / np.sqrt(bottom) if bottom > 0 else 0.0
+
+
+def compare(problem: Problem, small: Fit, large: Fit, filters: dict[str, Whitener] | None = None) -> Comparison:
+    """Everything that decides between a model and a larger one."""
+    filters = filters or whiteners(problem, large)
+    change = {o: small.residual[o] - large.residual[o] for o in problem.twin.outputs}
+    z = direction_z(problem, small, change, filters, problem.held_spans)
+    a, b = misfit(problem, small), misfit(problem, large)
+    wins = paired_t(
+        block_energy(problem, small, problem.held_blocks), block_energy(problem, large, problem.held_blocks)
+    )
+    excess = max(a - 1.0, 1e-9)
+    rows = problem.held_rows
+    effect = {o: float(np.std(change[o][rows])) for o in problem.twin.outputs}
+    return Comparison(z, 1 - b / max(a, 1e-300), (a - b) / excess, wins, effect)

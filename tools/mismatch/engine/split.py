@@ -1,0 +1,115 @@
+"""What may be fitted and what is held out: contiguous segments with guard gaps, scored in many blocks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Span = tuple[int, int]
+
+
+@dataclass(frozen=True)
+class Split:
+    """``fit`` and ``held_out`` are spans of samples (stop excluded) that never touch; ``blocks`` cut the held-out
+    spans, ``fit_blocks`` the fit spans, for paired comparisons. ``n`` samples in all.
+    """
+
+    n: int
+    fit: tuple[Span, ...]
+    held_out: tuple[Span, ...]
+    blocks: tuple[Span, ...]
+    fit_blocks: tuple[Span, ...]
+    own: bool = True
+
+    def fit_mask(self) -> NDArray[np.bool_]:
+        return _mask(self.n, self.fit)
+
+    def held_out_mask(self) -> NDArray[np.bool_]:
+        return _mask(self.n, self.held_out)
+
+
+def _mask(n: int, spans: tuple[Span, ...]) -> NDArray[np.bool_]:
+    mask = np.zeros(n, bool)
+    for a, b in spans:
+        mask[a:b] = True
+    return mask
+
+
+def cut(spans: tuple[Span, ...], at_least: int) -> tuple[Span, ...]:
+    """Spans cut into about equal blocks, ``at_least`` so many where their length allows (8 samples each)."""
+    total = sum(b - a for a, b in spans)
+    if total == 0:
+        return ()
+    length = max(8, total // max(at_least, 1))
+    blocks: list[Span] = []
+    for a, b in spans:
+        parts = max(1, (b - a) // length)
+        edges = np.linspace(a, b, parts + 1).astype(int)
+        blocks += [(int(p), int(q)) for p, q in zip(edges[:-1], edges[1:], strict=True) if q > p]
+    return tuple(blocks)
+
+
+def _coverage(signals: Array, held: NDArray[np.bool_], used: NDArray[np.bool_]) -> float:
+    """Largest distance between the distributions of held-out and fitted samples, over signals (Kolmogorov)."""
+    worst = 0.0
+    for x in signals.T:
+        grid = np.quantile(x, np.linspace(0.05, 0.95, 19))
+        a = np.searchsorted(np.sort(x[held]), grid, side="right") / max(held.sum(), 1)
+        b = np.searchsorted(np.sort(x[used]), grid, side="right") / max(used.sum(), 1)
+        worst = max(worst, float(np.max(np.abs(a - b))))
+    return worst
+
+
+def own_split(signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: int = 0, segments: int = 6) -> Split:
+    """Split of a recording that brings none.
+
+    ``signals`` (n, k): inputs and context, whose values and rates both parts shall cover. The record is cut into
+    ``segments`` stretches; each gives a contiguous held-out part with ``guard`` samples on either side that
+    nobody uses. Of 24 seeded layouts the one whose parts resemble each other most is taken.
+    """
+    n = signals.shape[0]
+    segments = max(1, min(segments, n // 60))
+    guard = min(guard, n // (20 * segments))
+    rng = np.random.default_rng([seed, n])
+    edges = np.linspace(0, n, segments + 1).astype(int)
+    features = np.column_stack([signals, np.gradient(signals, axis=0)]) if signals.size else np.empty((n, 0))
+    thin = slice(None, None, max(1, n // 20000))
+    best: tuple[float, list[Span]] | None = None
+    for _ in range(24):
+        held: list[Span] = []
+        for i in range(segments):
+            length = int(held_out * (edges[i + 1] - edges[i]))
+            room = edges[i + 1] - edges[i] - length
+            # never the first stretch of the record: the fit needs to see how everything starts
+            least = int(0.25 * room) if i == 0 else 0
+            start = int(edges[i] + rng.integers(least, max(room, least + 1)))
+            held.append((start, start + length))
+        mask = _mask(n, tuple(held))[thin]
+        score = _coverage(features[thin], mask, ~mask) if features.size else 0.0
+        if best is None or score < best[0]:
+            best = (score, held)
+    assert best is not None
+    return _with_guard(n, tuple(best[1]), guard)
+
+
+def _with_guard(n: int, held: tuple[Span, ...], guard: int) -> Split:
+    fit: list[Span] = []
+    position = 0
+    for a, b in held:
+        if a - guard > position:
+            fit.append((position, a - guard))
+        position = b + guard
+    if position < n:
+        fit.append((position, n))
+    fit = [s for s in fit if s[1] - s[0] >= 8]
+    return Split(n, tuple(fit), held, cut(held, 30), cut(tuple(fit), 48))
+
+
+def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Split:
+    """The split that a recording brings: its own fit range, its test range less the samples that set the state."""
+    start = test[0] + max(initialization, 0)
+    held = ((start, test[1]),)
+    return Split(n, (fit,), held, cut(held, 30), cut((fit,), 48), own=False)

@@ -1,0 +1,60 @@
+"""When it is worst: the residual's energy in blocks, cut into windows of constant level."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+def change_points(x: Array, penalty: float | None = None) -> list[int]:
+    """Edges (0 and len included) of the best piecewise constant fit of ``x`` (b,).
+
+    Optimal partitioning (Jackson et al., IEEE Signal Processing Letters 12, 2005) with a penalty per segment of
+    3 log(b) noise variances; the noise from first differences.
+    """
+    b = x.size
+    if b < 4:
+        return [0, b]
+    variance = (1.4826 * float(np.median(np.abs(np.diff(x)))) / np.sqrt(2)) ** 2
+    variance = max(variance, 1e-4 * float(np.var(x)), 1e-300)
+    cost_of_one = (penalty if penalty is not None else 3.0 * np.log(b)) * variance
+    s1 = np.concatenate(([0.0], np.cumsum(x)))
+    s2 = np.concatenate(([0.0], np.cumsum(x**2)))
+    best = np.full(b + 1, np.inf)
+    best[0] = -cost_of_one
+    previous = np.zeros(b + 1, int)
+    for stop in range(1, b + 1):
+        start = np.arange(stop)
+        cost = s2[stop] - s2[start] - (s1[stop] - s1[start]) ** 2 / (stop - start)
+        total = best[start] + cost + cost_of_one
+        previous[stop] = int(np.argmin(total))
+        best[stop] = total[previous[stop]]
+    edges = [b]
+    while edges[-1] > 0:
+        edges.append(int(previous[edges[-1]]))
+    return edges[::-1]
+
+
+def bad_windows(e: Array, noise_rms: float, dt: float, *, blocks: int = 96) -> list[tuple[float, float]]:
+    """Windows (start_s, stop_s) in which the residual ``e`` (n,) stands above its noise.
+
+    Neighbouring windows above are joined; the whole record is one window when nearly all of it is above.
+    """
+    n = e.size
+    blocks = max(4, min(blocks, n // 16))
+    edges = np.linspace(0, n, blocks + 1).astype(int)
+    energy = np.array([np.mean(e[a:b] ** 2) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    level = np.log(np.maximum(energy, (0.05 * noise_rms) ** 2 + 1e-300))
+    segments = change_points(level)
+    threshold = np.log(1.3 * noise_rms**2) if noise_rms > 0 else float(np.median(level))
+    out: list[tuple[float, float]] = []
+    for a, b in zip(segments[:-1], segments[1:], strict=True):
+        if float(np.log(np.mean(np.exp(level[a:b])))) > threshold:
+            start, stop = float(edges[a] * dt), float(edges[b] * dt)
+            if out and abs(out[-1][1] - start) < 1e-9:
+                out[-1] = (out[-1][0], stop)
+            else:
+                out.append((start, stop))
+    return out
