@@ -255,26 +255,7 @@ def _uniform(
 ) -> HandRecording:
     notes: list[str] = []
     if t is not None:
-        t = np.asarray(t, dtype=np.float64)
-        step = np.diff(t)
-        if not np.all(np.isfinite(t)) or np.any(step < 0.0):
-            raise HandFileError(f"{path}: time runs backwards or is no number at sample {np.argmin(step) + 1}")
-        keep = np.concatenate([[True], step > 0.0])
-        if not keep.all():
-            notes.append(f"{np.count_nonzero(~keep)} samples with a repeated time stamp left out")
-        t = t[keep] - t[0]
-        signals = {k: v[keep] for k, v in signals.items()}
-        gap_s = max(0.1, 5.0 * float(np.median(np.diff(t))))
-        edges = np.concatenate([[0], np.flatnonzero(np.diff(t) > gap_s) + 1, [len(t)]])
-        if len(edges) > 2:
-            longest = int(np.argmax(np.diff(edges)))
-            first, last = edges[longest], edges[longest + 1]
-            notes.append(f"{len(edges) - 2} gap(s): used {t[first]:.2f} s to {t[last - 1]:.2f} s")
-            t, signals = t[first:last] - t[first], {k: v[first:last] for k, v in signals.items()}
-        rate_hz = (len(t) - 1) / float(t[-1])
-        grid = np.arange(len(t)) / rate_hz
-        if np.max(np.abs(t - grid)) * rate_hz > 1e-3:
-            signals = {k: CubicSpline(t, v, axis=0)(np.minimum(grid, t[-1])) for k, v in signals.items()}
+        signals, rate_hz = _even(path, signals, np.asarray(t, dtype=np.float64), notes)
     if not rate_hz or rate_hz <= 0.0:
         raise HandFileError(f"{path}: no sampling rate: neither a column t_s nor rate_hz in meta.toml or the .toml")
     count = len(next(iter(signals.values())))
@@ -296,3 +277,30 @@ def _uniform(
         angular_rate=signals.get("angular rate"),
         notes=tuple(notes),
     )
+
+
+def _even(path: Path, signals: dict[str, Array], t: Array, notes: list[str]) -> tuple[dict[str, Array], float]:
+    """Signals on a uniform time base and its rate: repeated stamps left out, the longest stretch without a gap."""
+    step = np.diff(t)
+    if len(t) < 2 or not np.all(np.isfinite(t)) or np.any(step < 0.0):
+        at = int(np.argmin(step)) + 1 if len(t) > 1 else 0
+        raise HandFileError(f"{path}: time runs backwards or is no number at sample {at}")
+    keep = np.concatenate([[True], step > 0.0])
+    if not keep.all():
+        notes.append(f"{np.count_nonzero(~keep)} samples with a repeated time stamp left out")
+    t = t[keep] - t[0]
+    signals = {k: v[keep] for k, v in signals.items()}
+    if len(t) < 2:
+        raise HandFileError(f"{path}: all samples have the same time")
+    gap_s = max(0.1, 5.0 * float(np.median(np.diff(t))))
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(t) > gap_s) + 1, [len(t)]])
+    if len(edges) > 2:
+        longest = int(np.argmax(np.diff(edges)))
+        first, last = int(edges[longest]), int(edges[longest + 1])
+        notes.append(f"{len(edges) - 2} gap(s): used {t[first]:.2f} s to {t[last - 1]:.2f} s")
+        t, signals = t[first:last] - t[first], {k: v[first:last] for k, v in signals.items()}
+    rate_hz = (len(t) - 1) / float(t[-1]) if len(t) > 1 else 0.0
+    grid = np.arange(len(t)) / max(rate_hz, 1e-9)
+    if np.max(np.abs(t - grid)) * rate_hz > 1e-3:
+        signals = {k: CubicSpline(t, v, axis=0)(np.minimum(grid, t[-1])) for k, v in signals.items()}
+    return signals, rate_hz

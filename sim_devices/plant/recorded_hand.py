@@ -88,7 +88,7 @@ def make_hand(
 def _spectrum(config: HandConfig, recording: HandRecording) -> tuple[Array, NDArray[np.complex128]]:
     """Frequencies (m,) and Fourier coefficients (m, 6): tip displacement (body axes, m) and body angles (rad)."""
     count = round(recording.seconds * recording.rate_hz)
-    frequency_hz = np.fft.rfftfreq(count, 1.0 / recording.rate_hz)
+    frequency_hz: Array = np.asarray(np.fft.rfftfreq(count, 1.0 / recording.rate_hz), dtype=np.float64)
     low, high = config.recorded_band_hz
     window = _band(frequency_hz, low, min(high, 0.4 * recording.rate_hz))
     w = 2.0 * math.pi * np.maximum(frequency_hz, frequency_hz[1])

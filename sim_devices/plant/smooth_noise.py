@@ -44,7 +44,7 @@ def smooth_noise(correlation_s: float, step_s: float) -> SmoothNoise:
     system = np.zeros((5, 5))  # integral of p, p, p', p'', u
     system[0, 1] = system[1, 2] = system[2, 3] = 1.0
     system[3] = [0.0, -(pole**3), -3 * pole**2, -3 * pole, pole**3]
-    step = expm(system * step_s)
+    step: Array = np.asarray(expm(system * step_s), dtype=np.float64)
     covariance = solve_discrete_lyapunov(step[1:4, 1:4], np.outer(step[1:4, 4], step[1:4, 4]))
     gain = 1.0 / np.sqrt(covariance[0, 0])
     values, vectors = np.linalg.eigh(covariance * gain**2)

@@ -177,7 +177,7 @@ def second_order(resonance_hz: float, damping: float, step_s: float) -> tuple[Ar
     system = np.zeros((4, 4))  # x, x', u, u'
     system[0, 1] = system[2, 3] = 1.0
     system[1, :3] = [-w * w, -2.0 * damping * w, w * w]
-    e = expm(system * step_s)
+    e: Array = np.asarray(expm(system * step_s), dtype=np.float64)
     to = e[:2, 3] / step_s
     return e[:2, :2].copy(), e[:2, 2] - to, to
 

@@ -1,0 +1,269 @@
+"""The lab's measuring instruments: calibration recordings of the same physical unit as the bench with that seed.
+
+``python -m sim_devices.plant.lab piezo --out FOLDER [--axis 0] [--profile sawtooth|sine|tremor] [--rate-hz F]`` drives
+one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a contract recording.
+``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
+and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import sys
+import tomllib
+from pathlib import Path
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from pydantic import ValidationError
+
+from hal.errors import BenchError
+from sim_devices.config import EmulationConfig, HandConfig
+from sim_devices.plant.hand import NODE_S, SyntheticHand
+from sim_devices.plant.instrument import Instrument
+from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS
+from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
+from sim_devices.plant.streams import stream
+from sim_devices.plant.unit import start_temperature_C
+
+Array = NDArray[np.float64]
+
+INTERFEROMETER_RMS_UM = 0.07
+RATE_HZ = 1000.0
+
+
+class LabError(BenchError):
+    """A measurement was asked for that cannot be made."""
+
+
+@njit(cache=True)
+def drive_stack(params, state, volts, temperature_C, steps_per_sample, extension, terminal_V):
+    """One stack under held demands ``volts`` (n,): ``extension`` (n,) m and ``terminal_V`` (n,) at each sample's time.
+
+    Sample i is taken when its demand is given, so the answer to demand i shows from sample i + 1 on.
+    """
+    p, s = params[0], state[0]
+    for i in range(volts.shape[0]):
+        extension[i] = s["mode"][0]
+        terminal_V[i] = s["stack_V"]
+        for _ in range(steps_per_sample):
+            drive_step(p, s, volts[i], temperature_C)
+
+
+def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: float, seed: int) -> Array:
+    """Demand in volts about 50 V at 1 kHz: triangle (``sawtooth``), sine of growing amplitude, or a tremor."""
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    grow = np.minimum(1.0, t / max(0.2 * seconds, 1.0 / rate_hz))
+    phase = rate_hz * t
+    if profile == "sawtooth":
+        return 50.0 + amplitude_V * grow * (2.0 * np.abs(2.0 * ((phase + 0.25) % 1.0) - 1.0) - 1.0)
+    if profile == "sine":
+        return 50.0 + amplitude_V * grow * np.sin(2.0 * math.pi * phase)
+    if profile == "tremor":
+        hand = SyntheticHand(HandConfig(tremor_frequency_hz=rate_hz, tremor_frequency_spread_hz=0.0), seed)
+        pose, parts = np.zeros((len(t), 18)), np.zeros((len(t), 6))
+        hand.fill(pose, parts)
+        wave = parts[:, 5] + 0.3 * (pose[:, 2] - parts[:, 5])
+        return np.clip(50.0 + amplitude_V * grow * wave / np.max(np.abs(wave)), 0.0, 100.0)
+    raise LabError(f"profile '{profile}': it is sawtooth, sine or tremor")
+
+
+def measure_piezo(
+    config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float, amplitude_V: float
+) -> tuple[dict[str, Array], str]:
+    """Columns of the recording and its ``recording.toml``."""
+    if axis not in (0, 1, 2):
+        raise LabError(f"axis {axis}: the stacks are 0, 1 and 2")
+    if not 0.0 < rate_hz <= 200.0:
+        raise LabError(f"rate {rate_hz:g} Hz: give 0 < rate <= 200 Hz (sampled at {RATE_HZ:g} Hz)")
+    if not seconds * rate_hz >= 1.0:
+        raise LabError(f"{seconds:g} s hold no full cycle of {rate_hz:g} Hz")
+    if seconds > 3600.0:
+        raise LabError(f"{seconds:g} s: the lab closes after an hour (3600 s)")
+    if not 0.0 < amplitude_V <= 50.0:
+        raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
+    temperature_C = start_temperature_C(config)
+    volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
+    params, state = drive_channel(stack_unit(config.stack, config.seed, axis), config.amplifier, STEP_S, temperature_C)
+    extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
+    drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
+    noise = INTERFEROMETER_RMS_UM * stream(config.seed, f"lab.piezo.{axis}.{profile}").standard_normal(len(volts))
+    columns = {
+        "command_V": volts,
+        "displacement_um": extension * 1e6 + noise,
+        "temperature_C": np.full(len(volts), temperature_C),
+    }
+    descriptor = f"""format = 1
+title = "piezo stack {axis} of unit {config.seed}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
+data = "data.npz"
+rate_hz = {RATE_HZ}
+
+[twin]
+kind = "piezo_stack"
+[twin.parameters]
+gain_um_per_V = {config.stack.stroke_um_at_100_V / 100.0}
+offset_um = 0.0
+hold = "zero"
+
+[[channels]]
+column = "command_V"
+role = "input"
+signal = "command"
+unit = "V"
+
+[[channels]]
+column = "displacement_um"
+role = "output"
+signal = "displacement"
+unit = "um"
+noise_rms = {INTERFEROMETER_RMS_UM}
+
+[[channels]]
+column = "temperature_C"
+role = "context"
+signal = "temperature"
+unit = "degC"
+"""
+    return columns, descriptor
+
+
+class _Fixture:
+    """The rotary stages: holds the instrument still at one attitude."""
+
+    def __init__(self, frame: Array) -> None:
+        self.frame = frame
+
+    def start(self, pose: Array, parts: Array) -> None:
+        pose[:], parts[:] = 0.0, 0.0
+
+    def fill(self, pose: Array, parts: Array) -> None:
+        pose[:], parts[:] = 0.0, 0.0
+
+
+def tumble_attitudes(positions: int) -> tuple[Array, Array]:
+    """Stage angles (n, 2) rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity."""
+    n = np.arange(positions, dtype=np.float64)
+    polar: Array = np.arccos(1.0 - 2.0 * (n + 0.5) / positions)
+    turn = math.pi * (3.0 - math.sqrt(5.0)) * n % (2.0 * math.pi)
+    angles: Array = np.stack([turn, polar], axis=1).astype(np.float64)
+    frames = np.empty((positions, 3, 3))
+    for i, (a, b) in enumerate(angles):
+        ca, sa, cb, sb = math.cos(a), math.sin(a), math.cos(b), math.sin(b)
+        frames[i] = np.array([[cb, 0.0, sb], [0.0, 1.0, 0.0], [-sb, 0.0, cb]]) @ np.array(
+            [[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]]
+        )
+    return angles, frames
+
+
+def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> tuple[dict[str, Array], str]:
+    """Mean over ``seconds`` at each position (5 s in 000), with the true attitude of the stages."""
+    if not 12 <= positions <= 10_000:
+        raise LabError(f"{positions} positions: give 12 to 10000")
+    if not 0.01 <= seconds <= 60.0:
+        raise LabError(f"{seconds:g} s per position: give 0.01 to 60 s")
+    angles, frames = tumble_attitudes(positions)
+    analog, magnet = np.empty((positions, 8)), np.empty((positions, 3))
+    samples = round(seconds / NODE_S)
+    for i in range(positions):
+        instrument = Instrument(config, config.seed, _Fixture(frames[i]))
+        rng = stream(config.seed, f"lab.tumble.{i}")
+        # at rest the mean of n samples is the level plus the noise of that mean: no need to run n milliseconds
+        analog[i], magnet[i] = _level(instrument, config, rng, samples)
+    columns = {
+        "stage_z_rad": angles[:, 0],
+        "stage_y_rad": angles[:, 1],
+        "attitude": frames,
+        "analog_V": analog,
+        "magnetometer_V": magnet,
+    }
+    descriptor = f"""format = 1
+title = "tumble of unit {config.seed}: {positions} positions, mean of {samples} samples each"
+data = "data.npz"
+gravity_m_s2 = {config.environment.gravity_m_s2}
+# attitude (n, 3, 3): body to world = Ry(stage_y) Rz(stage_z)
+# analog_V (n, 8): a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36; magnetometer_V (n, 3)
+"""
+    return columns, descriptor
+
+
+def _level(
+    instrument: Instrument, config: EmulationConfig, rng: np.random.Generator, samples: int
+) -> tuple[Array, Array]:
+    sensors = config.sensors
+    tau_s = sensors.rc_ohm * sensors.rc_farad
+    # behind the RC the noise has the density D in V/rtHz: the mean over T has variance D^2 / (2 T)
+    density = sensors.noise_ug_per_rtHz * 1e-6
+    through_rc = density / math.sqrt(2.0 * max(samples * NODE_S, 2.0 * tau_s))
+    spread = np.full(8, sensors.daq_noise_uV * 1e-6 / math.sqrt(samples))
+    spread[:6] = np.hypot(spread[:6], through_rc)
+    magnet = sensors.magnetometer_noise_uG * 1e-6 / math.sqrt(samples)
+    return (
+        instrument.analog_V + spread * rng.standard_normal(8),
+        instrument.magnetometer_V + magnet * rng.standard_normal(3),
+    )
+
+
+def load_config(bench: Path | None, seed: int | None) -> EmulationConfig:
+    """The ``[emulation]`` table of a bench file, or the defaults; ``seed`` overrides."""
+    table: dict[str, object] = {}
+    if bench is not None:
+        try:
+            table = dict(tomllib.loads(bench.read_text()).get("emulation", {}))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            raise LabError(f"{bench}: {error}") from error
+    if seed is not None:
+        table["seed"] = seed
+    try:
+        return EmulationConfig.model_validate(table)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(v) for v in first["loc"])
+        raise LabError(f"{bench or '--seed'}: [emulation] {where}: {first['msg']}") from error
+
+
+def write_recording(folder: Path, columns: dict[str, Array], descriptor: str) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        np.savez_compressed(folder / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
+        (folder / "recording.toml").write_text(descriptor)
+    except OSError as error:
+        raise LabError(f"cannot write to {folder}: {error}") from error
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m sim_devices.plant.lab", description=__doc__)
+    what = parser.add_subparsers(dest="what", required=True)
+    piezo = what.add_parser("piezo", help="one stack under the interferometer")
+    piezo.add_argument("--axis", type=int, default=0)
+    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor"), default="sine")
+    piezo.add_argument("--rate-hz", type=float, default=10.0)
+    piezo.add_argument("--seconds", type=float, default=10.0)
+    piezo.add_argument("--amplitude-V", type=float, default=41.7, help="half of peak to peak, about 50 V")
+    tumble = what.add_parser("tumble", help="the resting instrument in many attitudes")
+    tumble.add_argument("--positions", type=int, default=100)
+    tumble.add_argument("--seconds", type=float, default=5.0, help="averaging at each position")
+    for command in (piezo, tumble):
+        command.add_argument("--out", type=Path, required=True, help="folder to write to")
+        command.add_argument("--bench", type=Path, help="bench file whose [emulation] table describes the unit")
+        command.add_argument("--seed", type=int, help="the unit, if not the bench's")
+    given = parser.parse_args(arguments)
+    try:
+        config = load_config(given.bench, given.seed)
+        if given.what == "piezo":
+            columns, descriptor = measure_piezo(
+                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V
+            )
+        else:
+            columns, descriptor = measure_tumble(config, given.positions, given.seconds)
+        write_recording(given.out, columns, descriptor)
+    except LabError as error:
+        sys.stderr.write(f"lab: {error}\n")
+        return 2
+    sys.stderr.write(f"{given.out / 'recording.toml'}: {len(next(iter(columns.values())))} rows\n")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
