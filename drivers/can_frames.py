@@ -1,0 +1,53 @@
+"""What the CAN drivers share: the checksum of setpoints and the heartbeat of this host."""
+
+from __future__ import annotations
+
+from drivers.dbc import DbcDatabase
+from hal.contracts import CanBus, Clock
+from hal.types import CanFrame
+
+HEARTBEAT_PERIOD_NS = 20_000_000
+
+
+def _crc_table() -> bytes:
+    table = bytearray(256)
+    for byte in range(256):
+        crc = byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x1D if crc & 0x80 else crc << 1) & 0xFF
+        table[byte] = crc
+    return bytes(table)
+
+
+_CRC_TABLE = _crc_table()
+
+
+def crc8_j1850(data: bytes) -> int:
+    """CRC-8/SAE-J1850: polynomial 0x1D, start 0xFF, result inverted; "123456789" gives 0x4B."""
+    table = _CRC_TABLE
+    crc = 0xFF
+    for byte in data:
+        crc = table[crc ^ byte]
+    return crc ^ 0xFF
+
+
+class HostHeartbeat:
+    """HOST_HEARTBEAT at 50 Hz, sent by whoever calls ``beat`` often enough. One per bus and process."""
+
+    def __init__(self, bus: CanBus, clock: Clock, database: DbcDatabase) -> None:
+        self.state = 0
+        self.sent = 0
+        self._bus = bus
+        self._clock = clock
+        self._id = database.get_message_by_name("HOST_HEARTBEAT").frame_id
+        self._due_ns = 0
+
+    def beat(self) -> None:
+        """Send if 20 ms have passed since the last one."""
+        now_ns = self._clock.now_ns()
+        if now_ns < self._due_ns:
+            return
+        # keep the phase, but never send a volley after a pause
+        self._due_ns = max(self._due_ns, now_ns - HEARTBEAT_PERIOD_NS) + HEARTBEAT_PERIOD_NS
+        self._bus.send(CanFrame(self._id, bytes((self.state & 0xFF,))), 0.0)
+        self.sent += 1

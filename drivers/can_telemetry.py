@@ -1,0 +1,98 @@
+"""Telemetry frames out, stop button in, over CAN (``drivers/dbc/micron.dbc``)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from drivers.can_frames import HostHeartbeat
+from drivers.dbc import load_database
+from hal.contracts import CanBus, Clock
+from hal.types import CanFrame, ChannelInfo
+
+BUTTON_LIMIT_NS = 1_500_000_000  # three heartbeats of the button
+RECEIVE_LIMIT = 32
+
+
+class CanTelemetry:
+    """Call ``poll`` at the rate of the supervisor; it also keeps the host heartbeat going."""
+
+    def __init__(
+        self, bus: CanBus, clock: Clock, *, heartbeat: HostHeartbeat | None = None, name: str = "telemetry"
+    ) -> None:
+        database = load_database()
+        self.name = name
+        self.stop_pressed = False
+        self.presses = 0
+        self.button_ns = 0
+        self.sent = 0
+        self.heartbeat = heartbeat or HostHeartbeat(bus, clock, database)
+        self._bus = bus
+        self._clock = clock
+        self._tremor = database.get_message_by_name("TELEMETRY_TREMOR")
+        self._state = database.get_message_by_name("TELEMETRY_STATE")
+        self._button = database.get_message_by_name("STOP_BUTTON")
+
+    @staticmethod
+    def receives() -> tuple[int, ...]:
+        """CAN ids for ``SharedCan.view``."""
+        return (load_database().get_message_by_name("STOP_BUTTON").frame_id,)
+
+    def poll(self) -> bool:
+        """Take what has arrived; True while the stop button is pressed. Never waits."""
+        self.heartbeat.beat()
+        for _ in range(RECEIVE_LIMIT):
+            frame = self._bus.recv(0.0)
+            if frame is None:
+                break
+            if frame.can_id == self._button.frame_id and len(frame.data) == self._button.length:
+                pressed = frame.data[0] != 0  # anything but a clear 'released' stops
+                self.presses += pressed and not self.stop_pressed
+                self.stop_pressed = pressed
+                self.button_ns = frame.t_ns
+        return self.stop_pressed
+
+    def button_silent(self) -> bool:
+        """True when the button has not been heard for 1.5 s, or never: it can then not stop anything."""
+        return self.button_ns == 0 or self._clock.now_ns() - self.button_ns > BUTTON_LIMIT_NS
+
+    def send_tremor(self, amplitude_um: Sequence[float], frequency_Hz: float) -> None:
+        """Tremor amplitude (3,) in um and frequency in Hz; values beyond the frame's range are sent as its end."""
+        x, y, z = amplitude_um
+        self._send(
+            self._tremor.frame_id,
+            self._tremor.encode(
+                {
+                    "amplitude_x": _within(x, 6553.5),
+                    "amplitude_y": _within(y, 6553.5),
+                    "amplitude_z": _within(z, 6553.5),
+                    "frequency": _within(frequency_Hz, 655.35),
+                }
+            ),
+        )
+
+    def send_state(self, state: int, flags: int, lost_samples: int, skipped_ticks: int, worst_tick_us: float) -> None:
+        """Condition of the loop; counts stop at 65535."""
+        self._send(
+            self._state.frame_id,
+            self._state.encode(
+                {
+                    "state": state & 0xFF,
+                    "flags": flags & 0xFF,
+                    "lost_samples": min(lost_samples, 0xFFFF),
+                    "skipped_ticks": min(skipped_ticks, 0xFFFF),
+                    "worst_tick": round(_within(worst_tick_us, 65535.0)),
+                }
+            ),
+        )
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        return [ChannelInfo(f"{self.name}.stop", "1", 0.0, 1.0, 1.0)]
+
+    def _send(self, can_id: int, data: bytes) -> None:
+        self._bus.send(CanFrame(can_id, data), 0.0)
+        self.sent += 1
+
+
+def _within(value: float, top: float) -> float:
+    return min(max(value, 0.0), top) if math.isfinite(value) else top

@@ -1,0 +1,28 @@
+"""The CAN frames of the bench, read from ``micron.dbc`` with cantools."""
+
+from __future__ import annotations
+
+from importlib import resources
+from typing import Protocol, cast
+
+import cantools.database
+
+
+class DbcMessage(Protocol):
+    """What we use of a cantools message."""
+
+    frame_id: int
+    length: int
+
+    def encode(self, data: dict[str, float]) -> bytes: ...
+    def decode(self, data: bytes) -> dict[str, float]: ...
+
+
+class DbcDatabase(Protocol):
+    def get_message_by_name(self, name: str) -> DbcMessage: ...
+
+
+def load_database() -> DbcDatabase:
+    """A fresh database object (about 10 ms); decoded signals are numbers, choices stay numbers too."""
+    text = resources.files("drivers.dbc").joinpath("micron.dbc").read_text(encoding="ascii")
+    return cast(DbcDatabase, cantools.database.load_string(text, "dbc"))

@@ -1,0 +1,168 @@
+"""PI E-727.3SDA digital piezo controller, three axes, over a serial line (GCS 2.0).
+
+Source: PI manual E727T0005 (commands SVO, SVA, MOV, VOL?, TMN?, TMX?, ERR?).
+
+A three-axis command is 30 to 36 bytes, about 3 ms at 115200 baud: the loop calls ``write`` every tick, the newest
+values go out at ``rate_hz`` at most, and errors are asked for now and then without waiting for the answer.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from drivers.base import wait_s
+from drivers.piezo.gcs import GcsLink
+from hal.contracts import Clock, Float64Array, SerialPort
+from hal.errors import BenchError, HalError, WrongDevice
+from hal.output_guard import OutputGuard
+from hal.types import ChannelInfo, OutputLimit
+
+CHANNELS = 3
+RATE_MAX_HZ = 200.0
+ASK_ERROR_EVERY = 20  # commands
+TICK_S = 0.001
+EPSILON_V = 1e-4  # four decimals are sent
+
+
+class E727:
+    """AnalogOutput of three stacks, in V at the stack.
+
+    ``mode`` "open loop": SVA with volts. "servo": MOV with micrometres, ``um_per_V`` converting, so that the
+    rest of the firmware still thinks in volts.
+    """
+
+    def __init__(
+        self,
+        port: SerialPort,
+        clock: Clock,
+        *,
+        lo_V: float = 0.0,
+        hi_V: float = 100.0,
+        neutral_V: float = 50.0,
+        slew_V_per_s: float = 20_000.0,
+        rate_hz: float = 100.0,
+        mode: Literal["open loop", "servo"] = "open loop",
+        um_per_V: float = 0.15,
+        name: str = "piezo",
+    ) -> None:
+        if not 0.0 < rate_hz <= RATE_MAX_HZ:
+            raise BenchError(f"rate_hz = {rate_hz} is outside 0 .. {RATE_MAX_HZ:g} Hz", device=name)
+        if not lo_V <= neutral_V <= hi_V:
+            raise BenchError(f"neutral_V = {neutral_V} is outside {lo_V} .. {hi_V} V", device=name)
+        self.name = name
+        self.limits = (OutputLimit(lo_V, hi_V, slew_V_per_s, neutral_V),) * CHANNELS
+        self.guard = OutputGuard(name, self.limits, clock, longest_gap_s=1.5 / rate_hz)
+        self.commands = 0
+        self.superseded = 0
+        self.late = 0
+        self._clock = clock
+        self._link = GcsLink(port, clock, name)
+        self._servo = mode == "servo"
+        self._verb = "MOV" if self._servo else "SVA"
+        self._per_V = um_per_V if self._servo else 1.0
+        self._period_ns = round(1e9 / rate_hz)
+        self._due_ns = 0
+        self._position_known = False
+
+    def probe(self) -> str:
+        """Identity, axes and limits; the servo is switched as ``mode`` says. Raises ``WrongDevice``."""
+        identity = self._link.query("*IDN?")[0]
+        if "E-727" not in identity:
+            raise WrongDevice(f"expected a PI E-727, found {identity!r}", device=self.name)
+        axes = self._link.query("SAI?")
+        if axes[:CHANNELS] != ["1", "2", "3"]:
+            raise WrongDevice(f"axes 1, 2, 3 are needed, the controller has {axes}", device=self.name)
+        self._link.clear_error()
+        on = int(self._servo)
+        self._link.command(f"SVO 1 {on} 2 {on} 3 {on}")
+        if self._servo:
+            low, high = self._link.values("TMN?"), self._link.values("TMX?")
+            limit = self.limits[0]
+            if max(low[:CHANNELS]) > limit.lo_V * self._per_V or min(high[:CHANNELS]) < limit.hi_V * self._per_V:
+                raise BenchError(f"the stage travels {low} .. {high} um, less than commanded", device=self.name)
+        return identity
+
+    def arm(self) -> None:
+        """Ramp to neutral, ask for errors, compare with what the controller says it was told."""
+        if not self._position_known:
+            self.probe()
+        self._position_known = False
+        while not self.safe_step():
+            wait_s(self._clock, TICK_S)
+        self._link.settle()
+        self._link.command(f"{self._verb} {self._values()}")
+        told = [v / self._per_V for v in self._link.values(f"{self._verb}?")[:CHANNELS]]
+        neutral = [limit.safe_V for limit in self.limits]
+        good = all(abs(a - b) < 0.01 for a, b in zip(told, neutral, strict=True))
+        self.guard.require(good, f"neutral is {neutral} V, the controller answers {told}")
+        self.guard.armed = True
+
+    def write(self, values_V: Float64Array) -> int:
+        """See ``AnalogOutput.write``: between two commands only the newest values count, the others are
+        ``superseded``. Raises what the controller reports, some commands later."""
+        self._link.take_error()
+        now_ns = self._clock.now_ns()
+        if now_ns < self._due_ns:
+            # still checked, so that a bad value trips in its own tick
+            mask = self.guard.admit(values_V)
+            self.superseded += 1
+            return mask
+        mask = self.guard.admit(values_V)
+        self._due_ns = max(self._due_ns, now_ns - self._period_ns) + self._period_ns
+        if self._send():
+            self.guard.sent()
+        return mask
+
+    def safe_step(self) -> bool:
+        """One tick of the ramp; steps between two command times are not sent, the last one always is."""
+        if not self._position_known:
+            self.guard.start_from([v / self._per_V for v in self._link.values(f"{self._verb}?")[:CHANNELS]])
+            self._position_known = True
+        done = self.guard.ramp()
+        now_ns = self._clock.now_ns()
+        if done or now_ns >= self._due_ns:
+            self._due_ns = max(self._due_ns, now_ns - self._period_ns) + self._period_ns
+            if not self._send():
+                return False
+        self.guard.sent()
+        return done
+
+    def readback_V(self) -> Float64Array:
+        """Piezo voltages of output channels 1 to 3, measured by the controller (``VOL?``)."""
+        self._link.settle()
+        return np.array(self._link.values("VOL? 1 2 3")[:CHANNELS])
+
+    def close(self) -> None:
+        """Ramp to neutral unless there, then close the port."""
+        try:
+            if self._position_known:
+                while not self.guard.at_safe_state() and not self.safe_step():
+                    wait_s(self._clock, TICK_S)
+        except HalError as error:
+            raise type(error)(
+                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
+            ) from error
+        finally:
+            self._position_known = False
+            self._link.close()
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        limit = self.limits[0]
+        return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, EPSILON_V) for i in range(CHANNELS)]
+
+    def _values(self) -> str:
+        a, b, c = self.guard.next_V
+        k = self._per_V
+        return f"1 {a * k:.4f} 2 {b * k:.4f} 3 {c * k:.4f}"
+
+    def _send(self) -> bool:
+        if not self._link.send(f"{self._verb} {self._values()}\n".encode()):
+            self.late += 1  # the line is slower than asked for: this value is given up
+            return False
+        self.commands += 1
+        if self.commands % ASK_ERROR_EVERY == 0:
+            self._link.ask_error()
+        return True

@@ -1,0 +1,52 @@
+"""The nidaqmx package, if it is there, and its errors in our words."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, HalError, HalTimeout, Overrun
+
+# nidaqmx.error_codes.DAQmxErrors
+NOT_YET_AVAILABLE = -200284
+OVERRUN_CODES = {-200279, -200222}  # samples no longer available, acquisition stopped before overwriting
+GONE_CODES = {-201003, -88710, -50405, -50103}  # cannot be accessed, aborted, reserved by another program
+UNKNOWN_DEVICE = -200220
+
+
+def load() -> Any:
+    """The package. ``DeviceNotFound`` says how to get it."""
+    try:
+        for part in ("constants", "errors", "stream_readers", "stream_writers"):
+            importlib.import_module(f"nidaqmx.{part}")
+        return importlib.import_module("nidaqmx")
+    except ImportError as error:
+        raise DeviceNotFound(
+            "the package 'nidaqmx' is not installed: uv pip install -e '.[ni]' in the project's folder"
+        ) from error
+
+
+def new_task(nidaqmx: Any, name: str) -> Any:
+    """An empty task. ``DeviceNotFound`` when NI's driver is missing."""
+    try:
+        return nidaqmx.Task()
+    except nidaqmx.errors.DaqNotFoundError as error:
+        raise DeviceNotFound(
+            "NI's driver NI-DAQmx is not installed on this machine: get it from NI, then run 'micron doctor'",
+            device=name,
+        ) from error
+
+
+def translated(error: Any, name: str, lost: int = 0) -> HalError:
+    """Our error for a ``DaqError``."""
+    code = int(error.error_code)
+    text = str(error).strip().splitlines()[0]
+    if code == NOT_YET_AVAILABLE:
+        return HalTimeout(text, device=name)
+    if code in OVERRUN_CODES:
+        return Overrun(f"the NI input buffer overflowed because the host did not read: {text}", device=name, lost=lost)
+    if code == UNKNOWN_DEVICE:
+        return BenchError(f"no NI device of this name: {text}", device=name)
+    if code in GONE_CODES:
+        return Disconnected(text, device=name)
+    return BusError(text, device=name)

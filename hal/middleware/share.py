@@ -1,0 +1,91 @@
+"""One CAN bus, several drivers: each gets a view that receives only its own frames.
+
+Cooperative: whoever receives sorts what arrives into all views, nobody needs a thread.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+
+from hal.contracts import CanBus
+from hal.errors import BenchError
+from hal.types import CanFrame, CanStats, PortInfo
+
+QUEUE_FRAMES = 1024
+
+
+class SharedCan:
+    """Owner of the bus. ``unclaimed`` counts frames that no view wants."""
+
+    def __init__(self, bus: CanBus) -> None:
+        self.unclaimed = 0
+        self._bus = bus
+        self._views: dict[int, CanView] = {}
+
+    def view(self, can_ids: Iterable[int]) -> CanView:
+        """A CanBus that receives exactly these ids. Raises ``BenchError`` when one is already claimed."""
+        wanted = frozenset(can_ids)
+        for can_id in wanted:
+            if can_id in self._views:
+                raise BenchError(f"CAN id 0x{can_id:X} is already received by another driver")
+        view = CanView(self, self._bus)
+        self._views.update(dict.fromkeys(wanted, view))
+        return view
+
+    def pump(self, timeout_s: float) -> bool:
+        """Receive one frame and hand it over. False when none came."""
+        frame = self._bus.recv(timeout_s)
+        if frame is None:
+            return False
+        view = self._views.get(frame.can_id)
+        if view is None:
+            self.unclaimed += 1
+        else:
+            view.accept(frame)
+        return True
+
+    def close(self) -> None:
+        self._bus.close()
+
+
+class CanView:
+    """CanBus contract for one driver. Closing a view closes nothing: the bus belongs to its owner."""
+
+    def __init__(self, owner: SharedCan, bus: CanBus) -> None:
+        self._owner = owner
+        self._bus = bus
+        self._queue: deque[CanFrame] = deque()
+        self._rx = 0
+        self._tx = 0
+        self._dropped = 0
+
+    def accept(self, frame: CanFrame) -> None:
+        """Called by the owner. A full queue gives up its oldest frame, and counts it."""
+        if len(self._queue) == QUEUE_FRAMES:
+            self._queue.popleft()
+            self._dropped += 1
+        self._queue.append(frame)
+
+    def send(self, frame: CanFrame, timeout_s: float) -> None:
+        self._bus.send(frame, timeout_s)
+        self._tx += 1
+
+    def recv(self, timeout_s: float) -> CanFrame | None:
+        """One wait of at most ``timeout_s`` on the bus; frames of other views do not end it early for long."""
+        while not self._queue and self._owner.pump(timeout_s):
+            pass
+        if not self._queue:
+            return None
+        self._rx += 1
+        return self._queue.popleft()
+
+    def stats(self) -> CanStats:
+        below = self._bus.stats()
+        return CanStats(self._rx, self._tx, self._dropped + below.dropped, below.error_frames)
+
+    def info(self) -> PortInfo:
+        return self._bus.info()
+
+    def close(self) -> None:
+        pass
