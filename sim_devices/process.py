@@ -70,6 +70,8 @@ class WorldProcess:
         self._worst_late_ns = 0
         self._turns = 0
         self._now_ns = self.world.epoch_ns
+        self._turn()  # makes up for what opening the ports took; from here on lateness counts
+        self._worst_late_ns = 0
 
     def request_stop(self, *_: object) -> None:
         self._stop = True

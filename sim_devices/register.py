@@ -114,20 +114,19 @@ class LockstepWorld:
         self._reschedule()
 
     def _reschedule(self) -> None:
-        due_ns = self.world.next_event_ns()
-        if due_ns is None or self._truth is not None:
-            return
-        if self._scheduled_ns < 0 or due_ns < self._scheduled_ns:
+        self._schedule(self.world.next_event_ns())
+
+    def _schedule(self, due_ns: int | None) -> None:
+        if due_ns is not None and (self._scheduled_ns < 0 or due_ns < self._scheduled_ns):
             self._scheduled_ns = due_ns
             self._clock.at(due_ns, self._on_due)
 
     def _on_due(self, t_ns: int) -> None:
         if self._truth is not None:
             return
-        self.world.advance_to(t_ns)
         if t_ns >= self._scheduled_ns:
             self._scheduled_ns = -1
-        self._reschedule()
+        self._schedule(self.world.advance_to(t_ns))
 
 
 class ProcessWorld:

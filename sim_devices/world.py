@@ -78,16 +78,18 @@ class World:
                 nearest = due
         return nearest
 
-    def advance_to(self, t_ns: int) -> None:
-        """Let everything happen that is due up to ``t_ns``, in order of time."""
+    def advance_to(self, t_ns: int) -> int | None:
+        """Let everything happen that is due up to ``t_ns``, in order of time; returns ``next_event_ns()``."""
         while True:
-            due_ns = self.next_event_ns()
-            if due_ns is None or due_ns > t_ns:
-                return
+            due_ns: int | None = None
+            first: TimedFace | None = None
             for face in self._timed:
                 mine = face.next_event_ns()
-                if mine is not None and mine <= due_ns:
-                    face.advance_to(due_ns)
+                if mine is not None and (due_ns is None or mine < due_ns):
+                    due_ns, first = mine, face
+            if first is None or due_ns is None or due_ns > t_ns:
+                return due_ns
+            first.advance_to(due_ns)
 
     def keep_up(self, t_ns: int) -> None:
         """Bring the plant to ``t_ns`` even if nothing looks at it, so that no later look has to wait for it."""
@@ -181,10 +183,11 @@ class World:
     def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
         self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
         self.devices[name] = face
-        self._timed.append(face)
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_i2c(name, device, Ads1115(self._magnetometer_V))
+        adc = Ads1115(self._magnetometer_V)
+        self._add_i2c(name, device, adc)
+        self._timed.append(adc)
 
     def _add_dac(self, name: str, device: Mapping[str, Any]) -> None:
         dac = Ad5696r(on_output=self._amplifier_input)

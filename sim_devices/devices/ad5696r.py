@@ -17,10 +17,11 @@ Model limits
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 REFERENCE_V = 2.5
 CHANNELS = 4
+SELECTED = tuple(tuple(c for c in range(CHANNELS) if bits >> c & 1) for bits in range(16))  # Table 8
 
 
 class Ad5696r:
@@ -68,18 +69,19 @@ class Ad5696r:
 
     def write(self, data: bytes, t_ns: int) -> int:
         """24-bit words: command and address nibble, high byte, low byte."""
+        n = len(data)
         if self.nack_data:
             return 0
-        for i in range(0, len(data), 3):
-            word = data[i : i + 3]
-            self._pointer = word[0] & 0xF
-            if len(word) == 3 and not self.frozen:
-                self._execute(word[0] >> 4, word[0] & 0xF, word[1] << 8 | word[2], t_ns)
-        return len(data)
+        for i in range(0, n, 3):
+            first = data[i]
+            self._pointer = first & 0xF
+            if i + 3 <= n and not self.frozen:
+                self._execute(first >> 4, first & 0xF, data[i + 1] << 8 | data[i + 2], t_ns)
+        return n
 
     def read(self, n: int, t_ns: int) -> bytes:
         """Input registers from the addressed channel on (A when several are), wrapping after D."""
-        selected = [c for c in range(CHANNELS) if self._pointer >> c & 1]
+        selected = SELECTED[self._pointer]
         channel = selected[0] if len(selected) == 1 else 0
         out = bytearray()
         while len(out) < n:
@@ -91,10 +93,15 @@ class Ad5696r:
         return False
 
     def _execute(self, command: int, address: int, value: int, t_ns: int) -> None:
-        if command in (1, 2, 3):
-            for channel in range(CHANNELS):
-                if address >> channel & 1:
-                    self._load(command, channel, value, t_ns)
+        if command in (1, 3):
+            for channel in SELECTED[address]:
+                self.input_codes[channel] = value
+        if command == 1:
+            if self._ldac_low:
+                self._update([c for c in SELECTED[address] if not self.ldac_mask >> c & 1], t_ns)
+            return
+        if command in (2, 3):
+            self._update(SELECTED[address], t_ns)
             return
         if command == 4:
             self.power_down = [value >> 2 * c & 0x3 for c in range(CHANNELS)]
@@ -107,13 +114,12 @@ class Ad5696r:
         for channel in range(CHANNELS):
             self._drive(channel, t_ns)
 
-    def _load(self, command: int, channel: int, value: int, t_ns: int) -> None:
-        if command != 2:
-            self.input_codes[channel] = value
-        transparent = self._ldac_low and not self.ldac_mask >> channel & 1
-        if command != 1 or transparent:
-            self.dac_codes[channel] = self.input_codes[channel]
-            self._drive(channel, t_ns)
+    def _update(self, channels: Sequence[int], t_ns: int) -> None:
+        for channel in channels:
+            code = self.input_codes[channel]
+            if code != self.dac_codes[channel]:
+                self.dac_codes[channel] = code
+                self._drive(channel, t_ns)
 
     def _volts(self, channel: int) -> float:
         if self.power_down[channel] or not self.reference_on:

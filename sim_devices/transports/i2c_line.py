@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Generator, Sequence
 from enum import IntEnum
 
-from hal.types import I2cOp, I2cRead, I2cWrite
+from hal.types import I2cOp, I2cWrite
 from sim_devices.devices.faces import I2cFace
 
 
@@ -50,31 +50,38 @@ class I2cLine:
         self.transfers += 1
         bits = 0
         data = b""
-        status = I2cStatus.BUS_ERROR if self.stuck else I2cStatus.OK
+        bit_ns = self._bit_ns
         face = self.faces.get(address)
+        status = I2cStatus.OK
+        if self.stuck:
+            status = I2cStatus.BUS_ERROR
+        elif not (address == 0 if face is None else face.acknowledges()):
+            status = I2cStatus.ADDRESS_NACK
         for op in ops:
             bits += 10
-            if status is I2cStatus.OK and not (address == 0 or (face is not None and face.acknowledges())):
-                status = I2cStatus.ADDRESS_NACK
             if status is not I2cStatus.OK:
                 break
-            count = op.n if isinstance(op, I2cRead) else len(op.data)
-            bits += 9 * count
-            end_ns = t_ns + round(bits * self._bit_ns)
-            yield end_ns
             if isinstance(op, I2cWrite):
-                status = self._write(face, op.data, end_ns)
-            elif face is None:
-                status = I2cStatus.ADDRESS_NACK  # nobody answers a read from address 0
+                sent = op.data
+                bits += 9 * len(sent)
+                end_ns = t_ns + int(bits * bit_ns)
+                yield end_ns
+                if face is None:
+                    if not any([f.general_call(sent, end_ns) for f in self.faces.values()]):
+                        status = I2cStatus.ADDRESS_NACK
+                        break
+                elif face.write(sent, end_ns) < len(sent):
+                    status = I2cStatus.DATA_NACK
+                    break
             else:
-                data += face.read(count, end_ns)
-        end_ns = t_ns + round((bits + 1) * self._bit_ns)
-        self.busy_ns += end_ns - t_ns
-        yield end_ns
+                bits += 9 * op.n
+                end_ns = t_ns + int(bits * bit_ns)
+                yield end_ns
+                if face is None:
+                    status = I2cStatus.ADDRESS_NACK  # nobody answers a read from address 0
+                    break
+                data += face.read(op.n, end_ns)
+        busy_ns = int((bits + 1) * bit_ns)
+        self.busy_ns += busy_ns
+        yield t_ns + busy_ns
         return status, data if status is I2cStatus.OK else b""
-
-    def _write(self, face: I2cFace | None, data: bytes, t_ns: int) -> I2cStatus:
-        if face is None:
-            answers = [listener.general_call(data, t_ns) for listener in self.faces.values()]
-            return I2cStatus.OK if any(answers) else I2cStatus.ADDRESS_NACK
-        return I2cStatus.OK if face.write(data, t_ns) >= len(data) else I2cStatus.DATA_NACK

@@ -112,14 +112,16 @@ class LockstepI2cBus(_Port):
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         if self._closed or self.unplugged:
             self._refuse()
-        clock = self._clock
-        steps = self._line.transfer(address, ops, clock.now_ns())
+        advance_to = self._clock.advance_to
+        steps = self._line.transfer(address, ops, self._clock.now_ns())
         try:
             while True:
-                clock.advance_to(next(steps))
+                advance_to(next(steps))
         except StopIteration as done:
             status, data = done.value
-        self._on_activity()
+        face = self._line.faces.get(address)
+        if face is None or face.next_event_ns() is not None:
+            self._on_activity()
         if status is not I2cStatus.OK:
             raise i2c_error(status, address, self._name)
         return data
