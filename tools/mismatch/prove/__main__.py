@@ -40,14 +40,10 @@ def main() -> int:
         if args.keep is None or args.seed is None:
             p.error("--generate-only needs --keep and --seed")
         plans = draw.plans(args.seed, args.cases, args.only)
-        _, answers = generate(
-            args.seed, plans, args.keep / "recordings", jobs=args.jobs, max_samples=args.max_samples
-        )
+        _, answers = generate(args.seed, plans, args.keep / "recordings", jobs=args.jobs, max_samples=args.max_samples)
         print(f"{len(answers)} recordings, sha256 {seal.close(answers, args.keep / 'sealed')}")
         return 0
-    result = prove(
-        args.cases, args.seed, args.jobs, args.keep, only=args.only, max_samples=args.max_samples
-    )
+    result = prove(args.cases, args.seed, args.jobs, args.keep, only=args.only, max_samples=args.max_samples)
     show(result, Console(file=sys.stdout if args.json is None else sys.stderr, width=150))
     if args.json is not None:
         args.json.write_text(json.dumps(result.to_json(), indent=1))

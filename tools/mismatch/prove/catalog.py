@@ -75,7 +75,9 @@ def _one_signal(where: str) -> dict[str, Entry]:
         "saturation": Entry(_shape("saturation", where), SCALAR_ALL, "the input reaches the limit"),
         "static_nonlinearity": Entry(_shape("static_nonlinearity", where), SCALAR_ALL, "a range of inputs"),
         "slew_limit": Entry(
-            _shape("slew_limit", where), ("sines", "chirp", "multisine", "staircase"), "fast and slow parts",
+            _shape("slew_limit", where),
+            ("sines", "chirp", "multisine", "staircase"),
+            "fast and slow parts",
             fast_only=True,
         ),
         "first_order_lag": Entry(
@@ -85,7 +87,9 @@ def _one_signal(where: str) -> dict[str, Entry]:
             _shape("ac_coupling", where), ("staircase", "sawtooth", "tremor", "multisine"), "content near the corner"
         ),
         "resonance": Entry(
-            _shape("resonance", where), ("staircase", "chirp", "multisine", "sines"), "steps or content near the mode",
+            _shape("resonance", where),
+            ("staircase", "chirp", "multisine", "sines"),
+            "steps or content near the mode",
             fast_only=True,
         ),
         "dead_time": Entry(

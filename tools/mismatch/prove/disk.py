@@ -108,7 +108,9 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
     if rng.random() < 0.5:
         head.append('data = "data.csv"')
         text = ",".join(columns)
-        np.savetxt(folder / "data.csv", np.stack(list(columns.values()), axis=1), "%.10g", ",", header=text, comments="")
+        np.savetxt(
+            folder / "data.csv", np.stack(list(columns.values()), axis=1), "%.10g", ",", header=text, comments=""
+        )
     else:
         head.append('data = "data.npz"')
         np.savez(folder / "data.npz", **columns)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -116,7 +116,9 @@ def scale(scene: Scene, bound: Bound, severity: float, sigma: dict[str, float], 
     return guess
 
 
-def _exact(scene: Scene, pairs: Sequence[tuple[Bound, float]], sigma: dict[str, float], refit: Refit) -> tuple[float, float]:
+def _exact(
+    scene: Scene, pairs: Sequence[tuple[Bound, float]], sigma: dict[str, float], refit: Refit
+) -> tuple[float, float]:
     """(raw, after an exact re-fit) rms of the joint effect on the worst output, in noise rms."""
     clean, y = simulate(scene), simulate(scene, pairs)
     if not all(np.all(np.isfinite(v)) for v in y.values()):
@@ -137,6 +139,8 @@ def _bound(rng: Rng, entry: Entry, scene: Scene, name: str) -> Bound:
 
 def _wish(rng: Rng, plan: Plan, entries: Sequence[Entry], max_samples: int) -> Wish:
     options = excitations_of(plan.twin)
+    if plan.kind == "unknown":
+        options = tuple(o for o in options if o != "sine")  # one line leaves nothing to tell a product by
     for e in entries:
         options = tuple(o for o in options if o in e.under)
     if not options:
@@ -148,7 +152,7 @@ def _wish(rng: Rng, plan: Plan, entries: Sequence[Entry], max_samples: int) -> W
     decoys = tuple(str(c) for c in rng.permutation(spare)[:1]) if spare and rng.random() < 0.35 else ()
     context = contexts[0] if contexts else None
     if plan.kind == "unknown":
-        names = [c for c in _strangers(plan.twin)]
+        names = list(_strangers(plan.twin))
         if rng.random() < 0.75:
             context = str(rng.choice(names))
             decoys = tuple(str(c) for c in rng.permutation([c for c in CONTEXTS[plan.twin] if c != context])[:1])
@@ -173,7 +177,7 @@ def _strangers(twin: str) -> tuple[str, ...]:
 
 def believed(rng: Rng, scene: Scene, share: float) -> dict[str, Any]:
     """The descriptor's parameters: the true ones moved by about ``share``."""
-    p = {k: v for k, v in scene.parameters.items()}
+    p = dict(scene.parameters)
 
     def move(v: Any, around: float = 0.0) -> Any:
         if isinstance(v, list):
@@ -188,7 +192,7 @@ def believed(rng: Rng, scene: Scene, share: float) -> dict[str, Any]:
         p["bias_V"] = move(p["bias_V"])
     if "offset_um" in p:
         p["offset_um"] = move(p["offset_um"], 1.0)
-    if "offset_force" in p and p["offset_force"]:
+    if p.get("offset_force"):
         p["offset_force"] = move(p["offset_force"])
     if scene.twin == "state_space":
         p["C"] = [[v * (1.0 + share * rng.uniform(-1, 1)) for v in row] for row in p["C"]]
@@ -238,8 +242,7 @@ def _attempt(rng: Rng, plan: Plan, max_samples: int, noise_kind: str | None) -> 
         for k in scene.outputs:
             steps[k], sigma[k] = noises.rounding_step(rng, sigma[k])
     refit = Refit(scene, sigma)
-    base_noisy = {k: v for k, v in simulate(replace(scene, keep=scene.t.size), noise=noise).items()}
-    noisy = {k: v[: scene.keep] for k, v in base_noisy.items()}
+    noisy = simulate(scene, noise=noise)
     bounds: list[Bound] = [_bound(rng, e, scene, n) for e, n in zip(entries, plan.effects, strict=True)]
     if plan.kind == "unknown":
         bounds = [unknown(rng, scene, wish.context)]
@@ -276,8 +279,17 @@ def _attempt(rng: Rng, plan: Plan, max_samples: int, noise_kind: str | None) -> 
         pairs.append((bound, s))
         truths.append(
             Truth(
-                bound.name, bound.form, s, bound.outputs, bound.stages, bound.depends, bound.predictable,
-                plan.severity, raw, left, figures,
+                bound.name,
+                bound.form,
+                s,
+                bound.outputs,
+                bound.stages,
+                bound.depends,
+                bound.predictable,
+                plan.severity,
+                raw,
+                left,
+                figures,
             )
         )
     recorded = simulate(scene, pairs, noise=noise)
@@ -291,9 +303,7 @@ def _attempt(rng: Rng, plan: Plan, max_samples: int, noise_kind: str | None) -> 
         given, true = dict(scene.parameters), True
     else:
         given, true = believed(rng, scene, 0.02), False
-    return Case(
-        plan, scene, recorded, tuple(truths), kind, sigma, bool(rng.random() < 0.5), given, true, wish.decoys
-    )
+    return Case(plan, scene, recorded, tuple(truths), kind, sigma, bool(rng.random() < 0.5), given, true, wish.decoys)
 
 
 def plans(seed: int, count: int, only: tuple[str, str, float] | None = None) -> list[Plan]:
@@ -357,7 +367,7 @@ def _restricted(rng: Rng, count: int, only: tuple[str, str, float]) -> list[Plan
             continue
         twins = [t for t in TWINS if (not twin or t == twin) and (not effect or effect in TABLE[t])]
         if not twins:
-            raise ValueError(f"no twin shows {effect!r} on {twin!r}; effects: {sorted(TABLE.get(twin, TABLE['piezo_stack']))}")
+            raise ValueError(f"no twin of {TWINS} shows {effect!r} on {twin or 'any twin'}")
         t = str(rng.choice(twins))
         out.append(Plan("single", t, (effect or str(rng.choice(list(TABLE[t]))),), sev))
     return out

@@ -131,9 +131,7 @@ def _angles(rng: Rng, kind: str, t: Array) -> Array:
         rise = np.full(count - 1, max(min(0.3 * dwell, rng.uniform(0.3, 1.2)), 2 * (t[1] - t[0])))
         first = np.cumsum(rng.choice([30.0, 45.0, 60.0, 90.0]) * np.ones(count))
         half = count // 2
-        second = np.concatenate(
-            [np.zeros(half), np.cumsum(rng.choice([30.0, 45.0, 90.0]) * np.ones(count - half))]
-        )
+        second = np.concatenate([np.zeros(half), np.cumsum(rng.choice([30.0, 45.0, 90.0]) * np.ones(count - half))])
         third = np.concatenate([np.zeros(count // 3), 35.0 * np.ones(count - count // 3)])
         cols = [levels(t, np.deg2rad(v), times, rise) for v in (third, first, second)]
         return np.stack([cols[i] for i in rng.permutation(3)], axis=1)

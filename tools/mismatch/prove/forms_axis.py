@@ -87,9 +87,7 @@ def cubic_stiffness(rng: Rng, scene: Scene) -> Bound:
     fifth = rng.uniform(0.0, 0.12)
     form = "hardening" if sign > 0 else "softening"
     top = 3.0 if sign > 0 else 0.35
-    return _core(
-        "cubic_stiffness", form, scene, {}, {"k3": sign * k / x**2, "k5": sign * fifth * k / x**4}, top
-    )
+    return _core("cubic_stiffness", form, scene, {}, {"k3": sign * k / x**2, "k5": sign * fifth * k / x**4}, top)
 
 
 def cogging(rng: Rng, scene: Scene) -> Bound:

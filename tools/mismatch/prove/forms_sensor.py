@@ -79,9 +79,7 @@ def cross_axis_nonlinearity(rng: Rng, scene: Scene) -> Bound:
         r = flow.drive[other] / ref
         return r**2 + c * r**4
 
-    return added(
-        "cross_axis_nonlinearity", form, scene, (out,), wave, stages=SENSOR, depends=(other,)
-    )
+    return added("cross_axis_nonlinearity", form, scene, (out,), wave, stages=SENSOR, depends=(other,))
 
 
 def scale_factor_variation(rng: Rng, scene: Scene) -> Bound:
@@ -129,9 +127,7 @@ def _follows(name: str, rng: Rng, scene: Scene, signal: str, stages: tuple[str, 
                 flow.out[k] = y + s * h * r
             flow.out[k] = flow.out[k] + s * g * r * (y - zero_level(scene, k))
 
-    return Bound(
-        name, form, on_out=after, outputs=outs, stages=stages, depends=(signal,), strength=(1e-6, 0.8)
-    )
+    return Bound(name, form, on_out=after, outputs=outs, stages=stages, depends=(signal,), strength=(1e-6, 0.8))
 
 
 def temperature_sensitivity(rng: Rng, scene: Scene) -> Bound:

@@ -36,9 +36,7 @@ def thermal_drift(rng: Rng, scene: Scene) -> Bound:
         return w
 
     truth = (lambda s: {"time_constant": (tau, "s")}) if form in ("one_exponential", "unknown_start") else None
-    return added(
-        "thermal_drift", form, scene, pick_outputs(rng, scene, False), wave, stages=ANYWHERE, truth=truth
-    )
+    return added("thermal_drift", form, scene, pick_outputs(rng, scene, False), wave, stages=ANYWHERE, truth=truth)
 
 
 def mains_interference(rng: Rng, scene: Scene) -> Bound:
@@ -237,7 +235,7 @@ def dropped_samples(rng: Rng, scene: Scene) -> Bound:
         index = np.arange(n)
         for a, w, g in zip(at[::-1], weight[::-1], sign[::-1], strict=True):
             k = int(a * scene.keep)
-            m = max(int(round(s * w)), 1)
+            m = max(round(s * w), 1)
             if g > 0:
                 index = np.concatenate([index[:k], index[k + m :]])
             else:

@@ -17,6 +17,15 @@ def _normal(x: Array) -> Array:
     return (x - mid) / max(float(np.max(np.abs(x - mid))), 1e-12)
 
 
+def _decorrelation(x: Array) -> int:
+    """Lag in samples at which x has forgotten most of itself: a shorter one makes the product a plain square."""
+    c = x - np.mean(x)
+    full = 1 << int(np.ceil(np.log2(2 * c.size)))
+    corr = np.fft.irfft(np.abs(np.fft.rfft(c, full)) ** 2)[: c.size // 4]
+    below = np.flatnonzero(corr < 0.2 * corr[0])
+    return int(below[0]) if below.size else c.size // 8
+
+
 def gain_follows_context(rng: Rng, scene: Scene, signal: str) -> Bound:
     form = str(rng.choice(["gain_bump", "gain_wave", "gain_valley", "gain_swell"]))
     centre, width, wave_k = rng.uniform(-0.3, 0.3), rng.uniform(0.2, 0.45), rng.uniform(3.0, 5.5)
@@ -35,9 +44,7 @@ def gain_follows_context(rng: Rng, scene: Scene, signal: str) -> Bound:
             g = h  # plain amplitude modulation by the recorded signal
         flow.out[out] = flow.out[out] + s * g * (flow.out[out] - zero)
 
-    return Bound(
-        NAME, form, on_out=after, outputs=(out,), stages=ANY_STAGE, depends=(signal,), strength=(1e-6, 0.9)
-    )
+    return Bound(NAME, form, on_out=after, outputs=(out,), stages=ANY_STAGE, depends=(signal,), strength=(1e-6, 0.9))
 
 
 def offset_follows_context(rng: Rng, scene: Scene, signal: str) -> Bound:
@@ -57,7 +64,7 @@ def product_of_history(rng: Rng, scene: Scene) -> Bound:
     key = main_drive(scene)
     x = scene.inputs[key]
     mid, half = 0.5 * (x.max() + x.min()), max(0.5 * float(np.ptp(x)), 1e-12)
-    late = rng.uniform(0.03, 0.2) if scene.dt < 0.5 else rng.uniform(60, 300)
+    late = _decorrelation(x) * scene.dt * rng.uniform(0.9, 1.3)
     form = str(rng.choice(["product_with_past", "past_square_times_now"]))
     out = str(rng.choice(list(scene.outputs)))
 
@@ -66,9 +73,7 @@ def product_of_history(rng: Rng, scene: Scene) -> Bound:
         past = np.interp(flow.t - late, flow.t, now)
         return now * past if form == "product_with_past" else now * past**2
 
-    return added(
-        NAME, form, scene, (out,), wave, stages=ANY_STAGE, depends=(key, *scene.outputs)
-    )
+    return added(NAME, form, scene, (out,), wave, stages=ANY_STAGE, depends=(key, *scene.outputs))
 
 
 def context_times_rate(rng: Rng, scene: Scene, signal: str) -> Bound:

@@ -249,20 +249,28 @@ def axis(force, dt, p, x0, v0):
             f1 -= fr
             fm -= fr
             stuck = False
-        a1, z1, w1 = _rates(x, v, z, w, f0, p)
-        h = 0.5 * dt
-        a2, z2, w2 = _rates(x + h * v, v + h * a1, z + h * z1, w + h * w1, fm, p)
-        v2 = v + h * a1
-        a3, z3, w3 = _rates(x + h * v2, v + h * a2, z + h * z2, w + h * w2, fm, p)
-        v3 = v + h * a2
-        v4 = v + dt * a3
-        a4, z4, w4 = _rates(x + dt * v3, v4, z + dt * z3, w + dt * w3, f1, p)
-        x += dt / 6.0 * (v + 2 * v2 + 2 * v3 + v4)
-        vn = v + dt / 6.0 * (a1 + 2 * a2 + 2 * a3 + a4)
-        if kind == 2 and vn * v < 0.0:
-            vn = 0.0
+        # bristles are stiff: as many parts as keep a Runge-Kutta step stable
+        parts = 1
+        if kind >= 3:
+            parts = 1 + int(2.0 * dt * p[13] * abs(v) / p[10])
+        h = dt / parts
+        df = (f1 - f0) / parts
+        last = v
+        for j in range(parts):
+            g0 = f0 + j * df
+            gm = g0 + 0.5 * df
+            a1, z1, w1 = _rates(x, v, z, w, g0, p)
+            v2 = v + 0.5 * h * a1
+            a2, z2, w2 = _rates(x + 0.5 * h * v, v2, z + 0.5 * h * z1, w + 0.5 * h * w1, gm, p)
+            v3 = v + 0.5 * h * a2
+            a3, z3, w3 = _rates(x + 0.5 * h * v2, v3, z + 0.5 * h * z2, w + 0.5 * h * w2, gm, p)
+            v4 = v + h * a3
+            a4, z4, w4 = _rates(x + h * v3, v4, z + h * z3, w + h * w3, g0 + df, p)
+            x += h / 6.0 * (v + 2 * v2 + 2 * v3 + v4)
+            v += h / 6.0 * (a1 + 2 * a2 + 2 * a3 + a4)
+            z += h / 6.0 * (z1 + 2 * z2 + 2 * z3 + z4)
+            w += h / 6.0 * (w1 + 2 * w2 + 2 * w3 + w4)
+        if kind == 2 and v * last < 0.0:
+            v = 0.0
             stuck = True
-        v = vn
-        z += dt / 6.0 * (z1 + 2 * z2 + 2 * z3 + z4)
-        w += dt / 6.0 * (w1 + 2 * w2 + 2 * w3 + w4)
     return xs, vs

@@ -118,9 +118,25 @@ def _axis(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
     core = flow.core
     vec = np.zeros(20)
     vec[0], vec[1], vec[2] = p["mass"], p["damping"], p["stiffness"]
-    names = (
-        "k3 k5 cog pitch phase second kind sliding static stribeck bristle bristle_damping curve loop yield_ beta gamma"
-    ).split()
+    names = [
+        "k3",
+        "k5",
+        "cog",
+        "pitch",
+        "phase",
+        "second",
+        "kind",
+        "sliding",
+        "static",
+        "stribeck",
+        "bristle",
+        "bristle_damping",
+        "curve",
+        "loop",
+        "yield_",
+        "beta",
+        "gamma",
+    ]
     defaults = {"pitch": 1.0, "stribeck": 1.0, "bristle": 1.0, "yield_": 1.0, "sliding": 1.0, "static": 1.0}
     for i, name in enumerate(names):
         vec[3 + i] = core.get(name, defaults.get(name, 0.0))

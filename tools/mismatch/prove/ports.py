@@ -87,7 +87,10 @@ def shaped(name: str, rng: Rng, scene: Scene, where: str) -> Bound:
     base = simulate(scene)
     span_of = {k: Span.of(base[k], zero) for k in outs}
     if name == "dead_zone":
-        span_of = {k: Span(zero_level(scene, k), max(float(np.max(np.abs(base[k] - zero_level(scene, k)))), 1e-12)) for k in outs}
+        span_of = {
+            k: Span(zero_level(scene, k), max(float(np.max(np.abs(base[k] - zero_level(scene, k)))), 1e-12))
+            for k in outs
+        }
 
     def out(flow: Flow, s: float) -> None:
         dt = float(flow.t[1] - flow.t[0])

@@ -63,13 +63,13 @@ def generate(
     *,
     jobs: int = 1,
     max_samples: int = 24_000,
-    noise_kinds: Sequence[str] | None = None,
+    each_noise: Sequence[str] | None = None,
 ) -> tuple[dict[str, Path], dict[str, dict[str, Any]]]:
-    """Write the recordings of these plans; (paths, answers). A plan that no scene shows is left out."""
-    work = [
-        (seed, i, p, folder, max_samples, noise_kinds[i % len(noise_kinds)] if noise_kinds else None)
-        for i, p in enumerate(plans)
-    ]
+    """Write the recordings of these plans; (paths, answers). A plan that no scene shows is left out.
+
+    ``each_noise`` fixes the kind of noise of each plan.
+    """
+    work = [(seed, i, p, folder, max_samples, each_noise[i] if each_noise else None) for i, p in enumerate(plans)]
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
             done = list(pool.map(_generate, work))
@@ -118,5 +118,7 @@ def prove(
     rows: list[dict[str, Any]] = []
     for name in sorted(reports):
         report, seconds = reports[name]
-        rows.append({"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report)})
+        rows.append(
+            {"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report)}
+        )
     return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder)

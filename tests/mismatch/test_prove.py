@@ -1,0 +1,141 @@
+"""The proof's machinery: seal, scoring, tables; and one small real run."""
+
+from __future__ import annotations
+
+import io
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from tools.mismatch.prove import prove, seal
+from tools.mismatch.prove.nulls import clopper_pearson, document, nulls
+from tools.mismatch.prove.score import coverage, score
+from tools.mismatch.prove.table import failures, show
+
+QUIET = {"max_samples": 2500, "progress": lambda text: None}
+
+
+def silent(path: Path) -> dict[str, Any]:
+    """Says that everything agrees."""
+    del path
+    return {"format": 1, "verdict": "agrees", "physics": [], "location": {}, "fit": {}, "seconds": 0.0}
+
+
+def peeking(path: Path) -> dict[str, Any]:
+    """A perfect tool: opens the seal beside the recordings. Only for tests of the scoring."""
+    answers = json.loads((path.parents[2] / "sealed" / "answers.json").read_text())
+    a = answers[path.parent.name]
+    outs = list(a["noise_rms"])
+    first = a["effects"][0] if a["effects"] else None
+    verdict = {"single": "missing_physics", "pair": "missing_physics", "unknown": "unexplained"}.get(
+        a["kind"], a["kind"]
+    )
+    physics = [
+        {"name": t["name"], "parameters": {}, "output": t["outputs"][0]} for t in a["effects"] if t["name"] != "unknown"
+    ]
+    rms = {k: a["noise_rms"][k] for k in outs}
+    return {
+        "format": 1,
+        "verdict": verdict,
+        "physics": physics,
+        "location": {
+            "outputs": first["outputs"] if first else [],
+            "stage": first["stages"][0] if first else "",
+            "depends_on": [{"signal": first["depends"][0], "feature": "value", "strength": 1.0}] if first else [],
+        },
+        "fit": {"unit": {}, "fitted_rms": rms, "recalibrated_rms": {k: 5 * v for k, v in rms.items()}},
+        "seconds": 0.0,
+    }
+
+
+def test_a_perfect_tool_scores_full_marks_and_a_silent_one_none(tmp_path: Path) -> None:
+    good = prove(12, 21, 1, tmp_path / "good", diagnose=peeking, **QUIET)
+    s = good.summary
+    for key in ("named_severity_4_up", "named_severity_2", "pairs_both_named", "unknown_with_right_signal"):
+        assert s[key][0] == s[key][1]
+    assert s["false_alarms"][0] == s["below_noise"][0] == s["errors"][0] == 0
+    assert failures(good) == []
+    bad = prove(12, 21, 1, tmp_path / "bad", diagnose=silent, **QUIET)
+    assert bad.summary["named_severity_4_up"][0] == 0
+    assert bad.summary["false_alarms"][0] == 0
+    assert bad.digest == good.digest
+    text = io.StringIO()
+    show(bad, Console(file=text, width=140))
+    assert "weak classes" in text.getvalue()
+    json.dumps(bad.to_json())
+
+
+def test_the_hash_is_said_before_any_diagnosis_and_a_broken_seal_is_noticed(tmp_path: Path) -> None:
+    said: list[str] = []
+
+    def tamper(path: Path) -> dict[str, Any]:
+        assert any("sha256" in line for line in said)
+        file = path.parents[2] / "sealed" / "answers.json"
+        file.write_text(file.read_text() + " ")
+        return silent(path)
+
+    with pytest.raises(ValueError, match="sealed"):
+        prove(2, 5, 1, tmp_path, diagnose=tamper, max_samples=2500, progress=said.append)
+
+
+def test_a_crash_of_the_tool_is_counted(tmp_path: Path) -> None:
+    def broken(path: Path) -> dict[str, Any]:
+        raise RuntimeError(str(path))
+
+    r = prove(3, 6, 1, tmp_path, diagnose=broken, **QUIET)
+    assert r.summary["errors"] == [len(r.rows), len(r.rows)]
+
+
+def _answer(**more: Any) -> dict[str, Any]:
+    effect = {
+        "name": "dead_time", "form": "f", "outputs": ["displacement"], "stages": ["amplifier"], "depends": ["command"],
+        "predictable": True, "figures": {"delay": [0.004, "s"]},
+    }  # fmt: skip
+    return {
+        "kind": "single", "twin": "piezo_stack", "severity": 4.0, "excitation": "chirp", "effects": [effect],
+        "noise_kind": "white", "noise_rms": {"displacement": 0.1}, "decoys": [], **more,
+    }  # fmt: skip
+
+
+def test_scoring_reads_units_intervals_and_order() -> None:
+    par = {"delay_ms": {"value": 4.1, "unit": "ms", "ci95": [3.9, 4.3]}}
+    report = {
+        "verdict": "missing_physics",
+        "physics": [{"name": "dead_time", "parameters": par}, {"name": "creep", "parameters": {}}],
+        "location": {"outputs": ["displacement"], "stage": "amplifier", "depends_on": [{"signal": "command"}]},
+        "fit": {"unit": {"displacement": "m"}, "recalibrated_rms": {"displacement": 0.41e-6},
+                "fitted_rms": {"displacement": 0.08e-6}},
+    }  # fmt: skip
+    row = score(_answer(), report)
+    assert row["ok"]
+    assert row["extra"] == ["creep"]
+    assert row["below_noise"]
+    assert row["ratio"] == pytest.approx(0.8)
+    assert [c["covered"] for c in coverage(report, _answer())] == [True]
+    report["physics"].reverse()
+    assert not score(_answer(), report)["ok"]
+
+
+def test_null_harness_counts_and_bounds(tmp_path: Path) -> None:
+    doc = tmp_path / "doc.md"
+    r = nulls(6, 3, 1, doc=doc, max_samples=1500, diagnose=silent, say=lambda text: None)
+    assert r.count() == (0, 6)
+    assert "0 of 6 (0.0 to 45.9 %)" in doc.read_text()
+    assert document(r) == doc.read_text()
+    assert clopper_pearson(0, 300)[1] == pytest.approx(0.0122, abs=1e-4)  # 1 - 0.025**(1/300)
+
+
+def test_sealed_answers_come_back(tmp_path: Path) -> None:
+    digest = seal.close({"r0": {"kind": "agrees"}}, tmp_path)
+    assert seal.opened(tmp_path, digest) == {"r0": {"kind": "agrees"}}
+
+
+@pytest.mark.slow
+def test_small_real_proof(tmp_path: Path) -> None:
+    """Six cases through the real tool: it runs, names most, and raises no alarm on the controls."""
+    r = prove(6, 1, 1, tmp_path, max_samples=6000, progress=lambda text: None)
+    assert r.summary["errors"][0] == 0
+    assert r.summary["false_alarms"][0] == 0
