@@ -181,10 +181,6 @@ class InstrumentLoop:
 
     def _start(self) -> None:
         self.supervisor.begin_self_test()
-        magnetometer = self._devices.magnetometer
-        if magnetometer is not None:
-            for _ in magnetometer.measure_offset():
-                self._clock.sleep_until_ns(self._clock.now_ns() + self._period_ns)
         self._started_ns = self._clock.now_ns()
         self._devices.daq.start()
 
@@ -318,14 +314,10 @@ class InstrumentLoop:
             self._bad_for(name, outside, t_ns, 100.0, f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}")
         telemetry = self._devices.telemetry
         if telemetry is not None:
-            telemetry.poll()
-            if telemetry.stop_pressed:
+            if telemetry.poll():
                 self._trip("stop button pressed")
-            silence_ms = telemetry.stop_button_silence_ns(t_ns) * 1e-6
-            if silence_ms > limits.stop_button_silence_ms:
-                self._trip(
-                    f"{telemetry.name}: the stop button has been silent for {silence_ms:.0f} ms; check the CAN bus"
-                )
+            elif telemetry.button_silent() and self.supervisor.may_move:
+                self._trip(f"{telemetry.name}: the stop button is not heard any more; check the CAN bus and the button")
 
     def _bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
         """Trip when ``bad`` has held for ``limit_ms``."""
@@ -337,19 +329,28 @@ class InstrumentLoop:
     def _send_telemetry(self, info: TickInfo) -> None:
         telemetry = self._devices.telemetry
         assert telemetry is not None
-        telemetry.send(self.stages.frame, int(self.supervisor.state), self.counts.lost)
+        frame, state = self._frame, int(self.supervisor.state)
+        telemetry.heartbeat.state = state
+        amplitude_um = [1e6 * float(v) for v in frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
+        telemetry.send_tremor(amplitude_um, float(frame[TREMOR_FREQUENCY]))
+        scheduler = self.scheduler
+        telemetry.send_state(
+            state, int(frame[STATUS]), self.counts.lost, scheduler.skipped_ticks, scheduler.worst_tick_ns * 1e-3
+        )
 
     def _self_test_passed(self, now_ns: int) -> bool:
         """Sensors have been watched long enough and are sane; trips when that takes too long."""
         limits = self._config.self_test
         watched_ms = (now_ns - self._started_ns) * 1e-6
         status = int(self._frame[STATUS])
+        telemetry = self._devices.telemetry
         waiting = [
             name
             for name, wrong in (
                 ("attitude is not aligned", status & FrameStatus.ALIGNING),
                 ("an accelerometer is out of range", status & FrameStatus.SATURATED),
                 ("a reading is not a number", status & FrameStatus.INVALID),
+                ("the stop button has not been heard", telemetry is not None and telemetry.button_silent()),
             )
             if wrong
         ]
@@ -382,5 +383,5 @@ class InstrumentLoop:
             "command_V": [float(v) for v in frame[COMMAND : COMMAND + 3]],
             "latency_us": [latency.p50_us, latency.p99_us],
             "lost": self.counts.lost,
-            "skipped": 0,
+            "skipped": self.scheduler.skipped_ticks,
         }

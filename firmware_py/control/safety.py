@@ -37,8 +37,6 @@ class SafetyLimits(BaseModel):
     temperature_C: tuple[float, float] = (0.0, 60.0)
     supply_V: tuple[float, float] = (4.5, 5.5)
     saturated_ms: float = 50.0
-    stop_button_silence_ms: float = 1500.0
-    amplifier_silence_ms: float = 500.0
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from drivers.adc.ads1115 import Ads1115
+from drivers.base import wait_s
+from drivers.can_frames import HostHeartbeat
 from drivers.can_telemetry import CanTelemetry
 from drivers.daq.di4108 import Di4108
+from drivers.dbc import load_database
 from drivers.hmc2003 import Hmc2003
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
@@ -23,8 +26,9 @@ from drivers.specs import (
     check_devices,
 )
 from hal.bench import DeviceSpec, OpenBench
-from hal.contracts import AnalogOutput
+from hal.contracts import AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
+from hal.middleware.share import SharedCan
 from hal.types import ScanConfig, ScanInfo
 
 ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))
@@ -66,7 +70,8 @@ def open_devices(bench: OpenBench) -> Devices:
 
     daq = Di4108(bench.serial(_bus(description.device[daq_name])), bench.clock, name=daq_name)
     probe(daq_name, daq.probe)
-    amplifier = _amplifier(bench, piezo_name, options[piezo_name])
+    can = _CanBuses(bench)
+    amplifier = _amplifier(bench, can, piezo_name, options[piezo_name])
     probe(piezo_name, amplifier.probe)
     magnetometer = None
     for name, spec in description.devices_with("hmc2003").items():
@@ -78,21 +83,30 @@ def open_devices(bench: OpenBench) -> Devices:
             bench.i2c(_bus(adc_spec)),
             bench.clock,
             adc_spec.address or 0x48,
-            range_V=adc_options.full_scale_V,
+            full_scale_V=adc_options.full_scale_V,
             name=adc_name,
         )
         probe(adc_name, adc.probe)
         magnetometer = Hmc2003(adc, daq, bench.clock, magnetometer_options.channels, name=name)
     telemetry = None
     for name, spec in description.devices_with("can_telemetry").items():
-        telemetry = CanTelemetry(bench.can(_bus(spec)), bench.clock, name=name)
+        bus = _bus(spec)
+        telemetry = CanTelemetry(
+            can.view(bus, CanTelemetry.receives()), bench.clock, heartbeat=can.heartbeat(bus), name=name
+        )
     if failures:
         raise failures[0] if len(failures) == 1 else OpenFailed(failures)
     daq_options: Di4108Options = options[daq_name]
     scan = daq.configure(
         ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
     )
-    return Devices(daq, scan, amplifier, magnetometer, telemetry, _sensing_table(options, scan, where), identities)
+    sensing = _sensing_table(options, scan, where)
+    if magnetometer is not None:
+        # set and reset pulses tell the bridge's offset of today; the DAQ takes no commands while it scans
+        for _ in magnetometer.measure_offset():
+            wait_s(bench.clock, 0.001)
+        sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
+    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, identities)
 
 
 def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:
@@ -106,7 +120,26 @@ def _bus(spec: DeviceSpec) -> str:
     return spec.bus
 
 
-def _amplifier(bench: OpenBench, name: str, options: Any) -> DacAmplifier | E727 | CanAmplifier:
+class _CanBuses:
+    """Several drivers on one CAN bus: each sees its own frames, and the host has one heartbeat."""
+
+    def __init__(self, bench: OpenBench) -> None:
+        self._bench = bench
+        self._shared: dict[str, SharedCan] = {}
+        self._heartbeats: dict[str, HostHeartbeat] = {}
+
+    def view(self, bus: str, can_ids: Iterable[int]) -> CanBus:
+        if bus not in self._shared:
+            self._shared[bus] = SharedCan(self._bench.can(bus))
+        return self._shared[bus].view(can_ids)
+
+    def heartbeat(self, bus: str) -> HostHeartbeat:
+        if bus not in self._heartbeats:
+            self._heartbeats[bus] = HostHeartbeat(self._bench.can(bus), self._bench.clock, load_database())
+        return self._heartbeats[bus]
+
+
+def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> DacAmplifier | E727 | CanAmplifier:
     spec = bench.file.description.device[name]
     match options:
         case DacAmplifierOptions():
@@ -115,6 +148,8 @@ def _amplifier(bench: OpenBench, name: str, options: Any) -> DacAmplifier | E727
                 bench.clock,
                 spec.address or 0x0C,
                 gain=options.gain,
+                lo_V=options.lo_V,
+                hi_V=options.hi_V,
                 neutral_V=options.neutral_V,
                 slew_V_per_s=options.slew_V_per_s,
                 name=name,
@@ -123,6 +158,8 @@ def _amplifier(bench: OpenBench, name: str, options: Any) -> DacAmplifier | E727
             return E727(
                 bench.serial(_bus(spec)),
                 bench.clock,
+                lo_V=options.lo_V,
+                hi_V=options.hi_V,
                 neutral_V=options.neutral_V,
                 slew_V_per_s=options.slew_V_per_s,
                 rate_hz=options.rate_hz,
@@ -130,10 +167,11 @@ def _amplifier(bench: OpenBench, name: str, options: Any) -> DacAmplifier | E727
             )
         case CanAmplifierOptions():
             return CanAmplifier(
-                bench.can(_bus(spec)),
+                can.view(_bus(spec), CanAmplifier.receives()),
                 bench.clock,
                 neutral_V=options.neutral_V,
                 slew_V_per_s=options.slew_V_per_s,
+                heartbeat=can.heartbeat(_bus(spec)),
                 name=name,
             )
         case _:

@@ -216,6 +216,16 @@ class Scheduler:
         for task in due[done + 1 :]:
             task.skipped += 1
 
+    @property
+    def skipped_ticks(self) -> int:
+        """Ticks that never ran since the last ``reset``."""
+        return self._skipped_ticks
+
+    @property
+    def worst_tick_ns(self) -> int:
+        """Longest tick since the last ``reset``."""
+        return self._tick_duration.max_ns
+
     # -- statistics --------------------------------------------------------------------------------------
 
     def ignore_next(self, reason: str, ticks: int = 1) -> None:

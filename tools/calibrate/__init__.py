@@ -1,0 +1,1 @@
+"""Identification: from calibration recordings to the tables that the firmware loads."""
