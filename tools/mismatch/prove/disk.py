@@ -113,7 +113,7 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
         )
     else:
         head.append('data = "data.npz"')
-        np.savez(folder / "data.npz", **columns)
+        np.savez(folder / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
     given = "\n".join(f"{k} = {_toml(v)}" for k, v in case.given.items())
     text = "\n".join(head) + f'\n\n[twin]\nkind = "{scene.twin}"\n[twin.parameters]\n{given}\n\n'
     path = folder / "recording.toml"

@@ -208,6 +208,7 @@ def _recalibration(rng: Rng, scene: Scene, sigma: dict[str, float], severity: fl
     """Wrong parameters whose error is about ``severity`` noise rms on the worst output."""
     truth, share = simulate(scene), 0.02
     state = rng.bit_generator.state
+    p = dict(scene.parameters)
     for _ in range(12):
         rng.bit_generator.state = state
         p = believed(rng, scene, share)

@@ -101,7 +101,7 @@ def rate_dependent_hysteresis(rng: Rng) -> Shape:
 
 def lti(num: list[float], den: list[float], x: Array, dt: float) -> Array:
     """Continuous transfer function applied on the fine grid, at rest in its steady state for x[0]."""
-    b, a = bilinear(num, den, fs=1.0 / dt)
+    b, a = (np.atleast_1d(np.asarray(v, float)) for v in bilinear(num, den, fs=1.0 / dt))
     zi = lfilter_zi(b, a) if abs(np.sum(a)) > 1e-14 else np.zeros(max(len(a), len(b)) - 1)
     y, _ = lfilter(b, a, x, zi=zi * x[0])
     return y

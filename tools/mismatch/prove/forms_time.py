@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.signal import lfilter
 
 from tools.mismatch.prove.forms_memory import Array, Rng
 from tools.mismatch.prove.plants import Bound, Flow, Scene, Signals
@@ -175,9 +177,7 @@ def random_walk(rng: Rng, scene: Scene) -> Bound:
         if form == "integrated_white":
             w = np.cumsum(steps)
         else:
-            from scipy.signal import lfilter
-
-            w = lfilter([1.0], [1.0, -np.exp(-scene.dt / tau)], steps)
+            w = np.asarray(lfilter([1.0], [1.0, -np.exp(-scene.dt / tau)], steps))
         w = w / np.std(w)
         return np.interp(flow.t, scene.t, w)
 
@@ -198,8 +198,6 @@ def clock_skew(rng: Rng, scene: Scene) -> Bound:
     change = rng.uniform(0.2, 0.6) if form == "drifting" else 0.0
 
     def clock(flow: Flow, s: float) -> None:
-        from scipy.interpolate import CubicSpline
-
         t = flow.t - flow.t[0]
         span = t[-1]
         skew = sign * s * 1e-6

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete
+from scipy.linalg import expm
 
 from tools.mismatch.prove import kernels
 
@@ -146,32 +146,40 @@ def _axis(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
     flow.out["velocity"] = v
 
 
+def held_step(a: Array, b: Array, h: float) -> tuple[Array, Array]:
+    """Discrete (A, B) for an input that is held over a step of ``h`` seconds."""
+    n, m = b.shape
+    block = np.zeros((n + m, n + m))
+    block[:n, :n], block[:n, n:] = a * h, b * h
+    e = np.asarray(expm(block), np.float64)
+    return np.ascontiguousarray(e[:n, :n]), np.ascontiguousarray(e[:n, n:])
+
+
+def ramp_step(a: Array, b: Array, h: float) -> tuple[Array, Array, Array]:
+    """Discrete (A, B0, B1) for an input linear in a step: x(k+1) = A x + B0 u(k) + B1 u(k+1)."""
+    n, m = b.shape
+    block = np.zeros((n + 2 * m, n + 2 * m))
+    block[:n, :n], block[:n, n : n + m] = a * h, b * h
+    block[n : n + m, n + m :] = np.eye(m)
+    e = np.asarray(expm(block), np.float64)
+    b1 = e[:n, n + m :]
+    return e[:n, :n], e[:n, n : n + m] - b1, b1
+
+
 def _state_space(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
     a, b, c, d = (np.asarray(p[k], float) for k in "ABCD")
     x0 = np.asarray(p["x0"], float)
     u = np.stack([flow.drive[k] for k in scene.inputs], axis=1)
-    if not p.get("discrete", False):
-        method = "zoh" if scene.hold == "zero" else "foh"
-        h = float(flow.t[1] - flow.t[0])
-        if method == "foh":  # own first-order hold: x(k+1) = Ad x + B0 u(k) + B1 u(k+1)
-            n, m = b.shape
-            block = np.zeros((n + 2 * m, n + 2 * m))
-            block[:n, :n], block[:n, n : n + m] = a * h, b * h
-            block[n : n + m, n + m :] = np.eye(m)
-            from scipy.linalg import expm
-
-            e = expm(block)
-            ad, b1 = e[:n, :n], e[:n, n + m :]
-            b0 = e[:n, n : n + m] - b1
-            # shift of state removes u(k+1): w = x - B1 u
-            y = kernels.linear_system(ad, b0 + ad @ b1, c, d + c @ b1, x0 - b1 @ u[0], u)
-        else:
-            ad, bd, c, d, _ = cont2discrete((a, b, c, d), h, method="zoh")
-            y = kernels.linear_system(
-                np.ascontiguousarray(ad), np.ascontiguousarray(bd), np.ascontiguousarray(c), d, x0, u
-            )
-    else:
+    h = float(flow.t[1] - flow.t[0])
+    if p.get("discrete", False):
         y = kernels.linear_system(a, b, c, d, x0, u)
+    elif scene.hold == "zero":
+        ad, bd = held_step(a, b, h)
+        y = kernels.linear_system(ad, bd, c, d, x0, u)
+    else:
+        ad, b0, b1 = ramp_step(a, b, h)
+        # with w = x - B1 u the step needs u(k) alone
+        y = kernels.linear_system(ad, b0 + ad @ b1, c, d + c @ b1, x0 - b1 @ u[0], u)
     y0 = np.broadcast_to(np.asarray(p.get("y0", 0.0), float), (len(scene.outputs),))
     for k, out in enumerate(scene.outputs):
         flow.out[out] = y[:, k] + y0[k]

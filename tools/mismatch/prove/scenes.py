@@ -10,7 +10,7 @@ import numpy as np
 from tools.mismatch.prove import excite
 from tools.mismatch.prove.catalog import BODY, SCALAR_ALL, VECTOR_ALL
 from tools.mismatch.prove.forms_memory import Array, Rng
-from tools.mismatch.prove.plants import AXES, Scene, Signals
+from tools.mismatch.prove.plants import AXES, Scene, Signals, held_step
 
 # context signals of the contract, section 2, with a level and a swing (contract unit)
 CONTEXTS: dict[str, dict[str, tuple[float, float]]] = {
@@ -174,18 +174,16 @@ def _state_space(rng: Rng, wish: Wish, t: Array) -> tuple[Signals, tuple[str, ..
     if form == "first":
         a, b, c, d = [[-w]], [[w]], [[g]], [[0.0]]
     elif form == "third":
-        p = 2 * np.pi * rng.uniform(3.0, 15.0)
-        a = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-w * w * p, -w * w - 2 * z * w * p, -2 * z * w - p]]
-        b, c, d = [[0.0], [0.0], [1.0]], [[g * w * w * p, 0.0, 0.0]], [[0.0]]
+        q = 2 * np.pi * rng.uniform(3.0, 15.0)
+        a = [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [-w * w * q, -w * w - 2 * z * w * q, -2 * z * w - q]]
+        b, c, d = [[0.0], [0.0], [1.0]], [[g * w * w * q, 0.0, 0.0]], [[0.0]]
     else:
         a, b = [[0.0, 1.0], [-w * w, -2 * z * w]], [[0.0], [w * w]]
         c = [[g, 0.0]] if form == "second" else [[g, 0.0], [0.0, g / w]]
         d = [[0.0]] * len(c)
     if discrete:
-        from scipy.signal import cont2discrete
-
-        ad, bd, cd, dd, _ = cont2discrete(tuple(np.asarray(m, float) for m in (a, b, c, d)), t[1] - t[0], "zoh")
-        a, b, c, d = ad.tolist(), bd.tolist(), cd.tolist(), dd.tolist()
+        ad, bd = held_step(np.asarray(a), np.asarray(b), float(t[1] - t[0]))
+        a, b = ad.tolist(), bd.tolist()
     u = excite.scalar(rng, wish.excitation, t) * rng.uniform(0.5, 5.0)
     outs = ("y",) if len(c) == 1 else ("angle", "speed")
     p: dict[str, Any] = {"A": a, "B": b, "C": c, "D": d, "x0": [0.0] * len(a)}
