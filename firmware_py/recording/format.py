@@ -150,21 +150,26 @@ def plain(value: object) -> Any:
     return str(value)
 
 
-def encode_metadata(value: object) -> dict[str, str]:
-    """A metadata record: the text, how to read it, and a CRC-32, because MCAP protects only chunks."""
+def encode_metadata(name: str, value: object) -> dict[str, str]:
+    """A metadata record: the text, how to read it, and a CRC-32 of name, type and text, because MCAP protects only
+    chunks."""
     if isinstance(value, str):
         kind, text = "text", value
     else:
         kind, text = "json", json.dumps(plain(value), ensure_ascii=False)
-    return {"text": text, "type": kind, "crc32": f"{zlib.crc32(text.encode()):08x}"}
+    return {"text": text, "type": kind, "crc32": _metadata_crc(name, kind, text)}
 
 
-def decode_metadata(record: Mapping[str, str]) -> Any:
-    """Inverse of ``encode_metadata``. ``RecordingError`` when the text does not match its CRC."""
+def decode_metadata(name: str, record: Mapping[str, str]) -> Any:
+    """Inverse of ``encode_metadata``. ``RecordingError`` when the CRC is wrong."""
     try:
         text, kind, crc = record["text"], record["type"], record["crc32"]
     except KeyError as missing:
         raise RecordingError(f"the metadata record has no {missing}") from missing
-    if f"{zlib.crc32(text.encode()):08x}" != crc:
+    if _metadata_crc(name, kind, text) != crc:
         raise RecordingError("the text of the metadata record does not match its CRC")
     return json.loads(text) if kind == "json" else text
+
+
+def _metadata_crc(name: str, kind: str, text: str) -> str:
+    return f"{zlib.crc32(chr(10).join((name, kind, text)).encode()):08x}"

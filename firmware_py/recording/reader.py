@@ -22,9 +22,10 @@ _MAX_LISTED = 1000
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Event ``number`` of the run."""
+    """Event ``number`` of the run, received at ``time_ns`` since its start."""
 
     number: int
+    time_ns: int
     content: dict[str, Any]
 
 
@@ -118,7 +119,7 @@ class Recording:
 
     def _take_metadata(self, item: MetadataRecord) -> None:
         try:
-            value = fmt.decode_metadata(item.metadata)
+            value = fmt.decode_metadata(item.name, item.metadata)
             if item.name == fmt.LAYOUT_METADATA:
                 self._take_layout(fmt.layout_of_text(value))
             else:
@@ -149,7 +150,7 @@ class Recording:
                 self._places.append(_Place(chunk.offset, block.row0, block.data.shape[1]))
                 self._ticks.take(block)
             elif isinstance(record, Message) and record.channel_id == fmt.EVENTS_CHANNEL:
-                self.events.append(Event(record.sequence, json.loads(record.data)))
+                self.events.append(Event(record.sequence, record.log_time, json.loads(record.data)))
 
     def _block_of(self, records: Sequence[McapRecord]) -> Block:
         """The block in a chunk; the writer puts at most one there."""
@@ -164,6 +165,9 @@ class Recording:
     def _health(self) -> Health:
         end: dict[str, Any] = self.metadata.get(fmt.END_METADATA, {})
         expected: int | None = end.get("rows_pushed")
+        for name in end.get("metadata", ()):
+            if name != fmt.LAYOUT_METADATA and name not in self.metadata:
+                self._damage.append(Damage(0, 0, f"metadata {name!r} is missing"))
         gaps: list[RowGap] = []
         next_row = 0
         for place in self._places:

@@ -126,6 +126,11 @@ class RecorderProcess:
             raise RecordingError(answer["error"]) if "error" in answer else RecorderFailed("the recorder did not start")
         return handle
 
+    @property
+    def pid(self) -> int:
+        """Process number of the recorder."""
+        return self._process.pid
+
     def push(self, row: NDArray[np.float64]) -> bool:
         """Hand over a copy of ``row[n_columns]``; False, and counted, when there is no room."""
         if self._lossless:

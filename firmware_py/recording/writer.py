@@ -95,10 +95,10 @@ class RecordingWriter:
             compression=CompressionType.ZSTD,
         )
         self._mcap.start(profile=fmt.PROFILE)
-        self._mcap.add_metadata(fmt.LAYOUT_METADATA, fmt.encode_metadata(fmt.layout_text(self.columns)))
+        self._metadata_names: list[str] = []
+        self.write_metadata(fmt.LAYOUT_METADATA, fmt.layout_text(self.columns))
         for name, value in metadata.items():
-            self._mcap.add_metadata(name, fmt.encode_metadata(value))
-        self._output.keep()
+            self.write_metadata(name, value)
         schema = self._mcap.register_schema(fmt.TICKS_SCHEMA, "jsonschema", fmt.ticks_schema(self.columns))
         self._mcap.register_channel(fmt.TICKS_TOPIC, fmt.TICKS_ENCODING, schema)
         schema = self._mcap.register_schema(fmt.EVENTS_SCHEMA, "jsonschema", fmt.events_schema())
@@ -117,16 +117,18 @@ class RecordingWriter:
         self.blocks += 1
         self.rows += len(rows)
 
-    def write_event(self, number: int, event: Mapping[str, Any]) -> None:
+    def write_event(self, number: int, event: Mapping[str, Any], time_ns: int | None = None) -> None:
         """Add event ``number``, stamped with the time of the last block; in the file after the next ``flush``."""
+        time_ns = self._now_ns if time_ns is None else time_ns
         text = json.dumps(fmt.plain(event), ensure_ascii=False).encode()
-        self._mcap.add_message(fmt.EVENTS_CHANNEL, self._now_ns, text, self._now_ns, number)
+        self._mcap.add_message(fmt.EVENTS_CHANNEL, time_ns, text, time_ns, number)
         self.events += 1
 
     def write_metadata(self, name: str, value: object) -> None:
         """Store one more text or JSON value."""
         self.flush()
-        self._mcap.add_metadata(name, fmt.encode_metadata(value))
+        self._mcap.add_metadata(name, fmt.encode_metadata(name, value))
+        self._metadata_names.append(name)
         self._output.keep()
 
     def flush(self) -> None:
@@ -143,7 +145,7 @@ class RecordingWriter:
 
         Returns the size of the file in bytes.
         """
-        self.write_metadata(fmt.END_METADATA, end)
+        self.write_metadata(fmt.END_METADATA, self._last_words(end))
         self._mcap.finish()
         self._output.keep()
         self._output.sync()
@@ -156,12 +158,13 @@ class RecordingWriter:
         The file has no index then; everything finished stays readable. Returns its size in bytes.
         """
         number, content = event
+        last = fmt.encode_metadata(fmt.END_METADATA, self._last_words(end))
         text = json.dumps(fmt.plain(content), ensure_ascii=False).encode()
         try:
             self._output.back_to_good()
             for record in (
                 _chunk_of(Message(fmt.EVENTS_CHANNEL, self._now_ns, text, self._now_ns, number)),
-                Metadata(name=fmt.END_METADATA, metadata=fmt.encode_metadata(end)),
+                Metadata(name=fmt.END_METADATA, metadata=last),
             ):
                 # not through the writer: it has lost the part that could not be written
                 self._output.write(_bytes_of(record))
@@ -171,6 +174,10 @@ class RecordingWriter:
         finally:
             self._output.close()
         return self._output.good_end
+
+    def _last_words(self, end: Mapping[str, Any]) -> dict[str, Any]:
+        """With the names of the texts, so that a reader notices a lost one."""
+        return {**end, "metadata": self._metadata_names}
 
     def _time_ns(self, row: Float64Array) -> int:
         t_s = float(row[self._time_column]) if self._time_column is not None else math.nan

@@ -1,0 +1,193 @@
+"""Recordings for other programs: csv, npz, parquet, and the recording folder of the mismatch contract.
+
+Everything streams block by block; a failed export leaves nothing behind.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+import zipfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.lib import format as npy
+
+from firmware_py.recording import format as fmt
+from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.files import new_file, new_folder
+from firmware_py.recording.format import Float64Array
+from firmware_py.recording.reader import Recording
+
+_ROLES = (("command", "input"), ("volts", "output"), ("magnetometer_raw", "output"))
+_FLAGS_UNIT = "bits"
+
+
+@dataclass(frozen=True, slots=True)
+class ExportReport:
+    """What was written; ``notes`` say what was left out and why."""
+
+    path: Path
+    format: str
+    rows: int
+    columns: int
+    notes: tuple[str, ...] = ()
+
+
+def export(recording: Recording, out: Path, format: str | None = None, *, overwrite: bool = False) -> ExportReport:
+    """Write ``recording`` as ``csv``, ``npz``, ``parquet`` or ``folder`` (None: what the name of ``out`` says,
+    without a suffix the folder). Columns keep their names, values every bit.
+
+    ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there.
+    """
+    writers: dict[str, Callable[[Recording, Path], None]] = {"csv": _csv, "npz": _npz, "parquet": _parquet}
+    chosen = format or out.suffix.removeprefix(".") or "folder"
+    if chosen == "folder":
+        return export_folder(recording, out)
+    if chosen not in writers:
+        raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(writers)} or folder")
+    with new_file(out, overwrite=overwrite) as part:
+        writers[chosen](recording, part)
+    return ExportReport(out, chosen, recording.n_rows, len(recording.columns))
+
+
+def export_folder(
+    recording: Recording,
+    out: Path,
+    *,
+    data: str = "npz",
+    kind: str = "instrument",
+    parameters: Mapping[str, object] | None = None,
+    roles: Mapping[str, str] | None = None,
+) -> ExportReport:
+    """The recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
+
+    ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
+    converters outputs, the rest context. Flags, and columns that are not finite throughout, are no channels.
+    The bench description stored in the recording becomes ``bench.toml`` and the twin's ``bench``.
+    """
+    if data not in ("npz", "csv"):
+        raise RecordingError(f"{out}: the data file is npz or csv, not {data!r}")
+    finite = _finite_columns(recording)
+    channels, notes = [], []
+    for index, (name, unit) in enumerate(recording.columns):
+        if name == fmt.TIME_COLUMN:
+            continue
+        if unit == _FLAGS_UNIT:
+            notes.append(f"{name} holds flags: it is in the data, but no channel")
+        elif not finite[index]:
+            notes.append(f"{name} is not a finite number throughout: it is in the data, but no channel")
+        else:
+            role = roles.get(name, "context") if roles is not None else _default_role(name)
+            channels.append({"column": name, "role": role, "signal": name, "unit": unit})
+    for role in ("input", "output"):
+        if not any(channel["role"] == role for channel in channels):
+            raise RecordingError(f"{recording.path}: no column has the role {role!r}; say which with 'roles'")
+    bench = recording.metadata.get("bench")
+    twin: dict[str, object] = dict(parameters or {})
+    with new_folder(out) as folder:
+        if isinstance(bench, str):
+            (folder / "bench.toml").write_text(bench, encoding="utf-8")
+            twin.setdefault("bench", "bench.toml")
+        (_npz if data == "npz" else _csv)(recording, folder / f"data.{data}")
+        text = _descriptor(recording, data, kind, twin, channels)
+        (folder / "recording.toml").write_text(text, encoding="utf-8")
+    return ExportReport(out, "folder", recording.n_rows, len(recording.columns), tuple(notes))
+
+
+def _default_role(name: str) -> str:
+    return next((role for prefix, role in _ROLES if name == prefix or name.startswith(f"{prefix}_")), "context")
+
+
+def _descriptor(
+    recording: Recording, data: str, kind: str, twin: Mapping[str, object], channels: list[dict[str, str]]
+) -> str:
+    lines = ["format = 1", f"title = {_toml(recording.path.stem)}", f'data = "data.{data}"']
+    if fmt.TIME_COLUMN in recording.names:
+        lines.append(f"time_column = {_toml(fmt.TIME_COLUMN)}")
+    else:
+        lines.append(f"rate_hz = {float(recording.metadata.get('tick_hz', 1000.0))}")
+    lines += ["", "[twin]", f"kind = {_toml(kind)}", "", "[twin.parameters]"]
+    lines += [f"{key} = {_toml(value)}" for key, value in twin.items()]
+    for channel in channels:
+        lines += ["", "[[channels]]", *(f"{key} = {_toml(value)}" for key, value in channel.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _toml(value: object) -> str:
+    """A TOML value; JSON's texts, numbers and lists are TOML's as well."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _finite_columns(recording: Recording) -> np.ndarray:
+    finite = np.ones(len(recording.columns), dtype=bool)
+    for block in recording.blocks():
+        finite &= np.isfinite(block.data).all(axis=1)
+    return finite
+
+
+def _csv(recording: Recording, path: Path) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write(",".join(recording.names) + "\n")
+        for block in recording.blocks():
+            file.writelines(",".join(map(repr, row)) + "\n" for row in block.data.T.tolist())
+
+
+def _npz(recording: Recording, path: Path) -> None:
+    """One array per column, without holding more than a block: each column goes through a file of its own."""
+    parts = path.parent / "columns"
+    parts.mkdir()
+    files = [(parts / str(i)).open("wb") for i in range(len(recording.columns))]
+    try:
+        header = {"descr": "<f8", "fortran_order": False, "shape": (recording.n_rows,)}
+        for file in files:
+            npy.write_array_header_1_0(file, header)
+        for block in recording.blocks():
+            for file, column in zip(files, block.data, strict=True):
+                file.write(_little_endian(column))
+    finally:
+        for file in files:
+            file.close()
+    with zipfile.ZipFile(path, "w", allowZip64=True) as archive:
+        for i, name in enumerate(recording.names):
+            archive.write(parts / str(i), f"{name}.npy")
+    shutil.rmtree(parts)
+
+
+def _little_endian(column: Float64Array) -> bytes:
+    return column.astype("<f8", copy=False).tobytes()
+
+
+def _parquet(recording: Recording, path: Path) -> None:
+    pa, pq = _pyarrow()
+    schema = pa.schema(
+        [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in recording.columns],
+        metadata={name: json.dumps(fmt.plain(value)) for name, value in recording.metadata.items()},
+    )
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        for rows in _batches(recording, 200):
+            writer.write_batch(pa.record_batch([pa.array(column) for column in rows], schema=schema))
+
+
+def _batches(recording: Recording, n_blocks: int) -> Any:
+    """Several blocks at a time: a row group of 100 rows would make a large file."""
+    waiting: list[Float64Array] = []
+    for block in recording.blocks():
+        waiting.append(block.data)
+        if len(waiting) == n_blocks:
+            yield np.concatenate(waiting, axis=1)
+            waiting.clear()
+    if waiting:
+        yield np.concatenate(waiting, axis=1)
+
+
+def _pyarrow() -> tuple[Any, Any]:
+    try:
+        import pyarrow
+        import pyarrow.parquet
+    except ImportError as error:
+        raise RecordingError("parquet needs pyarrow: pip install 'micron-bench[parquet]', or export npz") from error
+    return pyarrow, pyarrow.parquet
