@@ -24,3 +24,10 @@ class DigitalOutput(Protocol):
 def wait_s(clock: Clock, seconds: float) -> None:
     """Let ``seconds`` pass on the bench clock. For start-up only, never in a tick."""
     clock.sleep_until_ns(clock.now_ns() + round(seconds * 1e9))
+
+
+def next_due_ns(due_ns: int, now_ns: int, period_ns: int) -> int:
+    """When something periodic that was due at ``due_ns`` and is done now is due again: in phase, but never a
+    volley after a pause."""
+    following_ns = due_ns + period_ns
+    return following_ns if following_ns > now_ns else now_ns + period_ns

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from drivers.base import next_due_ns
 from drivers.dbc import DbcDatabase
 from hal.contracts import CanBus, Clock
 from hal.types import CanFrame
@@ -47,7 +48,6 @@ class HostHeartbeat:
         now_ns = self._clock.now_ns()
         if now_ns < self._due_ns:
             return
-        # keep the phase, but never send a volley after a pause
-        self._due_ns = max(self._due_ns, now_ns - HEARTBEAT_PERIOD_NS) + HEARTBEAT_PERIOD_NS
+        self._due_ns = next_due_ns(self._due_ns, now_ns, HEARTBEAT_PERIOD_NS)
         self._bus.send(CanFrame(self._id, bytes((self.state & 0xFF,))), 0.0)
         self.sent += 1

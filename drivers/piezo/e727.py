@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from drivers.base import wait_s
+from drivers.base import next_due_ns, wait_s
 from drivers.piezo.gcs import GcsLink
 from hal.contracts import Clock, Float64Array, SerialPort
 from hal.errors import BenchError, HalError, WrongDevice
@@ -111,7 +111,7 @@ class E727:
             self.superseded += 1
             return mask
         mask = self.guard.admit(values_V)
-        self._due_ns = max(self._due_ns, now_ns - self._period_ns) + self._period_ns
+        self._due_ns = next_due_ns(self._due_ns, now_ns, self._period_ns)
         if self._send():
             self.guard.sent()
         return mask
@@ -124,7 +124,7 @@ class E727:
         done = self.guard.ramp()
         now_ns = self._clock.now_ns()
         if done or now_ns >= self._due_ns:
-            self._due_ns = max(self._due_ns, now_ns - self._period_ns) + self._period_ns
+            self._due_ns = next_due_ns(self._due_ns, now_ns, self._period_ns)
             if not self._send():
                 return False
         self.guard.sent()

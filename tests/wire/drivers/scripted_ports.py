@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from hal.clock import VirtualClock
 from hal.errors import HalError
-from hal.types import I2cOp, I2cRead, I2cWrite, PortInfo
+from hal.middleware.trace import read_transcript
+from hal.types import CanFrame, CanStats, I2cOp, I2cWrite, PortInfo
 
 
 class ScriptedSerial:
@@ -95,6 +96,38 @@ class ScriptedI2c:
         assert not self.script, f"left over: {list(self.script)}"
 
 
-def reads(*ops: I2cOp) -> int:
-    """Number of bytes that a transfer reads."""
-    return sum(op.n for op in ops if isinstance(op, I2cRead))
+class ScriptedCan:
+    """A CAN bus whose other side is a test: ``sent`` holds what the driver sent, ``arrive`` queues a frame."""
+
+    def __init__(self, clock: VirtualClock) -> None:
+        self.clock = clock
+        self.sent: list[tuple[int, str]] = []
+        self.queue: deque[CanFrame] = deque()
+        self.on_send: list[Callable[[CanFrame], None]] = []
+
+    def arrive(self, can_id: int, data: str) -> None:
+        self.queue.append(CanFrame(can_id, bytes.fromhex(data), t_ns=self.clock.now_ns()))
+
+    def send(self, frame: CanFrame, timeout_s: float) -> None:
+        self.sent.append((frame.can_id, frame.data.hex()))
+        for react in self.on_send:
+            react(frame)
+
+    def recv(self, timeout_s: float) -> CanFrame | None:
+        if not self.queue:
+            self.clock.burn_ns(round(timeout_s * 1e9))
+        return self.queue.popleft() if self.queue else None
+
+    def stats(self) -> CanStats:
+        return CanStats()
+
+    def info(self) -> PortInfo:
+        return PortInfo("scripted://", "script", emulated=True)
+
+    def close(self) -> None:
+        raise AssertionError("a driver must not close the bus it shares")
+
+
+def serial_script(transcript: str) -> list[tuple[object, ...]]:
+    """A golden transcript of ``hal.middleware.trace`` as a script for ``ScriptedSerial``."""
+    return [(e.verb, bytes.fromhex(e.words[0])) for e in read_transcript(transcript.splitlines())]

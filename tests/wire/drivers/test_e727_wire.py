@@ -1,0 +1,231 @@
+"""PI E-727 driver: GCS 2.0 texts as in PI's manual E727T0005 and the captures of ecosystem.md section 6b."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.piezo.e727 import E727
+from hal.clock import VirtualClock
+from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
+from tests.wire.drivers.scripted_ports import ScriptedSerial
+
+MS = 1_000_000
+IDENTITY = b"(c)2016 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, 0116047977, 13.21.00.02\n"
+Script = list[tuple[object, ...]]
+PROBE: Script = [
+    ("w", b"*IDN?\n"),
+    ("r", IDENTITY),
+    ("w", b"SAI?\n"),
+    ("r", b"1 \n2 \n"),  # every line but the last ends SP LF, so this is not the end
+    ("r", b"3\n"),
+    ("w", b"ERR?\n"),
+    ("r", b"5\n"),  # left over from earlier, forgotten
+    ("w", b"SVO 1 0 2 0 3 0\n"),
+    ("w", b"ERR?\n"),
+    ("r", b"0\n"),
+]
+AT_NEUTRAL: Script = [
+    ("w", b"SVA?\n"),
+    ("r", b"1=5.000000000e+01 \n2=5.000000000e+01 \n3=5.000000000e+01\n"),
+]
+NEUTRAL = b"SVA 1 50.0000 2 50.0000 3 50.0000\n"
+ARM: Script = [*PROBE, *AT_NEUTRAL, ("w", NEUTRAL), ("w", NEUTRAL), ("w", b"ERR?\n"), ("r", b"0\n"), *AT_NEUTRAL]
+
+
+def make(*script: tuple[object, ...], **options: object) -> tuple[E727, ScriptedSerial, VirtualClock]:
+    clock = VirtualClock()
+    port = ScriptedSerial(clock, script)
+    return E727(port, clock, **options), port, clock
+
+
+def armed(*script: tuple[object, ...], **options: object) -> tuple[E727, ScriptedSerial, VirtualClock]:
+    device, port, clock = make(*ARM, *script, **options)
+    device.arm()
+    clock.burn_ns(20 * MS)
+    return device, port, clock
+
+
+def sva(a: float, b: float, c: float) -> tuple[object, ...]:
+    return ("w", f"SVA 1 {a:.4f} 2 {b:.4f} 3 {c:.4f}\n".encode())
+
+
+def test_probe_reads_identity_axes_and_sets_the_servo():
+    device, port, _ = make(*PROBE)
+    assert "E-727.3SDA" in device.probe()
+    port.done()
+
+
+def test_probe_refuses_another_controller():
+    device, _, _ = make(("w", b"*IDN?\n"), ("r", b"(c)2015 Physik Instrumente, E-709.CHG, 1, 2\n"))
+    with pytest.raises(WrongDevice, match=r"E-727.*E-709"):
+        device.probe()
+
+
+def test_probe_needs_three_axes():
+    device, _, _ = make(*PROBE[:2], ("w", b"SAI?\n"), ("r", b"1\n"))
+    with pytest.raises(WrongDevice, match="axes 1, 2, 3"):
+        device.probe()
+
+
+def test_silence_is_a_bounded_wait():
+    device, _, clock = make(("w", b"*IDN?\n"))
+    with pytest.raises(HalTimeout, match="IDN"):
+        device.probe()
+    assert clock.now_ns() == 500 * MS
+
+
+def test_set_command_error_is_told_in_words():
+    device, _, _ = make(*PROBE[:-1], ("r", b"303\n"))
+    with pytest.raises(ProtocolError, match=r"error 303.*open-loop motion with the servo on"):
+        device.probe()
+
+
+def test_arm_verifies_what_the_controller_was_told():
+    device, port, _ = make(*ARM[:-1], ("r", b"1=5.0e+01 \n2=5.0e+01 \n3=4.9e+01\n"))
+    with pytest.raises(SafetyTrip, match="self-test"):
+        device.arm()
+    port.done()
+
+
+def test_newest_value_goes_out_at_the_command_rate():
+    device, port, clock = armed(sva(51, 50, 50), sva(61, 50, 50), sva(71, 50, 50), slew_V_per_s=1e9)
+    for k in range(25):
+        device.write(np.array([51.0 + k, 50.0, 50.0]))
+        clock.burn_ns(MS)
+    port.done()  # 100 Hz: ticks 0, 10, 20
+    assert (device.commands, device.superseded) == (1 + 3, 22)  # one was the arming ramp's
+
+
+def test_a_bad_value_trips_in_its_own_tick():
+    device, port, clock = armed(sva(51, 50, 50))
+    device.write(np.array([51.0, 50.0, 50.0]))
+    clock.burn_ns(MS)
+    with pytest.raises(SafetyTrip, match="channel 2"):
+        device.write(np.array([51.0, 50.0, np.nan]))
+    port.done()
+
+
+def test_errors_are_asked_for_without_waiting():
+    # one command was the arming ramp's: the 20th of all asks
+    commands = [sva(50, 50, 50)] * 19
+    device, port, clock = armed(*commands, ("w", b"ERR?\n"), ("wait",), ("r", b"30"), ("r", b"2\n"), rate_hz=200.0)
+    for _ in range(91):
+        device.write(np.full(3, 50.0))
+        clock.burn_ns(MS)
+    # asked in tick 90; nothing, then half an answer, then the rest
+    assert port.script[0] == ("wait",)
+    device.write(np.full(3, 50.0))
+    device.write(np.full(3, 50.0))
+    with pytest.raises(ProtocolError, match=r"error 302.*voltage out of limits"):
+        device.write(np.full(3, 50.0))
+    port.done()
+
+
+def test_an_error_answer_that_never_comes_is_a_lost_link():
+    class Deaf(ScriptedSerial):
+        def write(self, data: bytes, timeout_s: float) -> None:
+            if self.script:
+                super().write(data, timeout_s)
+
+    clock = VirtualClock()
+    device = E727(Deaf(clock, ARM), clock, rate_hz=200.0)
+    device.arm()
+    clock.burn_ns(20 * MS)
+    ticks = 0
+    with pytest.raises(HalTimeout, match="link lost"):  # noqa: PT012
+        while ticks < 1000:
+            device.write(np.full(3, 50.0))
+            clock.burn_ns(MS)
+            ticks += 1
+    assert 590 <= ticks <= 600  # asked after 19 commands of 5 ms, then 500 ms
+
+
+def test_partial_writes_are_finished_before_anything_else():
+    class Narrow(ScriptedSerial):
+        """Takes ten bytes at a time once ``narrow``, as a full transmit queue does."""
+
+        narrow = False
+        taken = b""
+
+        def write(self, data: bytes, timeout_s: float) -> None:
+            if not self.narrow:
+                super().write(data, timeout_s)
+                return
+            self.taken += data[:10]
+            if len(data) > 10:
+                raise HalTimeout("full", partial=10)
+
+    clock = VirtualClock()
+    port = Narrow(clock, ARM)
+    device = E727(port, clock, rate_hz=200.0, slew_V_per_s=1e9)
+    device.arm()
+    clock.burn_ns(20 * MS)
+    port.narrow = True
+    for k in range(40):
+        device.write(np.array([50.0 + k, 50.0, 50.0]))
+        clock.burn_ns(MS)
+    lines = port.taken.split(b"\n")
+    assert all(line.startswith(b"SVA 1 ") and line.endswith(b" 2 50.0000 3 50.0000") for line in lines[:-1])
+    assert len(lines) >= 8
+
+
+def test_safe_ramp_is_twenty_ticks_and_ends_exactly_at_neutral():
+    steps = [sva(*(v + (50 - v) * k / 20 for v in (60, 40, 50))) for k in (1, 6, 11, 16, 20)]
+    device, port, clock = armed(sva(60, 40, 50), *steps, rate_hz=200.0, slew_V_per_s=1e9)
+    device.write(np.array([60.0, 40.0, 50.0]))
+    clock.burn_ns(5 * MS)
+    done = []
+    for _ in range(20):
+        done.append(device.safe_step())
+        clock.burn_ns(MS)
+    assert done == [False] * 19 + [True]
+    port.done()
+
+
+def test_servo_mode_commands_micrometres():
+    um = b"1=7.500000000e+00 \n2=7.500000000e+00 \n3=7.500000000e+00\n"
+    neutral = b"MOV 1 7.5000 2 7.5000 3 7.5000\n"
+    device, port, clock = make(
+        *PROBE[:7],
+        ("w", b"SVO 1 1 2 1 3 1\n"),
+        ("w", b"ERR?\n"),
+        ("r", b"0\n"),
+        ("w", b"TMN?\n"),
+        ("r", b"1=0.0e+00 \n2=0.0e+00 \n3=0.0e+00\n"),
+        ("w", b"TMX?\n"),
+        ("r", b"1=1.5e+01 \n2=1.5e+01 \n3=1.5e+01\n"),
+        ("w", b"MOV?\n"),
+        ("r", um),
+        ("w", neutral),
+        ("w", neutral),
+        ("w", b"ERR?\n"),
+        ("r", b"0\n"),
+        ("w", b"MOV?\n"),
+        ("r", um),
+        ("w", b"MOV 1 9.0000 2 7.5000 3 7.5000\n"),
+        mode="servo",
+        slew_V_per_s=1e9,
+    )
+    device.arm()
+    clock.burn_ns(20 * MS)
+    device.write(np.array([60.0, 50.0, 50.0]))
+    port.done()
+
+
+def test_readback_asks_for_output_voltages():
+    device, port, _ = make(("w", b"VOL? 1 2 3\n"), ("r", b"1=1.0e+01 \n2=2.0e+01 \n3=3.0e+01\n"))
+    assert device.readback_V().tolist() == [10.0, 20.0, 30.0]
+    port.done()
+
+
+def test_garbled_answer_names_itself():
+    device, _, _ = make(("w", b"VOL? 1 2 3\n"), ("r", b"what\n"))
+    with pytest.raises(ProtocolError, match="what"):
+        device.readback_V()
+
+
+@pytest.mark.parametrize("options", [{"rate_hz": 201.0}, {"rate_hz": 0.0}, {"neutral_V": 120.0}])
+def test_impossible_settings(options: dict[str, object]):
+    with pytest.raises(BenchError):
+        make(**options)
