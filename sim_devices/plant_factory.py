@@ -10,8 +10,8 @@ from pydantic import ValidationError
 from hal.bench import describe_validation_error
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig
-from sim_devices.plant.hand import SyntheticHand
 from sim_devices.plant.instrument import Instrument
+from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.world import Plant
 
 
@@ -24,8 +24,9 @@ def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
 
 
 def make_plant(description: Mapping[str, Any], hand_file: str | None, hand_scale: float | None) -> Plant:
-    """An ``Instrument`` in somebody's hand: synthetic, or recorded in ``hand_file``."""
+    """An ``Instrument`` in somebody's hand: synthetic, or recorded in ``hand_file``.
+
+    Raises ``BenchError`` (``HandFileError``) for a hand that cannot be used.
+    """
     config = emulation_config(description)
-    if hand_file is not None:
-        raise BenchError("recorded hands are not supported")
-    return Instrument(config, config.seed, SyntheticHand(config.hand, config.seed))
+    return Instrument(config, config.seed, make_hand(config.hand, config.seed, hand_file, hand_scale))

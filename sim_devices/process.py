@@ -1,9 +1,10 @@
 """The emulated world as a process of its own, in real time: ``python -m sim_devices.process JOB.json``.
 
 The job file (written by ``sim_devices.register``) holds the bench description and where to put things. The
-process serves each serial bus on a pty, each I2C bus on a Unix socket, each CAN bus on UDP multicast, writes
-their URIs to ``endpoints.json`` when it is ready, obeys fault commands on ``control.sock`` and, on SIGTERM or
-when its parent is gone, writes ``truth.npz`` and ends.
+process serves each serial bus on a pty, each I2C bus on a Unix socket, each CAN bus on UDP multicast (or, with
+``sim://NAME?via=slcan``, as a serial adapter on a pty) and writes their URIs to ``endpoints.json`` when it is
+ready. It obeys fault commands on ``control.sock``; on SIGTERM or when its parent is gone it writes ``truth.npz``
+and ends.
 
 One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
 millisecond. Device clocks never stretch: after a stall every scan that was due is made up, a few at a time so
@@ -29,10 +30,12 @@ from typing import Any
 import numpy as np
 
 from hal.clock import MonotonicClock
+from hal.errors import HalError
 from sim_devices.faults import UnknownFault, inject
 from sim_devices.transports.can_multicast import CanMulticast, free_udp_port
 from sim_devices.transports.i2c_socket import I2cSocketServer
 from sim_devices.transports.pty_carrier import PtyCarrier
+from sim_devices.transports.slcan_adapter import SlcanAdapter
 from sim_devices.world import Plant, World
 
 POLL_NS = 1_000_000
@@ -60,7 +63,11 @@ class WorldProcess:
         self._i2c = {
             name: I2cSocketServer(line, sockets / f"{name}.sock") for name, line in self.world.buses.i2c.items()
         }
-        self._can = {name: CanMulticast(hub, free_udp_port()) for name, hub in self.world.buses.can.items()}
+        slcan = {n for n, bus in description["bus"].items() if str(bus["uri"]).endswith("?via=slcan")}
+        hubs = self.world.buses.can
+        self._slcan = {n: PtyCarrier(SlcanAdapter(hub)) for n, hub in hubs.items() if n in slcan}
+        self._can = {n: CanMulticast(hub, free_udp_port()) for n, hub in hubs.items() if n not in slcan}
+        self._all_ptys = [*self._ptys.values(), *self._slcan.values()]
         for server in self._i2c.values():
             self.world.add_timed(server)
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -79,6 +86,7 @@ class WorldProcess:
     def endpoints(self) -> dict[str, str]:
         """URI of each bus for the ordinary adapters of hal."""
         uris = {name: f"serial://{pty.path}" for name, pty in self._ptys.items()}
+        uris |= {name: f"slcan://{pty.path}" for name, pty in self._slcan.items()}
         uris |= {name: f"unix-i2c://{server.path}" for name, server in self._i2c.items()}
         return uris | {name: can.uri for name, can in self._can.items()}
 
@@ -98,7 +106,7 @@ class WorldProcess:
     def _wait(self) -> list[int]:
         now_ns = self._clock.now_ns()
         deadline_ns = min(self.world.next_event_ns() or now_ns + POLL_NS, now_ns + POLL_NS)
-        watched = [pty.fileno() for pty in self._ptys.values() if pty.fileno() >= 0]
+        watched = [pty.fileno() for pty in self._all_ptys if pty.fileno() >= 0]
         for server in self._i2c.values():
             watched += server.filenos()
         watched += [can.fileno() for can in self._can.values()]
@@ -110,7 +118,7 @@ class WorldProcess:
         """Bring world and transports to the present."""
         self._turns += 1
         while True:
-            for pty in self._ptys.values():
+            for pty in self._all_ptys:
                 pty.refresh()
             due_ns = self.world.next_event_ns()
             now_ns = self._clock.now_ns()
@@ -118,7 +126,7 @@ class WorldProcess:
             self._worst_late_ns = max(self._worst_late_ns, late_ns)
             self._now_ns = now_ns if due_ns is None else min(now_ns, due_ns + CATCH_UP_NS)
             self.world.advance_to(self._now_ns)
-            for pty in self._ptys.values():
+            for pty in self._all_ptys:
                 pty.pump(self._now_ns)
             for can in self._can.values():
                 can.pump(self._now_ns)
@@ -140,7 +148,8 @@ class WorldProcess:
         message, sender = self._control.recvfrom(4096)
         try:
             order = json.loads(message)
-            unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in self._ptys.items()}
+            ptys = self._ptys | self._slcan
+            unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in ptys.items()}
             inject(self.world, str(order["fault"]), str(order.get("target", "")), unplug, self._bus_of)
             answer = {"ok": True}
         except (ValueError, KeyError, TypeError, UnknownFault) as error:
@@ -155,7 +164,7 @@ class WorldProcess:
         partial.rename(self._runtime_dir / "truth.npz")
         facts = {"worst_late_us": self._worst_late_ns / 1000, "turns": self._turns}
         (self._runtime_dir / "world.json").write_text(json.dumps(facts), encoding="utf-8")
-        for pty in self._ptys.values():
+        for pty in self._all_ptys:
             pty.unplug()
         for server in (*self._i2c.values(), *self._can.values()):
             server.close()
@@ -192,7 +201,11 @@ def main(argv: list[str]) -> int:
     job = json.loads(job_path.read_text(encoding="utf-8"))
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the firmware; it ends us when it is done
-    process = WorldProcess(job)
+    try:
+        process = WorldProcess(job)
+    except HalError as error:
+        job_path.with_name("error.txt").write_text(str(error), encoding="utf-8")
+        return 2
     signal.signal(signal.SIGTERM, process.request_stop)
     gc.collect()
     gc.freeze()

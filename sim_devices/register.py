@@ -225,6 +225,10 @@ class ProcessWorld:
         deadline = time.monotonic() + START_S
         while not path.exists():
             if not self.alive():
+                shutil.rmtree(self._sockets, ignore_errors=True)
+                refusal = self._dir / "error.txt"
+                if refusal.exists():
+                    raise BenchError(refusal.read_text(encoding="utf-8"))
                 raise BenchError(f"the emulated world did not start: {self._tail()}")
             if time.monotonic() > deadline:
                 self.stop()

@@ -7,7 +7,7 @@ happens in order of time. Plant time starts at zero; ``epoch_ns`` is the bench t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, Protocol
 
@@ -43,6 +43,7 @@ class Plant(Protocol):
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None: ...
     def strap(self, pulse: Literal["set", "reset"]) -> None: ...
     def truth(self) -> Truth: ...
+    def truth_row(self) -> Mapping[str, NDArray[np.float64]]: ...
 
 
 @dataclass
@@ -125,6 +126,10 @@ class World:
         if channel < 3:
             self.plant.set_demand_V(channel, volts, t_ns - self.epoch_ns)
 
+    def _stroke_um(self, axis: int, t_ns: int) -> float:
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        return float(self.plant.truth_row()["stroke_m"][axis]) * 1e6
+
     def _strap_switch(self, switches: int, t_ns: int) -> None:
         self.plant.advance_to(t_ns - self.epoch_ns)
         if switches & STRAP_SET:
@@ -178,7 +183,9 @@ class World:
         self._add_serial(name, device["bus"], Di4108(self._analog_V, on_switches=self._strap_switch))
 
     def _add_e727(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_serial(name, device["bus"], E727(on_output=self._piezo_demand))
+        controller = E727(on_output=self._piezo_demand, measure_um=self._stroke_um)
+        self._add_serial(name, device["bus"], controller)
+        self._rest_at(controller.output_V)
 
     def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
         self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
@@ -192,15 +199,21 @@ class World:
     def _add_dac(self, name: str, device: Mapping[str, Any]) -> None:
         dac = Ad5696r(on_output=self._amplifier_input)
         self._add_i2c(name, device, dac)
-        for channel in range(3):
-            self._amplifier_input(channel, dac.output_V[channel], self.epoch_ns)
+        self._rest_at([volts * AMPLIFIER_GAIN for volts in dac.output_V])
 
     def _add_can(self, name: str, device: Mapping[str, Any], node: Any) -> None:
         self.buses.can[device["bus"]].attach(node)
         self.devices[name] = node
 
     def _add_can_amplifier(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_can(name, device, CanPiezoNode(on_output=self._piezo_demand, start_ns=self.epoch_ns))
+        node = CanPiezoNode(on_output=self._piezo_demand, start_ns=self.epoch_ns)
+        self._add_can(name, device, node)
+        self._rest_at(node.output_V)
+
+    def _rest_at(self, demand_V: Sequence[float]) -> None:
+        """What the device puts out at power-up is what the amplifier starts from."""
+        for channel in range(3):
+            self.plant.set_demand_V(channel, demand_V[channel], 0)
 
     def _add_can_telemetry(self, name: str, device: Mapping[str, Any]) -> None:
         self._add_can(name, device, CanTelemetryListener())

@@ -67,7 +67,8 @@ class I2cLine:
                 end_ns = t_ns + int(bits * bit_ns)
                 yield end_ns
                 if face is None:
-                    if not any([f.general_call(sent, end_ns) for f in self.faces.values()]):
+                    answers = [f.general_call(sent, end_ns) for f in self.faces.values()]  # all of them hear it
+                    if not any(answers):
                         status = I2cStatus.ADDRESS_NACK
                         break
                 elif face.write(sent, end_ns) < len(sent):

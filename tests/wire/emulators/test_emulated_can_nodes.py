@@ -49,7 +49,9 @@ def armed() -> tuple[CanPiezoNode, list[tuple[int, float, int]]]:
 def test_setpoint_bytes() -> None:
     node, seen = armed()
     # 0, 25 V (16384 units), 100 V little endian; counter 7; CRC over bytes 0..6
-    node.receive(0x120, bytes.fromhex("0000 0040 ffff 07") + bytes((crc8_sae_j1850(bytes.fromhex("00000040ffff07")),)), 5)
+    node.receive(
+        0x120, bytes.fromhex("0000 0040 ffff 07") + bytes((crc8_sae_j1850(bytes.fromhex("00000040ffff07")),)), 5
+    )
     assert seen == [(0, 0.0, 5), (1, pytest.approx(16384 * 100 / 65535), 5), (2, 100.0, 5)]
 
 
@@ -150,7 +152,13 @@ def test_telemetry_listener() -> None:
     panel.receive(0x201, b"\x00", 7)
     assert panel.amplitude_um == (50.0, 1.0, 0.0)
     assert panel.frequency_hz == 9.9
-    assert (panel.state, panel.flags, panel.lost_samples, panel.skipped_ticks, panel.worst_tick_us) == (2, 5, 3, 4, 1000)
+    assert (panel.state, panel.flags, panel.lost_samples, panel.skipped_ticks, panel.worst_tick_us) == (
+        2,
+        5,
+        3,
+        4,
+        1000,
+    )
     assert (panel.malformed, panel.last_ns) == (1, 6)
 
 

@@ -78,7 +78,17 @@ def test_eol_is_unknown_in_binary_mode() -> None:
 
 @pytest.mark.parametrize(
     "command",
-    [b"srate 374", b"srate 65536", b"dec 0", b"dec 513", b"deca 40001", b"filter 8 0", b"slist 1", b"ps 8", b"nonsense"],
+    [
+        b"srate 374",
+        b"srate 65536",
+        b"dec 0",
+        b"dec 513",
+        b"deca 40001",
+        b"filter 8 0",
+        b"slist 1",
+        b"ps 8",
+        b"nonsense",
+    ],
 )
 def test_what_the_manual_excludes_is_refused(command: bytes) -> None:
     device, _ = make()
@@ -282,7 +292,9 @@ def test_no_bytes_from_the_host_break_it(chunks: list[tuple[bytes, int, bool]]) 
 
 
 @settings(max_examples=60, deadline=None)
-@given(st.lists(st.sampled_from(["start 0", "stop", "dec 2", "ps 3", "encode 1", "srate 375", "filter 0 1", "slist 0 8"])))
+@given(
+    st.lists(st.sampled_from(["start 0", "stop", "dec 2", "ps 3", "encode 1", "srate 375", "filter 0 1", "slist 0 8"]))
+)
 def test_legal_commands_in_any_order_keep_the_fifo_bounded(commands: list[str]) -> None:
     device, _ = make()
     for i, command in enumerate(commands):

@@ -1,0 +1,138 @@
+"""The I2C socket server's bytes against its own specification, and bus time on the socket, with time injected."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from sim_devices.devices.ad5696r import Ad5696r
+from sim_devices.transports.i2c_line import I2cLine
+from sim_devices.transports.i2c_socket import I2cSocketServer
+
+
+class Rig:
+    def __init__(self, path: Path) -> None:
+        self.dac = Ad5696r()
+        self.line = I2cLine(400_000)
+        self.line.attach(0x0C, self.dac)
+        self.server = I2cSocketServer(self.line, path)
+        self.client = self.connect()
+
+    def connect(self) -> socket.socket:
+        client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        client.settimeout(2.0)
+        client.connect(str(self.server.path))
+        self.server.on_readable(self.server.filenos()[0], 0)
+        return client
+
+    def deliver(self, t_ns: int, client: int = 1) -> None:
+        self.server.on_readable(self.server.filenos()[client], t_ns)
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Iterator[Rig]:
+    rig = Rig(tmp_path / "i2c0.sock")
+    yield rig
+    rig.client.close()
+    rig.server.close()
+
+
+def test_write_answers_after_its_bus_time(rig: Rig) -> None:
+    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.deliver(1000)
+    # START 1 + 4 bytes x 9 = 37 bits of 2.5 us, then STOP
+    assert rig.server.next_event_ns() == 1000 + 92_500
+    assert rig.dac.output_V[0] == 2.5
+    rig.server.advance_to(1000 + 92_500)
+    assert rig.dac.output_V[0] == 1.25
+    assert rig.server.next_event_ns() == 1000 + 95_000
+    rig.client.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        rig.client.recv(1)
+    rig.client.settimeout(2.0)
+    rig.server.advance_to(1000 + 95_000)
+    assert rig.client.recv(100) == bytes.fromhex("00 0000")
+    assert rig.server.next_event_ns() is None
+
+
+def test_write_then_read_in_one_transfer(rig: Rig) -> None:
+    rig.client.sendall(bytes.fromhex("0c 02 00 0100 01 01 0200"))
+    rig.deliver(0)
+    rig.server.advance_to(10**6)
+    assert rig.client.recv(100) == bytes.fromhex("00 0200 8000")
+
+
+@pytest.mark.parametrize(
+    ("request_hex", "prepare", "reply"),
+    [
+        ("50 01 01 0100", "", "01 0000"),
+        ("0c 01 00 0300 31 4000", "nack_data", "02 0000"),
+        ("0c 01 00 0300 31 4000", "stuck", "03 0000"),
+    ],
+)
+def test_status_codes(rig: Rig, request_hex: str, prepare: str, reply: str) -> None:
+    if prepare == "stuck":
+        rig.line.stuck = True
+    elif prepare:
+        setattr(rig.dac, prepare, True)
+    rig.client.sendall(bytes.fromhex(request_hex))
+    rig.deliver(0)
+    rig.server.advance_to(10**6)
+    assert rig.client.recv(100) == bytes.fromhex(reply)
+
+
+def test_request_in_pieces(rig: Rig) -> None:
+    for piece in ("0c", "01 00 03", "00 31 40", "00"):
+        assert rig.server.next_event_ns() is None
+        rig.client.sendall(bytes.fromhex(piece))
+        rig.deliver(5)
+    assert rig.server.next_event_ns() == 5 + 92_500
+
+
+def test_two_clients_share_the_bus_in_turn(rig: Rig) -> None:
+    other = rig.connect()
+    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.deliver(0, client=1)
+    other.sendall(bytes.fromhex("0c 01 00 0300 31 c000"))
+    rig.deliver(0, client=2)
+    rig.server.advance_to(95_000)
+    assert rig.dac.output_V[0] == 1.25
+    assert rig.server.next_event_ns() == 95_000 + 92_500
+    rig.server.advance_to(10**6)
+    assert rig.dac.output_V[0] == 3.75
+    assert rig.client.recv(10) == other.recv(10) == bytes(3)
+    other.close()
+
+
+@pytest.mark.parametrize("garbage", ["ff 01", "0c 00", "0c ff", "0c 01 07 0000", "0c 01 01 ffff"])
+def test_garbage_closes_the_connection_only(rig: Rig, garbage: str) -> None:
+    rig.client.sendall(bytes.fromhex(garbage))
+    rig.deliver(0)
+    assert rig.client.recv(10) == b""
+    rig.client.close()
+    rig.client = rig.connect()
+    rig.client.sendall(bytes.fromhex("0c 01 01 0200"))
+    rig.deliver(0)
+    rig.server.advance_to(10**6)
+    assert len(rig.client.recv(10)) == 5
+
+
+def test_client_that_goes_away_during_a_transfer(rig: Rig) -> None:
+    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.deliver(0)
+    rig.client.close()
+    rig.deliver(10)
+    rig.server.advance_to(10**6)
+    assert rig.dac.output_V[0] == 1.25
+    assert len(rig.server.filenos()) == 1
+
+
+def test_bus_time_at_100_khz() -> None:
+    line = I2cLine(100_000)
+    line.attach(0x0C, Ad5696r())
+    assert list(line.transfer(0x0D, [], 0)) == [10_000]
+    with pytest.raises(ValueError, match="0x0c"):
+        line.attach(0x0C, Ad5696r())
