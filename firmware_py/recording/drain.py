@@ -135,7 +135,8 @@ class Drain:
         while (item := self._events.pop()) is not None:
             number, text = item
             self._writer.write_event(number, json.loads(text))
-            self._event_since_s = self._event_since_s or now_s
+            if self._event_since_s is None:
+                self._event_since_s = now_s
             taken += 1
         return taken
 

@@ -18,7 +18,7 @@ from numpy.lib import format as npy
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
-from firmware_py.recording.files import new_file, new_folder
+from firmware_py.recording.files import new_file, new_folder, refuse_existing
 from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
 
@@ -71,6 +71,7 @@ def export_folder(
     """
     if data not in ("npz", "csv"):
         raise RecordingError(f"{out}: the data file is npz or csv, not {data!r}")
+    refuse_existing(out, overwrite=False)
     finite = _finite_columns(recording)
     channels, notes = [], []
     for index, (name, unit) in enumerate(recording.columns):
