@@ -18,6 +18,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from firmware_py.control.config import FirmwareConfig, load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.stages import StageConfigs, Stages
@@ -28,7 +30,7 @@ from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.bench import BenchFile, OpenBench, load_bench, open_bench
-from hal.errors import HalError
+from hal.errors import Disconnected, HalError
 
 StatusSink = Callable[[dict[str, Any]], None]
 LOOP_PRIORITY = 80
@@ -53,12 +55,15 @@ class RunRequest:
 
 
 def run_in_process(
-    request: RunRequest, on_status: StatusSink | None = None, runtime_dir: Path | None = None
+    request: RunRequest,
+    on_status: StatusSink | None = None,
+    runtime_dir: Path | None = None,
+    on_open: Callable[[OpenBench], None] | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Run the instrument; returns the outcome (JSON values) and, from an emulated world, the truth.
 
     Raises ``HalError`` when the bench cannot be opened. What goes wrong later is in the outcome's
-    ``safe_state``.
+    ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the opened bench (fault tests).
     """
     bench = load_bench(request.bench)
     load_firmware_config(bench, {})
@@ -75,7 +80,9 @@ def run_in_process(
             )
         )
         devices = open_devices(opened)
-        config, configs = load_firmware_config(bench, _wired(devices))
+        if on_open is not None:
+            on_open(opened)
+        config, configs = load_firmware_config(bench, devices.sensing_table)
         stages = Stages(configs)
         stages.warm_up()
         recorder = _recorder(request, bench, configs, opened)
@@ -100,13 +107,9 @@ def run_in_process(
         truth = None
         if opened.world is not None:
             opened.world.stop()
-            truth = opened.world.truth()
+            with contextlib.suppress(Disconnected):
+                truth = opened.world.truth()
         return outcome, truth
-
-
-def _wired(devices: Devices) -> dict[str, Any]:
-    """What opening the devices has taught about the sensors."""
-    return devices.sensing_table
 
 
 @contextlib.contextmanager
@@ -224,10 +227,12 @@ def main(arguments: list[str]) -> int:
         **{**table, "bench": Path(table["bench"]), "record": Path(record) if record is not None else None}
     )
     try:
-        outcome, _ = run_in_process(request, _status_pipe(), runtime_dir)
+        outcome, truth = run_in_process(request, _status_pipe(), runtime_dir)
     except HalError as error:
         sys.stderr.write(f"micron: {error}\n")
         return int(exit_code_of(error))
+    if truth is not None:
+        np.savez(runtime_dir / "truth.npz", **truth)
     (runtime_dir / "outcome.json").write_text(json.dumps(outcome))
     return 0
 

@@ -107,8 +107,9 @@ class AnalogInputScan(Protocol):
 
 
 class AnalogOutput(Protocol):
-    """A group of analog outputs that move together and know their safe state."""
+    """A group of analog outputs that move together and know their safe state. ``name`` is its bench entry."""
 
+    name: str
     limits: tuple[OutputLimit, ...]
 
     def arm(self) -> None:

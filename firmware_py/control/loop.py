@@ -41,6 +41,7 @@ from hal.errors import HalError
 from hal.types import ScanBlock, TimeSource
 
 MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
+SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
 BUDGETS_US = {
     "sense": 60.0,
     "estimate": 60.0,
@@ -219,11 +220,12 @@ class InstrumentLoop:
         return block
 
     def _ramp_without_scans(self) -> None:
-        """Finish the ramp on the host clock: the loop, or what drove it, is gone."""
+        """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
         while self.supervisor.state is State.SAFE_RAMP:
             due_ns = self._clock.now_ns() + self._period_ns
             self.supervisor.step()
             self._clock.sleep_until_ns(due_ns)
+        self._clock.sleep_until_ns(self._clock.now_ns() + SETTLE_TICKS * self._period_ns)
 
     def _stop(self) -> None:
         for close in (self._devices.daq.stop, self._devices.amplifier.close):
@@ -268,7 +270,12 @@ class InstrumentLoop:
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:
             self.stages.actuate()
-            clipped = self._devices.amplifier.write(self.stages.command_V)
+            try:
+                clipped = self._devices.amplifier.write(self.stages.command_V)
+            except HalError as error:
+                self.error = error
+                self._trip(f"{self._devices.amplifier.name}: {error}")
+                return
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1
             self.counts.clipped += clipped != 0

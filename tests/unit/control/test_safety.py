@@ -12,6 +12,7 @@ from hal.types import OutputLimit
 class FakeAmplifier:
     """Ramps in ``ticks`` steps; ``failing`` transfers are refused first."""
 
+    name = "piezo"
     limits = (OutputLimit(0.0, 100.0, 20_000.0, 50.0),)
 
     def __init__(self, ticks: int = RAMP_TICKS, failing: int = 0, self_test: bool = True) -> None:
