@@ -1,7 +1,8 @@
 """A CAN bus in bench time: one frame on the wire at a time, every node hears all frames but its own.
 
-Bus time of a frame with n data bytes: 47 + 8 n bits (ISO 11898-1 classic base frame with interframe space) plus
-half of the worst case of stuff bits. Frames go out in the order in which they were queued; arbitration by
+Bus time of a frame with n data bytes: 47 + 8 n bits (ISO 11898-1 classic base frame with interframe space; 67 + 8 n
+with an extended identifier) plus half of the worst case of stuff bits. An extended identifier travels with bit 31
+set, so that no node takes it for one of its own. Frames go out in the order in which they were queued; arbitration by
 priority, error frames and retransmission are not modelled. ``silent`` is a fault hook: a broken cable.
 """
 
@@ -13,12 +14,14 @@ from collections.abc import Callable
 from sim_devices.devices.faces import CanFace
 
 HOST = -1
+EXTENDED = 1 << 31
 
 
-def frame_ns(n_data: int, bitrate: int) -> int:
-    """Time on the wire of a base frame with ``n_data`` bytes."""
-    stuffable = 34 + 8 * n_data
-    return round((47 + 8 * n_data + (stuffable - 1) // 4 / 2) * 1e9 / bitrate)
+def frame_ns(n_data: int, bitrate: int, *, extended: bool = False) -> int:
+    """Time on the wire of a frame with ``n_data`` bytes."""
+    more = 20 if extended else 0
+    stuffable = 34 + more + 8 * n_data
+    return round((47 + more + 8 * n_data + (stuffable - 1) // 4 / 2) * 1e9 / bitrate)
 
 
 class CanHub:
@@ -42,7 +45,7 @@ class CanHub:
     def _queue(self, sender: int, can_id: int, data: bytes, t_ns: int) -> None:
         if self.silent:
             return
-        self._free_ns = max(self._free_ns, t_ns) + frame_ns(len(data), self._bitrate)
+        self._free_ns = max(self._free_ns, t_ns) + frame_ns(len(data), self._bitrate, extended=bool(can_id & EXTENDED))
         self._wire.append((self._free_ns, sender, can_id, data))
 
     def next_event_ns(self) -> int | None:

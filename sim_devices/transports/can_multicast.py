@@ -12,7 +12,7 @@ import importlib
 import socket
 from typing import Any
 
-from sim_devices.transports.can_hub import CanHub
+from sim_devices.transports.can_hub import EXTENDED, CanHub
 
 GROUP = "239.74.163.2"
 
@@ -42,8 +42,9 @@ class CanMulticast:
     def pump(self, t_ns: int) -> None:
         """Hand what has arrived to the nodes; the hub's bus time applies from ``t_ns`` on."""
         while (message := self._bus.recv(0)) is not None:
-            if message.arbitration_id not in self._own_ids and not message.is_extended_id:
-                self._hub.send_from_host(message.arbitration_id, bytes(message.data), t_ns)
+            can_id = message.arbitration_id | (EXTENDED if message.is_extended_id else 0)
+            if can_id not in self._own_ids:
+                self._hub.send_from_host(can_id, bytes(message.data), t_ns)
 
     def close(self) -> None:
         self._bus.shutdown()

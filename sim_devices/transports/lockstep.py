@@ -9,11 +9,12 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from typing import NoReturn
 
+from hal.backends.i2c_checks import check_address
 from hal.clock import VirtualClock
-from hal.errors import BusError, Closed, Disconnected, ErrorKind, I2cNack
+from hal.errors import BenchError, BusError, Closed, Disconnected, ErrorKind, I2cNack
 from hal.types import CanFrame, CanStats, I2cOp, PortInfo, TimeSource
 from sim_devices.devices.faces import ByteFace
-from sim_devices.transports.can_hub import CanHub
+from sim_devices.transports.can_hub import EXTENDED, CanHub
 from sim_devices.transports.i2c_line import I2cLine, I2cStatus
 
 USB_TRANSFER_NS = 125_000  # one high-speed USB microframe between a full packet and the host
@@ -112,6 +113,7 @@ class LockstepI2cBus(_Port):
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         if self._closed or self.unplugged:
             self._refuse()
+        check_address(address, self._name)
         advance_to = self._clock.advance_to
         steps = self._line.transfer(address, ops, self._clock.now_ns())
         try:
@@ -151,12 +153,18 @@ class LockstepCanBus(_Port):
 
     def _on_frame(self, can_id: int, data: bytes, t_ns: int) -> None:
         self._stats.rx += 1
-        self._received.append(CanFrame(can_id, data, t_ns=t_ns, source=TimeSource.SIMULATION))
+        extended = bool(can_id & EXTENDED)
+        self._received.append(CanFrame(can_id & ~EXTENDED, data, extended, t_ns, TimeSource.SIMULATION))
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
         if self._closed or self.unplugged:
             self._refuse()
-        self._hub.send_from_host(frame.can_id, frame.data, self._clock.now_ns())
+        if len(frame.data) > 8:
+            raise BenchError(
+                f"{len(frame.data)} bytes do not fit a classic CAN frame; send at most 8", device=self._name
+            )
+        can_id = frame.can_id | (EXTENDED if frame.extended else 0)
+        self._hub.send_from_host(can_id, frame.data, self._clock.now_ns())
         self._stats.tx += 1
         self._on_activity()
 

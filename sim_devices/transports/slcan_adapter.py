@@ -1,17 +1,18 @@
 """A serial CAN adapter (slcan) as a byte face: frames of a ``CanHub`` as ASCII on a pty.
 
 Source: LAWICEL CANUSB manual, "CANUSB ASCII commands". Commands end with CR; CR alone means done, BEL (07h) refused;
-a sent frame is confirmed by ``z`` or ``Z`` and CR. Only base frames reach the hub, whose nodes know no others.
+a sent frame is confirmed by ``z`` or ``Z`` and CR.
 
 Model limits
 - Nothing is taken from the bit rate chosen with ``Sn`` (the hub has its own); filters (``M``, ``m``) and time
   stamps (``Z1``) are acknowledged and ignored; the serial line itself takes no time.
+- Remote frames are confirmed and go nowhere; the nodes send base frames only.
 - Frames that arrive when 256 kB are waiting for the host are dropped and show in bit 0 of ``F``.
 """
 
 from __future__ import annotations
 
-from sim_devices.transports.can_hub import CanHub
+from sim_devices.transports.can_hub import EXTENDED, CanHub
 
 OK, REFUSED = b"\r", b"\x07"
 MAX_WAITING = 256 * 1024
@@ -91,6 +92,6 @@ class SlcanAdapter:
             or can_id > (0x7FF if digits == 3 else 0x1FFFFFFF)
         ):
             return REFUSED
-        if name == "t":
-            self._hub.send_from_host(can_id, data, t_ns)
+        if name in ("t", "T"):
+            self._hub.send_from_host(can_id | (EXTENDED if name == "T" else 0), data, t_ns)
         return b"z\r" if digits == 3 else b"Z\r"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+from itertools import pairwise
 
 import pytest
 
@@ -101,7 +102,7 @@ def test_watchdog_ramps_to_neutral_within_twenty_ms_of_the_last_setpoint() -> No
     assert node.state is NodeState.DISARMED
     assert node.codes == [0x8000] * 3
     ramp = [v for c, v, _ in seen if c == 0]
-    assert max(abs(b - a) for a, b in zip(ramp, ramp[1:], strict=False)) <= 5.01
+    assert max(abs(b - a) for a, b in pairwise(ramp)) <= 5.01
     assert node.watchdog_trips == 1
 
 

@@ -218,7 +218,7 @@ def test_frozen_daq_times_out() -> None:
     ("fault", "target"), [("melt", "daq"), ("nack", "daq"), ("freeze", "nobody"), ("unplug", "mag")]
 )
 def test_impossible_faults_say_what_is_possible(fault: str, target: str) -> None:
-    with pytest.raises(ValueError, match="faults are|named|ports are"):
+    with pytest.raises(ValueError, match=r"faults are|named|ports are"):
         Bench().world.inject(fault, target)
 
 

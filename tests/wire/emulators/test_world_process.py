@@ -144,7 +144,7 @@ def test_a_world_that_cannot_start_says_why(tmp_path: Path) -> None:
 
 def test_a_hand_that_cannot_be_read_is_named(tmp_path: Path) -> None:
     table = load_bench(BENCH).description.model_dump()
-    with pytest.raises(BenchError, match="nobody.csv"):
+    with pytest.raises(BenchError, match=r"nobody\.csv"):
         provider(table, clock=None, runtime_dir=tmp_path, hand_file=tmp_path / "nobody.csv", hand_scale=None)
 
 
