@@ -13,11 +13,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from firmware_py.app import RunRequest, run_in_process
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from firmware_py.app import RunRequest, run_in_process
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json

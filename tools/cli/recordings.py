@@ -1,0 +1,70 @@
+"""``micron recover`` and ``micron export``: torn recordings made whole, and other formats."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from firmware_py.recording.export import export as export_recording
+from firmware_py.recording.reader import Recording
+from firmware_py.recording.recover import recover as recover_recording
+from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, console, write_json
+
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the output file if it is there.")]
+
+
+def recover(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording that a killed run left behind.")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Default: NAME.recovered.mcap beside it.")] = None,
+    overwrite: Overwrite = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).
+
+    Example: micron recover out/run.mcap
+    """
+    with clear_errors():
+        check_writable(json_file, out)
+        report = recover_recording(file, out or file.with_suffix(".recovered.mcap"), overwrite=overwrite)
+        for line in report.lines():
+            console().print(line, soft_wrap=True)
+        write_json({"format": 1, **report.as_dict()}, json_file)
+        if report.exit_code:
+            raise typer.Exit(report.exit_code)
+
+
+def export(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
+    out: Annotated[
+        Path,
+        typer.Option(metavar="PATH", help="name.csv, name.npz, name.parquet, or a folder for the contract's form."),
+    ],
+    overwrite: Overwrite = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Write a recording as csv, npz, parquet, or the recording folder that the mismatch engine reads.
+
+    Example: micron export out/run.mcap --out out/run.csv
+    """
+    with clear_errors():
+        check_writable(json_file, out)
+        recording = Recording(file)
+        report = export_recording(recording, out, overwrite=overwrite)
+        for note in report.notes:
+            console().print(note, soft_wrap=True)
+        console().print(f"{report.path}: {report.rows} ticks, {report.columns} columns", soft_wrap=True)
+        write_json(
+            {
+                "format": 1,
+                "path": str(report.path),
+                "kind": report.format,
+                "rows": report.rows,
+                "columns": report.columns,
+                "health": recording.health.as_dict(),
+            },
+            json_file,
+        )
+        if recording.health.lost:
+            raise typer.Exit(Exit.DATA_LOST)

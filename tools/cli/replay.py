@@ -1,0 +1,57 @@
+"""``micron replay``: the same firmware over a recording, as fast as the machine can."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from firmware_py.control.replay import replay_recording
+from firmware_py.recording.reader import Recording
+from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, console, write_json
+
+
+def replay(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording made by micron run --record.")],
+    json_file: JsonOption = None,
+) -> None:
+    """Run the firmware over a recording and compare every estimate and command with the recorded one, bit for bit.
+
+    Example: micron replay out/run.mcap
+    """
+    with clear_errors():
+        check_writable(json_file)
+        opened = Recording(recording)
+        started_s = time.perf_counter()
+        report = replay_recording(opened)
+        took_s = time.perf_counter() - started_s
+        tick_hz = float(opened.metadata.get("tick_hz", 1000))
+        recorded_s = report.rows / tick_hz
+        say = console()
+        for line in opened.health.lines():
+            say.print(line)
+        if report.identical:
+            say.print(f"{report.rows} ticks replayed: every estimate and command is the recorded one, bit for bit")
+        else:
+            say.print(
+                f"[bold red]{report.mismatching_rows} of {report.rows} ticks differ[/]; the first: {report.first}. "
+                "Was the recording made by another revision of the firmware?"
+            )
+        say.print(f"{recorded_s:.1f} s in {took_s:.2f} s: {recorded_s / took_s:.0f} x real time")
+        write_json(
+            {
+                "format": 1,
+                "recording": str(recording),
+                **report.as_dict(),
+                "seconds": took_s,
+                "times_real_time": recorded_s / took_s,
+                "health": opened.health.as_dict(),
+            },
+            json_file,
+        )
+        if not report.identical:
+            raise typer.Exit(Exit.FAILED)
+        if opened.health.lost:
+            raise typer.Exit(Exit.DATA_LOST)
