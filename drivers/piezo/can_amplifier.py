@@ -96,24 +96,28 @@ class CanAmplifier:
         self._fresh_status(STATUS_LIMIT_NS * 1e-9)
         self.guard.require(self.state != FAULT, "the node reports a fault: switch it off and on")
         self.guard.start_from([float(v) for v in self.measured_V])
+        self.guard.next_V = list(self.guard.last_V)
+        # the node may compare with what it accepted last, and refuse a repeated counter
+        self._counter = (self._acknowledged + 1) & 0xFF
         self._send_command(1)
         limit_ns = self._clock.now_ns() + STATUS_LIMIT_NS
         while self.state != ARMED:
             self.guard.require(self._clock.now_ns() < limit_ns, "the node does not confirm 'arm'")
-            self._tick()
+            self._hold_one_tick()
         done = False
         while not done:
             done = self.guard.ramp()
-            self._send_setpoint()
-            self._tick()
+            self._hold_one_tick()
         limit_ns = self._clock.now_ns() + STATUS_LIMIT_NS
         neutral_V = np.array([limit.safe_V for limit in self.limits])
-        while self._lag() or np.abs(self.measured_V - neutral_V).max() > 1.0:
+        told = self._counter
+        while not self._accepted_since(told) or np.abs(self.measured_V - neutral_V).max() > 1.0:
             self.guard.require(
-                self._clock.now_ns() < limit_ns,
-                f"commanded {neutral_V.tolist()} V, the node measures {self.measured_V.round(2).tolist()} V",
+                self._clock.now_ns() < limit_ns and self.state == ARMED,
+                f"commanded {neutral_V.tolist()} V, the node measures {self.measured_V.round(2).tolist()} V and is "
+                f"{STATE_NAMES[self.state]}",
             )
-            self._tick()
+            self._hold_one_tick()
         self._safe_steps = 0
         self.guard.armed = True
 
@@ -149,8 +153,14 @@ class CanAmplifier:
         return False
 
     def readback_V(self) -> Float64Array:
-        """Voltages measured by the node, from the next status frame."""
-        self._fresh_status(STATUS_LIMIT_NS * 1e-9)
+        """Voltages measured by the node, from the next status frame; the setpoint is held meanwhile."""
+        if not self.guard.armed:
+            self._fresh_status(STATUS_LIMIT_NS * 1e-9)
+            return self.measured_V.copy()
+        asked_ns = self._clock.now_ns()
+        while self.status_ns <= asked_ns:
+            self._require_link()
+            self._hold_one_tick()
         return self.measured_V.copy()
 
     def close(self) -> None:
@@ -194,7 +204,12 @@ class CanAmplifier:
     def _lag(self) -> int:
         return (self._counter - 1 - self._acknowledged) & 0xFF
 
-    def _tick(self) -> None:
+    def _accepted_since(self, counter: int) -> bool:
+        return (self._acknowledged - counter) & 0xFF <= (self._counter - 1 - counter) & 0xFF
+
+    def _hold_one_tick(self) -> None:
+        """An armed node wants setpoints all the time: its own watchdog may be as short as 10 ms."""
+        self._send_setpoint()
         self.poll()
         wait_s(self._clock, TICK_S)
 
