@@ -53,6 +53,7 @@ PLANT = np.dtype(
         ("ambient_C", "f8"),
         ("ambient_wander_K", "f8"),
         ("ambient_keep", "f8"),
+        ("board_lag", "f8"),
         ("warm_up_K", "f8"),
         ("warm_up_s", "f8"),
         ("on_since_s", "f8"),
@@ -78,6 +79,7 @@ STATE = np.dtype(
         ("pose", "f8", (18,)),
         ("attitude", "f8", (3, 3)),
         ("ambient_K", "f8"),
+        ("board_K", "f8"),  # follows the room's wander
         ("supply_wander_V", "f8"),
         ("temperature_C", "f8"),
         ("supply_V", "f8"),
@@ -97,11 +99,12 @@ def room(p, s, noise):
     """Temperature of the sensor board and the supply, once per millisecond."""
     keep = p["ambient_keep"]
     s["ambient_K"] = keep * s["ambient_K"] + p["ambient_wander_K"] * math.sqrt(1.0 - keep * keep) * noise[0]
+    s["board_K"] += p["board_lag"] * (s["ambient_K"] - s["board_K"])
     keep = p["supply_keep"]
     s["supply_wander_V"] = keep * s["supply_wander_V"] + p["supply_wander_V"] * math.sqrt(1.0 - keep * keep) * noise[1]
     on_s = p["on_since_s"] + s["step"] * STEP_S
     warm = p["warm_up_K"] * (1.0 - math.exp(-on_s / p["warm_up_s"]))
-    s["temperature_C"] = p["ambient_C"] + s["ambient_K"] + warm
+    s["temperature_C"] = p["ambient_C"] + s["board_K"] + warm
     s["supply_V"] = p["supply_V"] + s["supply_wander_V"]
 
 

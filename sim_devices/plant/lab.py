@@ -22,11 +22,10 @@ from pydantic import ValidationError
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
-from sim_devices.plant.instrument import Instrument
-from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS
+from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
-from sim_devices.plant.unit import start_temperature_C
+from sim_devices.plant.unit import build_unit, plant_arrays, start_temperature_C
 
 Array = NDArray[np.float64]
 
@@ -65,8 +64,8 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
         hand = SyntheticHand(HandConfig(tremor_frequency_hz=rate_hz, tremor_frequency_spread_hz=0.0), seed)
         pose, parts = np.zeros((len(t), 18)), np.zeros((len(t), 6))
         hand.fill(pose, parts)
-        wave = parts[:, 5] + 0.3 * (pose[:, 2] - parts[:, 5])
-        return np.clip(50.0 + amplitude_V * grow * wave / np.max(np.abs(wave)), 0.0, 100.0)
+        wave = grow * parts[:, 5]
+        return 50.0 + amplitude_V * wave / np.max(np.abs(wave))
     raise LabError(f"profile '{profile}': it is sawtooth, sine or tremor")
 
 
@@ -129,19 +128,6 @@ unit = "degC"
     return columns, descriptor
 
 
-class _Fixture:
-    """The rotary stages: holds the instrument still at one attitude."""
-
-    def __init__(self, frame: Array) -> None:
-        self.frame = frame
-
-    def start(self, pose: Array, parts: Array) -> None:
-        pose[:], parts[:] = 0.0, 0.0
-
-    def fill(self, pose: Array, parts: Array) -> None:
-        pose[:], parts[:] = 0.0, 0.0
-
-
 def tumble_attitudes(positions: int) -> tuple[Array, Array]:
     """Stage angles (n, 2) rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity."""
     n = np.arange(positions, dtype=np.float64)
@@ -166,11 +152,15 @@ def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> t
     angles, frames = tumble_attitudes(positions)
     analog, magnet = np.empty((positions, 8)), np.empty((positions, 3))
     samples = round(seconds / NODE_S)
+    plant, state = plant_arrays(config, build_unit(config, config.seed), frames[0])
+    spread_V = _mean_noise_V(config, samples)
+    rng = stream(config.seed, "lab.tumble")
+    still, truth = np.zeros(18), np.zeros(TRUTH_COLUMNS)
     for i in range(positions):
-        instrument = Instrument(config, config.seed, _Fixture(frames[i]))
-        rng = stream(config.seed, f"lab.tumble.{i}")
-        # at rest the mean of n samples is the level plus the noise of that mean: no need to run n milliseconds
-        analog[i], magnet[i] = _level(instrument, config, rng, samples)
+        plant[0]["frame"] = frames[i]
+        begin(plant, state, still, still[:6], truth)
+        noise = spread_V * rng.standard_normal(11)
+        analog[i], magnet[i] = state[0]["daq_V"] + noise[:8], state[0]["magnetometer_V"] + noise[8:]
     columns = {
         "stage_z_rad": angles[:, 0],
         "stage_y_rad": angles[:, 1],
@@ -188,21 +178,16 @@ gravity_m_s2 = {config.environment.gravity_m_s2}
     return columns, descriptor
 
 
-def _level(
-    instrument: Instrument, config: EmulationConfig, rng: np.random.Generator, samples: int
-) -> tuple[Array, Array]:
+def _mean_noise_V(config: EmulationConfig, samples: int) -> Array:
+    """(11,) rms of the mean of ``samples`` milliseconds at rest: no need to run them one by one."""
     sensors = config.sensors
+    # behind the RC the noise still has its density D at low frequency: the mean over T has variance D^2 / (2 T)
     tau_s = sensors.rc_ohm * sensors.rc_farad
-    # behind the RC the noise has the density D in V/rtHz: the mean over T has variance D^2 / (2 T)
     density = sensors.noise_ug_per_rtHz * 1e-6
-    through_rc = density / math.sqrt(2.0 * max(samples * NODE_S, 2.0 * tau_s))
-    spread = np.full(8, sensors.daq_noise_uV * 1e-6 / math.sqrt(samples))
-    spread[:6] = np.hypot(spread[:6], through_rc)
-    magnet = sensors.magnetometer_noise_uG * 1e-6 / math.sqrt(samples)
-    return (
-        instrument.analog_V + spread * rng.standard_normal(8),
-        instrument.magnetometer_V + magnet * rng.standard_normal(3),
-    )
+    spread = np.full(11, sensors.daq_noise_uV * 1e-6 / math.sqrt(samples))
+    spread[:6] = np.hypot(spread[:6], density / math.sqrt(2.0 * max(samples * NODE_S, 2.0 * tau_s)))
+    spread[8:] = sensors.magnetometer_noise_uG * 1e-6 / math.sqrt(samples)
+    return spread
 
 
 def load_config(bench: Path | None, seed: int | None) -> EmulationConfig:

@@ -48,7 +48,7 @@ class RecordedHand:
         frequency_hz, body = _spectrum(config, recording)
         found_m = _band_rms_m(frequency_hz, body, recording)
         if scale is None:
-            if found_m == 0.0:
+            if found_m < 1e-12:
                 raise HandFileError(f"{recording.name}: nothing moves in 8 to 12 Hz, so it cannot be scaled to that")
             scale = config.tremor_pp_um * 1e-6 / (2.0 * math.sqrt(2.0)) / found_m
         self.scale = float(scale)

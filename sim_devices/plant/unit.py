@@ -16,6 +16,7 @@ from sim_devices.plant.stack import StackUnit, drive_channel, stack_unit
 
 _AMBIENT_S = 600.0
 _SUPPLY_S = 10.0
+_BOARD_S = 60.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ def plant_arrays(config: EmulationConfig, unit: Unit, frame: NDArray[np.float64]
     p["accelerometer"] = sensors.accelerometers
     p["supply_V"], p["supply_wander_V"] = sensors.supply_V, config.sensors.supply_wander_mV * 1e-3
     p["supply_keep"], p["ambient_keep"] = math.exp(-NODE_S / _SUPPLY_S), math.exp(-NODE_S / _AMBIENT_S)
+    p["board_lag"] = -math.expm1(-NODE_S / _BOARD_S)
     p["divider"], p["temperature_offset_K"] = sensors.divider, sensors.temperature_offset_K
     p["ambient_C"], p["ambient_wander_K"] = e.ambient_C, e.ambient_wander_K
     p["warm_up_K"], p["warm_up_s"], p["on_since_s"] = e.warm_up_K, e.warm_up_s, e.on_since_s
