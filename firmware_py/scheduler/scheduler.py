@@ -90,7 +90,7 @@ class Scheduler:
         late = [task for task in self._tasks if task.catch_up]
         self._due_late = [self._due_at(index, late) for index in range(self._hyperperiod)]
         self._last_scan: int | None = None  # newest tick that the catch_up tasks have seen
-        self._last_full: int | None = None  # newest tick that all tasks have seen
+        self._last_full = -1  # newest tick that all tasks have seen
         self._tick_duration = DurationHistogram()
         self._tick_lateness = DurationHistogram()
         self._ticks = self._caught_up = self._skipped_ticks = 0
@@ -111,8 +111,7 @@ class Scheduler:
         """
         started_ns = self._now_ns()
         lost = self._advance_scan(k)
-        last_full = k - 1 if self._last_full is None else self._last_full
-        self._last_full = k
+        last_full, self._last_full = self._last_full, k
         if k - last_full > 1:
             for task in self._tasks:
                 if not task.catch_up:
@@ -144,7 +143,9 @@ class Scheduler:
 
     def _advance_scan(self, k: int) -> int:
         """Note that tick ``k`` is being run; return how many were never run since the last one."""
-        last = k - 1 if self._last_scan is None else self._last_scan
+        if self._last_scan is None:
+            self._last_scan = self._last_full = k - 1
+        last = self._last_scan
         if k <= last:
             raise ValueError(f"tick {k} after tick {last}: ticks must grow")
         self._last_scan = k

@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import pytest
 
-from firmware_py.scheduler import HostTicker, Scheduler, TaskSpec, TickInfo
+from firmware_py.scheduler import HostTicker, Scheduler, TaskSpec, TickInfo, Ticks
 from hal.clock import MonotonicClock, VirtualClock
 from hal.errors import BenchError
+from hal.types import TimeSource
 
 MS = 1_000_000
 US = 1_000
@@ -198,6 +199,22 @@ def test_a_late_block_is_caught_up_by_sense_and_run_once_by_the_rest(bench: Benc
     assert snapshot.task("sense").skipped == 1
     assert snapshot.task("act").skipped == 4
     assert snapshot.task("half").skipped == 2  # 1 and 3
+
+
+def test_a_block_of_scans_from_a_ticker_is_run_by_that_policy(bench: Bench) -> None:
+    scheduler = bench.scheduler(
+        bench.task("sense", catch_up=True, cost_us=0.0),
+        bench.task("act", order=1, cost_us=0.0),
+    )
+    newest = scheduler.run(Ticks(7, 3, 70 * MS, 2 * MS, TimeSource.DEVICE_CLOCK))
+    assert (newest.k, newest.due_ns, newest.skipped) == (9, 74 * MS, 2)
+    assert (scheduler.snapshot().task("act").skipped, scheduler.snapshot().skipped_ticks) == (2, 0)
+    assert [(who, i.k, i.due_ns // MS) for who, i in bench.journal] == [
+        ("sense", 7, 70),
+        ("sense", 8, 72),
+        ("sense", 9, 74),
+        ("act", 9, 74),
+    ]
 
 
 def test_an_exception_is_marked_and_reaches_the_owner(bench: Bench) -> None:
