@@ -160,6 +160,8 @@ def make_outcome(
         "clock": "virtual" if request.virtual else "real",
         "seconds": request.seconds,
         "devices": devices.identities,
+        "armed_ns": loop.armed_ns,
+        "safe_ns": trip.t_ns if trip is not None else None,
         "tasks": {task.name: task.as_dict() for task in snapshot.tasks},
         "ticks": {
             "run": snapshot.ticks,

@@ -106,6 +106,7 @@ class InstrumentLoop:
         self.supervisor = Supervisor(devices.amplifier)
         self.counts = LoopCounts()
         self.error: HalError | None = None
+        self.armed_ns: int | None = None
         self.scheduler = Scheduler(
             self._task_table(tick_hz),
             clock,
@@ -208,7 +209,8 @@ class InstrumentLoop:
             if self.supervisor.state is State.SELF_TEST and self._self_test_passed(newest_ns):
                 self.scheduler.ignore_next("arming")
                 self.supervisor.arm()
-                end_ns = self._clock.now_ns() + round(seconds * 1e9)
+                self.armed_ns = self._clock.now_ns()
+                end_ns = self.armed_ns + round(seconds * 1e9)
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
 
     def _read(self, timeout_s: float) -> ScanBlock:

@@ -26,7 +26,7 @@ from tools.reports.run_report import html_page, picture, print_report, save_pict
 from tools.reports.tremor_figures import tremor_figures
 
 SETTLE_S = 2.0
-"""The estimator locks and the soft start ends within this time; figures are taken after it."""
+"""After arming, the estimator locks and the soft start ends within this time; figures are taken after it."""
 
 
 def run(
@@ -97,8 +97,8 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
         },
         "voluntary": {"gain": None, "delay_ms": None},
     }
-    if truth is not None:
-        scored = tremor_figures(truth, settle_s=SETTLE_S)
+    if truth is not None and outcome["armed_ns"] is not None:
+        scored = tremor_figures(truth, from_ns=outcome["armed_ns"] + round(SETTLE_S * 1e9), to_ns=outcome["safe_ns"])
         if scored is not None:
             figures = scored.to_json()
     return {**outcome, **figures}

@@ -232,6 +232,14 @@ class Model:
         """Measured minus simulated on the view."""
         return {o: view.measured(o) - y for o, y in self.simulate(view, theta).items()}
 
+    def excused(self, view: View, output: str) -> np.ndarray:
+        """(m,) bool: samples that a placed effect takes as its own events (bursts); not to be fitted or scored."""
+        out = np.zeros(view.recording.n, np.bool_)
+        for pl in self.placed:
+            if pl.effect.claims is not None and output in pl.outputs:
+                out |= pl.effect.claims(pl.settings, view.recording.n)
+        return out[view.index]
+
     def design(self, view: View, theta: Array) -> Design:
         """The affine structure at the nonlinear parameters of ``theta``; linear entries are ignored."""
         index = view.index
@@ -418,18 +426,34 @@ def view_mask(view: View) -> np.ndarray:
 
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
     """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
-    the view as mask and the declared noise."""
-    run = view_run(model.twin, view)
-    ctx = make_context(model.twin, run, pl.target if pl.site == "input" else output, output)
-    ctx = replace(ctx, mask=view_mask(view), noise=view.recording.noise.get(output))
+    the view as mask, the declared noise, and the way to the output."""
     twin = model.twin
-    if pl.site == "input":
-        return run.signals[pl.target], ctx
-    if pl.site == "feedback":
-        return run.measured[output], ctx
+    run = view_run(twin, view)
+    ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)
+    measured = run.measured[output]
+    mask = view_mask(view)
+    everything = View(view.recording, ((0, view.recording.n),), view.init, view.lead, view.memo)
+    whole = model.residual(everything if not twin.restart else view, theta)[output]
+    everywhere = whole if whole.size == mask.size else None
+    signals = ctx.signals
+    if pl.site == "feedback" and "velocity" in run.measured:
+        signals = {**signals, "velocity": run.measured["velocity"]}
+    ctx = replace(
+        ctx,
+        mask=mask,
+        noise=view.recording.noise.get(output),
+        measured=measured,
+        everywhere=everywhere,
+        signals=signals,
+    )
+    base = theta[: model.n_base]
+    if pl.site == "input" or pl.site == "feedback":
+        through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
+        ctx = replace(ctx, through=through)
+        return (run.signals[pl.target] if pl.site == "input" else measured), ctx
     drive = twin.drive(output)
     if twin.static and drive and pl.effect.kind == "add":
-        return run.signals[drive], ctx
+        return run.signals[drive], replace(ctx, through=twin.through(run, drive, base, output))
     return model._flow(run, theta, True)[output].value, ctx
 
 

@@ -9,49 +9,29 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Placed
 from tools.mismatch.twins.base import Twin
 
+SAME = "input or output"
+_WHOLE_RECORD = ("dead_time", "clock_skew", "dropped_samples")  # one clock for all outputs
+_DRIVES = ("amplifier", "actuator")  # stages before the base physics
+
 
 def sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed] = ()) -> list[Placed]:
     """Places for ``effect``, likeliest first. Empty: this twin or recording cannot have it (see ``why_not``).
 
     ``present``: effects that are already placed; behind a nonlinear one, input and output are different places.
     """
-    if why_not(twin, recording, effect):
-        return []
-    stages = [s for s in twin.chain if s in effect.stages] or [effect.stages[0]]
-    if effect.kind == "feedback":
-        return [Placed(effect, "feedback", twin.feedback_on, _stage(stages, "mechanics"), (twin.feedback_on,))]
-    if effect.shared:
-        return [Placed(effect, "output", "*", stages[0], twin.outputs)]
-    inputs = "input" in effect.sites
-    outputs = "output" in effect.sites
-    found: list[Placed] = []
-    if twin.static:
-        add = effect.kind == "add"
-        for o in twin.outputs:
-            drive = twin.drive(o)
-            if add or not inputs or not drive:
-                note = "input or output" if add and inputs and outputs else ""
-                found.append(Placed(effect, "output", o, stages[0], (o,), note=note))
-            else:
-                note = "input or output" if outputs else ""
-                found.append(Placed(effect, "input", drive, stages[0], (o,), note=note))
-                if outputs and present:
-                    found.append(Placed(effect, "output", o, stages[-1], (o,)))
-        return found
-    if outputs:
-        found += [Placed(effect, "output", o, stages[-1], (o,)) for o in twin.outputs]
-    if inputs and effect.driven:
-        # a linear operator commutes with a linear twin that has one input
-        merged = effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present
-        if merged:
-            found = [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note="input or output") for p in found]
-        else:
-            found += [Placed(effect, "input", s, stages[0], twin.outputs) for s in twin.inputs]
-    return found
+    out: list[Placed] = []
+    for one in (effect, *effect.variants):
+        out += _sites(twin, recording, one, present)
+    return out
 
 
 def why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
-    """Why an effect cannot be proposed here, in words; "" if it can."""
+    """Why an effect cannot be proposed here at all, in words; "" if it can."""
+    reasons = [_why_not(twin, recording, one) for one in (effect, *effect.variants)]
+    return "" if "" in reasons else reasons[0]
+
+
+def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
     if effect.twins and twin.kind not in effect.twins:
         return f"not in a {twin.kind}"
     if effect.kind == "feedback" and not twin.feedback_on:
@@ -59,8 +39,70 @@ def why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
     missing = [s for s in effect.needs if s not in recording.signals]
     if missing:
         return f"{', '.join(missing)} not recorded"
-    return ""
+    if effect.name == "channel_delay" and len(twin.outputs) < 2:
+        return "one output only: a late channel is dead_time"
+    reasons = [_here(effect, recording, o) for o in twin.outputs]
+    if effect.shared and len(twin.outputs) < 2 and effect.name == "misalignment":
+        return "one output only"
+    return "" if "" in reasons else reasons[0]
 
 
-def _stage(stages: Sequence[Stage], preferred: Stage) -> Stage:
-    return preferred if preferred in stages else stages[0]
+def _here(effect: Effect, recording: Recording, output: str) -> str:
+    return effect.available(recording.signals, output) if effect.available is not None else ""
+
+
+def _stage(twin: Twin, effect: Effect) -> Stage:
+    return next((s for s in effect.stages if s in twin.chain), effect.stages[0])
+
+
+def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed]) -> list[Placed]:
+    if _why_not(twin, recording, effect):
+        return []
+    stage = _stage(twin, effect)
+    if effect.kind == "feedback":
+        return [Placed(effect, "feedback", twin.feedback_on, stage, (twin.feedback_on,))]
+    usable = tuple(o for o in twin.outputs if not _here(effect, recording, o))
+    if effect.shared:
+        return [Placed(effect, "output", "+".join(g), stage, g) for g in _groups(twin, effect, usable)]
+    if effect.name in _WHOLE_RECORD:
+        return [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs, note=SAME)]
+    inputs, outputs = "input" in effect.sites, "output" in effect.sites
+    if twin.static:
+        return _static(twin, effect, stage, usable, inputs, outputs, bool(present))
+    found: list[Placed] = []
+    if outputs:
+        found += [Placed(effect, "output", o, stage, (o,)) for o in usable]
+    if inputs and effect.driven:
+        if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present:
+            # a linear operator commutes with a linear twin of one input
+            return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
+        found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]
+    return found
+
+
+def _static(
+    twin: Twin, effect: Effect, stage: Stage, usable: tuple[str, ...], inputs: bool, outputs: bool, present: bool
+) -> list[Placed]:
+    found: list[Placed] = []
+    note = SAME if inputs and outputs else ""
+    for o in usable:
+        drive = twin.drive(o)
+        before = inputs and drive and effect.kind != "add" and stage in _DRIVES and stage in twin.chain
+        if before:
+            found.append(Placed(effect, "input", drive, stage, (o,), note=note))
+            if outputs and present:
+                late: Stage = "sensor" if "sensor" in twin.chain else twin.chain[-1]
+                found.append(Placed(effect, "output", o, late, (o,)))
+        else:
+            found.append(Placed(effect, "output", o, stage, (o,), note=note))
+    return found
+
+
+def _groups(twin: Twin, effect: Effect, usable: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Outputs that share one set of weights: those of one location for a position error, else all."""
+    if effect.name != "sensor_position_error":
+        return [usable]
+    by: dict[float, list[str]] = {}
+    for o in usable:
+        by.setdefault(twin.facts(o).get("location", (0.0,))[0], []).append(o)
+    return [tuple(g) for g in by.values()]

@@ -68,18 +68,18 @@ def _compare(before: Array, after: Array) -> BandFigures:
 
 
 def tremor_figures(
-    truth: Mapping[str, Array], *, settle_s: float, band_hz: tuple[float, float] = TREMOR_BAND_HZ
+    truth: Mapping[str, Array], *, from_ns: int, to_ns: int, band_hz: tuple[float, float] = TREMOR_BAND_HZ
 ) -> TremorFigures | None:
-    """Figures over the truth after ``settle_s``; ``None`` when less than 2 s are left.
+    """Figures over the truth from ``from_ns`` to ``to_ns`` (bench time); ``None`` when that is less than 1 s.
 
     Filters run over the whole record, so that their own edges fall outside what is scored.
     """
-    t_s = (truth["t_ns"] - truth["t_ns"][0]) * 1e-9
-    if t_s[-1] - settle_s < 2.0:
-        return None
+    t_ns = np.asarray(truth["t_ns"])
+    t_s = (t_ns - t_ns[0]) * 1e-9
     rate_hz = (len(t_s) - 1) / t_s[-1]
-    edge_s = 0.25
-    keep = (t_s >= settle_s) & (t_s <= t_s[-1] - edge_s)
+    keep = (t_ns >= from_ns) & (t_ns < to_ns)
+    if np.count_nonzero(keep) < rate_hz:
+        return None
     rigid, tip, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "tip_m", "intended_m"))
     rigid_band, tip_band = (band_pass(x, rate_hz, band_hz)[keep] for x in (rigid, tip))
     per_axis = {a: _compare(rigid_band[:, [i]], tip_band[:, [i]]) for i, a in enumerate(AXES)}

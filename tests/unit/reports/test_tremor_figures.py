@@ -23,7 +23,7 @@ def truth(attenuation: float = 0.25, delay_s: float = 0.0, seconds: float = 12.0
 
 
 def test_reduction_per_axis_and_vector():
-    figures = tremor_figures(truth(), settle_s=2.0)
+    figures = tremor_figures(truth(), from_ns=2_000_000_000, to_ns=11_500_000_000)
     assert figures is not None
     assert figures.vector.uncompensated_rms_um == pytest.approx(np.sqrt((400 + 100 + 25) / 2), rel=0.01)
     assert figures.vector.reduction_percent == pytest.approx(75.0, abs=0.1)
@@ -32,13 +32,13 @@ def test_reduction_per_axis_and_vector():
 
 
 def test_amplified_tremor_is_a_negative_reduction():
-    figures = tremor_figures(truth(attenuation=1.5), settle_s=2.0)
+    figures = tremor_figures(truth(attenuation=1.5), from_ns=2_000_000_000, to_ns=11_500_000_000)
     assert figures is not None
     assert figures.vector.reduction_percent == pytest.approx(-50.0, abs=0.2)
 
 
 def test_voluntary_gain_and_delay():
-    figures = tremor_figures(truth(delay_s=0.012), settle_s=2.0)
+    figures = tremor_figures(truth(delay_s=0.012), from_ns=2_000_000_000, to_ns=11_500_000_000)
     assert figures is not None
     assert figures.voluntary_gain == pytest.approx(1.0, abs=0.005)
     assert figures.voluntary_delay_ms == pytest.approx(12.0, abs=0.5)
@@ -47,11 +47,19 @@ def test_voluntary_gain_and_delay():
 def test_what_came_before_settling_does_not_count():
     data = truth()
     data["tip_m"][:1500] += 1e-3
-    figures = tremor_figures(data, settle_s=2.0)
+    figures = tremor_figures(data, from_ns=2_000_000_000, to_ns=11_500_000_000)
     assert figures is not None
     assert figures.evaluated_s[0] >= 2.0
     assert figures.vector.reduction_percent == pytest.approx(75.0, abs=1.0)
 
 
 def test_too_short_to_say():
-    assert tremor_figures(truth(seconds=3.0), settle_s=2.0) is None
+    assert tremor_figures(truth(), from_ns=2_000_000_000, to_ns=2_900_000_000) is None
+
+
+def test_what_comes_after_the_run_does_not_count():
+    data = truth()
+    data["tip_m"][9000:] += 1e-3
+    figures = tremor_figures(data, from_ns=2_000_000_000, to_ns=8_000_000_000)
+    assert figures is not None
+    assert figures.vector.reduction_percent == pytest.approx(75.0, abs=1.0)

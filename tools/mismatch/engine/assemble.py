@@ -29,8 +29,9 @@ from tools.mismatch.engine.report import (
     Verdict,
     Window,
 )
+from tools.mismatch.engine.revise import reduced
 from tools.mismatch.engine.score import compare, held_rms, paired_t
-from tools.mismatch.engine.select import Rule, Selection, as_good, without
+from tools.mismatch.engine.select import Rule, Selection, as_good
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover
 from tools.mismatch.simulate import Model
@@ -89,7 +90,7 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
     rows = problem.held_rows
     out: list[PhysicsFound] = []
     for k, placed in enumerate(fitted.model.placed):
-        small = without(problem, fitted, k)
+        small = reduced(problem, fitted, k)
         c = compare(problem, small, fitted)
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
@@ -144,13 +145,14 @@ def alternatives(problem: Problem, selection: Selection, rule: Rule) -> tuple[li
                 continue
             o = t.placed.outputs[0]
             rms = _rms(t.fitted.residual[o][rows])
-            same = as_good(problem, t, step, rule)
+            same = as_good(t, step, rule)
             if same:
                 why = f"fits as well; {step.name} is simpler" if t.parameters > step.parameters else "fits as well"
                 if t.name not in (a.name for a in alike):
                     alike.append(t)
             else:
-                why = f"leaves {np.sqrt(t.misfit / max(step.misfit, 1e-12)):.2f} times the residual of {step.name}"
+                mine, best = (np.mean([v.misfits.get(q, np.inf) for q in t.placed.outputs]) for v in (t, step))
+                why = f"leaves {np.sqrt(mine / max(best, 1e-12)):.2f} times the residual of {step.name}"
             out.append(Alternative(t.name, o, rms, why))
         if alike:
             names = (step.name, *(t.name for t in alike))
@@ -203,8 +205,9 @@ def assemble(
     left: dict[str, Leftover],
     effects: Sequence[Effect],
     rule: Rule,
+    said: Sequence[str] = (),
 ) -> Report:
-    """Everything the contract asks for."""
+    """Everything the contract asks for. ``said``: messages of the checks."""
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
     verdict, p = decide(problem, raw, base, selection, left, rule)
@@ -225,10 +228,16 @@ def assemble(
     memory_p = 1.0
     seen: set[tuple[str, str]] = set()
     for o in guilty:
-        found, mp = follow(problem, looked, o)
+        if verdict == "unexplained":
+            found, mp = list(left[o].follows), left[o].memory_p
+        else:
+            found, mp = follow(problem, looked, o)
         memory_p = min(memory_p, mp)
         for d in found[:6]:
-            if d.p_value < 1e-3 and d.strength > 0.01 and (d.signal, d.feature) not in seen:
+            if (verdict == "unexplained" or (d.p_value < 1e-3 and d.strength > 0.01)) and (
+                d.signal,
+                d.feature,
+            ) not in seen:
                 seen.add((d.signal, d.feature))
                 depends.append(DependsOn(d.signal, d.feature, d.strength, d.p_value, d.memory))
     depends.sort(key=lambda d: -d.strength)
@@ -276,7 +285,7 @@ def assemble(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),
             all(ljung_box(fitted.residual[o][rows]) > 0.01 for o in twin.outputs),
             p,
-            (),
+            tuple(said),
             memory_p,
         ),
         seconds=0.0,
@@ -291,7 +300,7 @@ def assemble(
                 "p_value": t.candidate.p_value,
                 "z": t.comparison.z if t.comparison else 0.0,
                 "gain": t.comparison.gain if t.comparison else 0.0,
-                "misfit": t.misfit,
+                "misfit": float(np.mean(list(t.misfits.values()))) if t.misfits else None,
             }
             for t in selection.first
         ),

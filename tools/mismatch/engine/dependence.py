@@ -7,6 +7,7 @@ residual as it is, which books part of a true dependence as colour: conservative
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,7 +84,7 @@ def dependences(
     stretches = stretches or [(0, e.size)]
     if blocks is None:
         edges = np.linspace(0, e.size, 25).astype(int)
-        blocks = [(int(a), int(b)) for a, b in zip(edges[:-1], edges[1:], strict=True)]
+        blocks = [(int(a), int(b)) for a, b in itertools.pairwise(edges)]
     model = whitener or fit_whitener(e, stretches=stretches)
     white = whiten(model, e, stretches)
     limit = 8.0 * float(np.median(np.abs(white))) * 1.4826

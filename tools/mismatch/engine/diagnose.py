@@ -11,6 +11,7 @@ import numpy as np
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import assemble
+from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.fit import Fit, fit_base, residuals
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.problem import Problem
@@ -20,6 +21,9 @@ from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split
 from tools.mismatch.engine.unexplained import leftover
 from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import View
+from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make
 
 Progress = Callable[[str, int, int], None]
@@ -33,6 +37,31 @@ def make_split(recording: Recording, held_out: float, seed: int) -> Split:
         return given_split(recording.n, fit_span, given.test, initialization=given.initialization or 0)
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
     return own_split(signals, held_out=held_out, seed=seed, guard=max(4, recording.n // 2000))
+
+
+def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
+    """How our own split simulates: one run through the whole record where the inputs keep it on course, else afresh
+    at every range; and how many measured samples set a start state.
+
+    Only a plant that truly integrates is started afresh: a spring or drag forgets its start within the record.
+    """
+    if not isinstance(twin, DynamicTwin):
+        return twin, 0
+    if twin.restart and any(p.name == "stiffness_per_mass" for p in twin.parameters):
+        twin = replace(twin, restart=False)
+    if "x0" in recording.twin.parameters and not twin.restart:
+        return twin, 0
+    period = 4.0 / max(twin.fastest_per_s * recording.dt, 1e-9)
+    return twin, int(np.clip(period, 40, max(recording.n // 25, 20)))
+
+
+def gross(recording: Recording, twin: Twin, raw: Fit) -> list[str]:
+    """Messages of the cheap checks, on the simulation as given."""
+    whole = View.whole(recording)
+    with np.errstate(all="ignore"):
+        simulated = raw.model.simulate(whole, raw.theta)
+    drives = {o: twin.drive(o) for o in twin.outputs}
+    return messages(recording.inputs, recording.outputs, recording.context, simulated, drives, recording.dt)
 
 
 def as_given(problem: Problem) -> Fit:
@@ -77,6 +106,8 @@ def diagnose(
     twin = make(recording)
     split = make_split(recording, held_out, seed)
     init = recording.split.initialization or 0
+    if split.own:
+        twin, init = free_run(recording, twin)
     problem = Problem(recording, twin, split, init, seed)
     raw = as_given(problem)
     rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
@@ -89,7 +120,8 @@ def diagnose(
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
     left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
-    report = assemble(problem, raw, base, selection, left, catalogue, rule)
+    said = gross(recording, twin, raw)
+    report = assemble(problem, raw, base, selection, left, catalogue, rule, said)
     return replace(report, seconds=time.perf_counter() - began)
 
 

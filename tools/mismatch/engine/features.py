@@ -56,18 +56,16 @@ def recent_mean(x: Array, seconds: float, dt: float) -> Array:
 def last_reversal(x: Array, band: float) -> Array:
     """Value (n,) of ``x`` at its last reversal of more than ``band``: what a loop remembers."""
     out = np.empty_like(x)
-    extreme = x[0]
-    held = x[0]
-    direction = 0.0
+    extreme = held = x[0]
+    direction = 0
     for i, v in enumerate(x.tolist()):
-        if direction >= 0 and v > extreme:
+        if direction == 0:
+            if abs(v - extreme) > band:
+                direction, extreme = (1 if v > extreme else -1), v
+        elif (v - extreme) * direction > 0:
             extreme = v
-        elif direction <= 0 and v < extreme:
-            extreme = v
-        if direction >= 0 and v < extreme - band:
-            held, extreme, direction = extreme, v, -1.0
-        elif direction <= 0 and v > extreme + band:
-            held, extreme, direction = extreme, v, 1.0
+        elif (extreme - v) * direction > band:
+            held, extreme, direction = extreme, v, -direction
         out[i] = held
     return out
 
@@ -84,13 +82,20 @@ def local_frequency(x: Array, seconds: float, dt: float) -> Array:
     return envelope(rate, seconds, dt) / (2 * np.pi * np.maximum(envelope(x, seconds, dt), 1e-12 * np.std(x) + 1e-300))
 
 
+def _standard(x: Array) -> Array:
+    return (x - x.mean()) / (np.std(x) or 1.0)
+
+
 def _moves(x: Array) -> bool:
     return bool(np.std(x) > 1e-9 * max(float(np.max(np.abs(x))), 1e-300))
 
 
-def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True) -> list[Feature]:
+def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True, drive: str = "") -> list[Feature]:
     """Every feature tested: per signal its value, rate, acceleration, sign of rate, square, last reversal, recent
     history, amplitude and frequency; products of two signals; time itself. ``signals`` (n,) each.
+
+    A gain that depends on a signal is a curve of that signal times ``drive``: its ``kind`` is "cross product" and its
+    signal the one that sets the gain.
     """
     out: list[Feature] = []
     names = [k for k, v in signals.items() if _moves(v)]
@@ -109,6 +114,7 @@ def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True) 
             out.append(Feature(name, "acceleration", curve(rate_of(rate, dt), 4)))
             out.append(Feature(name, "running extremum", curve(last_reversal(z, 0.05), 4), memory=True))
         history = [z - recent_mean(z, s, dt) for s in _times(dt, duration)]
+        history += [recent_mean(np.abs(z), s, dt) for s in _times(dt, duration)]
         out.append(Feature(name, "recent history", np.column_stack(history), memory=True))
         slow = max(20 * dt, duration / 60)
         out.append(Feature(name, "amplitude", curve(envelope(z, slow, dt), 4), memory=True))
@@ -116,12 +122,16 @@ def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True) 
     if pairs:
         for i, a in enumerate(names):
             for b in names[i + 1 :]:
-                za = (signals[a] - signals[a].mean()) / np.std(signals[a])
-                zb = (signals[b] - signals[b].mean()) / np.std(signals[b])
-                out.append(Feature(f"{a}*{b}", "cross product", (za * zb)[:, None]))
+                gain_by, other = (b, a) if a == drive or b != drive else (a, b)
+                za, zb = _standard(signals[gain_by]), _standard(signals[other])
+                columns = curve(za, 5) * zb[:, None] if other == drive else (za * zb)[:, None]
+                out.append(Feature(gain_by, "cross product", columns))
     if n:
         phase = np.linspace(0, 1, n)
-        out.append(Feature("time", "time itself", np.column_stack([np.cos(np.pi * k * phase) for k in range(1, 7)])))
+        waves = np.column_stack([np.cos(np.pi * k * phase) for k in range(1, 7)])
+        out.append(Feature("time", "time itself", waves))
+        if drive in names and pairs:
+            out.append(Feature("time", "cross product", waves * _standard(signals[drive])[:, None]))
     return [f for f in out if f.columns.shape[1] > 0 and np.all(np.isfinite(f.columns))]
 
 

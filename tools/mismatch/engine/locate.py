@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,13 +30,24 @@ def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> t
 
 
 def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
-    """What the residual of one output follows, strongest first, and the p-value that history adds nothing."""
+    """What the residual of one output follows, strongest first, and the p-value that history adds nothing.
+
+    Both its mean and its size are looked at: bursts have no mean that follows, but a size that does.
+    """
     e, signals, dt = thinned(problem, fitted, output)
-    features = features_of(signals, dt)
+    features = features_of(signals, dt, drive=problem.twin.drive(output))
     found = dependences(e, features)
     present = [f for f in features if not f.memory and f.kind in ("value", "rate")]
-    past = [f for f in features if f.memory and f.kind in ("running extremum", "recent history")]
+    past = [f for f in features if f.memory and f.kind in ("running extremum", "recent history", "amplitude")]
     return found, needs_memory(e, present, past)
+
+
+def follow_size(problem: Problem, fitted: Fit, output: str) -> list[Dependence]:
+    """What the size of the residual follows (its logarithm, floored at the noise), strongest first."""
+    e, signals, dt = thinned(problem, fitted, output)
+    size = np.log(e**2 + (0.5 * problem.sigma(output)) ** 2)
+    features = [f for f in features_of(signals, dt, pairs=False) if f.kind in ("value", "rate", "amplitude")]
+    return dependences(size - size.mean(), features)
 
 
 def regime(problem: Problem, fitted: Fit, output: str) -> str:
@@ -44,7 +57,7 @@ def regime(problem: Problem, fitted: Fit, output: str) -> str:
     edges = np.linspace(0, e.size, blocks + 1).astype(int)
 
     def per_block(x: Array) -> Array:
-        return np.array([x[a:b].mean() for a, b in zip(edges[:-1], edges[1:], strict=True)])
+        return np.array([x[a:b].mean() for a, b in itertools.pairwise(edges)])
 
     energy = np.sqrt(per_block(e**2))
     seconds = max(20 * dt, e.size * dt / 60)

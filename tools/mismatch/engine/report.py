@@ -157,9 +157,7 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the contract, with optional keys beside; numbers finite or null."""
-        body = asdict(
-            Report(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, "pictures": None})  # noqa: RUF005
-        )
+        body = asdict(Report(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, "pictures": None}))
         body.pop("pictures")
         return _plain({"format": 1, **body})
 

@@ -23,16 +23,31 @@ class Comparison:
     """A larger model against a smaller one on held-out samples.
 
     ``z``: whitened correlation of what the larger model changes with what the smaller one leaves, standard normal
-    when nothing is missing (the direction was learned on other data, so there is no optimism in it). ``gain``:
-    share of the smaller model's mean square that goes; ``excess_gain``: the same of its part above the noise
-    floor; ``wins``: paired t of block scores; ``effect_rms``: what the larger model changes, per output.
+    when nothing is missing (the direction was learned on other data, so there is no optimism in it). The rest is
+    over the outputs that change: ``before`` and ``after`` mean square over noise variance per output;
+    ``effect_rms`` what the larger model changes, per output.
     """
 
     z: float
-    gain: float
-    excess_gain: float
-    wins: float
+    before: dict[str, float]
+    after: dict[str, float]
     effect_rms: dict[str, float]
+
+    @property
+    def improvement(self) -> float:
+        """Mean square over noise variance that goes, summed over outputs."""
+        return sum(self.before[o] - self.after[o] for o in self.before)
+
+    @property
+    def gain(self) -> float:
+        """Share of the mean square that goes, on the output where most goes."""
+        return max((1 - self.after[o] / max(b, 1e-300) for o, b in self.before.items()), default=0.0)
+
+    @property
+    def excess_gain(self) -> float:
+        """Share of what stands above the noise that goes, over the outputs that change."""
+        room = sum(max(b - 1.0, 0.0) for b in self.before.values())
+        return self.improvement / max(room, 1e-9)
 
     @property
     def log_p(self) -> float:
@@ -70,14 +85,19 @@ def block_energy(problem: Problem, fitted: Fit, blocks: list[Span]) -> Array:
     return out
 
 
-def misfit(problem: Problem, fitted: Fit) -> float:
-    """Mean square over noise variance on held-out samples, averaged over outputs; 1 is perfect."""
+def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
+    """Mean square over noise variance on held-out samples, per output; 1 is perfect."""
     rows = problem.held_rows
-    total = 0.0
+    out: dict[str, float] = {}
     for o in problem.twin.outputs:
         s = problem.sigma(o)
-        total += float(np.mean((winsorised(fitted.residual[o][rows], s) / s) ** 2))
-    return total / len(problem.twin.outputs)
+        out[o] = float(np.mean((winsorised(fitted.residual[o][rows], s) / s) ** 2)) if fitted.ok else np.inf
+    return out
+
+
+def misfit(problem: Problem, fitted: Fit) -> float:
+    """The same, averaged over outputs."""
+    return float(np.mean(list(misfits(problem, fitted).values())))
 
 
 def paired_t(a: Array, b: Array) -> float:
@@ -122,16 +142,13 @@ def direction_z(
     return top / np.sqrt(bottom) if bottom > 0 else 0.0
 
 
-def compare(problem: Problem, small: Fit, large: Fit, filters: dict[str, Whitener] | None = None) -> Comparison:
+def compare(problem: Problem, small: Fit, large: Fit) -> Comparison:
     """Everything that decides between a model and a larger one."""
-    filters = filters or whiteners(problem, large)
+    filters = whiteners(problem, large)
     change = {o: small.residual[o] - large.residual[o] for o in problem.twin.outputs}
     z = direction_z(problem, small, change, filters, problem.held_spans)
-    a, b = misfit(problem, small), misfit(problem, large)
-    wins = paired_t(
-        block_energy(problem, small, problem.held_blocks), block_energy(problem, large, problem.held_blocks)
-    )
-    excess = max(a - 1.0, 1e-9)
     rows = problem.held_rows
     effect = {o: float(np.std(change[o][rows])) for o in problem.twin.outputs}
-    return Comparison(z, 1 - b / max(a, 1e-300), (a - b) / excess, wins, effect)
+    before, after = misfits(problem, small), misfits(problem, large)
+    moved = [o for o in problem.twin.outputs if effect[o] > 1e-3 * problem.sigma(o)]
+    return Comparison(z, {o: before[o] for o in moved}, {o: after[o] for o in moved}, effect)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -48,7 +49,7 @@ def cut(spans: tuple[Span, ...], at_least: int) -> tuple[Span, ...]:
     for a, b in spans:
         parts = max(1, (b - a) // length)
         edges = np.linspace(a, b, parts + 1).astype(int)
-        blocks += [(int(p), int(q)) for p, q in zip(edges[:-1], edges[1:], strict=True) if q > p]
+        blocks += [(int(p), int(q)) for p, q in itertools.pairwise(edges) if q > p]
     return tuple(blocks)
 
 

@@ -10,7 +10,7 @@ from joblib import Parallel, delayed
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.score import Comparison, block_energy, compare, misfit
+from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
 from tools.mismatch.engine.screen import Candidate, one_step
 from tools.mismatch.simulate import Model, Placed
 
@@ -23,21 +23,26 @@ LEAST_P = 1e-3
 
 @dataclass(frozen=True)
 class Trial:
-    """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfit`` on held-out samples
-    (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds.
+    """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfits`` per output on held-out
+    samples (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds.
     """
 
     placed: Placed
     candidate: Candidate
     fitted: Fit | None
     comparison: Comparison | None
-    misfit: float
+    misfits: dict[str, float]
     energy: Array
     parameters: int
 
     @property
     def name(self) -> str:
         return self.placed.effect.name
+
+    @property
+    def improvement(self) -> float:
+        """Held-out mean square over noise variance that goes."""
+        return self.comparison.improvement if self.comparison else -np.inf
 
     @property
     def label(self) -> str:
@@ -57,11 +62,11 @@ def try_one(problem: Problem, current: Fit, place: Placed, stride: int, always: 
         candidate = one_step(problem, current, place)
         hopeful = always or candidate.share > LEAST_SHARE or candidate.p_value < LEAST_P
         if not hopeful:
-            return Trial(candidate.placed, candidate, None, None, np.inf, np.empty((0, 0)), 0)
+            return Trial(candidate.placed, candidate, None, None, {}, np.empty((0, 0)), 0)
         model, _ = extended(problem, current, candidate.placed)
         fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=12)
         comparison = compare(problem, current, fitted)
-        value = misfit(problem, fitted) if fitted.ok else np.inf
+        value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
     added = len(model.parameters) - len(current.model.parameters)
     return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added)

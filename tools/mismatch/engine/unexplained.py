@@ -8,7 +8,7 @@ import numpy as np
 
 from tools.mismatch.engine.dependence import Dependence
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.locate import follow
+from tools.mismatch.engine.locate import follow, follow_size
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import winsorised
 
@@ -27,14 +27,21 @@ class Leftover:
     real: bool
 
 
-def leftover(problem: Problem, fitted: Fit, output: str, *, p_limit: float = 1e-5, least: float = 0.03) -> Leftover:
+def leftover(
+    problem: Problem, fitted: Fit, output: str, *, p_limit: float = 1e-6, least: float = 0.03, least_size: float = 0.05
+) -> Leftover:
     """Judge what one output has left."""
     s = problem.sigma(output)
     r = winsorised(fitted.residual[output][problem.held_rows], s)
     ratio = float(np.mean((r / s) ** 2))
     found, memory = follow(problem, fitted, output)
-    said = tuple(d for d in found if d.p_value < p_limit and d.strength > least)
-    declared = problem.floors[output].declared
-    loud = declared and ratio > 1.5
+    said = [d for d in found if d.p_value < p_limit and d.strength > least]
     followed = any(d.feature != "time itself" for d in said)
-    return Leftover(output, ratio, said or tuple(found[:1]) if loud else said, memory, bool(followed or loud))
+    if not followed:
+        sizes = [d for d in follow_size(problem, fitted, output) if d.p_value < p_limit and d.strength > least_size]
+        followed = bool(sizes)
+        said += sizes
+    loud = problem.floors[output].declared and ratio > 1.5
+    if loud and not said:
+        said = found[:1]
+    return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))

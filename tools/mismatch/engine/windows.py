@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -45,12 +47,12 @@ def bad_windows(e: Array, noise_rms: float, dt: float, *, blocks: int = 96) -> l
     n = e.size
     blocks = max(4, min(blocks, n // 16))
     edges = np.linspace(0, n, blocks + 1).astype(int)
-    energy = np.array([np.mean(e[a:b] ** 2) for a, b in zip(edges[:-1], edges[1:], strict=True)])
+    energy = np.array([np.mean(e[a:b] ** 2) for a, b in itertools.pairwise(edges)])
     level = np.log(np.maximum(energy, (0.05 * noise_rms) ** 2 + 1e-300))
     segments = change_points(level)
     threshold = np.log(1.3 * noise_rms**2) if noise_rms > 0 else float(np.median(level))
     out: list[tuple[float, float]] = []
-    for a, b in zip(segments[:-1], segments[1:], strict=True):
+    for a, b in itertools.pairwise(segments):
         if float(np.log(np.mean(np.exp(level[a:b])))) > threshold:
             start, stop = float(edges[a] * dt), float(edges[b] * dt)
             if out and abs(out[-1][1] - start) < 1e-9:

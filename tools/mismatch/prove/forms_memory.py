@@ -164,25 +164,28 @@ def dead_zone(rng: Rng) -> Shape:
 
 
 def saturation(rng: Rng) -> Shape:
-    form = str(rng.choice(["hard", "one_sided", "asymmetric", "soft_power", "soft_tanh"]))
+    """Limits that are reached: the output flattens. (A gentle tanh alone would only be curvature.)"""
+    form = str(rng.choice(["hard", "one_sided", "asymmetric", "soft_power", "soft_knee"]))
     side = float(rng.choice([-1.0, 1.0]))
     other = rng.uniform(0.0, 0.6)
-    power = rng.uniform(2.5, 8.0)
+    power = rng.uniform(6.0, 14.0)
+    knee = rng.uniform(0.75, 0.95)
 
     def transform(x: Array, dt: float, s: float) -> Array:
+        limit = 1.0 - s
         if form == "hard":
-            return np.clip(x, s - 1.0, 1.0 - s)
+            return np.clip(x, -limit, limit)
         if form == "one_sided":
-            return side * np.minimum(side * x, 1.0 - s)
+            return side * np.minimum(side * x, limit)
         if form == "asymmetric":
-            return side * np.clip(side * x, other * s - 1.0, 1.0 - s)
-        r = np.abs(x) * s
+            return side * np.clip(side * x, other * s - 1.0, limit)
         if form == "soft_power":
-            return x / (1.0 + r**power) ** (1.0 / power)
-        return np.tanh(x * s) / s
+            return x / (1.0 + np.abs(x / limit) ** power) ** (1.0 / power)
+        start, room = knee * limit, (1.0 - knee) * limit
+        over = np.maximum(np.abs(x) - start, 0.0)
+        return np.sign(x) * (np.minimum(np.abs(x), start) + room * np.tanh(over / room))
 
-    soft = form.startswith("soft")
-    return Shape(form, transform, (0.05, 3.0) if soft else (1e-4, 0.85))
+    return Shape(form, transform, (-0.4 if form == "soft_power" else 1e-4, 0.85))
 
 
 def static_nonlinearity(rng: Rng) -> Shape:
@@ -223,7 +226,7 @@ def first_order_lag(rng: Rng) -> Shape:
         return lti([1.0], [extra * s * s, s * (1.0 + extra), 1.0] if extra else [s, 1.0], x, dt)
 
     truth = None if extra else (lambda s: {"time_constant": (s, "s"), "corner": (1 / (2 * np.pi * s), "Hz")})
-    return Shape(form, transform, (1e-6, 1.0), truth)
+    return Shape(form, transform, (1e-6, 0.12), truth)
 
 
 def ac_coupling(rng: Rng) -> Shape:
@@ -263,7 +266,7 @@ def dead_time(rng: Rng) -> Shape:
         i = np.arange(x.size, dtype=float)
         return np.interp(i - s / dt, i, x)
 
-    return Shape("fractional_delay", transform, (1e-6, 0.3), lambda s: {"delay": (s, "s")})
+    return Shape("fractional_delay", transform, (1e-6, 0.06), lambda s: {"delay": (s, "s")})
 
 
 SHAPES: dict[str, Callable[[Rng], Shape]] = {

@@ -294,6 +294,6 @@ def channel_delay(rng: Rng, scene: Scene) -> Bound:
         outputs=(late,),
         stages=("acquisition", "sensor"),
         depends=tuple(scene.inputs) + scene.outputs,
-        strength=(1e-6, 0.3),
+        strength=(1e-6, 0.06),
         truth=lambda s: {"delay": (s, "s")},
     )

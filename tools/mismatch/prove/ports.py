@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from tools.mismatch.prove.forms_memory import SHAPES, Array, Rng
+from tools.mismatch.prove.forms_memory import SHAPES, Array, Rng, lti
 from tools.mismatch.prove.plants import Bound, Flow, Scene, per_output, simulate
 
 STAGES_DRIVE = ("amplifier", "actuator", "mechanics", "acquisition")
@@ -107,6 +107,29 @@ def shaped(name: str, rng: Rng, scene: Scene, where: str) -> Bound:
         depends=tuple(scene.inputs) + scene.outputs,
         strength=shape.strength,
         truth=shape.truth if name not in ("backlash",) else None,
+    )
+
+
+def same_place(name: str, other: Bound) -> Bound:
+    """A plain 'dead_time' or 'first_order_lag' where ``other`` sits: could one pass for the other?"""
+
+    def late(x: Array, dt: float, s: float) -> Array:
+        if name == "first_order_lag":
+            return lti([1.0], [s, 1.0], x - x[0], dt) + x[0]
+        i = np.arange(x.size, dtype=float)
+        return np.interp(i - s / dt, i, x)
+
+    def drive(flow: Flow, s: float) -> None:
+        key = next(iter(flow.drive)) if "force" not in flow.drive else "force"
+        flow.drive[key] = late(flow.drive[key], float(flow.t[1] - flow.t[0]), s)
+
+    def out(flow: Flow, s: float) -> None:
+        for k in other.outputs:
+            flow.out[k] = late(flow.out[k], float(flow.t[1] - flow.t[0]), s)
+
+    at_drive = other.on_drive is not None
+    return Bound(
+        name, "plain", on_drive=drive if at_drive else None, on_out=None if at_drive else out, strength=(1e-6, 0.5)
     )
 
 

@@ -112,6 +112,11 @@ class Twin(Protocol):
         """
         ...
 
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array] | None:
+        """What a change of an input (or, for "", of the force behind the input gain) does to an output, linear part
+        only; None: unknown."""
+        ...
+
     def human(self, theta: Array) -> Sequence[Human]:
         """Base parameters under the contract's names."""
         ...

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +57,11 @@ class ClusterTwin:
     def input_gain(self, signal: str, theta: Array) -> float:
         """See Twin."""
         return 1.0
+
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
+        """See Twin."""
+        gain = self.sensitivity(output, theta)
+        return lambda change: gain * change
 
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool

@@ -148,6 +148,29 @@ class DynamicTwin:
                     add(link.j if j < 0 else j, link.output, column)
         return self._settle(run, d.ad, value, columns)
 
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
+        """See Twin."""
+        source = signal or self.inputs[0]
+        plant = self.plant_of(theta)
+        d = discretise(plant.a, plant.b, run.dt, self.hold)
+        normal = self._gain_index(source) >= 0
+        group = next((g for g in self.groups if output in g), None)
+        links = [link for link in self.links if link.source == source and (link.output == output or normal)]
+        ss = self._start_state(run, d.ad, group) if group is not None else None
+
+        def carry(change: Array) -> Array:
+            x = _states(d, change, run.starts)
+            y = {o: np.zeros(change.size) for o in (group or (output,))}
+            for link in links:
+                if link.output in y:
+                    gain = 1.0 if normal and not signal else theta[link.j]
+                    y[link.output] += gain * (x[:, link.row] if link.row >= 0 else change)
+            if ss is not None:
+                y[output] += ss.response(ss.states({o: -v for o, v in y.items()}), output, change.size)
+            return y[output]
+
+        return carry
+
     def _settle(
         self, run: Run, ad: Array, value: dict[str, Array], columns: dict[int, dict[str, Array]]
     ) -> dict[str, Signal]:

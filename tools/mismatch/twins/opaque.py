@@ -71,6 +71,10 @@ class OpaqueTwin:
         """See Twin."""
         return 1.0
 
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> None:
+        """See Twin."""
+        return None
+
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,6 +67,11 @@ class StaticTwin:
         """See Twin."""
         return 1.0
 
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
+        """See Twin."""
+        gain = self.sensitivity(output, theta)
+        return lambda change: gain * change
+
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
@@ -101,7 +106,11 @@ class StaticTwin:
 
 
 _KINDS: dict[str, tuple[str, str, tuple[Stage, ...]]] = {
-    "piezo_stack": ("offset_um", "gain_um_per_V", ("amplifier", "actuator", "mechanics", "sensor", "acquisition")),
+    "piezo_stack": (
+        "offset_um",
+        "gain_um_per_V",
+        ("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
+    ),
     "accelerometer": ("bias_V", "scale_V_per_g", ("mounting", "sensor", "environment", "acquisition")),
     "magnetometer": ("bias_V", "scale_V_per_uT", ("mounting", "environment", "sensor", "acquisition")),
 }
