@@ -123,17 +123,23 @@ class PythonCan:
         if not self._open:
             raise Closed("the bus is closed", device=self._uri)
         end = time.monotonic() + timeout_s
+        left_s = timeout_s
         while True:
-            # python-can's own waiting is per byte with slcan, and ends early at an acknowledgement
-            own_wait_s = 0.0 if self._wait else max(0.0, end - time.monotonic())
             try:
-                message = self._bus.recv(own_wait_s)
-                if message is None:
-                    if self._wait and select.select(self._wait, (), (), max(0.0, end - time.monotonic()))[0]:
-                        continue
-                    return None
+                # python-can's own waiting is per byte with slcan and ends early at an acknowledgement: we wait
+                if self._wait:
+                    if not select.select(self._wait, (), (), left_s)[0]:
+                        return None
+                    message = self._bus.recv(0.0)
+                else:
+                    message = self._bus.recv(left_s)
+                    if message is None:
+                        return None
             except self._errors as error:
                 raise self._failed(error) from error
+            left_s = max(0.0, end - time.monotonic())
+            if message is None:
+                continue
             if not self._is_mine(message.channel) and self._is_data(message):
                 self._stats.rx += 1
                 return CanFrame(

@@ -31,7 +31,10 @@ class UnixI2c:
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._open = True
         try:
-            self._socket.settimeout(timeout_s)
+            # the kernel's own timeouts: Python's would cost two more system calls per transfer
+            limit = struct.pack("@ll", int(timeout_s), round(timeout_s % 1 * 1e6))
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
             self._socket.connect(path)
         except OSError as error:
             self._socket.close()
@@ -56,7 +59,7 @@ class UnixI2c:
         except OSError as error:
             # half a reply may still be under way: this connection cannot be used any more
             self.close()
-            what = f"no answer within {self._timeout_s} s" if isinstance(error, TimeoutError) else str(error)
+            what = f"no answer within {self._timeout_s} s" if isinstance(error, BlockingIOError) else str(error)
             raise Disconnected(f"the emulated bus has gone: {what}", device=self._path) from error
         if n != _REPLY.size + length:
             self.close()

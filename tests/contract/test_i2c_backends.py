@@ -17,8 +17,19 @@ import smbus2
 import smbus2.smbus2
 
 from hal.backends import open_i2c
+from hal.backends.unix_i2c import UnixI2c
 from hal.contracts import I2cBus
-from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, ErrorKind, HalError, HalTimeout, I2cNack
+from hal.errors import (
+    BenchError,
+    BusError,
+    Closed,
+    DeviceNotFound,
+    Disconnected,
+    ErrorKind,
+    HalError,
+    HalTimeout,
+    I2cNack,
+)
 from hal.types import I2cRead, I2cWrite
 from tests.contract.i2c_contract import MEMORY, REFUSING, I2cContract, RegisterDevice
 
@@ -75,6 +86,18 @@ class TestUnixSocket(I2cContract):
     def test_dead_world_is_a_disconnect(self, bus: I2cBus):
         with pytest.raises(Disconnected, match="gone"):
             bus.transfer(0x7F, [I2cRead(1)])
+
+
+def test_stuck_world_is_a_bounded_wait(tmp_path: Path):
+    path = tmp_path / "stuck.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(1)  # connects, but nobody ever answers
+        bus = UnixI2c(str(path), timeout_s=0.05)
+        with pytest.raises(Disconnected, match=r"no answer within 0\.05 s"):
+            bus.transfer(MEMORY, [I2cRead(1)])
+        with pytest.raises(Closed):
+            bus.transfer(MEMORY, [I2cRead(1)])
 
 
 class KernelBus:
