@@ -1,0 +1,80 @@
+"""Dependence tests: right false-alarm rate on correlated noise, power on nonlinear relations, memory told from function."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import binom
+
+from tools.mismatch.engine.dependence import dependences, needs_memory
+from tools.mismatch.engine.features import Feature, curve, features_of, last_reversal
+
+N = 3000
+DT = 1e-2
+
+
+def wander(rng: np.random.Generator, pole: float = 0.98) -> np.ndarray:
+    x = lfilter([1.0], [1.0, -pole], rng.standard_normal(N))
+    return x / x.std()
+
+
+def noise(kind: str, rng: np.random.Generator) -> np.ndarray:
+    if kind == "white":
+        return rng.standard_normal(N)
+    if kind == "red":
+        return wander(rng, 0.9)
+    if kind == "mixed":
+        return wander(rng, 0.99) + rng.standard_normal(N)
+    return rng.standard_t(3, N)
+
+
+@pytest.mark.parametrize("kind", ["white", "red", "mixed", "heavy"])
+def test_false_alarms_stay_at_the_nominal_rate(kind: str) -> None:
+    rng = np.random.default_rng([11, len(kind)])
+    runs = 60
+    alarms = 0
+    for _ in range(runs):
+        x = wander(rng)
+        found = dependences(noise(kind, rng), [Feature("x", "value", curve(x))])
+        alarms += found[0].p_value < 0.05
+    assert alarms <= binom.ppf(0.9999, runs, 0.07)
+
+
+def test_many_features_are_corrected_for() -> None:
+    rng = np.random.default_rng(5)
+    runs = 12
+    alarms = sum(
+        min(d.p_value for d in dependences(noise("mixed", rng), features_of({"a": wander(rng), "b": wander(rng)}, DT)))
+        < 0.05
+        for _ in range(runs)
+    )
+    assert alarms <= binom.ppf(0.9999, runs, 0.07)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_nonlinear_relation_is_found_and_the_decoy_is_not(seed: int) -> None:
+    rng = np.random.default_rng([seed, 2])
+    x, decoy = wander(rng), wander(rng)
+    found = dependences(noise("red", rng) + 0.9 * np.abs(x), features_of({"x": x, "decoy": decoy}, DT, pairs=False))
+    best = found[0]
+    assert best.signal == "x"
+    assert best.p_value < 1e-4
+    assert all(d.p_value > 1e-4 or d.strength < best.strength / 2 for d in found if d.signal == "decoy")
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_function_is_told_from_memory(seed: int) -> None:
+    rng = np.random.default_rng([seed, 3])
+    x = lfilter([1.0], [1.0, -0.9], wander(rng))
+    x /= x.std()
+    function = 0.5 * x**2 + 0.5 * rng.standard_normal(N)
+    state = 0.6 * lfilter([0.05], [1.0, -0.95], np.abs(x)) + 0.2 * rng.standard_normal(N)
+    features = features_of({"x": x}, DT)
+    now = [f for f in features if f.kind in ("value", "rate")]
+    past = [f for f in features if f.kind in ("running extremum", "recent history")]
+    assert needs_memory(function, now, past) > 1e-3
+    assert needs_memory(state, now, past) < 1e-6
+
+
+def test_last_reversal_holds_the_turning_value() -> None:
+    x = np.array([0.0, 1.0, 2.0, 1.0, 0.0, 1.0, 3.0, 2.0])
+    assert last_reversal(x, 0.5).tolist() == [0.0, 0.0, 0.0, 2.0, 2.0, 0.0, 0.0, 3.0]

@@ -1,0 +1,148 @@
+"""Second thoughts: effects that stopped paying are dropped, early choices are put against their rivals again, and two
+effects are tried together when neither pays alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
+from tools.mismatch.engine.trial import Trial
+from tools.mismatch.simulate import Model, Placed, prepare
+
+Array = np.ndarray
+
+
+def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
+    """The fit without one of its effects, everything else fitted again."""
+    placed = [p for j, p in enumerate(fitted.model.placed) if j != drop]
+    model = Model(problem.twin, placed)
+    theta = model.carry(fitted.model, fitted.theta, problem.recording)
+    return fit(problem, model, [theta], stride=2, iterations=12)
+
+
+def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
+    """The fit with one effect replaced by a rival, prepared and started from what the others leave."""
+    rest = reduced(problem, fitted, drop)
+    return added(problem, rest, rival)
+
+
+def added(problem: Problem, current: Fit, place: Placed) -> Fit:
+    """The fit with one more effect, from its own starting points."""
+    placed = prepare(current.model, problem.fit_view, current.theta, place)
+    model = Model(problem.twin, (*current.model.placed, placed))
+    theta = model.carry(current.model, current.theta, problem.recording)
+    starts = model.starts(len(model.placed) - 1, problem.fit_view, theta)
+    return fit(problem, model, list(starts), stride=2, iterations=12)
+
+
+def total(problem: Problem, fitted: Fit) -> float:
+    """Mean square over noise variance, summed over outputs."""
+    return sum(misfits(problem, fitted).values())
+
+
+def better(problem: Problem, old: Fit, new: Fit, *, margin: float, t_limit: float = 3.0) -> bool:
+    """Is ``new`` better than ``old`` on held-out blocks: by more than ``margin`` of the excess, and by a paired test."""
+    if not new.ok:
+        return False
+    a, b = total(problem, old), total(problem, new)
+    room = a - len(problem.twin.outputs)
+    if a - b < margin * max(room, 0.0) + 0.02:
+        return False
+    blocks = problem.held_blocks
+    return paired_t(block_energy(problem, old, blocks), block_energy(problem, new, blocks)) > t_limit
+
+
+def swap_pass(
+    problem: Problem, fitted: Fit, rivals: Sequence[Sequence[Trial]], *, margin: float = 0.25
+) -> tuple[Fit, list[int]]:
+    """Each effect but the last put against the best rivals of its step, now that the others are in place.
+
+    Returns the model and the positions that changed.
+    """
+    changed: list[int] = []
+    count = len(fitted.model.placed)
+    if count < 2:
+        return fitted, changed
+    for k in range(count):
+        held = [p for j, p in enumerate(fitted.model.placed) if j != k]
+        tried: set[str] = set()
+        for rival in rivals[k][:4] if k < len(rivals) else ():
+            name = rival.placed.effect.name
+            same = any(p.effect.name == name and p.target == rival.placed.target for p in held)
+            if same or name in tried or name == fitted.model.placed[k].effect.name:
+                continue
+            tried.add(name)
+            with np.errstate(all="ignore"):
+                candidate = replaced(problem, fitted, k, rival.placed)
+            if better(problem, fitted, candidate, margin=margin):
+                # the newcomer is last in its model; keep the order of acceptance
+                fitted = _reordered(problem, candidate, k)
+                changed.append(k)
+                break
+    return fitted, changed
+
+
+def _reordered(problem: Problem, fitted: Fit, k: int) -> Fit:
+    order = list(fitted.model.placed)
+    order.insert(k, order.pop())
+    model = Model(problem.twin, order)
+    theta = model.carry(fitted.model, fitted.theta, problem.recording)
+    return fit(problem, model, [theta], iterations=6)
+
+
+def prune(problem: Problem, fitted: Fit, *, z: float, gain: float) -> tuple[Fit, list[int]]:
+    """Effects that no longer pay are dropped, the least useful first. Returns the model and the dropped positions
+    (in the order of the model that came in).
+    """
+    positions = list(range(len(fitted.model.placed)))
+    dropped: list[int] = []
+    while len(positions) > 1:
+        worth: list[tuple[float, int, Fit]] = []
+        for k, placed in enumerate(fitted.model.placed):
+            if placed.effect.stochastic:
+                continue
+            small = reduced(problem, fitted, k)
+            c = compare(problem, small, fitted)
+            if not (c.z > z and c.gain > gain):
+                worth.append((c.improvement, k, small))
+        if not worth:
+            break
+        _, k, fitted = min(worth, key=lambda w: (w[0], w[1]))
+        dropped.append(positions.pop(k))
+    return fitted, dropped
+
+
+def pair_search(
+    problem: Problem, current: Fit, trials: Sequence[Trial], *, z: float, gain: float, most: int = 5
+) -> tuple[Fit, tuple[Trial, Trial]] | None:
+    """Two effects together where none pays alone: the most promising by their one-step share, all pairs of them."""
+    hopeful = sorted((t for t in trials if t.fitted is not None), key=lambda t: -t.candidate.share)
+    chosen: list[Trial] = []
+    for t in hopeful:
+        if all(t.name != c.name for c in chosen):
+            chosen.append(t)
+        if len(chosen) == most:
+            break
+    best: tuple[float, Fit, tuple[Trial, Trial]] | None = None
+    for i, a in enumerate(chosen):
+        for b in chosen[i + 1 :]:
+            assert a.fitted is not None
+            with np.errstate(all="ignore"):
+                both = added(problem, a.fitted, b.placed)
+            if not both.ok:
+                continue
+            c = compare(problem, current, both)
+            alone = max(a.improvement, b.improvement)
+            if (
+                c.z > z
+                and c.gain > 2 * gain
+                and c.improvement > alone + 0.05
+                and (best is None or c.improvement > best[0])
+            ):
+                best = (c.improvement, both, (a, b))
+    return None if best is None else (best[1], best[2])
