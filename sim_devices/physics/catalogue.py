@@ -1,15 +1,64 @@
-"""Every effect of the vocabulary, by its contract name."""
+"""Every effect of the vocabulary, by its contract name, in the contract's order."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from sim_devices.physics.axes import CROSS_AXIS_NONLINEARITY, MISALIGNMENT, SCALE_FACTOR_VARIATION, SOFT_IRON
+from sim_devices.physics.backlash import BACKLASH
+from sim_devices.physics.creep import CREEP
+from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT, THERMAL_DRIFT
 from sim_devices.physics.effect import Effect
+from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
+from sim_devices.physics.friction import COULOMB_FRICTION, STRIBECK_FRICTION
 from sim_devices.physics.hysteresis import HYSTERESIS
-from sim_devices.physics.lag import FIRST_ORDER_LAG
-from sim_devices.physics.lines import MAINS_INTERFERENCE
+from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
+from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
+from sim_devices.physics.memoryless import DEAD_ZONE, QUANTIZATION, SLEW_LIMIT, STATIC_NONLINEARITY
+from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
+from sim_devices.physics.resonance import RESONANCE
+from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_ERROR
 from sim_devices.physics.saturation import SATURATION
+from sim_devices.physics.spikes import SPIKES
+from sim_devices.physics.spring import COGGING_FORCE, CUBIC_STIFFNESS
+from sim_devices.physics.timebase import CHANNEL_DELAY, CLOCK_SKEW, DEAD_TIME, DROPPED_SAMPLES
 
-_ALL = (HYSTERESIS, SATURATION, FIRST_ORDER_LAG, MAINS_INTERFERENCE)
+_ALL = (
+    HYSTERESIS,
+    RATE_DEPENDENT_HYSTERESIS,
+    CREEP,
+    BACKLASH,
+    DEAD_ZONE,
+    SATURATION,
+    STATIC_NONLINEARITY,
+    SLEW_LIMIT,
+    FIRST_ORDER_LAG,
+    AC_COUPLING,
+    RESONANCE,
+    DEAD_TIME,
+    MISALIGNMENT,
+    CROSS_AXIS_NONLINEARITY,
+    SCALE_FACTOR_VARIATION,
+    THERMAL_DRIFT,
+    TEMPERATURE_SENSITIVITY,
+    SUPPLY_SENSITIVITY,
+    CURRENT_COUPLING,
+    SOFT_IRON,
+    MAINS_INTERFERENCE,
+    VIBRATION,
+    SPIKES,
+    STEP_SHIFT,
+    RANDOM_WALK,
+    CLOCK_SKEW,
+    DROPPED_SAMPLES,
+    QUANTIZATION,
+    COULOMB_FRICTION,
+    STRIBECK_FRICTION,
+    CUBIC_STIFFNESS,
+    COGGING_FORCE,
+    CENTRIPETAL_ACCELERATION,
+    SENSOR_POSITION_ERROR,
+    CHANNEL_DELAY,
+)
 EFFECTS: Mapping[str, Effect] = MappingProxyType({e.name: e for e in _ALL})

@@ -15,7 +15,7 @@ weights    the coefficients of ``basis`` columns, solved exactly (kinds "add" an
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -76,6 +76,9 @@ class Context:
     ``starts``: samples where simulation starts afresh (0 first); memory is cleared there. ``mask`` (n,):
     where the residual may be looked at (None = everywhere); ``noise``: rms of the output's noise if known.
     ``facts``: constants of the twin that some effects need (sensor positions, axis of a channel).
+    For guesses only: ``measured`` (n,) the output's recording; ``everywhere`` (n,) the residual beyond the mask too,
+    for nothing but locating single events (bursts); ``through`` carries a small change of the signal
+    that the effect sits on to the output (linear, compiled).
     """
 
     t: Array
@@ -88,15 +91,18 @@ class Context:
     mask: NDArray[np.bool_] | None = None
     noise: float | None = None
     facts: Mapping[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
+    measured: Array | None = None
+    everywhere: Array | None = None
+    through: Callable[[Array], Array] | None = None
 
     @property
     def keep(self) -> NDArray[np.bool_]:
         """Mask with None resolved, (n,) bool."""
         return np.ones(self.t.size, np.bool_) if self.mask is None else self.mask
 
-    def with_target(self, target: str) -> Context:
-        """The same context for another signal."""
-        return replace(self, target=target)
+    def to_output(self, change: Array) -> Array:
+        """What a change (n,) of the signal does to the output, to first order."""
+        return change if self.through is None else self.through(change)
 
 
 @dataclass(frozen=True)
@@ -157,10 +163,9 @@ class Effect:
     ``apply(x, ctx, q, settings) -> (n,)`` for kinds linear and nonlinear; ``basis(x, ctx, q, settings) -> (n, k)``
     for kinds add (columns are added to the signal) and feedback (``x`` is position, columns are forces, velocity
     is ``ctx.signals["velocity"]``). ``q`` (len(parts.nonlinear),). Pure: same arguments, same answer.
-    ``guess(x, residual, ctx, settings)`` gives one or more starts for ``q``. ``probe(x, ctx, settings) -> (n, k)``
-    gives the directions in which a weak effect would move the signal: what the score test projects on; None
-    means ``basis`` at each guess. ``test`` replaces the score test where columns cannot say it (lines, bursts,
-    steps, grids). ``report(p, settings, scale)`` gives human parameters from ``p`` (nonlinear, then weights);
+    ``guess(x, residual, ctx, settings)`` gives one or more starts for ``q``. ``test`` replaces the score test on
+    the directions at the guesses (``simulate_screen.directions``) where columns cannot say it (lines, bursts, steps,
+    grids). ``report(p, settings, scale)`` gives human parameters from ``p`` (nonlinear, then weights);
     ``scale`` is the base twin's sensitivity at that place, in output per input unit.
     ``equation`` is TeX; ``source`` paper and equation, or standard text.
     ``driven``: depends on the signal it sits on (False: an addition from outside, such as hum).
@@ -181,7 +186,6 @@ class Effect:
     guess: Guess = no_start
     apply: Apply | None = None
     basis: Basis | None = None
-    probe: Callable[[Array, Context, Settings], Array] | None = None
     test: Test | None = None
     report: Report | None = None
     driven: bool = True
@@ -190,7 +194,13 @@ class Effect:
     shared: bool = False
     twins: tuple[str, ...] = ()
     """Twin kinds that can have it; empty: all."""
+    available: Callable[[Mapping[str, Array], str], str] | None = None
+    """(signals, output) -> why it cannot be proposed there, "" if it can; for needs that a fixed list cannot say."""
+    claims: Callable[[Settings, int], NDArray[np.bool_]] | None = None
+    """(settings, n) -> samples that it takes as its own events: not to be fitted, nor held against the model."""
+    variants: tuple[Effect, ...] = ()
+    """The same physics at another place of the equations (hysteresis as a force); same name."""
     fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
-    """Its course cannot be predicted on unseen data beyond its level at the start (random walk, spikes)."""
+    """Its course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""

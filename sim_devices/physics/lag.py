@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import rank_starts, thin
 
 
 @njit(cache=True)
@@ -45,20 +46,17 @@ def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return low_pass(x, ctx.dt, q[0], np.array(ctx.starts))
 
 
+def _target(residual: Array, ctx: Context, x: Array) -> Array:
+    """What the output should be: its recording, or the model plus its residual."""
+    return ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
+
+
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    dx = np.gradient(x, ctx.dt)
-    k = ctx.keep
-    den = float(dx[k] @ dx[k])
-    r = residual[k] - residual[k].mean()
-    tau = abs(float(dx[k] @ r) / den) if den > 0 else ctx.dt
-    span = ctx.dt * ctx.t.size
-    tau = float(np.clip(tau, 0.1 * ctx.dt, 0.1 * span))
-    return ((tau,), (min(8 * tau, 0.2 * span),), (0.25 * tau,))
-
-
-def _probe(x: Array, ctx: Context, settings: Settings) -> Array:
-    taus = (2 * ctx.dt, 10 * ctx.dt, 50 * ctx.dt)
-    return np.stack([low_pass(x, ctx.dt, t, np.array(ctx.starts)) - x for t in taus], axis=1)
+    dt, span = settings["time"]
+    model, at = ctx.to_output(x), np.zeros(1, np.int64)
+    grid: list[tuple[float, ...]] = [(float(t),) for t in np.geomspace(0.1 * dt, 0.1 * span, 20)]
+    ranked = rank_starts(grid, lambda q: low_pass(model, dt, q[0], at), _target(residual, ctx, x), thin(ctx.keep, 8000))
+    return ranked[:3]
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -78,6 +76,54 @@ FIRST_ORDER_LAG = Effect(
     prepare=_prepare,
     guess=_guess,
     apply=_apply,
-    probe=_probe,
+    report=_report,
+)
+
+
+# -- AC coupling ------------------------------------------------------------------------------------
+
+
+def _ac_parts(settings: Settings) -> Parts:
+    dt, span = settings.get("time", (1e-3, 1.0))
+    return Parts(
+        (
+            Parameter("time_constant_s", "s", 2 * dt, 3 * span, log=True, scale=dt),
+            Parameter("settled_share", "1", 0.0, 1.0, scale=0.1),
+        )
+    )
+
+
+def _ac_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    at = np.array(ctx.starts)
+    k = np.arange(x.size)
+    since = k - at[np.searchsorted(at, k, side="right") - 1]
+    slow = low_pass(x, ctx.dt, q[0], at) - (1 - q[1]) * x[k - since] * np.exp(-since * ctx.dt / q[0])
+    return x - slow
+
+
+def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    dt, span = settings["time"]
+    grid: list[tuple[float, ...]] = [(float(t), s) for t in np.geomspace(5 * dt, 2 * span, 20) for s in (1.0, 0.0)]
+    return rank_starts(
+        grid,
+        lambda q: ctx.to_output(_ac_apply(x, ctx, np.array(q), settings)),
+        _target(residual, ctx, x),
+        thin(ctx.keep, 8000),
+    )[:3]
+
+
+AC_COUPLING = Effect(
+    name="ac_coupling",
+    summary="high-pass: the mean is lost",
+    kind="linear",
+    stages=("amplifier", "acquisition", "sensor"),
+    parts=_ac_parts,
+    equation=r"\tau \dot y + y = \tau \dot x",
+    source="A. V. Oppenheim, A. S. Willsky, Signals and Systems, 2nd ed., section 6.5.1",
+    excitation="changes of the mean that last longer than the time constant",
+    confusable_with=("creep", "thermal_drift"),
+    prepare=_prepare,
+    guess=_ac_guess,
+    apply=_ac_apply,
     report=_report,
 )

@@ -5,77 +5,227 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.special import gammaincc
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.drift import hats
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
+from sim_devices.physics.statistics import runs, thin
+
+MAINS_HZ = (50.0, 60.0)
+MOST_KNOTS = 24
 
 
 def tones(t: Array, frequency: float, harmonics: int) -> Array:
     """Sine and cosine of each harmonic, (n, 2 * harmonics)."""
     phase = 2 * np.pi * frequency * t
-    cols = [f(h * phase) for h in range(1, harmonics + 1) for f in (np.sin, np.cos)]
+    first = np.exp(1j * phase)
+    cols: list[Array] = []
+    power = np.ones_like(first)
+    for _ in range(harmonics):
+        power = power * first
+        cols += [power.imag.copy(), power.real.copy()]
     return np.stack(cols, axis=1)
 
 
-def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
+    """Complex amplitude of a line in windows of ``width`` seconds, (windows,)."""
+    dt = t[1] - t[0]
+    m = max(1, int(round(width / dt)))
+    c = (t.size // m) * m
+    z = e[:c] * np.exp(-2j * np.pi * frequency * t[:c])
+    return 2 * z.reshape(-1, m).mean(axis=1)
+
+
+def periodogram(e: Array, keep: np.ndarray, dt: float) -> tuple[Array, Array]:
+    """Frequencies and power of the kept residual (gaps as zeros), finely spaced."""
+    clean = np.where(keep, e - e[keep].mean(), 0.0)
+    n = 1 << int(np.ceil(np.log2(2 * e.size)))
+    return np.fft.rfftfreq(n, dt), np.abs(np.fft.rfft(clean, n)) ** 2
+
+
+def local_floor(power: Array, around: int) -> Array:
+    """Running median of a spectrum in blocks: the noise under a line."""
+    m = max(1, power.size // max(around, 1))
+    width = power.size // m
+    blocks = power[: m * width].reshape(m, width)
+    centre = (np.arange(m) + 0.5) * width
+    return np.interp(np.arange(power.size), centre, np.median(blocks, axis=1) / np.log(2))
+
+
+def _peak(x: Array, residual: Array, ctx: Context, lo: float, hi: float, driven: bool) -> tuple[float, float]:
+    """(frequency, power over the local floor) of the strongest line between lo and hi."""
+    f, p = periodogram(residual, ctx.keep, ctx.dt)
+    z = p / np.maximum(local_floor(p, 400), 1e-300)
+    allowed = (f >= lo) & (f <= hi) & (f > 4 / (ctx.dt * ctx.t.size))
+    if not driven:
+        for m in MAINS_HZ:
+            allowed &= np.abs((f + m / 2) % m - m / 2) > 0.6
+        allowed &= ~_excited(x, ctx, f)
+    if not np.any(allowed):
+        return 0.0, 0.0
+    i = int(np.argmax(np.where(allowed, z, 0.0)))
+    return float(f[i]), float(z[i])
+
+
+def _excited(x: Array, ctx: Context, f: Array) -> Array:
+    """Frequencies where an input has a line of its own (a residual line there is a wrong response, not a visitor)."""
+    bad = np.zeros(f.size, bool)
+    for name, s in ctx.signals.items():
+        if float(np.ptp(s)) == 0 or name.startswith(("temperature", "supply")):
+            continue
+        g, p = periodogram(s, np.ones(s.size, bool), ctx.dt)
+        line = p > 1e-3 * p.max()
+        bad |= np.interp(f, g, line.astype(np.float64)) > 0
+        # and twice, three times as much: distortion
+        for h in (2, 3):
+            bad |= np.interp(f / h, g, line.astype(np.float64)) > 0
+    return bad
+
+
+def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Settings:
+    """How many knots the amplitude and phase need: as coarse as their wander allows."""
+    span = ctx.dt * ctx.t.size
+    width = max(10 / f0, span / 200)
+    longest = max(runs(ctx.keep), key=lambda s: s[1] - s[0])
+    t, e = ctx.t[slice(*longest)], residual[slice(*longest)]
+    knots = 1
+    if t.size * ctx.dt > 8 * width:
+        z = carrier(t, e, f0, width)
+        d = z - z.mean()
+        power = float(np.mean(np.abs(z) ** 2))
+        rough = float(np.mean(np.abs(np.diff(z)) ** 2)) / 2
+        wander = float(np.mean(np.abs(d) ** 2))
+        if wander > max(2.0 * rough, 0.02 * power):
+            knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
+    grid = tuple(float(v) for v in np.linspace(0, span, knots)) if knots > 1 else (0.0,)
+    return {"nominal": (f0,), "harmonics": (float(harmonics),), "span": (span,), "knots_s": grid}
+
+
+def _mains_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     nyquist = 0.5 / ctx.dt
     f0, best = 50.0, -1.0
-    r = residual - residual.mean()
-    for f in (50.0, 60.0):
-        if f < nyquist:
-            c = tones(ctx.t, f, 1)
-            power = float(np.sum((c.T @ r) ** 2))
-            if power > best:
-                f0, best = f, power
+    for m in MAINS_HZ:
+        f, z = _peak(x, residual, ctx, 0.99 * m, min(1.01 * m, 0.99 * nyquist), True) if m < nyquist else (m, -1.0)
+        if z > best and f > 0:
+            f0, best = f, z
     harmonics = int(max(1, min(5, 0.9 * nyquist // f0)))
-    return {"nominal": (f0,), "harmonics": (float(harmonics),), "span": (ctx.dt * ctx.t.size,)}
+    return _settle(residual, ctx, f0, harmonics)
 
 
-def _parts(settings: Settings) -> Parts:
+def _line_parts(settings: Settings) -> Parts:
     f0 = settings.get("nominal", (50.0,))[0]
-    n = int(settings.get("harmonics", (1.0,))[0])
+    h = int(settings.get("harmonics", (1.0,))[0])
     span = settings.get("span", (1.0,))[0]
-    names = [f"{p}{h}" for h in range(1, n + 1) for p in ("sin", "cos")]
+    knots = len(settings.get("knots_s", (0.0,)))
+    reach = max(2.0 / span, 2e-4 * f0)
+    names = [f"{p}{i}" for i in range(1, h + 1) for p in ("sin", "cos")]
+    if knots > 1:
+        names = [f"{m}_{k + 1}" for m in names for k in range(knots)]
+    penalty = 0.02 * np.eye(len(names))
+    if knots > 2:
+        bend = np.diff(np.eye(knots), axis=0)
+        penalty = np.concatenate([penalty, 0.2 * np.kron(np.eye(2 * h), bend)])
     return Parts(
-        (Parameter("frequency_Hz", "Hz", 0.99 * f0, 1.01 * f0, scale=0.1 / span),),
-        tuple(Parameter(m, "{out}", scale=1.0) for m in names),
+        (Parameter("frequency_Hz", "Hz", f0 - reach, f0 + reach, scale=0.1 / span),),
+        tuple(Parameter(m, "{out}") for m in names),
+        penalty,
     )
 
 
-def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return tones(ctx.t, q[0], int(settings.get("harmonics", (1.0,))[0]))
+def _line_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    c = tones(ctx.t, q[0], int(settings.get("harmonics", (1.0,))[0]))
+    knots = np.array(settings.get("knots_s", (0.0,)))
+    if knots.size == 1:
+        return c
+    h = hats(ctx.t, knots)
+    return np.concatenate([c[:, j : j + 1] * h for j in range(c.shape[1])], axis=1)
 
 
-def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    f0 = settings["nominal"][0]
-    span = settings["span"][0]
-    grid = np.arange(0.99 * f0, 1.01 * f0, 0.25 / span)[:4000]
-    r = residual - residual.mean()
-    power = [float(np.sum((tones(ctx.t, f, 1).T @ r) ** 2)) for f in grid]
-    return ((float(grid[int(np.argmax(power))]),),)
+def _line_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return ((settings["nominal"][0],),)
 
 
-def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    amplitudes = np.hypot(p[1::2], p[2::2])
+def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    knots = len(settings.get("knots_s", (0.0,)))
+    h = int(settings["harmonics"][0])
+    w = p[1:].reshape(2 * h, knots)
+    amplitudes = np.sqrt(np.mean(w[0::2] ** 2 + w[1::2] ** 2, axis=1))
     return (
         Human("frequency_Hz", float(p[0]), "Hz"),
-        *(Human(f"amplitude_{h + 1}", float(a), "{out}") for h, a in enumerate(amplitudes)),
+        *(Human(f"amplitude_{i + 1}", float(a), "{out}") for i, a in enumerate(amplitudes)),
     )
 
+
+def _line_signature(z: float, f: float, trials: float, residual: Array, ctx: Context) -> Signature:
+    """A single bin of a white stretch of spectrum is exponential: p = trials exp(-z)."""
+    k = thin(ctx.keep, 40_000)
+    if f <= 0:
+        return Signature(1.0, 0.0, "no line")
+    cols = tones(ctx.t[k], f, 1)
+    e = residual[k] - residual[k].mean()
+    w = np.linalg.lstsq(cols, e, rcond=None)[0]
+    power = float(e @ e)
+    share = 1 - float(np.sum((e - cols @ w) ** 2)) / power if power > 0 else 0.0
+    # the floor is itself estimated and coloured: count a quarter of the excess
+    return Signature(float(min(1.0, trials * gammaincc(1.0, 0.5 * z))), max(share, 0.0), f"line at {f:.4g} Hz")
+
+
+def _mains_test(x: Array, residual: Array, ctx: Context) -> Signature:
+    best = (0.0, 0.0)
+    for m in MAINS_HZ:
+        if m < 0.5 / ctx.dt:
+            found = _peak(x, residual, ctx, 0.99 * m, 1.01 * m, True)
+            best = max(best, found, key=lambda b: b[1])
+    return _line_signature(best[1], best[0], 4 * 50 * ctx.dt * ctx.t.size * 0.02 + 2, residual, ctx)
+
+
+def _vibration_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    f0, _ = _peak(x, residual, ctx, 0.0, 0.49 / ctx.dt, False)
+    f0 = f0 or 0.1 / ctx.dt
+    return _settle(residual, ctx, f0, 1 if 2 * f0 > 0.45 / ctx.dt else 2)
+
+
+def _vibration_test(x: Array, residual: Array, ctx: Context) -> Signature:
+    f, z = _peak(x, residual, ctx, 0.0, 0.49 / ctx.dt, False)
+    return _line_signature(z, f, ctx.t.size, residual, ctx)
+
+
+_LINE = r"y = x + \sum_h A_h(t) \sin 2\pi h f t + B_h(t) \cos 2\pi h f t,\; A, B \text{ slow}"
 
 MAINS_INTERFERENCE = Effect(
     name="mains_interference",
     summary="50 or 60 Hz and harmonics",
     kind="add",
     stages=("acquisition", "environment"),
-    parts=_parts,
-    equation=r"y = x + \sum_h a_h \sin 2\pi h f t + b_h \cos 2\pi h f t",
+    parts=_line_parts,
+    equation=_LINE,
     source="H. W. Ott, Electromagnetic Compatibility Engineering, chapters 2-3; IEC 61000-4-7 for harmonics",
     excitation="a sampling rate above 100 Hz",
     confusable_with=("vibration",),
-    prepare=_prepare,
-    guess=_guess,
-    basis=_basis,
-    report=_report,
+    prepare=_mains_prepare,
+    guess=_line_guess,
+    basis=_line_basis,
+    test=_mains_test,
+    report=_line_report,
+    driven=False,
+    sites=("output",),
+)
+
+VIBRATION = Effect(
+    name="vibration",
+    summary="a narrow line elsewhere in the spectrum, not driven by the input",
+    kind="add",
+    stages=("environment", "mounting", "mechanics"),
+    parts=_line_parts,
+    equation=_LINE,
+    source="M. B. Priestley, Spectral Analysis and Time Series, section 6.1.4 (Fisher's test for a line)",
+    excitation="an input without lines near that frequency",
+    confusable_with=("mains_interference", "resonance"),
+    prepare=_vibration_prepare,
+    guess=_line_guess,
+    basis=_line_basis,
+    test=_vibration_test,
+    report=_line_report,
     driven=False,
     sites=("output",),
 )

@@ -8,6 +8,7 @@ import numpy as np
 from numba import njit
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import rank_starts, thin
 
 
 @njit(cache=True)
@@ -53,13 +54,16 @@ def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     lo, hi = settings["range"]
     span = hi - lo
-    far = 0.5 * span
-    return (
-        (lo + 0.1 * span, hi - 0.1 * span, 0.01 * span),
-        (lo - far, hi - 0.15 * span, 0.01 * span),
-        (lo + 0.15 * span, hi + far, 0.01 * span),
-        (lo - 0.1 * span, hi + 0.1 * span, 0.3 * span),
-    )
+    measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
+    cut = (-0.4, 0.02, 0.1, 0.2, 0.35)
+    grid: list[tuple[float, ...]] = [
+        (lo + a * span, hi - b * span, w * span) for a in cut for b in cut for w in (0.005, 0.1) if a > 0 or b > 0
+    ]
+    # a gentle bend whose limits lie outside what was reached
+    grid += [
+        (lo + a * span, hi - b * span, w * span) for a, b in ((-0.1, -0.1), (-0.4, 0.0), (0.0, -0.4)) for w in (0.3,)
+    ]
+    return rank_starts(grid, lambda q: ctx.to_output(limit(x, q[0], q[1], q[2])), measured, thin(ctx.keep, 4000))[:4]
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

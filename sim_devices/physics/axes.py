@@ -1,0 +1,278 @@
+"""What other axes do to one axis: misalignment, quadratic bias, varying sensitivity, soft iron."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+
+_VECTORS = ("specific_force_", "field_")
+
+
+def own_axis(output: str) -> str:
+    """The axis letter of an output such as ``voltage_x`` or ``accel_3y``."""
+    return output[-1]
+
+
+def vector_of(signals: Mapping[str, Array]) -> dict[str, str]:
+    """Axis letter -> signal of the recorded input vector."""
+    for prefix in _VECTORS:
+        found = {a: prefix + a for a in "xyz" if prefix + a in signals}
+        if found:
+            return found
+    return {}
+
+
+def others(signals: Mapping[str, Array], output: str) -> list[str]:
+    """Axis letters beside the output's own whose signals vary."""
+    return [a for a, s in vector_of(signals).items() if a != own_axis(output) and float(np.ptp(signals[s])) > 0.0]
+
+
+def _available(signals: Mapping[str, Array], output: str) -> str:
+    return "" if others(signals, output) else "no other axis was recorded, or none changes"
+
+
+def _columns_of(ctx: Context, axes: Sequence[str]) -> list[Array]:
+    vector = vector_of(ctx.signals)
+    return [ctx.signals[vector[a]] for a in axes]
+
+
+def _axes(settings: Settings) -> list[str]:
+    return ["xyz"[int(i)] for i in settings.get("axes", (0.0, 1.0, 2.0))]
+
+
+def _axis_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {"axes": tuple(float("xyz".index(a)) for a in others(ctx.signals, ctx.output))}
+
+
+# -- misalignment -----------------------------------------------------------------------------------
+
+_PAIRS = (("x", "y"), ("x", "z"), ("y", "z"))
+
+
+def _rotation_columns(ctx: Context) -> Array:
+    """Columns of a small rotation of the whole vector: output i gets -(phi x f)_i."""
+    vector = vector_of(ctx.signals)
+    i = "xyz".index(own_axis(ctx.output))
+    out = np.zeros((ctx.t.size, 3))
+    j, k = (i + 1) % 3, (i + 2) % 3
+    # (phi x f)_i = phi_j f_k - phi_k f_j
+    if "xyz"[k] in vector:
+        out[:, j] = -ctx.signals[vector["xyz"[k]]]
+    if "xyz"[j] in vector:
+        out[:, k] = ctx.signals[vector["xyz"[j]]]
+    return out
+
+
+def _mis_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    return _axis_settings(x, residual, ctx)
+
+
+def _mis_parts(settings: Settings) -> Parts:
+    return Parts((), tuple(Parameter(f"from_{a}", "{out}/{in}", scale=0.01) for a in _axes(settings)))
+
+
+def _mis_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    axes = _axes(settings)
+    if not vector_of(ctx.signals):
+        return np.zeros((ctx.t.size, len(axes)))
+    return np.stack(_columns_of(ctx, axes), axis=1)
+
+
+def _mis_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return [Human(f"angle_to_{a}", 1e3 * float(v) / g, "mrad") for a, v in zip(_axes(settings), p, strict=True)]
+
+
+def _rot_parts(settings: Settings) -> Parts:
+    return Parts((), tuple(Parameter(f"rotation_{a}", "{out}/{in}", scale=0.01) for a in "xyz"))
+
+
+def _rot_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return _rotation_columns(ctx)
+
+
+def _rot_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return [Human(f"rotation_{a}", 1e3 * float(v) / g, "mrad") for a, v in zip("xyz", p, strict=True)]
+
+
+_MIS_SOURCE = "IEEE Std 1293-2018, model equation (cross-axis sensitivities); D. Titterton, J. Weston, ch. 8"
+
+_ROTATION = Effect(
+    name="misalignment",
+    summary="the whole sensor is turned by a small angle",
+    kind="add",
+    stages=("mounting",),
+    parts=_rot_parts,
+    equation=r"y = x - s\,(\varphi \times f)_i",
+    source=_MIS_SOURCE,
+    excitation="every axis moved on its own",
+    basis=_rot_basis,
+    report=_rot_report,
+    driven=False,
+    sites=("output",),
+    available=_available,
+    shared=True,
+)
+
+MISALIGNMENT = Effect(
+    name="misalignment",
+    summary="linear sensitivity to the other axes",
+    kind="add",
+    stages=("mounting", "sensor"),
+    parts=_mis_parts,
+    equation=r"y_i = x_i + \sum_{j \ne i} m_{ij} f_j",
+    source=_MIS_SOURCE,
+    excitation="every axis moved on its own, or tumbles",
+    confusable_with=("soft_iron", "sensor_position_error"),
+    prepare=_mis_prepare,
+    basis=_mis_basis,
+    report=_mis_report,
+    driven=False,
+    sites=("output",),
+    available=_available,
+    variants=(_ROTATION,),
+)
+
+# -- soft iron --------------------------------------------------------------------------------------
+
+_CROSS = tuple((i, j) for i in "xyz" for j in "xyz" if i != j)
+
+
+def _iron_parts(settings: Settings) -> Parts:
+    return Parts((), tuple(Parameter(f"{i}{j}", "{out}/{in}", scale=0.01) for i, j in _CROSS), 0.02 * np.eye(6))
+
+
+def _iron_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    vector = vector_of(ctx.signals)
+    out = np.zeros((ctx.t.size, 6))
+    for c, (i, j) in enumerate(_CROSS):
+        if i == own_axis(ctx.output) and j in vector:
+            out[:, c] = ctx.signals[vector[j]]
+    return out
+
+
+def _iron_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    out = [Human(f"{i}{j}", float(v) / g, "1") for (i, j), v in zip(_CROSS, p, strict=True)]
+    at = {c: v for c, v in zip(_CROSS, p, strict=True)}
+    even = sum((at[i, j] + at[j, i]) ** 2 for i, j in _PAIRS) / 2
+    total = float(np.sum(p**2))
+    out.append(Human("symmetric_share", float(even / total) if total > 0 else 1.0, "1"))
+    return out
+
+
+SOFT_IRON = Effect(
+    name="soft_iron",
+    summary="linear distortion of a field vector (off-diagonal or unequal gains)",
+    kind="add",
+    stages=("environment",),
+    parts=_iron_parts,
+    equation=r"B' = (I + S)\,B",
+    source="M. J. Caruso, Applications of Magnetic Sensors for Low Cost Compass Systems, IEEE PLANS 2000; V. Renaudin et al.,"
+    " J. Sensors 2010, eq. 6",
+    excitation="the instrument turned through all directions",
+    confusable_with=("misalignment",),
+    basis=_iron_basis,
+    report=_iron_report,
+    driven=False,
+    sites=("output",),
+    shared=True,
+    twins=("magnetometer",),
+    available=_available,
+)
+
+# -- quadratic cross-axis bias ----------------------------------------------------------------------
+
+
+def _cross_terms(axes: Sequence[str]) -> list[str]:
+    terms = [a + a for a in axes]
+    return terms + ([axes[0] + axes[1]] if len(axes) == 2 else [])
+
+
+def _quad_parts(settings: Settings) -> Parts:
+    names = _cross_terms(_axes(settings)[:2])
+    return Parts((), tuple(Parameter(f"k_{m}", "{out}/{in}^2", scale=0.01) for m in names), 0.02 * np.eye(len(names)))
+
+
+def _quad_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    axes = _axes(settings)[:2]
+    vector = vector_of(ctx.signals)
+    names = _cross_terms(axes)
+    if not vector:
+        return np.zeros((ctx.t.size, len(names)))
+    return np.stack([ctx.signals[vector[m[0]]] * ctx.signals[vector[m[1]]] for m in names], axis=1)
+
+
+def _quad_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    names = _cross_terms(_axes(settings)[:2])
+    return [Human(f"k_{m}", float(v), "{out}/{in}^2") for m, v in zip(names, p, strict=True)]
+
+
+CROSS_AXIS_NONLINEARITY = Effect(
+    name="cross_axis_nonlinearity",
+    summary="bias that depends quadratically on another axis",
+    kind="add",
+    stages=("sensor",),
+    parts=_quad_parts,
+    equation=r"y_i = x_i + \sum_{j, k \ne i} k_{jk} f_j f_k",
+    source="IEEE Std 1293-2018, model equation, terms K_pp, K_oo, K_po",
+    excitation="large values of the other axes while the own axis is small",
+    confusable_with=("misalignment", "scale_factor_variation", "centripetal_acceleration"),
+    prepare=_axis_settings,
+    basis=_quad_basis,
+    report=_quad_report,
+    driven=False,
+    sites=("output",),
+    available=_available,
+)
+
+# -- scale factor that follows another axis ---------------------------------------------------------
+
+
+def _sfv_parts(settings: Settings) -> Parts:
+    names = [f"k_{a}{d}" for a in _axes(settings) for d in (1, 2)]
+    return Parts((), tuple(Parameter(m, "{out}/{in}^2", scale=0.01) for m in names), 0.05 * np.eye(len(names)))
+
+
+def _sfv_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    axes = _axes(settings)
+    vector = vector_of(ctx.signals)
+    if not vector or own_axis(ctx.output) not in vector:
+        return np.zeros((ctx.t.size, 2 * len(axes)))
+    own = ctx.signals[vector[own_axis(ctx.output)]]
+    cols: list[Array] = []
+    for f in _columns_of(ctx, axes):
+        cols += [own * f, own * f * f]
+    return np.stack(cols, axis=1)
+
+
+def _sfv_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    out: list[Human] = []
+    for i, a in enumerate(_axes(settings)):
+        out.append(Human(f"scale_change_per_{a}", float(p[2 * i]) / g, "1/{in}"))
+        out.append(Human(f"scale_change_per_{a}^2", float(p[2 * i + 1]) / g, "1/{in}^2"))
+    return out
+
+
+SCALE_FACTOR_VARIATION = Effect(
+    name="scale_factor_variation",
+    summary="an axis' sensitivity depends on another axis",
+    kind="add",
+    stages=("sensor",),
+    parts=_sfv_parts,
+    equation=r"y_i = x_i + x_i \sum_{j \ne i} (a_j f_j + b_j f_j^2)",
+    source="IEEE Std 1293-2018, model equation, cross-coupling terms K_ip, K_io",
+    excitation="own and other axis large at the same time, in several combinations",
+    confusable_with=("cross_axis_nonlinearity", "static_nonlinearity"),
+    prepare=_axis_settings,
+    basis=_sfv_basis,
+    report=_sfv_report,
+    driven=False,
+    sites=("output",),
+    available=_available,
+)

@@ -1,0 +1,66 @@
+"""Backlash: after each reversal the output stands still (or nearly) until the gap is taken up."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.hysteresis import stops
+from sim_devices.physics.statistics import least_squares, thin
+
+
+def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    return {"span": (float(np.ptp(x[k])) or 1.0,), "rest": (float(x[0]),)}
+
+
+def _parts(settings: Settings) -> Parts:
+    span = settings.get("span", (1.0,))[0]
+    return Parts(
+        (Parameter("half_gap", "{in}", 1e-5 * span, 0.45 * span, log=True, scale=0.01 * span),),
+        (Parameter("missing_slope", "{out}/{in}"),),
+    )
+
+
+def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return -stops(x, q[:1], settings.get("rest", (0.0,))[0], np.array(ctx.starts, np.int64))
+
+
+def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    span = settings["span"][0]
+    k = thin(ctx.keep, 8000)
+    straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    grid = span * np.geomspace(5e-4, 0.4, 16)
+    every = stops(x, grid, float(x[0]), np.array(ctx.starts, np.int64))
+    tried: list[tuple[float, float]] = []
+    for j, r in enumerate(grid):
+        column = ctx.to_output(np.ascontiguousarray(every[:, j]))[k]
+        tried.append((least_squares(np.column_stack([straight, column]), residual[k])[1], float(r)))
+    tried.sort()
+    return tuple((r,) for _, r in tried[:3])
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("gap", 2 * float(p[0]), "{in}"),
+        Human("slope_lost_inside", float(p[1] / scale) if scale else 0.0, "1"),
+    )
+
+
+BACKLASH = Effect(
+    name="backlash",
+    summary="free play: output stands still for a fixed travel after each reversal",
+    kind="add",
+    stages=("mechanics", "actuator"),
+    parts=_parts,
+    equation=r"y = x - w\,(x - P_r[x])",
+    source="M. Nordin, P.-O. Gutman, Automatica 38 (2002) 1633, section 2; play operator as in Kuhnen 2003, eq. 2",
+    excitation="reversals with travel of several gaps",
+    confusable_with=("hysteresis", "dead_zone", "coulomb_friction", "dead_time"),
+    prepare=_prepare,
+    guess=_guess,
+    basis=_basis,
+    report=_report,
+)

@@ -1,0 +1,309 @@
+"""Slow changes that no recorded signal explains: warm-up, level steps, random walk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numba import njit
+from scipy.stats import kstwobign, norm
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
+from sim_devices.physics.statistics import least_squares, long_run_rms, runs, thin
+
+# -- warm-up ----------------------------------------------------------------------------------------
+
+
+def _span(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
+
+
+def _warm_parts(settings: Settings) -> Parts:
+    dt, span = settings.get("time", (1e-3, 1.0))
+    return Parts(
+        (
+            Parameter("time_constant_s", "s", max(20 * dt, 2e-3 * span), 3 * span, log=True, scale=0.1 * span),
+            Parameter("ratio", "1", 0.02, 0.5, log=True, scale=0.1),
+        ),
+        (Parameter("slow", "{out}"), Parameter("fast", "{out}")),
+        np.diag([0.01, 0.05]),
+    )
+
+
+def _warm_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.stack([np.exp(-ctx.t / q[0]), np.exp(-ctx.t / (q[0] * q[1]))], axis=1)
+
+
+def _warm_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    p = _warm_parts(settings).nonlinear[0]
+    k = thin(ctx.keep, 4000)
+    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    tried: list[tuple[float, float, float]] = []
+    for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
+        for ratio in (0.05, 0.2):
+            cols = _warm_basis(x, ctx, np.array([tau, ratio]), settings)[k]
+            tried.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(tau), ratio))
+    tried.sort()
+    return tuple((tau, ratio) for _, tau, ratio in tried[:3])
+
+
+def _warm_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    span = settings["time"][1]
+    t = np.array([0.0, span])
+    change = _exponentials(t, p)
+    return (
+        Human("drift_over_record", float(change[1] - change[0]), "{out}"),
+        Human("time_constant_s", float(p[0] if abs(p[2]) >= abs(p[3]) else p[0] * p[1]), "s"),
+        Human("slow_amplitude", float(-p[2]), "{out}"),
+        Human("fast_amplitude", float(-p[3]), "{out}"),
+    )
+
+
+def _exponentials(t: Array, p: Array) -> Array:
+    return p[2] * np.exp(-t / p[0]) + p[3] * np.exp(-t / (p[0] * p[1]))
+
+
+THERMAL_DRIFT = Effect(
+    name="thermal_drift",
+    summary="warm-up: slow, exponential-like, no temperature recorded",
+    kind="add",
+    stages=("environment", "sensor", "acquisition"),
+    parts=_warm_parts,
+    equation=r"y = x + a\,e^{-t/\tau} + b\,e^{-t/(r\tau)}",
+    source="F. P. Incropera et al., Fundamentals of Heat and Mass Transfer, 6th ed., eq. 5.6 (lumped capacitances)",
+    excitation="a record of a time constant or more, from switch-on",
+    confusable_with=("creep", "random_walk", "temperature_sensitivity"),
+    prepare=_span,
+    guess=_warm_guess,
+    basis=_warm_basis,
+    report=_warm_report,
+    driven=False,
+    sites=("output",),
+)
+
+# -- level steps ------------------------------------------------------------------------------------
+
+MOST_STEPS = 6
+
+
+@njit(cache=True)
+def best_split(total, count):
+    """Where two levels fit best: (index, gain in sum of squares) for block sums and counts."""
+    n = total.size
+    s = 0.0
+    c = 0.0
+    ss = total.sum()
+    cc = count.sum()
+    best = 0
+    gain = 0.0
+    for i in range(n - 1):
+        s += total[i]
+        c += count[i]
+        if c <= 0.0 or cc - c <= 0.0:
+            continue
+        d = s / c - (ss - s) / (cc - c)
+        g = d * d * c * (cc - c) / cc
+        if g > gain:
+            gain = g
+            best = i + 1
+    return best, gain
+
+
+def find_steps(residual: Array, keep: np.ndarray) -> tuple[list[int], float, float]:
+    """(samples where the level jumps, largest standardised CUSUM, share explained), by binary segmentation.
+
+    The price of a step is in units of the long-run variance, which coloured noise has more of.
+    """
+    e = np.where(keep, residual, 0.0)
+    n = e.size
+    sigma = max(long_run_rms(residual[keep]), 1e-300)
+    size = max(1, n // 4000)
+    m = n // size
+    total = e[: m * size].reshape(m, size).sum(axis=1)
+    count = keep[: m * size].reshape(m, size).sum(axis=1).astype(np.float64)
+    cuts: list[int] = []
+    pieces = [(0, m)]
+    top = 0.0
+    price = 2.0 * np.log(max(m, 10)) + 6.0
+    explained = 0.0
+    while pieces and len(cuts) < MOST_STEPS:
+        scored = [(best_split(total[a:b], count[a:b]), a, b) for a, b in pieces if b - a >= 8]
+        if not scored:
+            break
+        (at, gain), a, b = max(scored, key=lambda s: s[0][1])
+        z = gain / sigma**2
+        top = max(top, float(np.sqrt(z)))
+        if z < price:
+            break
+        cuts.append(a + at)
+        explained += gain
+        pieces.remove((a, b))
+        pieces += [(a, a + at), (a + at, b)]
+    power = float(np.sum((residual[keep] - residual[keep].mean()) ** 2))
+    refined = sorted(_refine(residual, keep, c * size, size) for c in cuts)
+    return refined, top, min(1.0, explained / power) if power > 0 else 0.0
+
+
+def _refine(residual: Array, keep: np.ndarray, at: int, size: int) -> int:
+    """The sample where two means around ``at`` part best."""
+    reach = max(4 * size, 40)
+    a, b = max(0, at - reach), min(residual.size, at + reach)
+    k = keep[a:b]
+    split, gain = best_split(np.where(k, residual[a:b], 0.0), k.astype(np.float64))
+    return a + int(split) if gain > 0 else at
+
+
+def _step_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    cuts, _, _ = find_steps(residual, ctx.keep)
+    return {"times_s": tuple(float(ctx.t[c]) for c in cuts)}
+
+
+def _step_parts(settings: Settings) -> Parts:
+    n = len(settings.get("times_s", ()))
+    return Parts((), tuple(Parameter(f"step{i + 1}", "{out}") for i in range(n)))
+
+
+def _step_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    times = settings.get("times_s", ())
+    return (
+        np.stack([(ctx.t >= s - 0.5 * ctx.dt).astype(np.float64) for s in times], axis=1)
+        if times
+        else np.zeros((ctx.t.size, 0))
+    )
+
+
+def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
+    """Largest CUSUM against the Brownian bridge (Kolmogorov's distribution)."""
+    e = residual[ctx.keep]
+    if e.size < 50:
+        return Signature(1.0, 0.0)
+    e = e - e.mean()
+    sigma = max(long_run_rms(e), 1e-300)
+    peak = float(np.max(np.abs(np.cumsum(e)))) / (sigma * np.sqrt(e.size))
+    cuts, _, share = find_steps(residual, ctx.keep)
+    return Signature(float(kstwobign.sf(peak)) if cuts else 1.0, share, f"{len(cuts)} level changes")
+
+
+def _step_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    times = settings.get("times_s", ())
+    out = [Human("steps", float(len(times)), "1")]
+    for i, (s, h) in enumerate(zip(times, p, strict=True)):
+        out += [Human(f"time{i + 1}_s", s, "s"), Human(f"step{i + 1}", float(h), "{out}")]
+    return out
+
+
+STEP_SHIFT = Effect(
+    name="step_shift",
+    summary="the level jumps once or a few times and stays",
+    kind="add",
+    stages=("mounting", "sensor", "acquisition"),
+    parts=_step_parts,
+    equation=r"y = x + \sum_i h_i\,\theta(t - t_i)",
+    source="E. S. Page, Biometrika 41 (1954) 100 (CUSUM); A. J. Scott, M. Knott, Biometrics 30 (1974) 507",
+    excitation="time before and after the jump",
+    confusable_with=("random_walk", "thermal_drift", "spikes"),
+    prepare=_step_prepare,
+    basis=_step_basis,
+    test=_step_test,
+    report=_step_report,
+    driven=False,
+    sites=("output",),
+)
+
+# -- random walk ------------------------------------------------------------------------------------
+
+KNOTS = 48
+
+
+def hats(t: Array, knots: Array) -> Array:
+    """Linear interpolation between knots, one column each, (n, knots); held outside."""
+    out = np.zeros((t.size, knots.size))
+    i = np.clip(np.searchsorted(knots, t, side="right") - 1, 0, knots.size - 2)
+    f = np.clip((t - knots[i]) / (knots[i + 1] - knots[i]), 0.0, 1.0)
+    rows = np.arange(t.size)
+    out[rows, i] = 1 - f
+    out[rows, i + 1] += f
+    return out
+
+
+def increments(residual: Array, keep: np.ndarray, dt: float) -> tuple[float, float, float, int]:
+    """(white rms per sample, walk in unit/sqrt(s), z of the walk, block length) from block-mean differences.
+
+    Var of the difference of neighbouring means of m samples: 2 s^2/m + q m dt (2/3). Two block lengths that differ
+    by 16 separate the two (Allan variance slopes -1/2 and +1/2, IEEE Std 952-2020, annex C).
+    """
+    found: list[tuple[int, float, int]] = []
+    stretches = runs(keep)
+    n = int(keep.sum())
+    for m in np.unique(np.geomspace(max(1, n // 4000), max(2, n // 24), 10).astype(int)):
+        d: list[Array] = []
+        for a, b in stretches:
+            c = (b - a) // m
+            if c > 1:
+                d.append(np.diff(residual[a : a + c * m].reshape(c, m).mean(axis=1)))
+        if d:
+            every = np.concatenate(d)
+            if every.size > 6:
+                found.append((int(m), float(np.mean(every**2)), every.size))
+    if len(found) < 4:
+        return float(np.std(residual[keep])), 0.0, 0.0, 1
+    m = np.array([f[0] for f in found], np.float64)
+    v = np.array([f[1] for f in found])
+    w = np.sqrt([f[2] for f in found]) / v
+    cols = np.stack([2 / m, 2 / 3 * m * dt], axis=1) * w[:, None]
+    gram = np.linalg.pinv(cols.T @ cols)
+    s2, q = gram @ cols.T @ (v * w)
+    z = q / max(float(np.sqrt(gram[1, 1] * 2)), 1e-300)
+    return float(np.sqrt(max(s2, 0.0))), float(np.sqrt(max(q, 0.0))), float(z), int(m[-1])
+
+
+def _walk_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    white, walk, _, _ = increments(residual, ctx.keep, ctx.dt)
+    span = ctx.dt * ctx.t.size
+    n = int(np.clip(KNOTS, 4, max(4, ctx.t.size // 20)))
+    return {"walk": (walk,), "white": (white,), "knots_s": tuple(float(v) for v in np.linspace(0, span, n))}
+
+
+def _walk_parts(settings: Settings) -> Parts:
+    knots = settings.get("knots_s", (0.0, 1.0))
+    n = len(knots)
+    return Parts((), tuple(Parameter(f"level{i + 1}", "{out}") for i in range(n)), 0.5 * np.diff(np.eye(n), axis=0))
+
+
+def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return hats(ctx.t, np.array(settings.get("knots_s", (0.0, 1.0))))
+
+
+def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
+    white, walk, z, _ = increments(residual, ctx.keep, ctx.dt)
+    e = residual[ctx.keep]
+    power = float(np.var(e))
+    share = min(1.0, max(0.0, 1 - white**2 / power)) if power > 0 else 0.0
+    return Signature(float(norm.sf(z)) if walk > 0 else 1.0, share, f"walk {walk:.3g} per sqrt(s)")
+
+
+def _walk_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("walk_per_sqrt_s", float(settings["walk"][0]), "{out}/s^0.5"),
+        Human("range", float(np.ptp(p)) if p.size else 0.0, "{out}"),
+    )
+
+
+RANDOM_WALK = Effect(
+    name="random_walk",
+    summary="integrated noise: drift without a shape",
+    kind="add",
+    stages=("sensor", "environment"),
+    parts=_walk_parts,
+    equation=r"y = x + \sum_i \ell_i h_i(t),\quad \ell_{i+1} - \ell_i \sim N(0, q^2 \Delta)",
+    source="IEEE Std 952-2020, annex C (rate random walk); B. D. O. Anderson, J. B. Moore, Optimal Filtering, ch. 7",
+    excitation="a long record",
+    confusable_with=("thermal_drift", "step_shift", "temperature_sensitivity"),
+    prepare=_walk_prepare,
+    basis=_walk_basis,
+    test=_walk_test,
+    report=_walk_report,
+    driven=False,
+    sites=("output",),
+    stochastic=True,
+)

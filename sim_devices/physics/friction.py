@@ -1,0 +1,159 @@
+"""Dry friction inside an equation of motion: Coulomb, and Stribeck's fall as motion starts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.forces import FRICTION
+from sim_devices.physics.statistics import least_squares, smooth, thin
+
+
+def velocity_of(x: Array, ctx: Context) -> Array:
+    """The recorded velocity, else the smoothed derivative of the position x (n,)."""
+    v = ctx.signals.get("velocity")
+    if v is not None:
+        return v
+    return smooth(np.gradient(smooth(x, 5), ctx.dt), 9)
+
+
+def _still(v: Array) -> float:
+    """Speed below which a measured velocity is noise: a small part of what is usual."""
+    return 0.02 * float(np.sqrt(np.mean(v * v))) or 1e-9
+
+
+def soft_sign(v: Array) -> Array:
+    """Sign of a measured velocity, gentle around zero where noise decides."""
+    return np.tanh(v / _still(v))
+
+
+def _no_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    v = velocity_of(x, ctx)
+    return {"speed": (float(np.sqrt(np.mean(v[ctx.keep] ** 2))) or 1.0,)}
+
+
+_UNIT = "{out}/s^2"
+
+
+def _coulomb_parts(settings: Settings) -> Parts:
+    return Parts(
+        (),
+        (
+            Parameter("level", _UNIT),
+            Parameter("asymmetry", _UNIT),
+            Parameter("viscous_asymmetry", "1/s"),
+        ),
+        np.diag([0.0, 0.05, 0.05]),
+    )
+
+
+def _coulomb_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    v = velocity_of(x, ctx)
+    s = soft_sign(v)
+    return -np.stack([s, s * s, np.abs(v)], axis=1)
+
+
+def _coulomb_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0], row[1], row[4] = w
+    return {"friction": row}
+
+
+def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("coulomb_forward", float(p[0] + p[1]) / g, "{in}"),
+        Human("coulomb_backward", float(p[0] - p[1]) / g, "{in}"),
+        Human("viscous_difference", 2 * float(p[2]) / g, "{in} s/{out}"),
+    )
+
+
+_FRICTION_SOURCE = "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, eqs. 1-3"
+
+COULOMB_FRICTION = Effect(
+    name="coulomb_friction",
+    summary="constant force against the motion",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_coulomb_parts,
+    equation=r"m\ddot x = F - F_c\,\mathrm{sgn}\,\dot x - \Delta F - \Delta c\,|\dot x|",
+    source=_FRICTION_SOURCE,
+    excitation="reversals of motion, at speeds that differ",
+    confusable_with=("stribeck_friction", "backlash", "hysteresis", "dead_zone"),
+    prepare=_no_settings,
+    basis=_coulomb_basis,
+    fill=_coulomb_fill,
+    report=_coulomb_report,
+)
+
+
+def _stribeck_parts(settings: Settings) -> Parts:
+    speed = settings.get("speed", (1.0,))[0]
+    return Parts(
+        (Parameter("stribeck_speed", "{out}/s", 1e-3 * speed, 2 * speed, log=True, scale=0.05 * speed),),
+        (
+            Parameter("level", _UNIT),
+            Parameter("asymmetry", _UNIT),
+            Parameter("viscous_asymmetry", "1/s"),
+            Parameter("extra", _UNIT),
+        ),
+        np.diag([0.0, 0.05, 0.05, 0.0]),
+    )
+
+
+def _stribeck_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    v = velocity_of(x, ctx)
+    extra = -soft_sign(v) * np.exp(-((v / q[0]) ** 2))
+    return np.column_stack([_coulomb_basis(x, ctx, q, settings), extra])
+
+
+def _stribeck_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0], row[1], row[4], row[2] = w
+    row[3] = q[0]
+    return {"friction": row}
+
+
+def _stribeck_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    speed = settings["speed"][0]
+    k = thin(ctx.keep, 8000)
+    common = [np.ones(x.size), *_coulomb_basis(x, ctx, np.zeros(1), settings).T]
+    base = np.stack([common[0], *(ctx.to_output(c) for c in common[1:])], axis=1)[k]
+    tried: list[tuple[float, float]] = []
+    for vs in speed * np.geomspace(0.01, 1.0, 8):
+        extra = _stribeck_basis(x, ctx, np.array([vs]), settings)[:, 3]
+        column = ctx.to_output(np.ascontiguousarray(extra))[k]
+        tried.append((least_squares(np.column_stack([base, column]), residual[k])[1], float(vs)))
+    tried.sort()
+    return tuple((vs,) for _, vs in tried[:2])
+
+
+def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("coulomb_forward", float(p[1] + p[2]) / g, "{in}"),
+        Human("coulomb_backward", float(p[1] - p[2]) / g, "{in}"),
+        Human("breakaway_extra", float(p[4]) / g, "{in}"),
+        Human("stribeck_speed", float(p[0]), "{out}/s"),
+        Human("viscous_difference", 2 * float(p[3]) / g, "{in} s/{out}"),
+    )
+
+
+STRIBECK_FRICTION = Effect(
+    name="stribeck_friction",
+    summary="friction that falls as motion starts",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_stribeck_parts,
+    equation=r"m\ddot x = F - \left(F_c + F_s e^{-(\dot x/v_s)^2}\right)\mathrm{sgn}\,\dot x - \Delta c\,|\dot x|",
+    source=_FRICTION_SOURCE,
+    excitation="slow motion and reversals, beside fast motion",
+    confusable_with=("coulomb_friction",),
+    prepare=_no_settings,
+    guess=_stribeck_guess,
+    basis=_stribeck_basis,
+    fill=_stribeck_fill,
+    report=_stribeck_report,
+)

@@ -1,0 +1,107 @@
+"""Memory whose loop changes with speed: plays with speed-dependent weights, and plays behind a lag."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.hysteresis import loop_width, stops, test_cycle, thresholds
+from sim_devices.physics.lag import low_pass
+from sim_devices.physics.statistics import smooth
+
+N_PLAYS = 8
+N_FAST = 5
+
+
+def speed(x: Array, dt: float, usual: float) -> Array:
+    """Slope of x relative to its usual size, compressed: log(1 + |x'|/usual)."""
+    slope = smooth(np.gradient(x, dt), 3)
+    return np.log1p(np.abs(slope) / usual)
+
+
+def _columns(x: Array, dt: float, tau: float, settings: Settings, starts: tuple[int, ...]) -> Array:
+    radii = np.array(settings.get("thresholds", (1.0,)))
+    usual = settings.get("usual_slope", (1.0,))[0]
+    at = np.array(starts, np.int64)
+    rest = settings.get("rest", (0.0,))[0]
+    e = stops(x, radii, rest, at)
+    fast = np.array(settings.get("fast", (0.0,)), np.int64)
+    v = speed(x, dt, usual)[:, None]
+    late = np.stack([low_pass(np.ascontiguousarray(e[:, j]), dt, tau, at) for j in fast], axis=1)
+    lag = (low_pass(x, dt, tau, at) - x)[:, None]
+    return np.concatenate([e, e[:, fast] * v, late - e[:, fast], lag], axis=1)
+
+
+def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    half = 0.5 * float(np.ptp(x[k])) or 1.0
+    slope = np.abs(smooth(np.gradient(x, ctx.dt), 3))
+    radii = thresholds(half, N_PLAYS)
+    fast = tuple(float(i) for i in np.unique(np.linspace(0, N_PLAYS - 1, N_FAST).astype(int)))
+    return {
+        "thresholds": radii,
+        "fast": fast,
+        "usual_slope": (float(np.sqrt(np.mean(slope[k] ** 2))) or 1.0,),
+        "rest": (float(x[0]),),
+        "range": (float(x[k].min()), float(x[k].max())),
+        "time": (ctx.dt, ctx.dt * ctx.t.size),
+    }
+
+
+def _parts(settings: Settings) -> Parts:
+    dt, span = settings.get("time", (1e-3, 1.0))
+    n, m = len(settings.get("thresholds", (1.0,))), len(settings.get("fast", (0.0,)))
+    names = [f"w{i + 1}" for i in range(n)] + [f"v{i + 1}" for i in range(m)] + [f"l{i + 1}" for i in range(m)]
+    names.append("lag")
+    return Parts(
+        (Parameter("time_constant_s", "s", 0.2 * dt, 0.1 * span, log=True, scale=dt),),
+        tuple(Parameter(a, "{out}/{in}", scale=0.1) for a in names),
+        0.05 * np.eye(len(names)),
+    )
+
+
+def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return _columns(x, ctx.dt, q[0], settings, ctx.starts)
+
+
+def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    dt, span = settings["time"]
+    usual = settings["usual_slope"][0]
+    lo, hi = settings["range"]
+    period = (hi - lo) / usual  # of the order of a quarter cycle
+    grid = (0.02 * period, 0.1 * period, 0.5 * period)
+    return tuple((float(np.clip(v, 0.3 * dt, 0.09 * span)),) for v in grid)
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    lo, hi = settings["range"]
+    usual = settings["usual_slope"][0]
+    x = test_cycle(lo, hi)
+    out: list[Human] = []
+    for name, factor in (("slow", 0.05), ("fast", 2.0)):
+        # a triangle of slope factor * usual
+        dt = (hi - lo) / (0.5 * 201) / (factor * usual)
+        y = scale * x + _columns(x, dt, p[0], settings, (0,)) @ p[1:]
+        out.append(Human(f"loop_width_share_{name}", loop_width(y, 3), "1"))
+    return (*out, Human("time_constant_s", float(p[0]), "s"))
+
+
+RATE_DEPENDENT_HYSTERESIS = Effect(
+    name="rate_dependent_hysteresis",
+    summary="memory whose loop changes with speed",
+    kind="add",
+    stages=("actuator",),
+    parts=_parts,
+    equation=r"y = x + \sum_i \left(w_i + v_i \ln(1 + |\dot x|/s)\right) E_i + \ell_i (L_\tau E_i - E_i)"
+    r" + \ell (L_\tau x - x),\; E_i = x - P_{r_i}[x]",
+    source="W. T. Ang, P. K. Khosla, C. N. Riviere, IEEE/ASME Trans. Mechatronics 12 (2007) 134, eqs. 12-15;"
+    " M. Al Janaideh et al., IEEE Trans. Control Syst. Technol. 17 (2009)",
+    excitation="reversals at several amplitudes and at speeds that differ by five or more",
+    confusable_with=("hysteresis", "first_order_lag", "creep", "resonance"),
+    prepare=_prepare,
+    guess=_guess,
+    basis=_basis,
+    report=_report,
+)

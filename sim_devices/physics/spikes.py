@@ -1,0 +1,140 @@
+"""Short isolated bursts of any shape: found one by one, taken out of the comparison, counted and described."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parts, Settings, Signature
+from sim_devices.physics.statistics import robust_rms, smooth, whiten
+
+MOST_SHARE = 0.05  # of all samples; more is not "short and isolated"
+THRESHOLD = 6.0
+
+
+def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
+    """[start, stop) and peak of each burst: innovations beyond six robust rms, grown until the level is usual."""
+    n = residual.size
+    w = whiten(residual, keep, 8)
+    scale = robust_rms(w[keep])
+    if scale == 0.0:
+        return []
+    hot = (np.abs(w) > THRESHOLD * scale) & keep
+    if not hot.any() or hot.sum() > MOST_SHARE * keep.sum():
+        return []
+    # close gaps of a few samples, so that one burst is one event
+    join = max(3, n // 20_000)
+    index = np.flatnonzero(hot)
+    breaks = np.flatnonzero(np.diff(index) > join) + 1
+    level = smooth(np.where(keep, residual, 0.0), max(101, n // 500) | 1)
+    usual = max(robust_rms((residual - level)[keep]), 1e-300)
+    out: list[tuple[int, int, float]] = []
+    for group in np.split(index, breaks):
+        a, b = int(group[0]), int(group[-1]) + 1
+        local = float(np.median(np.concatenate([residual[max(0, a - 60) : max(1, a - 5)], residual[b + 5 : b + 60]])))
+        while a > 0 and abs(residual[a - 1] - local) > 2.5 * usual:
+            a -= 1
+        while b < n and abs(residual[b] - local) > 2.5 * usual:
+            b += 1
+        a, b = max(0, a - 1), min(n, b + 1)
+        if out and a <= out[-1][1]:
+            a = out.pop()[0]
+        piece = residual[a:b] - local
+        out.append((a, b, float(piece[np.argmax(np.abs(piece))])))
+    return out
+
+
+def _where(ctx: Context, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
+    if ctx.everywhere is not None:
+        return ctx.everywhere, np.ones(residual.size, np.bool_)
+    return residual, ctx.keep
+
+
+def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    bursts = find_bursts(*_where(ctx, residual))
+    return {
+        "starts": tuple(float(b[0]) for b in bursts),
+        "stops": tuple(float(b[1]) for b in bursts),
+        "peaks": tuple(b[2] for b in bursts),
+        "time": (ctx.dt, ctx.dt * ctx.t.size),
+    }
+
+
+def claims(settings: Settings, n: int) -> NDArray[np.bool_]:
+    """Samples inside bursts, (n,)."""
+    out = np.zeros(n, np.bool_)
+    for a, b in zip(settings.get("starts", ()), settings.get("stops", ()), strict=True):
+        out[int(a) : int(b)] = True
+    return out
+
+
+def _parts(settings: Settings) -> Parts:
+    return Parts()
+
+
+def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.zeros((ctx.t.size, 0))
+
+
+def _test(x: Array, residual: Array, ctx: Context) -> Signature:
+    """Bursts beyond what heavy tails of the rest allow: Student-t with 4 degrees of freedom as the null."""
+    keep = ctx.keep
+    bursts = find_bursts(residual, keep)
+    if not bursts:
+        return Signature(1.0, 0.0, "no burst")
+    taken = np.zeros(residual.size, np.bool_)
+    for a, b, _ in bursts:
+        taken[a:b] = True
+    e = residual[keep] - np.median(residual[keep])
+    power = float(e @ e)
+    inside = taken[keep]
+    share = float(e[inside] @ e[inside]) / power if power > 0 else 0.0
+    w = whiten(residual, keep, 8)
+    scale = robust_rms(w[keep]) or 1.0
+    tops = np.sort([float(np.max(np.abs(w[a:b]))) / scale for a, b, _ in bursts])[::-1]
+    # a typical burst, not the largest: heavy-tailed noise has one outlier, spikes have several alike
+    typical = float(tops[min(len(tops) - 1, 2)])
+    p = min(1.0, keep.sum() * 2 * float(student.sf(typical * 0.74, 4)))
+    width = np.mean([b - a for a, b, _ in bursts])
+    if width > 2.5:
+        # neighbours far out together do not happen to independent noise
+        p = p * p if p < 1 else 1e-3
+    return Signature(float(p), share, f"{len(bursts)} bursts, {width:.1f} samples wide")
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    starts, stops = np.array(settings.get("starts", ())), np.array(settings.get("stops", ()))
+    peaks = np.array(settings.get("peaks", ()))
+    dt, span = settings.get("time", (1.0, 1.0))
+    if not starts.size:
+        return (Human("events", 0.0, "1"),)
+    return (
+        Human("events", float(starts.size), "1"),
+        Human("events_per_minute", float(60 * starts.size / span), "1/min"),
+        Human("typical_peak", float(np.median(np.abs(peaks))), "{out}"),
+        Human("typical_duration_s", float(np.median(stops - starts) * dt), "s"),
+    )
+
+
+SPIKES = Effect(
+    name="spikes",
+    summary="short isolated bursts (button press, electrical)",
+    kind="add",
+    stages=("acquisition", "mounting", "environment"),
+    parts=_parts,
+    equation=r"y = x + \sum_i b_i(t - t_i),\; b_i \text{ short, of any shape}",
+    source="R. K. Pearson, Mining Imperfect Data, SIAM 2005, section 3.2 (robust detection of outliers)",
+    excitation="none; the longer the record, the more events",
+    confusable_with=("dropped_samples", "quantization", "step_shift"),
+    prepare=_prepare,
+    basis=_basis,
+    test=_test,
+    report=_report,
+    driven=False,
+    sites=("output",),
+    claims=claims,
+    stochastic=True,
+)

@@ -1,0 +1,131 @@
+"""Position-dependent forces: a spring that hardens or softens, and cogging."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.forces import COGGING
+from sim_devices.physics.statistics import least_squares, thin
+
+
+def _travel(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    return {"size": (float(np.max(np.abs(x[k]))) or 1.0,), "travel": (float(np.ptp(x[k])) or 1.0,)}
+
+
+def _spring_parts(settings: Settings) -> Parts:
+    return Parts(
+        (),
+        (Parameter("cubic", "1/({out}^2 s^2)"), Parameter("quadratic", "1/({out} s^2)")),
+        np.diag([0.0, 0.02]),
+    )
+
+
+def _spring_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return -np.stack([x * x * x, x * x], axis=1)
+
+
+def _spring_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    return {"spring": np.asarray(w, np.float64)}
+
+
+def _spring_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("cubic_stiffness", float(p[0]) / g, "{in}/{out}^3"),
+        Human("quadratic_stiffness", float(p[1]) / g, "{in}/{out}^2"),
+    )
+
+
+CUBIC_STIFFNESS = Effect(
+    name="cubic_stiffness",
+    summary="spring that hardens or softens",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_spring_parts,
+    equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 x^3 = F",
+    source="I. Kovacic, M. J. Brennan, The Duffing Equation, Wiley 2011, eq. 1.1",
+    excitation="small and large amplitudes",
+    confusable_with=("static_nonlinearity", "saturation"),
+    prepare=_travel,
+    basis=_spring_basis,
+    fill=_spring_fill,
+    report=_spring_report,
+)
+
+
+def _cog_parts(settings: Settings) -> Parts:
+    travel = settings.get("travel", (1.0,))[0]
+    lo, hi = settings.get("near", (2e-3 * travel, 2 * travel))
+    unit = "{out}/s^2"
+    return Parts(
+        (Parameter("period", "{out}", lo, hi, log=True, scale=1e-3 * lo),),
+        tuple(Parameter(m, unit) for m in ("sin1", "cos1", "sin2", "cos2")),
+        np.diag([0.0, 0.0, 0.05, 0.05]),
+    )
+
+
+def _cog_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    a = 2 * np.pi * x / q[0]
+    return np.stack([np.sin(a), np.cos(a), np.sin(2 * a), np.cos(2 * a)], axis=1)
+
+
+def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tuple[float, float]]:
+    """(misfit, period) over a grid fine enough that phase turns by less than a quarter over the travel."""
+    k = thin(ctx.keep, 4000)
+    line = np.stack([np.ones(k.size), ctx.to_output(np.ones(x.size))[k]], axis=1)
+    tried: list[tuple[float, float]] = []
+    turns = np.concatenate([np.arange(0.5, 12, 0.25), np.geomspace(12, 300, 90)])
+    for period in travel / turns:
+        a = 2 * np.pi * x / period
+        cols = np.stack([ctx.to_output(np.sin(a)), ctx.to_output(np.cos(a))], axis=1)[k]
+        tried.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
+    return sorted(tried)
+
+
+def _cog_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    settings = dict(_travel(x, residual, ctx))
+    best = _cog_scan(x, residual, ctx, settings["travel"][0])[:3]
+    settings["periods"] = tuple(p for _, p in best)
+    return settings
+
+
+def _cog_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return tuple((p,) for p in settings.get("periods", (settings["travel"][0] / 4,)))
+
+
+def _cog_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(COGGING)
+    row[0] = q[0]
+    row[1:] = w
+    return {"cogging": row}
+
+
+def _cog_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("period", float(p[0]), "{out}"),
+        Human("amplitude_1", float(np.hypot(p[1], p[2])) / g, "{in}"),
+        Human("amplitude_2", float(np.hypot(p[3], p[4])) / g, "{in}"),
+    )
+
+
+COGGING_FORCE = Effect(
+    name="cogging",
+    summary="force periodic in position",
+    kind="feedback",
+    stages=("mechanics", "actuator"),
+    parts=_cog_parts,
+    equation=r"m\ddot x = F + \sum_h a_h \sin(2\pi h x/\lambda) + b_h \cos(2\pi h x/\lambda)",
+    source="J. R. Hendershot, T. J. E. Miller, Design of Brushless Permanent-Magnet Machines, section 5.4",
+    excitation="slow travel over several periods",
+    confusable_with=("static_nonlinearity", "coulomb_friction"),
+    prepare=_cog_prepare,
+    guess=_cog_guess,
+    basis=_cog_basis,
+    fill=_cog_fill,
+    report=_cog_report,
+)

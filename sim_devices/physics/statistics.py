@@ -1,0 +1,113 @@
+"""Small statistics for guesses and signature tests: residuals are coloured, so every null here allows for that."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_toeplitz
+from scipy.signal import lfilter
+
+from sim_devices.physics.effect import Array
+
+Bool = NDArray[np.bool_]
+
+
+def robust_rms(x: Array) -> float:
+    """1.4826 times the median absolute deviation."""
+    return 1.4826 * float(np.median(np.abs(x - np.median(x)))) if x.size else 0.0
+
+
+def runs(mask: Bool) -> list[tuple[int, int]]:
+    """Stretches [start, stop) where the mask is true."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], mask, [False]]).astype(np.int8)))
+    return [(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def autoregression(x: Array, order: int) -> Array:
+    """Coefficients a (order + 1,), a[0] = 1, such that filtering x with them leaves innovations (Yule-Walker)."""
+    n = x.size
+    if n < 4 * order or order < 1:
+        return np.ones(1)
+    size = 1 << int(np.ceil(np.log2(2 * n)))
+    f = np.fft.rfft(x - x.mean(), size)
+    r = np.fft.irfft(f * np.conj(f), size)[: order + 1] / n
+    if r[0] <= 0:
+        return np.ones(1)
+    r[0] *= 1 + 1e-6
+    return np.concatenate([[1.0], -solve_toeplitz(r[:-1], r[1:])])
+
+
+def whiten(x: Array, mask: Bool | None = None, order: int = 10) -> Array:
+    """Innovations of x (n,) by an autoregression estimated where the mask is true; zero at the start of each run."""
+    stretches = runs(np.ones(x.size, np.bool_) if mask is None else mask)
+    longest = max(stretches, key=lambda s: s[1] - s[0], default=(0, 0))
+    a = autoregression(np.clip(x[slice(*longest)], *_fences(x[slice(*longest)])), order)
+    out = np.zeros_like(x)
+    for b, e in stretches:
+        w = lfilter(a, 1.0, x[b:e])
+        w[: a.size - 1] = 0.0
+        out[b:e] = w
+    return out
+
+
+def _fences(x: Array) -> tuple[float, float]:
+    if x.size == 0:
+        return (-np.inf, np.inf)
+    m, s = float(np.median(x)), robust_rms(x)
+    return (m - 6 * s, m + 6 * s) if s > 0 else (-np.inf, np.inf)
+
+
+def long_run_rms(x: Array, blocks: int = 64) -> float:
+    """Square root of the spectral density at zero, per sample, from differences of neighbouring block means.
+
+    Steps and drifts hardly change it, since one of many differences is robustly ignored.
+    """
+    length = max(1, x.size // blocks)
+    m = x[: (x.size // length) * length].reshape(-1, length).mean(axis=1)
+    d = np.diff(m)
+    return robust_rms(d) / np.sqrt(2.0) * np.sqrt(length) if d.size > 3 else float(np.std(x))
+
+
+def least_squares(columns: Array, y: Array) -> tuple[Array, float]:
+    """Coefficients and the residual sum of squares; columns (n, k) are scaled first."""
+    size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    size[size == 0] = 1.0
+    q = columns / size
+    gram = q.T @ q
+    gram[np.diag_indices_from(gram)] += 1e-10
+    w = np.linalg.solve(gram, q.T @ y)
+    r = y - q @ w
+    return w / size, float(r @ r)
+
+
+def thin(ctx_keep: Bool, at_most: int = 20_000) -> NDArray[np.int64]:
+    """Indices where the mask is true, at most so many, evenly spread."""
+    index = np.flatnonzero(ctx_keep)
+    return index[:: max(1, index.size // at_most)]
+
+
+def smooth(x: Array, width: int) -> Array:
+    """Centred moving average over an odd ``width``; edges by the mean of what is there."""
+    width = max(1, width | 1)
+    if width == 1 or x.size < width:
+        return x.copy()
+    c = np.concatenate([[0.0], np.cumsum(x)])
+    h = width // 2
+    lo = np.maximum(np.arange(x.size) - h, 0)
+    hi = np.minimum(np.arange(x.size) + h + 1, x.size)
+    return (c[hi] - c[lo]) / (hi - lo)
+
+
+def affine_misfit(candidate: Array, measured: Array) -> float:
+    """Sum of squares left when ``a + b candidate`` is fitted to the measured samples."""
+    return least_squares(np.stack([np.ones(candidate.size), candidate], axis=1), measured)[1]
+
+
+def rank_starts(
+    candidates: list[tuple[float, ...]], output_of: Callable[[tuple[float, ...]], Array], measured: Array, k: Array
+) -> list[tuple[float, ...]]:
+    """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first."""
+    found = [(affine_misfit(output_of(q)[k], measured[k]), i) for i, q in enumerate(candidates)]
+    return [candidates[i] for _, i in sorted(found)]
