@@ -1,7 +1,8 @@
 """Attitude without gyroscopes: angular acceleration integrated twice, held by gravity and the magnetic field.
 
 A third-order observer (attitude, rate, bias of the angular acceleration) with its three poles at one
-frequency. The accelerations of the hand enter the gravity reference, so the corner sits far below the tremor
+frequency, about the tool axis a higher one: there the placement (000 (2.54)) makes angular acceleration eight
+times as noisy. The accelerations of the hand enter the gravity reference, so the corner sits far below the tremor
 band and the error passes a further low-pass: in the tremor band attitude is the double integral of alpha
 alone, behind the same RC filter as the specific force, so that the tilt part of gravity cancels with the right
 phase (it equals a lever of g / omega^2 = 2.5 mm at 10 Hz). The corner starts high and falls as 1/t, which
@@ -24,10 +25,13 @@ from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.triad import triad
 
+# closer to the corner the low-pass would eat the observer's phase margin
+LOWPASS_PER_CORNER = 6.0
+
 ATTITUDE = np.dtype(
     [
         ("start_rad_s", "f8"),
-        ("corner_rad_s", "f8"),
+        ("corner_rad_s", "f8", (3,)),  # about each body axis
         ("lowpass_rad_s", "f8"),
         ("align_samples", "f8"),
         ("dt_s", "f8"),
@@ -55,7 +59,7 @@ def attitude_params(config: SensingConfig) -> Record:
     return new_record(
         ATTITUDE,
         start_rad_s=2.0 * pi * config.attitude_start_hz,
-        corner_rad_s=2.0 * pi * config.attitude_hz,
+        corner_rad_s=2.0 * pi * np.array(config.attitude_hz),
         lowpass_rad_s=2.0 * pi * config.attitude_lowpass_hz,
         align_samples=max(1.0, round(config.align_s * config.tick_hz)),
         dt_s=1.0 / config.tick_hz,
@@ -140,15 +144,14 @@ def propagate(
     ex += heading * ux
     ey += heading * uy
     ez += heading * uz
-    corner = max(params.corner_rad_s, min(params.start_rad_s, 3.0 / state.time_s))
-    smoothing = 1.0 - exp(-max(params.lowpass_rad_s, 10.0 * corner) * dt)
-    state.error[0] += smoothing * (ex - state.error[0])
-    state.error[1] += smoothing * (ey - state.error[1])
-    state.error[2] += smoothing * (ez - state.error[2])
     state.time_s += dt
     # --- observer with three poles at -corner
+    present = (ex, ey, ez)
     turn = np.empty(3)
     for i in range(3):
+        corner = max(params.corner_rad_s[i], min(params.start_rad_s, 3.0 / state.time_s))
+        lowpass = max(params.lowpass_rad_s, LOWPASS_PER_CORNER * corner)
+        state.error[i] += (1.0 - exp(-lowpass * dt)) * (present[i] - state.error[i])
         alpha = motion[3 + i] - state.bias[i]
         before = state.rate[i]
         state.rate[i] += 0.5 * (alpha + state.previous[i]) * dt + 3.0 * corner * corner * state.error[i] * dt

@@ -62,7 +62,7 @@ class SensingConfig(BaseModel):
 
     align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.3
     attitude_start_hz: Positive = 1.0
-    attitude_hz: Positive = 0.1
+    attitude_hz: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.5)  # about the body axes
     attitude_lowpass_hz: Positive = 1.5
     max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
 

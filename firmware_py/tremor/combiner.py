@@ -77,13 +77,3 @@ def combiner_displacement(state: Record, params: Record, ahead_s: float) -> floa
     size = -sqrt(1.0 + lag * lag) / (w * w)
     angle = state.wflc.phase + atan2(lag, 1.0) + w * ahead_s
     return size * (state.weights[1] * cos(angle) + state.weights[0] * sin(angle))
-
-
-@kernel
-def combiner_velocity(state: Record, params: Record) -> float:
-    """Time derivative of the displacement now, m/s, at constant weights."""
-    w = state.wflc.omega * params.tick_hz
-    lag = w / params.cutoff_rad_s
-    size = -sqrt(1.0 + lag * lag) / w
-    angle = state.wflc.phase + atan2(lag, 1.0)
-    return size * (-state.weights[1] * sin(angle) + state.weights[0] * cos(angle))

@@ -33,7 +33,7 @@ ORDER = 4  # states of a mode: x, v, u, du/dt
 class OscillatorModel:
     """Discrete filter in balanced states s: s <- F s, then s += K (y - C s).
 
-    ``now``, ``ahead`` and ``velocity`` are rows that give tremor x(t), x(t + loop delay) in m and dx/dt in m/s.
+    ``now`` and ``ahead`` are rows that give tremor x(t) and x(t + loop delay) in m.
     """
 
     transition: Matrix
@@ -41,7 +41,6 @@ class OscillatorModel:
     observe: Matrix
     now: Matrix
     ahead: Matrix
-    velocity: Matrix
     error_rms_m: float  # of x(t), when the model is true
     n_modes: int
 
@@ -81,13 +80,11 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     a = np.zeros((n, n))
     q = np.zeros((n, n))
     displacement = np.zeros(n)
-    velocity = np.zeros(n)
     acceleration = np.zeros(n)
     for i, frequency in enumerate(k.frequencies_hz):
         span = slice(ORDER * i, ORDER * (i + 1))
         a[span, span], q[span, span] = _mode(frequency, k.bandwidth_hz, k.tremor_rms_m**2 / m)
         displacement[ORDER * i] = 1.0
-        velocity[ORDER * i + 1] = 1.0
         acceleration += a[ORDER * i + 1]
     drift, rc = n - 2, n - 1
     a[drift, drift] = -1.0 / k.drift_s
@@ -110,7 +107,7 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     posterior = prior - np.outer(gain, c[0] @ prior)
     now = displacement * scale
     ahead = displacement @ expm(a * config.loop_delay_s) * scale
-    return OscillatorModel(f, gain, c[0], now, ahead, velocity * scale, float(np.sqrt(now @ posterior @ now)), m)
+    return OscillatorModel(f, gain, c[0], now, ahead, float(np.sqrt(now @ posterior @ now)), m)
 
 
 def kalman_dtype(n_modes: int) -> np.dtype[Any]:
@@ -125,7 +122,6 @@ def kalman_dtype(n_modes: int) -> np.dtype[Any]:
             ("observe", "f8"),
             ("now", "f8", (n,)),
             ("ahead", "f8", (n,)),
-            ("velocity", "f8", (n,)),
         ]
     )
 
@@ -143,7 +139,6 @@ def kalman_params(config: TremorConfig) -> Record:
         observe=model.observe[-1],
         now=model.now,
         ahead=model.ahead,
-        velocity=model.velocity,
     )
 
 

@@ -32,7 +32,6 @@ from firmware_py.tremor.combiner import (
     combiner_displacement,
     combiner_params,
     combiner_step,
-    combiner_velocity,
 )
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.oscillator_kalman import (
@@ -70,9 +69,8 @@ def estimate_state_dtype(n_modes: int) -> np.dtype[Any]:
             ("combiner", COMBINER_STATE, (3,)),
             ("predicted", "f8", (3, HISTORY)),  # ring of past predictions
             ("at", "i8"),
-            ("power", "f8", (3,)),  # smoothed x^2, v^2 and (x - predicted)^2
-            ("speed", "f8", (3,)),
-            ("miss", "f8", (3,)),
+            ("power", "f8", (3,)),  # smoothed x^2
+            ("miss", "f8", (3,)),  # smoothed (x - predicted)^2
             ("ticks", "f8"),  # since the start
             ("last_tick", "f8"),
         ]
@@ -112,7 +110,6 @@ def restart_estimate(state: Record, param: Record) -> None:
     state.predicted[:, :] = 0.0
     state.at = 0
     state.power[:] = 0.0
-    state.speed[:] = 0.0
     state.miss[:] = 0.0
     state.ticks = 0.0
     state.last_tick = np.nan
@@ -146,40 +143,29 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
     for n in range(steps):
         state.at = (state.at + 1) % HISTORY
         for i in range(3):
-            if param.use_kalman:
-                kalman_predict(state.kalman[i], param.kalman)
-            elif coast or n < steps - 1:
+            kalman_predict(state.kalman[i], param.kalman)
+            if coast or n < steps - 1:
                 combiner_coast(state.combiner[i])
     for i in range(3):
         if not coast:
-            if param.use_kalman:
-                kalman_correct(state.kalman[i], frame[TIP_ACCELERATION + i], param.kalman)
-            else:
-                combiner_step(frame[TIP_ACCELERATION + i], state.combiner[i], param.combiner)
+            # the combiner runs in either case: it is also what measures the frequency
+            kalman_correct(state.kalman[i], frame[TIP_ACCELERATION + i], param.kalman)
+            combiner_step(frame[TIP_ACCELERATION + i], state.combiner[i], param.combiner)
         if param.use_kalman:
             now = combine(state.kalman[i], param.kalman.now)
             ahead = combine(state.kalman[i], param.kalman.ahead)
-            velocity = combine(state.kalman[i], param.kalman.velocity)
         else:
             now = combiner_displacement(state.combiner[i], param.combiner, 0.0)
             ahead = combiner_displacement(state.combiner[i], param.combiner, param.combiner.delay_s)
-            velocity = combiner_velocity(state.combiner[i], param.combiner)
         ring = state.predicted[i]
         missed = now - ring[(state.at - param.delay_ticks) % HISTORY]
         ring[state.at] = ahead
         state.power[i] += param.smoothing * (now * now - state.power[i])
-        state.speed[i] += param.smoothing * (velocity * velocity - state.speed[i])
         state.miss[i] += param.smoothing * (missed * missed - state.miss[i])
         frame[TREMOR + i] = now
         frame[TREMOR_AHEAD + i] = ahead
         frame[TREMOR_AMPLITUDE + i] = sqrt(2.0 * state.power[i])
-        if param.use_kalman:
-            frequency = 0.0
-            if state.power[i] > 0.0:
-                frequency = sqrt(state.speed[i] / state.power[i]) / (2.0 * pi)
-        else:
-            frequency = state.combiner[i].wflc.omega * param.combiner.tick_hz / (2.0 * pi)
-        frame[TREMOR_FREQUENCY + i] = frequency
+        frame[TREMOR_FREQUENCY + i] = state.combiner[i].wflc.omega * param.combiner.tick_hz / (2.0 * pi)
         confidence = 0.0
         if settled:
             total = state.power[i] + param.floor2
