@@ -68,6 +68,7 @@ class WorldProcess:
         self._slcan = {n: PtyCarrier(SlcanAdapter(hub)) for n, hub in hubs.items() if n in slcan}
         self._can = {n: CanMulticast(hub, free_udp_port()) for n, hub in hubs.items() if n not in slcan}
         self._all_ptys = [*self._ptys.values(), *self._slcan.values()]
+        self._devices = self.world.timed_faces()
         for server in self._i2c.values():
             self.world.add_timed(server)
         self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
@@ -77,8 +78,6 @@ class WorldProcess:
         self._worst_late_ns = 0
         self._turns = 0
         self._now_ns = self.world.epoch_ns
-        self._turn()  # makes up for what opening the ports took; from here on lateness counts
-        self._worst_late_ns = 0
 
     def request_stop(self, *_: object) -> None:
         self._stop = True
@@ -92,6 +91,8 @@ class WorldProcess:
 
     def run(self) -> None:
         """Serve until asked to stop, then write what happened."""
+        self._turn()  # makes up for what starting took; from here on lateness counts
+        self._worst_late_ns = 0
         check_ns = 0
         while not self._stop:
             for fileno in self._wait():
@@ -105,7 +106,15 @@ class WorldProcess:
 
     def _wait(self) -> list[int]:
         now_ns = self._clock.now_ns()
-        deadline_ns = min(self.world.next_event_ns() or now_ns + POLL_NS, now_ns + POLL_NS)
+        deadline_ns = now_ns + POLL_NS
+        for face in self._devices:
+            due_ns = face.next_event_ns()
+            if due_ns is not None and due_ns < deadline_ns:
+                deadline_ns = due_ns
+        for server in self._i2c.values():
+            due_ns = server.reply_ns()
+            if due_ns is not None and due_ns < deadline_ns:
+                deadline_ns = due_ns
         watched = [pty.fileno() for pty in self._all_ptys if pty.fileno() >= 0]
         for server in self._i2c.values():
             watched += server.filenos()
@@ -128,8 +137,6 @@ class WorldProcess:
             self.world.advance_to(self._now_ns)
             for pty in self._all_ptys:
                 pty.pump(self._now_ns)
-            for can in self._can.values():
-                can.pump(self._now_ns)
             if late_ns <= CATCH_UP_NS:
                 self.world.keep_up(self._now_ns)
                 return
@@ -140,6 +147,11 @@ class WorldProcess:
             if fileno in server.filenos():
                 self._turn()  # what was due before this request happens before it
                 server.on_readable(fileno, self._now_ns)
+                return
+        for can in self._can.values():
+            if fileno == can.fileno():
+                self._turn()
+                can.pump(self._now_ns)
                 return
         if fileno == self._control.fileno():
             self._obey()
@@ -162,7 +174,7 @@ class WorldProcess:
         partial = self._runtime_dir / "truth.partial.npz"
         np.savez(partial, **truth)  # type: ignore[arg-type]
         partial.rename(self._runtime_dir / "truth.npz")
-        facts = {"worst_late_us": self._worst_late_ns / 1000, "turns": self._turns}
+        facts = {"worst_late_us": self._worst_late_ns / 1000, "turns": self._turns, "cpu_s": time.process_time()}
         (self._runtime_dir / "world.json").write_text(json.dumps(facts), encoding="utf-8")
         for pty in self._all_ptys:
             pty.unplug()

@@ -198,7 +198,7 @@ class ProcessWorld:
             return {name: data[name] for name in data.files}
 
     def statistics(self) -> dict[str, float]:
-        """After ``stop``: ``worst_late_us`` (how late the world ran at worst) and ``turns`` of its loop."""
+        """After ``stop``: ``worst_late_us`` (how late the world ran at worst), ``turns`` of its loop, ``cpu_s``."""
         path = self._dir / "world.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 

@@ -96,6 +96,10 @@ class World:
         """Bring the plant to ``t_ns`` even if nothing looks at it, so that no later look has to wait for it."""
         self.plant.advance_to(t_ns - self.epoch_ns)
 
+    def timed_faces(self) -> tuple[TimedFace, ...]:
+        """Everything that acts by itself."""
+        return tuple(self._timed)
+
     def add_timed(self, face: TimedFace) -> None:
         """A transport that acts in bench time (for example a transfer under way)."""
         self._timed.append(face)

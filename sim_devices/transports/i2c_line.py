@@ -42,6 +42,11 @@ class I2cLine:
             raise ValueError(f"two devices at I2C address 0x{address:02x}; give one of them another address")
         self.faces[address] = face
 
+    def duration_ns(self, ops: Sequence[I2cOp]) -> int:
+        """Bus time of a transfer that nobody refuses."""
+        bits = 1 + sum(10 + 9 * (len(op.data) if isinstance(op, I2cWrite) else op.n) for op in ops)
+        return int(bits * self._bit_ns)
+
     def transfer(self, address: int, ops: Sequence[I2cOp], t_ns: int) -> Transfer:
         """Steps of one transfer: yields when each segment ends (bench ns), acts then, returns status and data.
 

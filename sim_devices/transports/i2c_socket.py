@@ -37,6 +37,7 @@ class I2cSocketServer:
         self._queue: deque[tuple[int, int, Sequence[I2cOp]]] = deque()  # client, address, operations
         self._active: tuple[int, Transfer] | None = None
         self._due_ns = 0
+        self._reply_ns = 0
 
     def filenos(self) -> list[int]:
         return [self._listener.fileno(), *self._clients]
@@ -61,6 +62,10 @@ class I2cSocketServer:
         if not data:
             self._drop(fileno)
         self._start_next(t_ns)
+
+    def reply_ns(self) -> int | None:
+        """When the transfer under way is over: nobody needs to wake for its single segments."""
+        return self._reply_ns if self._active is not None else None
 
     def next_event_ns(self) -> int | None:
         return self._due_ns if self._active is not None else None
@@ -88,6 +93,7 @@ class I2cSocketServer:
             transfer = self._line.transfer(address, ops, t_ns)
             self._active = (fileno, transfer)
             self._due_ns = next(transfer)
+            self._reply_ns = t_ns + self._line.duration_ns(ops)
 
     def _answer(self, fileno: int, result: TransferResult) -> None:
         status, data = result

@@ -2,7 +2,8 @@
 
 A pty swallows some 20 kB before it blocks, far more than a device's FIFO. The carrier therefore keeps the slave
 open itself, asks it how much the host has not read (FIONREAD) and never has more under way than the kernel's
-4095-byte line buffer can count; the face sees that number as ``unread`` and applies its own limit.
+4095-byte line buffer can count; the face sees that number as ``unread`` and applies its own limit. (Bytes that the
+kernel's worker has not moved yet are not counted: on a busy machine an overflow may be noticed that much later.)
 Unplugging closes the master: the host reads EOF or gets EIO, as when a USB adapter is pulled.
 """
 
