@@ -56,7 +56,6 @@ class Instrument:
         s = self._state[0]
         self._demand_V, self._demand_fix_V = s["demand_V"], s["demand_fix_V"]
         self._daq_V, self._magnetometer_V = s["daq_V"], s["magnetometer_V"]
-        self._between_V = np.zeros(8), np.zeros(3)
 
     @property
     def now_ns(self) -> int:
@@ -103,19 +102,21 @@ class Instrument:
     @property
     def analog_V(self) -> Array:
         """(8,) at the DAQ inputs now: a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36. Changes as time goes on."""
-        return self._outputs()[0]
+        self._now()
+        return self._daq_V
 
     @property
     def magnetometer_V(self) -> Array:
         """(3,) HMC-2003 outputs now. Changes as time goes on."""
-        return self._outputs()[1]
+        self._now()
+        return self._magnetometer_V
 
     def strap(self, pulse: Literal["set", "reset"]) -> None:
         """A pulse on the magnetometer's set/reset strap: ``reset`` turns the sign of its sensitivity."""
         if pulse not in ("set", "reset"):
             raise ValueError(f"strap pulse {pulse!r}: it is 'set' or 'reset'")
         self._state[0]["strap"] = 1.0 if pulse == "set" else -1.0
-        outputs(self._plant[0], self._state[0], 0.0, self._daq_V, self._magnetometer_V)
+        outputs(self._plant[0], self._state[0], 0.0)
 
     @property
     def clipped(self) -> NDArray[np.int64]:
@@ -137,12 +138,11 @@ class Instrument:
             columns[name] = rows[:, at] if n == 1 else rows[:, at : at + n]
         return columns
 
-    def _outputs(self) -> tuple[Array, Array]:
+    def _now(self) -> None:
+        """Bring the voltages from the last step to the present instant."""
         later_ns = self._t_ns - self._steps * STEP_NS
-        if later_ns == 0:
-            return self._daq_V, self._magnetometer_V
-        outputs(self._plant[0], self._state[0], later_ns * 1e-9, *self._between_V)
-        return self._between_V
+        if later_ns:
+            outputs(self._plant[0], self._state[0], later_ns * 1e-9)
 
     def _next_block(self) -> None:
         if self._row + BLOCK_MS > _CHUNK_ROWS:

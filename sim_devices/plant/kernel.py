@@ -95,6 +95,13 @@ STATE = np.dtype(
 
 
 @njit(cache=True)
+def copy(a, b):
+    """b <- a. A slice assignment would compile half of numba's string library, for its error message."""
+    for i in range(b.shape[0]):
+        b[i] = a[i]
+
+
+@njit(cache=True)
 def room(p, s, noise):
     """Temperature of the sensor board and the supply, once per millisecond."""
     keep = p["ambient_keep"]
@@ -109,8 +116,8 @@ def room(p, s, noise):
 
 
 @njit(cache=True)
-def sense(p, s, noise, settled):
-    """Attitude and accelerometers at ``s["pose"]``; with ``settled`` the RC filters have come to rest there."""
+def sense(p, s, noise):
+    """Attitude at ``s["pose"]`` and accelerometers, one step of their RC filters included."""
     pose, c = s["pose"], s["attitude"]
     omega, alpha, f = np.empty(3), np.empty(3), np.empty((3, 3))
     attitude(p["frame"], pose[3:6], c)
@@ -122,21 +129,19 @@ def sense(p, s, noise, settled):
         v = accelerometer_V(a, f[a["location"]], s["supply_V"], s["temperature_C"])
         if abs(v - 0.5 * s["supply_V"]) >= a["range_V"] * s["supply_V"] / 5.0 * (1.0 - 1e-12):
             s["clipped"][i] += 1
-        if settled:
-            s["rc_V"][i] = v
-        else:
-            hiss = a["noise_V"] * noise[i]
-            keep = a["rc_keep"]
-            s["rc_V"][i] = keep * s["rc_V"][i] + a["rc_from"] * s["sensor_V"][i] + a["rc_to"] * v + (1.0 - keep) * hiss
+        hiss = a["noise_V"] * noise[i]
+        keep = a["rc_keep"]
+        s["rc_V"][i] = keep * s["rc_V"][i] + a["rc_from"] * s["sensor_V"][i] + a["rc_to"] * v + (1.0 - keep) * hiss
         s["sensor_V"][i] = v
 
 
 @njit(cache=True)
-def outputs(p, s, later_s, daq_V, magnetometer_V):
-    """Voltages at the connectors, ``later_s`` (less than a step) after the present instant.
+def outputs(p, s, later_s):
+    """Writes the voltages at the connectors, ``later_s`` (less than a step) after the present instant.
 
-    ``daq_V`` (8,): six accelerometers, supply, temperature; ``magnetometer_V`` (3,). Each step has its own noise.
+    ``s["daq_V"]``: six accelerometers, supply, temperature; ``s["magnetometer_V"]``. Each step has its own noise.
     """
+    daq_V, magnetometer_V = s["daq_V"], s["magnetometer_V"]
     noise = s["noise"]
     supply = s["supply_V"]
     for i in range(8):
@@ -189,9 +194,10 @@ def begin(plant, state, node, part, truth):
     """The world's first instant: everything at rest, filters settled; writes the first truth row."""
     p, s = plant[0], state[0]
     room(p, s, np.zeros(SLOW_NOISES))
-    s["pose"][:] = node
-    sense(p, s, s["noise"], True)
-    outputs(p, s, 0.0, s["daq_V"], s["magnetometer_V"])
+    copy(node, s["pose"])
+    sense(p, s, s["noise"])
+    copy(s["sensor_V"], s["rc_V"])
+    outputs(p, s, 0.0)
     truth_row(p, s, part, truth)
 
 
@@ -213,15 +219,15 @@ def advance(plant, state, nodes, parts, noise, slow, first, stop, truth, row):
             s["demand_fix_V"][i] = 0.0
         s["step"] += 1
         if k + 1 == STEPS_PER_MS:
-            s["pose"][:] = nodes[ms + 1]
+            copy(nodes[ms + 1], s["pose"])
             room(p, s, slow[ms])
         else:
             pose_between(s["quintic"], (k + 1.0) / STEPS_PER_MS, NODE_S, s["pose"])
-        s["noise"][:] = noise[j]
-        sense(p, s, s["noise"], False)
+        copy(noise[j], s["noise"])
+        sense(p, s, s["noise"])
         if k + 1 == STEPS_PER_MS:
             truth_row(p, s, parts[ms], truth[row])
             row += 1
     if stop > first:
-        outputs(p, s, 0.0, s["daq_V"], s["magnetometer_V"])
+        outputs(p, s, 0.0)
     return row

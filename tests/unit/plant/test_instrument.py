@@ -186,9 +186,9 @@ def test_compiled_and_python_agree():
         arrays = unit._nodes, unit._parts, unit._noise, unit._slow
         row = advance(unit._plant, unit._state, *arrays, 0, 24, truth, 1)
         assert row == 4
-        later = np.zeros(8), np.zeros(3)
-        outputs(unit._plant[0], unit._state[0], 5e-5, *later)
-        results.append((truth, unit.analog_V.copy(), unit.magnetometer_V.copy(), *later))
+        stepped = unit._daq_V.copy(), unit._magnetometer_V.copy()
+        outputs(unit._plant[0], unit._state[0], 5e-5)
+        results.append((truth, *stepped, unit._daq_V.copy(), unit._magnetometer_V.copy()))
     for ours, python in zip(*results, strict=True):
         assert np.allclose(ours, python, rtol=1e-10, atol=1e-15)
 
@@ -198,7 +198,7 @@ def test_parts_of_the_kernel_in_python(name):
     units = [instrument(), instrument()]
     arguments = {
         "room": lambda: (np.array([0.4, -1.2]),),
-        "sense": lambda: (np.linspace(-1.0, 1.0, kernel.NOISES), False),
+        "sense": lambda: (np.linspace(-1.0, 1.0, kernel.NOISES),),
         "truth_row": lambda: (np.arange(6.0), np.zeros(kernel.TRUTH_COLUMNS)),
     }[name]
     called = [arguments(), arguments()]
