@@ -59,6 +59,7 @@ class Case:
     plan: Plan
     scene: Scene
     recorded: Signals
+    noise: Signals
     truths: tuple[Truth, ...]
     noise_kind: str
     noise_rms: dict[str, float]
@@ -340,13 +341,19 @@ def _attempt(rng: Rng, plan: Plan, max_samples: int, noise_kind: str | None) -> 
         recorded[k] = np.round(recorded[k] / q) * q
     if not all(np.all(np.isfinite(v)) for v in recorded.values()):
         raise NotVisible("unstable")
+    quiet = simulate(scene, [p for p in pairs if not p[0].with_noise])
+    left_over = {k: recorded[k] - quiet[k] for k in recorded}
+    if any(b.with_noise for b in bounds):  # steps coarser than the noise are the effect, not the noise
+        left_over = {k: noise[k][: scene.keep] for k in recorded}
     if plan.kind == "recalibrate":
         given, true = _recalibration(rng, scene, sigma, plan.severity), False
     elif plan.kind == "agrees" or rng.random() < 0.5:
         given, true = dict(scene.parameters), True
     else:
         given, true = believed(rng, scene, 0.02), False
-    return Case(plan, scene, recorded, tuple(truths), kind, sigma, bool(rng.random() < 0.5), given, true, wish.decoys)
+    return Case(
+        plan, scene, recorded, left_over, tuple(truths), kind, sigma, bool(rng.random() < 0.5), given, true, wish.decoys
+    )
 
 
 def plans(seed: int, count: int, only: tuple[str, str, float] | None = None) -> list[Plan]:

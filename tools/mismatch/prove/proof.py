@@ -53,6 +53,7 @@ def _generate(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[s
         return None
     name = f"r{index:03d}"
     path = write(case, folder / name, f"recording {index}", np.random.default_rng([seed, index, 99]))
+    seal.keep_noise(case, folder.parent / "sealed", name)
     return name, seal.answer(case), str(path)
 
 
@@ -118,7 +119,9 @@ def prove(
     rows: list[dict[str, Any]] = []
     for name in sorted(reports):
         report, seconds = reports[name]
+        spans = (report.get("fit") or {}).get("held_out_spans")
+        oracle = seal.noise_on(folder / "sealed", name, spans) if spans else None
         rows.append(
-            {"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report)}
+            {"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report, oracle)}
         )
     return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder)

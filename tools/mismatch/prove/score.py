@@ -57,9 +57,15 @@ def _rms(report: Mapping[str, Any], key: str, output: str) -> float | None:
     return float(value)
 
 
-def fit_figures(report: Mapping[str, Any], answer: Mapping[str, Any], outputs: Sequence[str]) -> dict[str, Any]:
+def fit_figures(
+    report: Mapping[str, Any],
+    answer: Mapping[str, Any],
+    outputs: Sequence[str],
+    oracle: Mapping[str, float] | None = None,
+) -> dict[str, Any]:
     """Held-out rms against the known noise on ``outputs``: ratio, explained share, below-noise flag."""
-    noise = answer["noise_rms"]
+    noise = oracle or answer["noise_rms"]
+    chance = 0.02 if oracle else CHANCE[answer["noise_kind"]]
     ratio, explained, below = 0.0, 1.0, False
     found = False
     for out in outputs:
@@ -70,7 +76,7 @@ def fit_figures(report: Mapping[str, Any], answer: Mapping[str, Any], outputs: S
         found = True
         sigma = noise[out]
         ratio = max(ratio, fitted / sigma)
-        below |= fitted < sigma * (1.0 - CHANCE[answer["noise_kind"]])
+        below |= fitted < sigma * (1.0 - chance)
         room = before**2 - sigma**2
         if room > 0.25 * sigma**2:
             explained = min(explained, (before**2 - fitted**2) / room)
@@ -110,8 +116,10 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any]) -> list[dict[
     return rows
 
 
-def score(answer: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any]:
-    """One row of the result."""
+def score(
+    answer: Mapping[str, Any], report: Mapping[str, Any], oracle: Mapping[str, float] | None = None
+) -> dict[str, Any]:
+    """One row of the result. ``oracle``: the noise rms on the held-out samples themselves, if the report names them."""
     verdict = str(report.get("verdict", "error"))
     said = names_of(report)
     true = [t["name"] for t in answer["effects"] if t["name"] != "unknown"]
@@ -150,7 +158,7 @@ def score(answer: Mapping[str, Any], report: Mapping[str, Any]) -> dict[str, Any
         if kind == "single":
             row["predictable"] = all(t["predictable"] for t in answer["effects"])
         row["coverage"] = coverage(report, answer)
-    row |= fit_figures(report, answer, outputs)
+    row |= fit_figures(report, answer, outputs, oracle)
     return row
 
 

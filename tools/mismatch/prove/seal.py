@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from tools.mismatch.prove.draw import Case
 
@@ -28,6 +31,24 @@ def answer(case: Case) -> dict[str, Any]:
         "given_is_true": case.given_is_true,
         "decoys": list(case.decoys),
     }
+
+
+def keep_noise(case: Case, folder: Path, name: str) -> None:
+    """The noise as it was drawn, so that a held-out figure can be compared on its own samples."""
+    folder.mkdir(parents=True, exist_ok=True)
+    values = {k: v.astype(np.float32) for k, v in case.noise.items()}
+    np.savez(folder / f"{name}.npz", **values)  # pyright: ignore[reportArgumentType]
+
+
+def noise_on(folder: Path, name: str, spans: Sequence[Sequence[int]]) -> dict[str, float]:
+    """True noise rms per output on these sample spans (stop excluded)."""
+    with np.load(folder / f"{name}.npz") as file:
+        noise = {k: file[k].astype(float) for k in file.files}
+    out: dict[str, float] = {}
+    for k, v in noise.items():
+        parts = [v[int(a) : int(b)] for a, b in spans]
+        out[k] = float(np.sqrt(np.mean(np.concatenate(parts) ** 2)))
+    return out
 
 
 def close(answers: dict[str, dict[str, Any]], folder: Path) -> str:
