@@ -66,7 +66,9 @@ def run_in_process(
     ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the opened bench (fault tests).
     """
     bench = load_bench(request.bench)
-    load_firmware_config(bench, {})
+    # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
+    _, configs = load_firmware_config(bench, {})
+    Stages(configs).warm_up()
     with contextlib.ExitStack() as stack:
         folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
         opened = stack.enter_context(
@@ -84,7 +86,6 @@ def run_in_process(
             on_open(opened)
         config, configs = load_firmware_config(bench, devices.sensing_table)
         stages = Stages(configs)
-        stages.warm_up()
         recorder = _recorder(request, bench, configs, opened)
         loop = InstrumentLoop(
             devices,

@@ -9,7 +9,7 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,7 +56,7 @@ BUDGETS_US = {
 class Recorder(Protocol):
     """Where finished frames go; never blocks, counts what it drops."""
 
-    def push(self, frame: NDArray[np.float64]) -> bool: ...
+    def push(self, row: NDArray[np.float64]) -> bool: ...
     def event(self, event: dict[str, object]) -> bool: ...
 
 
@@ -172,7 +172,7 @@ class InstrumentLoop:
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
-    def _catch_signals(self) -> dict[signal.Signals, object]:
+    def _catch_signals(self) -> dict[signal.Signals, Any]:
         def interrupt(number: int, _frame: object) -> None:
             self._interrupted = signal.Signals(number).name
 

@@ -15,6 +15,7 @@ import numpy as np
 import typer
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.spinner import Spinner
 from rich.table import Table
 
 from firmware_py.app import RunRequest, run_in_process
@@ -147,7 +148,8 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
 def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     """Draw the status lines of the firmware until it ends."""
     assert process.stdout is not None
-    with Live(console=console(), refresh_per_second=8, transient=True) as live:
+    starting = "starting the emulated world and the firmware; the first run on a machine compiles for about a minute"
+    with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
             live.update(_status_table(json.loads(line), seconds))
 

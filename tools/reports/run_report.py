@@ -108,7 +108,7 @@ def print_report(result: Mapping[str, Any], console: Console) -> None:
 
 
 def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
-    """PNG: three axes before and after in the tremor band, the last 3 s, and the spectra of the whole run."""
+    """PNG: three axes before and after in the tremor band, the last 3 s that were scored, and the spectra."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -117,24 +117,28 @@ def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
 
     t_s = (truth["t_ns"] - truth["t_ns"][0]) * 1e-9
     rate_hz = (len(t_s) - 1) / t_s[-1]
-    show = t_s >= max(0.0, t_s[-1] - 3.0)
+    start_s, stop_s = result["tremor"]["evaluated_s"]
+    scored = (t_s >= start_s) & (t_s <= stop_s)
+    show = scored & (t_s >= stop_s - 3.0)
     before, after = (1e6 * band_pass(np.asarray(truth[k]), rate_hz, TREMOR_BAND_HZ) for k in ("tip_rigid_m", "tip_m"))
     figure, panels = plt.subplots(3, 2, figsize=(12, 7.2), width_ratios=(2.2, 1), layout="constrained")
     for i, axis in enumerate(AXES):
         left, right = panels[i]
-        left.plot(t_s[show], before[show, i], color="0.65", lw=1.2, label="without compensation")
-        left.plot(t_s[show], after[show, i], color="C0", lw=1.2, label="with compensation")
+        left.plot(t_s[show] - start_s, before[show, i], color="0.65", lw=1.2, label="without compensation")
+        left.plot(t_s[show] - start_s, after[show, i], color="C0", lw=1.2, label="with compensation")
         left.set_ylabel(f"{axis}, 8-12 Hz (um)")
         left.grid(alpha=0.3)
         for key, colour in (("tip_rigid_m", "0.65"), ("tip_m", "C0")):
-            frequency, power = welch(1e6 * truth[key][:, i], rate_hz, nperseg=min(len(t_s), 2048))
-            right.semilogy(frequency, np.sqrt(power), color=colour, lw=1.2)
+            path = 1e6 * np.asarray(truth[key])[scored, i]
+            frequency, power = welch(path, rate_hz, nperseg=min(len(path), 2048), detrend="linear")
+            right.semilogy(frequency[1:], np.sqrt(power[1:]), color=colour, lw=1.2)
         right.set_xlim(0, 40)
+        right.set_ylim(1e-3, None)
         right.set_ylabel("um/sqrt(Hz)")
         right.axvspan(*TREMOR_BAND_HZ, color="C1", alpha=0.12, lw=0)
         right.grid(alpha=0.3)
     panels[0, 0].legend(loc="upper right", ncols=2, fontsize=9)
-    panels[2, 0].set_xlabel("time (s)")
+    panels[2, 0].set_xlabel("time since scoring began (s)")
     panels[2, 1].set_xlabel("frequency (Hz)")
     figure.suptitle(headline(result), fontsize=12)
     buffer = io.BytesIO()
