@@ -95,9 +95,10 @@ class WorldProcess:
         self._worst_late_ns = 0
         check_ns = 0
         while not self._stop:
-            for fileno in self._wait():
+            ready = self._wait()
+            self._turn()  # what was due before a request came happens before it
+            for fileno in ready:
                 self._on_readable(fileno)
-            self._turn()
             if self._now_ns >= check_ns:
                 check_ns = self._now_ns + PARENT_CHECK_NS
                 if os.getppid() != self._parent:
@@ -136,7 +137,7 @@ class WorldProcess:
             self._now_ns = now_ns if due_ns is None else min(now_ns, due_ns + CATCH_UP_NS)
             self.world.advance_to(self._now_ns)
             for pty in self._all_ptys:
-                pty.pump(self._now_ns)
+                pty.send()
             if late_ns <= CATCH_UP_NS:
                 self.world.keep_up(self._now_ns)
                 return
@@ -145,13 +146,16 @@ class WorldProcess:
     def _on_readable(self, fileno: int) -> None:
         for server in self._i2c.values():
             if fileno in server.filenos():
-                self._turn()  # what was due before this request happens before it
                 server.on_readable(fileno, self._now_ns)
                 return
         for can in self._can.values():
             if fileno == can.fileno():
-                self._turn()
                 can.pump(self._now_ns)
+                return
+        for pty in self._all_ptys:
+            if fileno == pty.fileno():
+                pty.receive(self._now_ns)
+                pty.send()
                 return
         if fileno == self._control.fileno():
             self._obey()

@@ -41,24 +41,23 @@ class PtyCarrier:
         if self._master >= 0:
             self._face.unread = self._count_unread()
 
-    def pump(self, t_ns: int) -> None:
-        """Carry bytes both ways, as far as they go without waiting."""
+    def receive(self, t_ns: int) -> None:
+        """Hand what the host has written to the face, without waiting."""
+        if self._master >= 0:
+            with contextlib.suppress(BlockingIOError):
+                self._face.receive(os.read(self._master, READ_BYTES), t_ns)
+
+    def send(self) -> None:
+        """Give the host what the face has for it, as far as there is room. ``refresh`` comes before."""
         if self._master < 0:
             return
-        with contextlib.suppress(BlockingIOError):
-            data = os.read(self._master, READ_BYTES)
-            if data:
-                self._face.receive(data, t_ns)
-        unread = self._count_unread()
         if not self._pending:
-            self._pending = self._face.take(max(0, LINE_BUFFER_BYTES - unread))
+            self._pending = self._face.take(max(0, LINE_BUFFER_BYTES - self._face.unread))
+            self._face.unread += len(self._pending)
         if self._pending:
-            written = 0
             with contextlib.suppress(BlockingIOError):
                 written = os.write(self._master, self._pending)
-            self._pending = self._pending[written:]
-            unread += written
-        self._face.unread = unread
+                self._pending = self._pending[written:]
 
     def unplug(self) -> None:
         """Fault hook and end of life: hang up on the host. Idempotent."""

@@ -27,7 +27,8 @@ class Rig:
         self.t_ns += dt_ns
         self.carrier.refresh()
         self.device.advance_to(self.t_ns)
-        self.carrier.pump(self.t_ns)
+        self.carrier.receive(self.t_ns)
+        self.carrier.send()
 
     def settle(self, n: int) -> None:
         """Until ``n`` bytes lie unread: the kernel moves pty data in a worker of its own."""
