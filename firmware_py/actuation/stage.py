@@ -126,9 +126,9 @@ def actuate_params(config: ActuationConfig) -> Record:
         at = attributes(stack)[0]
         risen = plays_after_rise(at.r, config.neutral_V)
         param.neutral_extension[i] = extension(config.neutral_V, risen, at)
-        up, down = risen.copy(), risen.copy()
-        param.stroke_high[i] = extension(config.high_V, up, at) - param.neutral_extension[i]
-        param.stroke_low[i] = extension(config.low_V, down, at) - param.neutral_extension[i]
+        # what is reached whatever came before: the top erases all memory, the bottom is worst right after the top
+        param.stroke_high[i] = extension(config.high_V, risen, at) - param.neutral_extension[i]
+        param.stroke_low[i] = extension(config.low_V, risen, at) - param.neutral_extension[i]
     return params
 
 

@@ -1,0 +1,173 @@
+"""The actuation stage: sign, ramp, gate, limits; against the mechanism's constraints and the forward hysteresis."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from firmware_py.actuation import stage
+from firmware_py.actuation.config import ActuationConfig
+from firmware_py.actuation.hysteresis import extension, plays_after_rise
+from firmware_py.actuation.stage import Actuation
+from firmware_py.frame import (
+    CLIP,
+    CLIP_SLEW,
+    CLIP_VOLTAGE,
+    CLIP_WORKSPACE,
+    COMMAND,
+    CONFIDENCE,
+    DESIRED_TIP,
+    LAYOUT,
+    SETTLING,
+    STATUS,
+    TREMOR_AHEAD,
+)
+from firmware_py.records import attributes
+from hal.errors import BenchError
+from tests.unit.actuation.truth import tip_from_strokes
+from tests.unit.pure_python import without_compiler
+
+
+def trembling(n: int, size: float = 25e-6) -> np.ndarray:
+    t = np.arange(n) / 1000.0
+    frames = np.zeros((n, LAYOUT.size))
+    frames[:, CONFIDENCE : CONFIDENCE + 3] = 0.9
+    frames[:, LAYOUT["tremor_ahead"]] = size * np.sin(2 * np.pi * np.array([9.0, 10.0, 11.0]) * t[:, None])
+    return frames
+
+
+def run(config: ActuationConfig, frames: np.ndarray) -> Actuation:
+    actuation = Actuation(config)
+    for frame in frames:
+        actuation.step(frame)
+    return actuation
+
+
+def tip_of(actuation: Actuation, frames: np.ndarray) -> np.ndarray:
+    """Where stacks that are exactly the model and the real mechanism put the tip, manipulator frame."""
+    config, param = actuation.config, attributes(actuation.params)[0]
+    plays = [plays_after_rise(param.stacks[i].r, config.neutral_V) for i in range(3)]
+    tips = []
+    for k, frame in enumerate(frames):
+        z = np.array(
+            [
+                extension(frame[COMMAND + i], plays[i], actuation.params[0]["stacks"][i]) - param.neutral_extension[i]
+                for i in range(3)
+            ]
+        )
+        if k % 25 == 0:
+            tips.append(tip_from_strokes(z, config.ball_circle_m, config.shaft_m, config.lever_gain))
+    return np.array(tips)
+
+
+def test_the_tip_goes_where_minus_the_tremor_says() -> None:
+    frames = trembling(1500)
+    actuation = run(ActuationConfig(), frames)
+    assert np.all(frames[:, CLIP] == 0.0)
+    wanted = frames[::25, LAYOUT["desired_tip"]]
+    np.testing.assert_allclose(wanted[-20:], -frames[::25, LAYOUT["tremor_ahead"]][-20:], atol=1e-20)
+    np.testing.assert_allclose(tip_of(actuation, frames), wanted, atol=1e-10)
+
+
+def test_mounting_turns_the_wish_into_the_manipulators_frame() -> None:
+    frames = trembling(800)
+    quarter = ((0.0, 1.0, 0.0), (-1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+    run(ActuationConfig(mounting=quarter), frames)
+    tremor, wish = frames[-1, TREMOR_AHEAD : TREMOR_AHEAD + 3], frames[-1, DESIRED_TIP : DESIRED_TIP + 3]
+    np.testing.assert_allclose(wish, -np.array(quarter) @ tremor, atol=1e-20)
+
+
+def test_compensation_fades_in_and_out_with_trust() -> None:
+    frames = trembling(2500)
+    frames[:, LAYOUT["tremor_ahead"]] = 10e-6
+    frames[:100, STATUS] = SETTLING
+    frames[1500:, CONFIDENCE + 1] = 0.1
+    run(ActuationConfig(ramp_s=0.5), frames)
+    wish = -frames[:, LAYOUT["desired_tip"]] / 10e-6
+    assert np.all(wish[:100] == 0.0)
+    np.testing.assert_allclose(wish[100:700, 0], np.minimum(1.0, np.arange(1, 601) / 500), atol=1e-9)
+    assert np.all(np.abs(np.diff(wish, axis=0)) < 0.0021)
+    assert wish[-1, 1] == 0.0
+    assert wish[-1, 0] == 1.0
+
+
+def test_out_of_reach_is_scaled_back_and_flagged() -> None:
+    frames = trembling(1500, size=400e-6)
+    actuation = run(ActuationConfig(), frames)
+    clipped = frames[600:, CLIP].astype(int) & CLIP_WORKSPACE != 0
+    assert 0.2 < np.mean(clipped) < 1.0
+    wish, tremor = frames[600:, LAYOUT["desired_tip"]], frames[600:, LAYOUT["tremor_ahead"]]
+    for w, x in zip(wish[clipped], tremor[clipped], strict=True):
+        np.testing.assert_allclose(np.cross(w, x), 0.0, atol=1e-12)  # the direction is kept
+        assert w @ x < 0.0
+    assert np.all(frames[:, COMMAND : COMMAND + 3] >= 0.0)
+    assert np.all(frames[:, COMMAND : COMMAND + 3] <= 100.0)
+    # where the amplifier could follow (a wish that swings through zero in one tick is too fast for it)
+    followed = frames[::25, CLIP].astype(int) & CLIP_SLEW == 0
+    assert np.mean(followed) > 0.8
+    wanted = frames[::25, LAYOUT["desired_tip"]]
+    np.testing.assert_allclose(tip_of(actuation, frames)[followed], wanted[followed], atol=1e-9)
+
+
+def test_slew_and_voltage_limits_hold_and_are_flagged() -> None:
+    frames = trembling(1500, size=60e-6)
+    run(ActuationConfig(slew_V_per_s=500.0), frames)
+    command = frames[:, LAYOUT["command"]]
+    assert np.max(np.abs(np.diff(command, axis=0))) <= 0.5 + 1e-12
+    assert np.any(frames[:, CLIP].astype(int) & CLIP_SLEW)
+    frames = trembling(1500, size=60e-6)
+    run(ActuationConfig(low_V=45.0, high_V=55.0), frames)
+    assert np.any(frames[:, CLIP].astype(int) & (CLIP_VOLTAGE | CLIP_WORKSPACE))
+    command = frames[:, LAYOUT["command"]]
+    assert command.min() >= 45.0
+    assert command.max() <= 55.0
+
+
+def test_nan_is_no_command() -> None:
+    frames = trembling(1000)
+    frames[900:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = np.nan
+    run(ActuationConfig(), frames)
+    assert np.all(np.isfinite(frames[:, COMMAND : COMMAND + 3]))
+    np.testing.assert_array_equal(frames[900:, DESIRED_TIP : DESIRED_TIP + 3], 0.0)
+
+
+def test_at_rest_the_amplifier_stays_at_neutral() -> None:
+    frames = trembling(10, size=0.0)
+    run(ActuationConfig(neutral_V=47.0), frames)
+    np.testing.assert_allclose(frames[:, COMMAND : COMMAND + 3], 47.0, atol=1e-9)
+
+
+def test_stacks_of_different_size_share_one_kernel() -> None:
+    linear = {"play_thresholds_V": [0.0], "play_weights_um_per_V": [0.15]}
+    config = ActuationConfig.from_dict({"stacks": [linear, {}, linear]})
+    frames = trembling(600)
+    actuation = run(config, frames)
+    np.testing.assert_allclose(tip_of(actuation, frames), frames[::25, LAYOUT["desired_tip"]], atol=1e-10)
+
+
+def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = trembling(60, size=100e-6)
+    twins = frames.copy()
+    config = ActuationConfig(ramp_s=0.01, slew_V_per_s=3000.0)
+    run(config, frames)
+    without_compiler(monkeypatch)
+    twin = Actuation(config)
+    for frame in twins:
+        stage.actuate_kernel(frame, attributes(twin.state), attributes(twin.params))
+    np.testing.assert_allclose(twins, frames, rtol=1e-9, atol=1e-18)
+
+
+def test_reset_is_a_new_start() -> None:
+    frames, again = trembling(700), trembling(700)
+    actuation = run(ActuationConfig(), frames)
+    actuation.reset()
+    for frame in again:
+        actuation.step(frame)
+    assert np.array_equal(frames, again)
+
+
+def test_a_wrong_key_is_named() -> None:
+    with pytest.raises(BenchError, match="neutral_V"):
+        ActuationConfig.from_dict({"neutral_V": 120.0})
+    with pytest.raises(BenchError, match="rotation"):
+        ActuationConfig.from_dict({"mounting": [[1, 0, 0], [0, 1, 0], [0, 0, 2]]})

@@ -1,0 +1,41 @@
+"""Independent truth for the actuation tests: the manipulator's constraints, and play operators by definition."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+PINS = np.array([[1.0, 0.0], [-0.5, np.sqrt(3) / 2], [-0.5, -np.sqrt(3) / 2]])  # 000 (6.1), (6.2) for R = r = 1
+
+
+def tip_from_strokes(strokes: Array, ball_circle_m: float, shaft_m: float, lever_gain: float) -> Array:
+    """Tip displacement (3,) m by solving the constraints for the star's pose: each ball stays in the vertical
+    plane of its leg (6.13) and at the height its actuator gives it. Unknowns: rotation vector and centre."""
+    r = ball_circle_m
+    balls = np.column_stack([r * PINS, np.zeros(3)])
+
+    def constraint(pose: Array) -> Array:
+        rotation = Rotation.from_rotvec(pose[:3])
+        at = rotation.apply(balls) + r * pose[3:]
+        out_of_plane = at[:, 0] * PINS[:, 1] - at[:, 1] * PINS[:, 0]
+        return np.concatenate([out_of_plane, at[:, 2] - lever_gain * strokes]) / r
+
+    pose, _, found, message = fsolve(constraint, np.zeros(6), full_output=True, xtol=1e-14)
+    assert found == 1 or np.max(np.abs(constraint(pose))) < 1e-12, message
+    shaft = np.array([0.0, 0.0, shaft_m])
+    return Rotation.from_rotvec(pose[:3]).apply(shaft) + r * pose[3:] - shaft
+
+
+class Plays:
+    """w . H_r of 000 (7.1)-(7.4), one operator after the other."""
+
+    def __init__(self, r: Array, w: Array, start: Array) -> None:
+        self.r, self.w, self.y = r, w, start.copy()
+
+    def step(self, x: float) -> float:
+        for i, r in enumerate(self.r):
+            self.y[i] = max(x - r, min(x + r, self.y[i]))
+        return float(self.w @ self.y)
