@@ -158,7 +158,7 @@ def _iron_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _iron_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
     out = [Human(f"{i}{j}", float(v) / g, "1") for (i, j), v in zip(_CROSS, p, strict=True)]
-    at = {c: v for c, v in zip(_CROSS, p, strict=True)}
+    at = dict(zip(_CROSS, p, strict=True))
     even = sum((at[i, j] + at[j, i]) ** 2 for i, j in _PAIRS) / 2
     total = float(np.sum(p**2))
     out.append(Human("symmetric_share", float(even / total) if total > 0 else 1.0, "1"))
@@ -172,8 +172,8 @@ SOFT_IRON = Effect(
     stages=("environment",),
     parts=_iron_parts,
     equation=r"B' = (I + S)\,B",
-    source="M. J. Caruso, Applications of Magnetic Sensors for Low Cost Compass Systems, IEEE PLANS 2000; V. Renaudin et al.,"
-    " J. Sensors 2010, eq. 6",
+    source="M. J. Caruso, Applications of Magnetic Sensors for Low Cost Compass Systems, IEEE PLANS 2000;"
+    " V. Renaudin et al., J. Sensors 2010, eq. 6",
     excitation="the instrument turned through all directions",
     confusable_with=("misalignment",),
     basis=_iron_basis,

@@ -91,8 +91,8 @@ CREEP = Effect(
     stages=("actuator", "sensor", "mechanics"),
     parts=_parts,
     equation=r"y = x + \sum_j c_j z_j,\quad \tau_j \dot z_j = x - z_j",
-    source="H. Janocha, K. Kuhnen, Sensors and Actuators A 79 (2000) 83, eq. 6; W. N. Findley et al., Creep and Relaxation"
-    " of Nonlinear Viscoelastic Materials, ch. 5 (Kelvin chain)",
+    source="H. Janocha, K. Kuhnen, Sensors and Actuators A 79 (2000) 83, eq. 6; W. N. Findley et al., Creep and"
+    " Relaxation of Nonlinear Viscoelastic Materials, ch. 5 (Kelvin chain)",
     excitation="steps or changes of the mean, with minutes to settle; several of both signs tell it from warm-up",
     confusable_with=("thermal_drift", "first_order_lag", "hysteresis", "ac_coupling"),
     prepare=_prepare,

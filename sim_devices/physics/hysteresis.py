@@ -1,4 +1,4 @@
-"""Rate-independent memory: play operators (Prandtl-Ishlinskii), with loops that may depend on position."""
+"""Rate-independent memory: superpositions of play, Dahl and relay operators, chosen by the data."""
 
 from __future__ import annotations
 
@@ -11,7 +11,16 @@ from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter,
 from sim_devices.physics.statistics import least_squares, thin
 
 N_PLAYS = 10
-N_BENT = 5  # elements whose weight may vary along the range
+FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays")
+"""Bases from few to many columns; the data choose (``choose_form``). Each meets what the others meet badly:
+
+stops        Prandtl-Ishlinskii, Maxwell-slip, Iwan
+dahl         smooth elements dz = dx - |dx| z / r: Dahl, Bouc-Wen with exponent one (gamma = 0)
+dahl_stops   both
+dahl_skewed  dz = dx - (|dx| z + g dx |z|) / r as well: Bouc-Wen at large, loops whose branches differ in bend
+stops_bent   stops whose weight varies along the range: Preisach densities, generalised Prandtl-Ishlinskii
+relays       smooth relays on a triangular grid (Krasnosel'skii-Pokrovskii): any Preisach operator
+"""
 
 
 @njit(cache=True)
@@ -41,69 +50,157 @@ def thresholds(half: float, count: int) -> tuple[float, ...]:
     return tuple(float(half * (i / (count + 0.5)) ** 1.5) for i in range(1, count + 1))
 
 
-def columns(x: Array, radii: Array, rest: float, lo: float, hi: float, bent: int, starts: tuple[int, ...]) -> Array:
-    """Stops (n, k), then every second one times the normalised input and its square (``bent`` 1 or 2)."""
-    e = stops(x, radii, rest, np.array(starts, np.int64))
-    if bent == 0:
-        return e
-    z = np.clip((x - 0.5 * (lo + hi)) / (0.5 * (hi - lo)), -1.2, 1.2)[:, None]
-    some = e[:, 1::2][:, :N_BENT]
-    parts = [e, some * z]
-    if bent > 1:
-        parts.append(some * z * z)
-    return np.concatenate(parts, axis=1)
+@njit(cache=True)
+def dahl(x, radii, skew, rest, starts):
+    """Smooth elements dz = dx - (|dx| z + g dx |z|) / r, (n, k), exact for any step; z = 0 at ``rest`` at each start.
+
+    P. R. Dahl, AIAA J. 14 (1976) 1675 (g = 0); Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1.
+    """
+    n, k = x.size, radii.size
+    out = np.empty((k, n))
+    for j in range(k):
+        r, g = radii[j], skew[j]
+        a = (1.0 - g) / r
+        b = (1.0 + g) / r
+        z = 0.0
+        before = rest
+        s = 0
+        for i in range(n):
+            if s < starts.size and i == starts[s]:
+                s += 1
+                z = 0.0
+                before = rest
+            d = x[i] - before
+            before = x[i]
+            if d != 0.0:
+                sign = 1.0 if d > 0.0 else -1.0
+                d = abs(d)
+                u = sign * z
+                if u < 0.0:
+                    zero = np.log(1.0 - u * a) / a  # travel until it has relaxed to zero
+                    if d < zero:
+                        u = 1.0 / a + (u - 1.0 / a) * np.exp(-a * d)
+                        d = 0.0
+                    else:
+                        u = 0.0
+                        d -= zero
+                if d > 0.0:
+                    u = 1.0 / b + (u - 1.0 / b) * np.exp(-b * d)
+                z = sign * u
+            out[j, i] = z
+    return out.T
+
+
+@njit(cache=True)
+def relays(x, lo, hi, count, starts):
+    """Relays with ridges of one grid step, rising at g[q], falling at g[p], p <= q, (n, count (count + 1) / 2).
+
+    M. A. Krasnosel'skii, A. V. Pokrovskii, Systems with Hysteresis (1989), section 36; all down at each start.
+    """
+    n = x.size
+    out = np.empty((count * (count + 1) // 2, n))
+    w = (hi - lo) / count
+    c = 0
+    for p in range(count):
+        for q in range(p, count):
+            v = -1.0
+            s = 0
+            for i in range(n):
+                if s < starts.size and i == starts[s]:
+                    s += 1
+                    v = -1.0
+                up = min(max(2.0 * (x[i] - lo - q * w) / w - 1.0, -1.0), 1.0)
+                down = min(max(2.0 * (x[i] - lo - p * w) / w - 1.0, -1.0), 1.0)
+                v = max(up, min(down, v))
+                out[c, i] = v
+            c += 1
+    return out.T
+
+
+N_DAHL = 7
+N_GRID = 8
+
+
+def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tuple[int, ...]) -> Array:
+    """Columns of one form (n, k), every one without memory of what lies before a start."""
+    at = np.array(starts, np.int64)
+    half = 0.5 * (hi - lo)
+    radii = np.array(thresholds(half, N_PLAYS))
+    wide = half * np.geomspace(0.05, 4.0, N_DAHL)
+    match form:
+        case "stops":
+            return stops(x, radii, rest, at)
+        case "dahl":
+            return dahl(x, wide, np.zeros(N_DAHL), rest, at)
+        case "dahl_stops":
+            return np.concatenate([dahl(x, wide, np.zeros(N_DAHL), rest, at), stops(x, radii, rest, at)], axis=1)
+        case "dahl_skewed":
+            skew = np.repeat([-0.6, 0.0, 0.6], N_DAHL)
+            return dahl(x, np.tile(wide, 3), skew, rest, at)
+        case "stops_bent":
+            e = stops(x, radii, rest, at)
+            z = np.clip((x - 0.5 * (lo + hi)) / half, -1.1, 1.1)[:, None]
+            some = e[:, 1::2]
+            return np.concatenate([e, some * z, some * z * z], axis=1)
+        case _:
+            return relays(x, lo, hi, N_GRID, at)
+
+
+def width_of(form: str) -> int:
+    """Number of columns of a form."""
+    return {
+        "stops": N_PLAYS,
+        "dahl": N_DAHL,
+        "dahl_stops": N_DAHL + N_PLAYS,
+        "dahl_skewed": 3 * N_DAHL,
+        "stops_bent": 2 * N_PLAYS,
+        "relays": N_GRID * (N_GRID + 1) // 2,
+    }[form]
+
+
+def choose_form(x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS) -> str:
+    """The form that predicts left-out blocks best; a larger one must be better by 7 % of the sum of squares."""
+    index = thin(ctx.keep, 6000)
+    fold = (np.arange(index.size) * 8 // max(index.size, 1)) % 2
+    straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
+    best: tuple[float, str] | None = None
+    for form in forms:
+        e = columns(x, form, lo, hi, float(x[0]), ctx.starts)
+        if ctx.through is not None:
+            e = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in e.T], axis=1)
+        a = np.column_stack([straight, e[index]])
+        left = 0.0
+        for out in (0, 1):
+            w = least_squares(a[fold != out], residual[index][fold != out], 1e-6)[0]
+            left += float(np.sum((residual[index][fold == out] - a[fold == out] @ w) ** 2))
+        if best is None or left < 0.93 * best[0]:
+            best = (left, form)
+    assert best is not None
+    return best[1]
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
     lo, hi = float(x[k].min()), float(x[k].max())
-    half = 0.5 * (hi - lo) or 1.0
-    radii = np.array(thresholds(half, N_PLAYS))
-    index = thin(k, 8000)
-    r = residual[index]
-    straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
-    full = columns(x, radii, float(x[0]), lo, hi, 2, ctx.starts)
-    if ctx.through is not None:
-        full = np.stack([ctx.to_output(c) for c in full.T], axis=1)
-    full = full[index]
-    best: tuple[float, int] | None = None
-    n = max(index.size / 10.0, 40.0)  # coloured residuals: one sample in ten counts
-    for bent in (0, 1, 2):
-        count = N_PLAYS + bent * N_BENT
-        rss = least_squares(np.column_stack([straight, full[:, :count]]), r)[1]
-        score = n * np.log(max(rss, 1e-300)) + count * np.log(n)
-        if best is None or score < best[0] - 6.0:
-            best = (score, bent)
-    assert best is not None
-    return {
-        "thresholds": tuple(float(v) for v in radii),
-        "range": (lo, hi),
-        "rest": (float(x[0]),),
-        "bent": (float(best[1]),),
-    }
+    if hi <= lo:
+        lo, hi = lo - 0.5, hi + 0.5
+    form = choose_form(x, residual, ctx, lo, hi)
+    return {"range": (lo, hi), "rest": (float(x[0]),), "form": (float(FORMS.index(form)),)}
+
+
+def _form(settings: Settings) -> str:
+    return FORMS[int(settings.get("form", (0.0,))[0])]
 
 
 def _parts(settings: Settings) -> Parts:
-    count = len(settings.get("thresholds", (1.0,)))
-    bent = int(settings.get("bent", (0.0,))[0])
-    names = [f"w{i + 1}" for i in range(count)]
-    for b in range(1, bent + 1):
-        names += [f"w{2 * i + 2}z{b}" for i in range(len(range(1, count, 2)[:N_BENT]))]
-    weights = tuple(Parameter(m, "{out}/{in}", scale=0.1) for m in names)
-    return Parts((), weights, 0.05 * np.eye(len(names)))
+    n = width_of(_form(settings))
+    unit = "{out}" if _form(settings) == "relays" else "{out}/{in}"
+    return Parts((), tuple(Parameter(f"w{i + 1}", unit, scale=0.1) for i in range(n)), 0.05 * np.eye(n))
 
 
 def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
-    return columns(
-        x,
-        np.array(settings.get("thresholds", (1.0,))),
-        settings.get("rest", (0.0,))[0],
-        lo,
-        hi,
-        int(settings.get("bent", (0.0,))[0]),
-        ctx.starts,
-    )
+    return columns(x, _form(settings), lo, hi, settings.get("rest", (0.0,))[0], ctx.starts)
 
 
 def loop_width(y_of: Array, turns: int) -> float:
@@ -125,8 +222,7 @@ def test_cycle(lo: float, hi: float) -> Array:
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     lo, hi = settings["range"]
     x = test_cycle(lo, hi)
-    radii = np.array(settings["thresholds"])
-    y = scale * x + columns(x, radii, lo, lo, hi, int(settings.get("bent", (0.0,))[0]), (0,)) @ p
+    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,)) @ p
     return (Human("loop_width_share", loop_width(y, 3), "1"),)
 
 
@@ -179,8 +275,9 @@ HYSTERESIS = Effect(
     kind="add",
     stages=("actuator", "sensor"),
     parts=_parts,
-    equation=r"y = x + \sum_i w_i(\tilde x)\,(x - P_{r_i}[x])",
-    source="K. Kuhnen, Eur. J. Control 9 (2003) 407, eqs. 2-5; M. Al Janaideh et al., Smart Mater. Struct. 18 (2009) 045001",
+    equation=r"y = x + \sum_i w_i\,E_i[x],\; E_i = x - P_{r_i}[x]"
+    r" \text{ or } \mathrm{d}E_i = \mathrm{d}x - |\mathrm{d}x| E_i / r_i",
+    source="K. Kuhnen, Eur. J. Control 9 (2003) 407, eqs. 2-5; Dahl 1976; Krasnosel'skii, Pokrovskii 1989, section 36",
     excitation="reversals at several amplitudes; speeds that differ tell it from rate-dependent memory",
     confusable_with=("backlash", "rate_dependent_hysteresis", "creep", "first_order_lag", "dead_time"),
     prepare=_prepare,

@@ -30,7 +30,7 @@ def tones(t: Array, frequency: float, harmonics: int) -> Array:
 def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
     """Complex amplitude of a line in windows of ``width`` seconds, (windows,)."""
     dt = t[1] - t[0]
-    m = max(1, int(round(width / dt)))
+    m = max(1, round(width / dt))
     c = (t.size // m) * m
     z = e[:c] * np.exp(-2j * np.pi * frequency * t[:c])
     return 2 * z.reshape(-1, m).mean(axis=1)

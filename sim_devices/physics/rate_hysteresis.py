@@ -7,12 +7,12 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.hysteresis import loop_width, stops, test_cycle, thresholds
+from sim_devices.physics.hysteresis import dahl, loop_width, stops, test_cycle, thresholds
 from sim_devices.physics.lag import low_pass
 from sim_devices.physics.statistics import smooth
 
-N_PLAYS = 8
-N_FAST = 5
+N_PLAYS = 6
+N_DAHL = 5
 
 
 def speed(x: Array, dt: float, usual: float) -> Array:
@@ -22,27 +22,26 @@ def speed(x: Array, dt: float, usual: float) -> Array:
 
 
 def _columns(x: Array, dt: float, tau: float, settings: Settings, starts: tuple[int, ...]) -> Array:
-    radii = np.array(settings.get("thresholds", (1.0,)))
+    lo, hi = settings.get("range", (-1.0, 1.0))
+    half = 0.5 * (hi - lo)
     usual = settings.get("usual_slope", (1.0,))[0]
     at = np.array(starts, np.int64)
     rest = settings.get("rest", (0.0,))[0]
-    e = stops(x, radii, rest, at)
-    fast = np.array(settings.get("fast", (0.0,)), np.int64)
+    wide = half * np.geomspace(0.1, 3.0, N_DAHL)
+    e = np.concatenate(
+        [stops(x, np.array(thresholds(half, N_PLAYS)), rest, at), dahl(x, wide, np.zeros(N_DAHL), rest, at)], axis=1
+    )
+    fast = e[:, ::2]
     v = speed(x, dt, usual)[:, None]
-    late = np.stack([low_pass(np.ascontiguousarray(e[:, j]), dt, tau, at) for j in fast], axis=1)
+    late = np.stack([low_pass(np.ascontiguousarray(c), dt, tau, at) for c in fast.T], axis=1)
     lag = (low_pass(x, dt, tau, at) - x)[:, None]
-    return np.concatenate([e, e[:, fast] * v, late - e[:, fast], lag], axis=1)
+    return np.concatenate([e, fast * v, late - fast, lag], axis=1)
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
-    half = 0.5 * float(np.ptp(x[k])) or 1.0
     slope = np.abs(smooth(np.gradient(x, ctx.dt), 3))
-    radii = thresholds(half, N_PLAYS)
-    fast = tuple(float(i) for i in np.unique(np.linspace(0, N_PLAYS - 1, N_FAST).astype(int)))
     return {
-        "thresholds": radii,
-        "fast": fast,
         "usual_slope": (float(np.sqrt(np.mean(slope[k] ** 2))) or 1.0,),
         "rest": (float(x[0]),),
         "range": (float(x[k].min()), float(x[k].max())),
@@ -52,7 +51,8 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 def _parts(settings: Settings) -> Parts:
     dt, span = settings.get("time", (1e-3, 1.0))
-    n, m = len(settings.get("thresholds", (1.0,))), len(settings.get("fast", (0.0,)))
+    n = N_PLAYS + N_DAHL
+    m = (n + 1) // 2
     names = [f"w{i + 1}" for i in range(n)] + [f"v{i + 1}" for i in range(m)] + [f"l{i + 1}" for i in range(m)]
     names.append("lag")
     return Parts(
@@ -95,7 +95,7 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     stages=("actuator",),
     parts=_parts,
     equation=r"y = x + \sum_i \left(w_i + v_i \ln(1 + |\dot x|/s)\right) E_i + \ell_i (L_\tau E_i - E_i)"
-    r" + \ell (L_\tau x - x),\; E_i = x - P_{r_i}[x]",
+    r" + \ell (L_\tau x - x),\; E_i \text{ as for hysteresis}",
     source="W. T. Ang, P. K. Khosla, C. N. Riviere, IEEE/ASME Trans. Mechatronics 12 (2007) 134, eqs. 12-15;"
     " M. Al Janaideh et al., IEEE Trans. Control Syst. Technol. 17 (2009)",
     excitation="reversals at several amplitudes and at speeds that differ by five or more",

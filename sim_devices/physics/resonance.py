@@ -76,7 +76,6 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     length = int(min(n, max(256, n // 16)))
     f, cross = csd(model, residual, 1 / ctx.dt, nperseg=length)
     _, power = welch(model, 1 / ctx.dt, nperseg=length)
-    _, error = welch(residual, 1 / ctx.dt, nperseg=length)
     explained = np.abs(cross) ** 2 / np.maximum(power, 1e-12 * power.max())
     explained[:2] = 0.0
     found: list[tuple[float, float, float]] = []

@@ -70,13 +70,13 @@ def long_run_rms(x: Array, blocks: int = 64) -> float:
     return robust_rms(d) / np.sqrt(2.0) * np.sqrt(length) if d.size > 3 else float(np.std(x))
 
 
-def least_squares(columns: Array, y: Array) -> tuple[Array, float]:
-    """Coefficients and the residual sum of squares; columns (n, k) are scaled first."""
+def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array, float]:
+    """Coefficients and the residual sum of squares; columns (n, k) are scaled first, ``ridge`` is relative."""
     size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
     size[size == 0] = 1.0
     q = columns / size
     gram = q.T @ q
-    gram[np.diag_indices_from(gram)] += 1e-10
+    gram[np.diag_indices_from(gram)] += ridge
     w = np.linalg.solve(gram, q.T @ y)
     r = y - q @ w
     return w / size, float(r @ r)

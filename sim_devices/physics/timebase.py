@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numba import njit
@@ -48,9 +49,9 @@ def delay_by_correlation(x: Array, y: Array, longest: int) -> float:
     k = int(np.argmax(np.abs(c)))
     fine = 0.0
     if 0 < k < c.size - 1:
-        l, m, r = abs(c[k - 1]), abs(c[k]), abs(c[k + 1])
-        bend = l - 2 * m + r
-        fine = 0.5 * (l - r) / bend if bend < 0 else 0.0
+        left, peak, right = abs(c[k - 1]), abs(c[k]), abs(c[k + 1])
+        bend = left - 2 * peak + right
+        fine = 0.5 * (left - right) / bend if bend < 0 else 0.0
     return k - longest + fine
 
 
@@ -134,7 +135,7 @@ def local_delays(model: Array, error: Array, keep: np.ndarray, windows: int) -> 
     slope = np.gradient(model)
     edges = np.linspace(0, n, windows + 1).astype(int)
     centre, delay, sd = [], [], []
-    for a, b in zip(edges[:-1], edges[1:], strict=True):
+    for a, b in pairwise(edges):
         k = np.flatnonzero(keep[a:b]) + a
         if k.size < 8:
             continue
@@ -178,7 +179,7 @@ def _skew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
         # windows against each other where the shift exceeds what a regression can follow
         edges = np.linspace(0, n, 9).astype(int)
         shifts = []
-        for a, b in zip(edges[:-1], edges[1:], strict=True):
+        for a, b in pairwise(edges):
             if b - a > 64 and np.ptp(model[a:b]) > 0:
                 shifts.append((0.5 * (a + b), delay_by_correlation(model[a:b], out[a:b], (b - a) // 4)))
         if len(shifts) > 3:
@@ -323,7 +324,7 @@ def _drop_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _drop_test(x: Array, residual: Array, ctx: Context) -> Signature:
-    at, total, share = _drops(x, residual, ctx)
+    at, _, share = _drops(x, residual, ctx)
     if not at:
         return Signature(1.0, 0.0, "no jump of the delay found")
     return Signature(10.0 ** (-3.0 - 4.0 * share * len(at)), share, f"{len(at)} jumps of the delay")

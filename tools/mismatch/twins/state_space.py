@@ -140,7 +140,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
     def text_of(theta: Array) -> dict[str, object]:
         return _text(plant_of(theta), links, theta, inputs, outputs, m)
 
-    continuous = [p for p in poles] if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
+    continuous = list(poles) if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
     slowest = min((-p.real for p in continuous), default=np.inf)
     single = len(inputs) == 1
     return DynamicTwin(
