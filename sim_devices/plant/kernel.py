@@ -78,6 +78,9 @@ STATE = np.dtype(
         ("quintic", "f8", (6, 6)),
         ("pose", "f8", (18,)),
         ("attitude", "f8", (3, 3)),
+        ("rate", "f8", (3,)),
+        ("angular_acceleration", "f8", (3,)),
+        ("specific_force", "f8", (3, 3)),  # per sensor location, body
         ("ambient_K", "f8"),
         ("board_K", "f8"),  # follows the room's wander
         ("supply_wander_V", "f8"),
@@ -119,7 +122,7 @@ def room(p, s, noise):
 def sense(p, s, noise):
     """Attitude at ``s["pose"]`` and accelerometers, one step of their RC filters included."""
     pose, c = s["pose"], s["attitude"]
-    omega, alpha, f = np.empty(3), np.empty(3), np.empty((3, 3))
+    omega, alpha, f = s["rate"], s["angular_acceleration"], s["specific_force"]
     attitude(p["frame"], pose[3:6], c)
     body_rates(pose[3:6], pose[9:12], pose[15:18], omega, alpha)
     for i in range(3):
