@@ -11,8 +11,8 @@ What is known, and what was chosen:
   width is published in 000; the recordings at hand (shared/data: arm extended 0.75 Hz, mouse hand 1.0 Hz where the peak
   stands out) are as wide. A sharper line would be easier to predict than a hand.
 - Size: 50 um peak to peak per axis at the tip (Hunter 1993 in 000), so 17.7 um rms per body axis and 30.7 um rms as a
-  vector (38 um: Singh 2002 in 000). The three axes share carrier and gain, their envelopes are correlated by 0.4. 60 % of
-  the lateral motion is a turn about the grip, 90 mm behind the tip.
+  vector (38 um: Singh 2002 in 000). The three axes share carrier and gain, their envelopes are correlated by 0.4.
+  60 % of the lateral motion is a turn about the grip, 90 mm behind the tip.
 - Jerk (normal myoclonus) and drift are often larger than tremor (Riviere, Rader, Khosla 1997, in 000 ch. 1);
   between drift and tremor there is broadband unsteadiness of some micrometres.
 - Voluntary motion: minimum-jerk reaches (Flash and Hogan 1985) of 1.2 to 3 s with rests between them; no content
