@@ -10,12 +10,17 @@ from firmware_py.compiled import kernel
 
 @kernel
 def reach_scale(strokes: NDArray[np.float64], low: NDArray[np.float64], high: NDArray[np.float64]) -> float:
-    """Largest factor <= 1 that brings every stroke (m from neutral) into its range, low < 0 < high."""
+    """Largest factor <= 1 that brings every stroke (m from neutral) into its range, low < 0 < high.
+
+    A stroke within 1e-9 of its range beyond the border counts as inside; one that is not finite gives 0.
+    """
     scale = 1.0
     for i in range(3):
-        if strokes[i] > high[i]:
+        if not np.isfinite(strokes[i]):
+            return 0.0
+        if strokes[i] > high[i] * (1.0 + 1e-9):
             scale = min(scale, high[i] / strokes[i])
-        elif strokes[i] < low[i]:
+        elif strokes[i] < low[i] * (1.0 + 1e-9):
             scale = min(scale, low[i] / strokes[i])
     return scale
 

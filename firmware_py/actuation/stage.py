@@ -37,6 +37,10 @@ from firmware_py.frame import (
 from firmware_py.records import Record, attributes, copy_record, new_record
 
 
+# strokes are not quite linear in the displacement: each pass leaves about a hundredth of the excess
+REACH_PASSES = 4
+
+
 def _sizes(config: ActuationConfig) -> tuple[int, int]:
     return (
         max(len(stack.play_thresholds_V) for stack in config.stacks),
@@ -165,14 +169,13 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
         tip[i] = param.mounting[i, 0] * wish[0] + param.mounting[i, 1] * wish[1] + param.mounting[i, 2] * wish[2]
     clip = 0
     strokes_from_tip(tip, param.ball_circle_m, param.shaft_m, param.lever_gain, stroke)
-    scale = reach_scale(stroke, param.stroke_low, param.stroke_high)
-    if scale < 1.0 or not np.isfinite(stroke[0] + stroke[1] + stroke[2]):
-        clip |= CLIP_WORKSPACE
-        if not np.isfinite(scale):
-            scale = 0.0
-        # a little inside the border: the strokes are not quite linear in the displacement
+    for _ in range(REACH_PASSES):
+        scale = reach_scale(stroke, param.stroke_low, param.stroke_high)
+        if scale == 1.0:
+            break
+        clip = CLIP_WORKSPACE
         for i in range(3):
-            tip[i] *= 0.99 * scale
+            tip[i] *= scale
         strokes_from_tip(tip, param.ball_circle_m, param.shaft_m, param.lever_gain, stroke)
     for i in range(3):
         stack = param.stacks[i]
