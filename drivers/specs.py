@@ -95,6 +95,18 @@ class E727Options(_Options):
     rate_hz: float = Field(default=100.0, gt=0, le=200)
 
 
+class NiOutputOptions(_Options):
+    """National Instruments analog outputs in front of the amplifier: output volts = card volts x ``gain``."""
+
+    device: str
+    channels: tuple[Annotated[int, Field(ge=0, le=31)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
+    gain: float = Field(default=20.0, gt=0, le=100)
+    lo_V: float = 0.0
+    hi_V: float = Field(default=100.0, le=150)
+    neutral_V: float = 50.0
+    slew_V_per_s: float = Field(default=20_000.0, gt=0)
+
+
 class CanAmplifierOptions(_Options):
     """The CAN piezo node of ``drivers/dbc/micron.dbc``."""
 
@@ -117,6 +129,7 @@ OPTIONS: dict[str, type[_Options]] = {
     "hmc2003": Hmc2003Options,
     "dac_amplifier": DacAmplifierOptions,
     "e727": E727Options,
+    "nidaqmx_ao": NiOutputOptions,
     "can_amplifier": CanAmplifierOptions,
     "can_telemetry": CanTelemetryOptions,
 }

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import tomllib
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -266,7 +266,7 @@ def open_bench(
     hand_file: Path | None = None,
     hand_scale: float | None = None,
     seed: int | None = None,
-) -> Iterator[OpenBench]:
+) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
     ``hand_file`` and ``hand_scale`` go to the emulated world. Raises ``OpenFailed`` with every cause.

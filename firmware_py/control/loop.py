@@ -276,7 +276,8 @@ class InstrumentLoop:
                 clipped = self._devices.amplifier.write(self.stages.command_V)
             except HalError as error:
                 self.error = error
-                self._trip(f"{self._devices.amplifier.name}: {error}")
+                name = self._devices.amplifier.name
+                self._trip(f"{error}" if str(error).startswith(name) else f"{name}: {error}")
                 return
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 from drivers.adc.ads1115 import Ads1115
 from drivers.base import wait_s
@@ -23,10 +23,12 @@ from drivers.specs import (
     Di4108Options,
     E727Options,
     Hmc2003Options,
+    NiDaqOptions,
+    NiOutputOptions,
     check_devices,
 )
 from hal.bench import DeviceSpec, OpenBench
-from hal.contracts import AnalogOutput, CanBus
+from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.middleware.share import SharedCan
 from hal.types import ScanConfig, ScanInfo
@@ -35,11 +37,19 @@ ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("
 """Devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
 
 
+class Daq(AnalogInputScan, Protocol):
+    """A scanning DAQ whose digital outputs fire the magnetometer's strap."""
+
+    name: str
+
+    def write_digital(self, bits: int) -> None: ...
+
+
 @dataclass
 class Devices:
     """The instrument's devices, configured and not yet running. ``identities`` is what each probe found."""
 
-    daq: Di4108
+    daq: Daq
     scan: ScanInfo
     amplifier: AnalogOutput
     magnetometer: Hmc2003 | None
@@ -57,8 +67,10 @@ def open_devices(bench: OpenBench) -> Devices:
     where = str(bench.file.path)
     description = bench.file.description
     options = check_devices(description, where)
-    daq_name = _only(description.devices_with("di4108"), "DAQ (driver di4108)", where)
-    piezo_name = _only(description.devices_with("dac_amplifier", "e727", "can_amplifier"), "piezo output", where)
+    daq_name = _only(description.devices_with("di4108", "nidaqmx"), "DAQ (driver di4108 or nidaqmx)", where)
+    piezo_name = _only(
+        description.devices_with("dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"), "piezo output", where
+    )
     identities: dict[str, str] = {}
     failures: list[HalError] = []
 
@@ -68,11 +80,11 @@ def open_devices(bench: OpenBench) -> Devices:
         except HalError as error:
             failures.append(error)
 
-    daq = Di4108(bench.serial(_bus(description.device[daq_name])), bench.clock, name=daq_name)
-    probe(daq_name, daq.probe)
+    daq, identify = _daq(bench, daq_name, options[daq_name])
+    probe(daq_name, identify)
     can = _CanBuses(bench)
-    amplifier = _amplifier(bench, can, piezo_name, options[piezo_name])
-    probe(piezo_name, amplifier.probe)
+    amplifier, identify = _amplifier(bench, can, piezo_name, options[piezo_name])
+    probe(piezo_name, identify)
     magnetometer = None
     for name, spec in description.devices_with("hmc2003").items():
         magnetometer_options: Hmc2003Options = options[name]
@@ -96,7 +108,7 @@ def open_devices(bench: OpenBench) -> Devices:
         )
     if failures:
         raise failures[0] if len(failures) == 1 else OpenFailed(failures)
-    daq_options: Di4108Options = options[daq_name]
+    daq_options: Di4108Options | NiDaqOptions = options[daq_name]
     scan = daq.configure(
         ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
     )
@@ -139,43 +151,39 @@ class _CanBuses:
         return self._heartbeats[bus]
 
 
-def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> DacAmplifier | E727 | CanAmplifier:
+Identify = Callable[[], str]
+
+
+def _daq(bench: OpenBench, name: str, options: Any) -> tuple[Daq, Identify]:
+    if isinstance(options, NiDaqOptions):
+        from hal.backends.nidaqmx_ai import NidaqmxScan  # the package and its driver are optional
+
+        return NidaqmxScan(options.device, bench.clock, name=name), lambda: f"NI {options.device}"
+    daq = Di4108(bench.serial(_bus(bench.file.description.device[name])), bench.clock, name=name)
+    return daq, daq.probe
+
+
+def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tuple[AnalogOutput, Identify]:
     spec = bench.file.description.device[name]
+    clock = bench.clock
+    common = {"neutral_V": options.neutral_V, "slew_V_per_s": options.slew_V_per_s, "name": name}
     match options:
-        case DacAmplifierOptions():
-            return DacAmplifier(
-                bench.i2c(_bus(spec)),
-                bench.clock,
-                spec.address or 0x0C,
-                gain=options.gain,
-                lo_V=options.lo_V,
-                hi_V=options.hi_V,
-                neutral_V=options.neutral_V,
-                slew_V_per_s=options.slew_V_per_s,
-                name=name,
-            )
-        case E727Options():
-            return E727(
-                bench.serial(_bus(spec)),
-                bench.clock,
-                lo_V=options.lo_V,
-                hi_V=options.hi_V,
-                neutral_V=options.neutral_V,
-                slew_V_per_s=options.slew_V_per_s,
-                rate_hz=options.rate_hz,
-                name=name,
-            )
+        case DacAmplifierOptions(gain=gain, lo_V=lo_V, hi_V=hi_V):
+            bus, address = bench.i2c(_bus(spec)), spec.address or 0x0C
+            amplifier = DacAmplifier(bus, clock, address, gain=gain, lo_V=lo_V, hi_V=hi_V, **common)
+        case E727Options(lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz):
+            amplifier = E727(bench.serial(_bus(spec)), clock, lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz, **common)
         case CanAmplifierOptions():
-            return CanAmplifier(
-                can.view(_bus(spec), CanAmplifier.receives()),
-                bench.clock,
-                neutral_V=options.neutral_V,
-                slew_V_per_s=options.slew_V_per_s,
-                heartbeat=can.heartbeat(_bus(spec)),
-                name=name,
-            )
+            bus = can.view(_bus(spec), CanAmplifier.receives())
+            amplifier = CanAmplifier(bus, clock, heartbeat=can.heartbeat(_bus(spec)), **common)
+        case NiOutputOptions(device=device, channels=channels, gain=gain, lo_V=lo_V, hi_V=hi_V):
+            from hal.backends.nidaqmx_ao import NidaqmxOutput  # the package and its driver are optional
+
+            output = NidaqmxOutput(device, clock, channels, gain=gain, lo_V=lo_V, hi_V=hi_V, **common)
+            return output, lambda: f"NI {device} analog outputs"
         case _:
             raise BenchError(f"{bench.file.path}: [device.{name}] no piezo driver for these options")
+    return amplifier, amplifier.probe
 
 
 def _sensing_table(options: Mapping[str, Any], scan: ScanInfo, where: str) -> dict[str, Any]:
