@@ -8,7 +8,7 @@ by alternating least squares; only the product of M and B shows, so the mean sca
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,10 @@ class TumbleResult:
     condition: float
     positions: int
 
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return asdict(self)
+
 
 def load_tumble(folder: Path) -> dict[str, Array]:
     """Arrays of a tumble recording: ``attitude`` (n,3,3) body to world, ``analog_V`` (n,8), ``magnetometer_V``."""
@@ -52,7 +56,7 @@ def load_tumble(folder: Path) -> dict[str, Array]:
     return data
 
 
-def identify(data: dict[str, Array], *, gravity_m_s2: float, supply_divider: float = 2.0) -> TumbleResult:
+def identify(data: dict[str, Array], *, supply_divider: float = 2.0) -> TumbleResult:
     """Fit all axes. Raises ``InputError`` when the attitudes do not span enough."""
     attitude, analog, field_V = data["attitude"], data["analog_V"], data["magnetometer_V"]
     up_body = attitude.transpose(0, 2, 1) @ np.array([0.0, 0.0, 1.0])  # specific force in g

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import doctor, recordings, replay, run
+from tools.cli import calibrate, doctor, recordings, replay, run
 
 app = typer.Typer(
     name="micron",
@@ -39,6 +39,7 @@ app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
+app.add_typer(calibrate.calibrate, name="calibrate")
 
 
 def main() -> None:
