@@ -60,20 +60,25 @@ class _Projected:
         self.problem = problem
         self.model = model
         self.view = problem.view
-        self.rows = problem.fit_rows[:: max(1, stride)]
+        step = max(1, stride)
+        self.pick = slice(None, None, step)
+        fitted = np.zeros(problem.index.size)
+        fitted[problem.fit_rows] = 1.0
         self.theta = theta.copy()
         self.free = [i for i in model.nonlinear if not (fixed_base and i < model.n_base)]
         self.linear = np.array(model.linear, int)
         self.position = {j: i for i, j in enumerate(model.linear)}
         self.outputs = problem.twin.outputs
-        self.weight = {o: np.full(self.rows.size, 1.0 / problem.sigma(o)) for o in self.outputs}
+        self.usual = {o: fitted[self.pick] * ~model.excused(self.view, o)[self.pick] for o in self.outputs}
+        self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
         self.evaluations = 0
 
     def reweight(self, residual: dict[str, Array]) -> None:
         for o in self.outputs:
-            r = residual[o][self.rows]
+            r = residual[o][self.pick]
             s = robust_scale(r, self.problem.sigma(o))
-            self.weight[o] = np.sqrt(huber_weights((r - np.median(r)) / s)) / self.problem.sigma(o)
+            robust = np.sqrt(huber_weights((r - np.median(r)) / s))
+            self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
 
     def evaluate(self, theta: Array) -> tuple[Array, Array]:
         """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
@@ -82,7 +87,7 @@ class _Projected:
         design = self.model.design(self.view, theta)
         if self.linear.size == 0:
             parts = [
-                (self.problem.measured[o][self.rows] - design.constant[o][self.rows]) * self.weight[o]
+                (self.problem.measured[o][self.pick] - design.constant[o][self.pick]) * self.weight[o]
                 for o in self.outputs
             ]
             return np.concatenate(parts), theta
@@ -93,8 +98,8 @@ class _Projected:
         for o in self.outputs:
             w = self.weight[o]
             at = np.array([self.position[j] for j in design.linear[o]], int)
-            a = design.columns[o][self.rows] * w[:, None]
-            b = (self.problem.measured[o][self.rows] - design.constant[o][self.rows]) * w
+            a = np.asfortranarray(design.columns[o][self.pick]) * w[:, None]
+            b = (self.problem.measured[o][self.pick] - design.constant[o][self.pick]) * w
             gram[np.ix_(at, at)] += a.T @ a
             cross[at] += a.T @ b
             kept.append((o, a, b, at))
@@ -194,9 +199,23 @@ def _search(projected: _Projected, theta: Array, iterations: int, tolerance: flo
 
 
 def residuals(problem: Problem, model: Model, theta: Array) -> dict[str, Array]:
-    """Measured minus simulated on the problem's view; not finite becomes very large."""
-    out = model.residual(problem.view, theta)
-    return {o: np.nan_to_num(out[o], nan=1e12, posinf=1e12, neginf=-1e12) for o in problem.twin.outputs}
+    """Measured minus simulated on the problem's view; not finite becomes very large.
+
+    In samples that an effect takes as its own events the nearest earlier usual sample stands in, so that every
+    mean square is over usual samples.
+    """
+    found = model.residual(problem.view, theta)
+    out: dict[str, Array] = {}
+    for o in problem.twin.outputs:
+        r = np.nan_to_num(found[o], nan=1e12, posinf=1e12, neginf=-1e12)
+        excused = model.excused(problem.view, o)
+        if excused.any() and not excused.all():
+            source = np.where(excused, -1, np.arange(r.size))
+            source = np.maximum.accumulate(source)
+            source[source < 0] = int(np.argmin(excused))
+            r = r[source]
+        out[o] = r
+    return out
 
 
 def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
@@ -219,7 +238,7 @@ def fit(
     iterations: int = 25,
     rounds: int = 2,
     tolerance: float = 1e-5,
-    tries: int = 4,
+    tries: int = 3,
 ) -> Fit:
     """Best fit over ``starts``. Each start is tried coarsely on thinned rows; the best two are refined.
 
@@ -239,12 +258,12 @@ def fit(
         tried: list[tuple[float, int, Array]] = []
         for cost, i, theta in ranked[:tries]:
             projected = _Projected(problem, model, theta, 3 * coarse)
-            theta, cost = _search(projected, theta, 6, 1e-3)
+            theta, cost = _search(projected, theta, 4, 1e-3)
             tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
             evaluations += projected.evaluations
         tried.sort(key=lambda r: (r[0], r[1]))
         best = [t[2] for t in tried[:2]]
-        if len(tried) > 1 and tried[1][0] > 1.2 * tried[0][0]:
+        if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
     else:
         best = starts[:1]

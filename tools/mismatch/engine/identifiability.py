@@ -126,9 +126,12 @@ def detection(
     """
     limit: dict[str, dict[str, float]] = {o: {} for o in problem.twin.outputs}
     cannot: dict[str, str] = {}
-    thin = max(1, problem.index.size // 60000)
     base_design = current.model.design(problem.view, current.theta)
-    rows = problem.held_rows[::thin]
+    rows = problem.held_rows[:: max(1, problem.held_rows.size // 20000)]
+    q: dict[str, Array] = {}
+    for o in problem.twin.outputs:
+        columns = base_design.columns[o]
+        q[o] = np.linalg.pinv(columns[rows], rcond=1e-9) if columns.shape[1] else np.zeros((0, rows.size))
     for effect in effects:
         best: dict[str, float] = {}
         tried = False
@@ -139,7 +142,6 @@ def detection(
                 moves = directions(problem, current, placed)
             for o in placed.outputs:
                 values: list[float] = []
-                columns = base_design.columns[o][rows]
                 for move in moves:
                     d = move.get(o)
                     if d is None or not np.all(np.isfinite(d)):
@@ -148,9 +150,8 @@ def detection(
                     if size <= 1e-12 * max(float(np.max(np.abs(problem.measured[o]))), 1e-300):
                         continue
                     left = d.copy()
-                    if columns.shape[1]:
-                        weight = np.linalg.lstsq(columns, d[rows], rcond=1e-10)[0]
-                        left = d - base_design.columns[o] @ weight
+                    if q[o].shape[0]:
+                        left = d - base_design.columns[o] @ (q[o] @ d[rows])
                     rest = float(np.sqrt(np.mean(left[rows] ** 2)))
                     if rest < 0.01 * size:
                         continue

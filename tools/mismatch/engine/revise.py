@@ -104,7 +104,7 @@ def prune(problem: Problem, fitted: Fit, *, z: float, gain: float) -> tuple[Fit,
     while len(positions) > 1:
         worth: list[tuple[float, int, Fit]] = []
         for k, placed in enumerate(fitted.model.placed):
-            if placed.effect.stochastic:
+            if placed.effect.claims is not None:
                 continue
             small = reduced(problem, fitted, k)
             c = compare(problem, small, fitted)

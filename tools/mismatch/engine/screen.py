@@ -38,9 +38,7 @@ def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, .
     out: list[Placed] = []
     for effect in effects:
         for place in sites(problem.twin, problem.recording, effect, present):
-            taken = any(
-                p.effect.name == effect.name and p.target == place.target and p.site == place.site for p in present
-            )
+            taken = any(p.effect.name == effect.name and set(p.outputs) & set(place.outputs) for p in present)
             if not taken:
                 out.append(place)
     return out

@@ -29,7 +29,7 @@ class Rule:
 
     z: float = 5.5
     gain: float = 0.04
-    excess: float = 0.08
+    excess: float = 0.25
     form: float = 0.015
     tie: float = 1.3
     p_tested: float = 1e-7
@@ -57,8 +57,8 @@ def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
     c = trial.comparison
     if trial.fitted is None or c is None or not trial.fitted.ok:
         return False
-    if trial.placed.effect.stochastic:
-        return trial.candidate.p_value < rule.p_tested and trial.candidate.share > rule.gain
+    if trial.placed.effect.claims is not None:
+        return trial.candidate.p_value < rule.p_tested and trial.candidate.share > 0.2
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
     return c.z > rule.z and c.gain > rule.gain and c.excess_gain > rule.excess and c.improvement > rule.form * explained
@@ -82,7 +82,7 @@ def search(
     steps: list[Trial] = []
     rivals: list[tuple[Trial, ...]] = []
     first: tuple[Trial, ...] = ()
-    known: dict[tuple[str, str, str], Trial] = {}
+    known: dict[tuple[str, ...], Trial] = {}
     decoupled = bool(getattr(problem.twin, "static", False))
     while len(steps) < rule.most * len(problem.twin.outputs):
         now = misfits(problem, current)
@@ -112,7 +112,9 @@ def search(
             continue
         if not good:
             break
-        best = choose(good, rule)
+        # bursts taken out of the comparison make no model: only where no model does better
+        models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
+        best = choose(models or good, rule)
         refined = refine(problem, current, best)
         steps.append(refined)
         rivals.append(tuple(sorted((t for t in good if t is not best), key=lambda t: -t.improvement)))
@@ -139,8 +141,8 @@ def second_thoughts(
     return current, steps, rivals
 
 
-def _key(p: Placed) -> tuple[str, str, str]:
-    return (p.effect.name, p.site, p.target)
+def _key(p: Placed) -> tuple[str, ...]:
+    return (p.effect.name, p.effect.kind, p.site, p.target)
 
 
 def choose(good: Sequence[Trial], rule: Rule) -> Trial:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
@@ -17,8 +18,11 @@ from tools.mismatch.simulate import Model, Placed
 Array = np.ndarray
 Progress = Callable[[str, int, int], None]
 
-LEAST_SHARE = 0.004
-LEAST_P = 1e-3
+LEAST_SHARE = 0.004  # of the residual's mean square, by one step
+LEAST_FITS = 5  # per output, whatever their share
+MOST_FITS = 14
+NEAR_TOP = 0.25
+CLEAR_P = 1e-7
 
 
 @dataclass(frozen=True)
@@ -55,21 +59,41 @@ def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Arr
     return model, model.carry(current.model, current.theta, problem.recording)
 
 
-def try_one(problem: Problem, current: Fit, place: Placed, stride: int, always: bool = False) -> Trial:
-    """Screen one candidate, fit it jointly with everything that is there, compare on held-out samples."""
+def screen_one(problem: Problem, current: Fit, place: Placed) -> Candidate:
+    """One step of one candidate."""
+    with np.errstate(all="ignore"):
+        return one_step(problem.fresh(), current, place)
+
+
+def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int) -> Trial:
+    """Fit one candidate jointly with everything that is there, compare on held-out samples."""
     problem = problem.fresh()
     with np.errstate(all="ignore"):
-        candidate = one_step(problem, current, place)
-        hopeful = always or candidate.share > LEAST_SHARE or candidate.p_value < LEAST_P
-        if not hopeful:
-            return Trial(candidate.placed, candidate, None, None, {}, np.empty((0, 0)), 0)
         model, _ = extended(problem, current, candidate.placed)
-        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=12)
+        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=10)
         comparison = compare(problem, current, fitted)
         value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
     added = len(model.parameters) - len(current.model.parameters)
     return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added)
+
+
+def hopeful(candidates: Sequence[Candidate]) -> list[bool]:
+    """Which candidates deserve a fit: per output the best by their one-step share, and whatever has a clear test."""
+    keep = [False] * len(candidates)
+    outputs = {o for c in candidates for o in c.placed.outputs}
+    for o in outputs:
+        here = [i for i, c in enumerate(candidates) if o in c.placed.outputs]
+        here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
+        top = candidates[here[0]].share if here else 0.0
+        for rank, i in enumerate(here):
+            share = candidates[i].share
+            if share > LEAST_SHARE and (rank < LEAST_FITS or (share > NEAR_TOP * top and rank < MOST_FITS)):
+                keep[i] = True
+    for i, c in enumerate(candidates):
+        if c.tested and c.p_value < CLEAR_P:
+            keep[i] = True
+    return keep
 
 
 def try_all(
@@ -82,19 +106,28 @@ def try_all(
     progress: Progress | None = None,
     what: str = "candidates",
 ) -> list[Trial]:
-    """Every candidate tried. The answer does not depend on ``jobs``."""
-    heavy = problem.recording.n * len(problem.twin.outputs) * len(candidates) > 3_000_000
-    if jobs > 1 and heavy and len(candidates) > 2:
-        work = (delayed(try_one)(problem, current, c, stride) for c in candidates)
-        found: list[Trial] = []
-        for trial in Parallel(n_jobs=jobs, return_as="generator", batch_size=1)(work):  # type: ignore[union-attr]
-            found.append(trial)
+    """Every candidate screened, the hopeful ones fitted. The answer does not depend on ``jobs``."""
+    heavy = problem.recording.n * len(problem.twin.outputs) * len(candidates) > 4_000_000
+    parallel = Parallel(n_jobs=jobs, return_as="generator") if jobs > 1 and heavy else None
+
+    def run(function: Callable[..., Any], items: Sequence[Any], extra: tuple[Any, ...], label: str) -> list[Any]:
+        work = ((problem, current, item, *extra) for item in items)
+        if parallel is not None and len(items) > 2:
+            stream = parallel(delayed(function)(*w) for w in work)
+        else:
+            stream = (function(*w) for w in work)
+        found: list[Any] = []
+        for result in stream:
+            found.append(result)
             if progress:
-                progress(what, len(found), len(candidates))
+                progress(label, len(found), len(items))
         return found
-    found = []
-    for c in candidates:
-        found.append(try_one(problem, current, c, stride))
-        if progress:
-            progress(what, len(found), len(candidates))
-    return found
+
+    screened: list[Candidate] = run(screen_one, candidates, (), f"{what}: screen")
+    keep = hopeful(screened)
+    chosen = [c for c, k in zip(screened, keep, strict=True) if k]
+    fitted = iter(run(fit_one, chosen, (stride,), f"{what}: fit"))
+    return [
+        next(fitted) if k else Trial(c.placed, c, None, None, {}, np.empty((0, 0)), 0)
+        for c, k in zip(screened, keep, strict=True)
+    ]
