@@ -155,21 +155,49 @@ def _refine(residual: Array, keep: np.ndarray, at: int, size: int) -> int:
 
 def _step_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     cuts, _, _ = find_steps(residual, ctx.keep)
-    return {"times_s": tuple(float(ctx.t[c]) for c in cuts)}
+    if ctx.everywhere is not None:
+        # that there is a step is known from the mask; where in a gap of it, only the gap can say
+        cuts = [_in_gap(ctx.everywhere, ctx.keep, c) for c in cuts]
+    return {"times_s": tuple(float(ctx.t[c]) for c in cuts), "time": (ctx.dt, ctx.dt * ctx.t.size)}
+
+
+def _in_gap(everywhere: Array, keep: np.ndarray, at: int) -> int:
+    """The cut moved to where it fits best inside the gap that it touches, if it touches one."""
+    reach = 40
+    near = np.flatnonzero(~keep[max(0, at - reach) : at + reach])
+    if near.size == 0:
+        return at
+    i = max(0, at - reach) + int(near[np.argmin(np.abs(near - reach))])
+    a, b = i, i
+    while a > 0 and not keep[a - 1]:
+        a -= 1
+    while b < keep.size and not keep[b]:
+        b += 1
+    margin = max(20, (b - a) // 4)
+    lo, hi = max(0, a - margin), min(keep.size, b + margin)
+    split, gain = best_split(everywhere[lo:hi].copy(), np.ones(hi - lo))
+    return lo + int(split) if gain > 0 else at
 
 
 def _step_parts(settings: Settings) -> Parts:
     n = len(settings.get("times_s", ()))
-    return Parts((), tuple(Parameter(f"step{i + 1}", "{out}") for i in range(n)))
+    dt, span = settings.get("time", (1e-3, 1.0))
+    return Parts(
+        (Parameter("rise_s", "s", 0.1 * dt, max(2 * dt, 0.02 * span), log=True, scale=dt),),
+        tuple(Parameter(f"step{i + 1}", "{out}") for i in range(n)),
+    )
 
 
 def _step_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     times = settings.get("times_s", ())
-    return (
-        np.stack([(ctx.t >= s - 0.5 * ctx.dt).astype(np.float64) for s in times], axis=1)
-        if times
-        else np.zeros((ctx.t.size, 0))
-    )
+    if not times:
+        return np.zeros((ctx.t.size, 0))
+    return np.stack([np.clip((ctx.t - s) / q[0] + 0.5, 0.0, 1.0) for s in times], axis=1)
+
+
+def _step_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    p = _step_parts(settings).nonlinear[0]
+    return ((0.5 * ctx.dt,), (float(np.sqrt(ctx.dt * p.hi)),))
 
 
 def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
@@ -187,7 +215,7 @@ def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
 def _step_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     times = settings.get("times_s", ())
     out = [Human("steps", float(len(times)), "1")]
-    for i, (s, h) in enumerate(zip(times, p, strict=True)):
+    for i, (s, h) in enumerate(zip(times, p[1:], strict=True)):
         out += [Human(f"time{i + 1}_s", s, "s"), Human(f"step{i + 1}", float(h), "{out}")]
     return out
 
@@ -203,6 +231,7 @@ STEP_SHIFT = Effect(
     excitation="time before and after the jump",
     confusable_with=("random_walk", "thermal_drift", "spikes"),
     prepare=_step_prepare,
+    guess=_step_guess,
     basis=_step_basis,
     test=_step_test,
     report=_step_report,

@@ -9,7 +9,7 @@ from scipy.special import gammaincc
 
 from sim_devices.physics.drift import hats
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
-from sim_devices.physics.statistics import runs, thin
+from sim_devices.physics.statistics import thin
 
 MAINS_HZ = (50.0, 60.0)
 MOST_KNOTS = 24
@@ -34,6 +34,13 @@ def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
     c = (t.size // m) * m
     z = e[:c] * np.exp(-2j * np.pi * frequency * t[:c])
     return 2 * z.reshape(-1, m).mean(axis=1)
+
+
+def carrier_kept(keep: np.ndarray, dt: float, width: float) -> np.ndarray:
+    """Windows of ``carrier`` that lie in the mask altogether, (windows,) bool."""
+    m = max(1, round(width / dt))
+    c = (keep.size // m) * m
+    return keep[:c].reshape(-1, m).all(axis=1)
 
 
 def periodogram(e: Array, keep: np.ndarray, dt: float) -> tuple[Array, Array]:
@@ -86,17 +93,17 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
     """How many knots the amplitude and phase need: as coarse as their wander allows."""
     span = ctx.dt * ctx.t.size
     width = max(10 / f0, span / 200)
-    longest = max(runs(ctx.keep), key=lambda s: s[1] - s[0])
-    t, e = ctx.t[slice(*longest)], residual[slice(*longest)]
     knots = 1
-    if t.size * ctx.dt > 8 * width:
-        z = carrier(t, e, f0, width)
-        d = z - z.mean()
-        power = float(np.mean(np.abs(z) ** 2))
-        rough = float(np.mean(np.abs(np.diff(z)) ** 2)) / 2
-        wander = float(np.mean(np.abs(d) ** 2))
-        if wander > max(2.0 * rough, 0.02 * power):
-            knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
+    if span > 8 * width:
+        z, whole = carrier(ctx.t, residual, f0, width), carrier_kept(ctx.keep, ctx.dt, width)
+        power = float(np.mean(np.abs(z[whole]) ** 2)) if whole.sum() > 8 else 0.0
+        if power > 0:
+            # noise of one window from second differences; what varies beyond it is wander
+            pair = whole[1:] & whole[:-1]
+            rough = float(np.mean(np.abs(np.diff(z)[pair]) ** 2)) / 2
+            wander = float(np.var(z[whole]))
+            if wander > max(1.5 * rough, 0.01 * power):
+                knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
     grid = tuple(float(v) for v in np.linspace(0, span, knots)) if knots > 1 else (0.0,)
     return {"nominal": (f0,), "harmonics": (float(harmonics),), "span": (span,), "knots_s": grid}
 

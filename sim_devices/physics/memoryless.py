@@ -173,8 +173,8 @@ STATIC_NONLINEARITY = Effect(
 
 
 @njit(cache=True)
-def slew(x, down, up, starts):
-    """Follow x by at most ``up`` and ``down`` per sample; begins on x at each start."""
+def slew(x, down, up, share, starts):
+    """Move towards x by ``share`` of the distance per sample, at most ``up`` and ``down``; on x at each start."""
     y = np.empty_like(x)
     s = 0
     v = 0.0
@@ -183,8 +183,7 @@ def slew(x, down, up, starts):
             s += 1
             v = x[i]
         else:
-            d = x[i] - v
-            v += min(max(d, -down), up)
+            v += min(max(share * (x[i] - v), -down), up)
         y[i] = v
     return y
 
@@ -193,28 +192,32 @@ def _slew_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     rate = np.abs(np.diff(x)) / ctx.dt
     top = float(rate.max()) or 1.0
     usual = float(np.quantile(rate[rate > 0], 0.9)) if np.any(rate > 0) else 1.0
-    return {"rates": (usual, top)}
+    return {"rates": (usual, top), "time": (ctx.dt,)}
 
 
 def _slew_parts(settings: Settings) -> Parts:
     usual, top = settings.get("rates", (1.0, 10.0))
+    dt = settings.get("time", (1e-3,))[0]
     lo = 0.02 * usual
     return Parts(
         (
             Parameter("rate_up", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
             Parameter("rate_down", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
+            Parameter("time_constant_s", "s", 0.05 * dt, 50 * dt, log=True, scale=dt),
         )
     )
 
 
 def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return slew(x, q[1] * ctx.dt, q[0] * ctx.dt, np.array(ctx.starts))
+    return slew(x, q[1] * ctx.dt, q[0] * ctx.dt, -np.expm1(-ctx.dt / q[2]), np.array(ctx.starts))
 
 
 def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     usual, top = settings["rates"]
     measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
-    grid: list[tuple[float, ...]] = [(float(r), float(r)) for r in np.geomspace(0.03 * usual, top, 20)]
+    grid: list[tuple[float, ...]] = [
+        (float(r), float(r), f * ctx.dt) for r in np.geomspace(0.03 * usual, top, 20) for f in (0.1, 3.0, 12.0)
+    ]
     return rank_starts(
         grid,
         lambda q: ctx.to_output(_slew_apply(x, ctx, np.array(q), settings)),
@@ -224,7 +227,11 @@ def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 
 def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("rate_up", float(p[0]), "{in}/s"), Human("rate_down", float(p[1]), "{in}/s"))
+    return (
+        Human("rate_up", float(p[0]), "{in}/s"),
+        Human("rate_down", float(p[1]), "{in}/s"),
+        Human("time_constant_s", float(p[2]), "s"),
+    )
 
 
 SLEW_LIMIT = Effect(
@@ -233,7 +240,7 @@ SLEW_LIMIT = Effect(
     kind="nonlinear",
     stages=("amplifier", "actuator"),
     parts=_slew_parts,
-    equation=r"\dot y = \mathrm{clip}\left((x - y)/\mathrm{d}t,\, -r_-,\, r_+\right)",
+    equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r_-,\, r_+\right)",
     source="W. Jung, Op Amp Applications Handbook, section 1-4",
     excitation="changes quicker and slower than the limit",
     confusable_with=("first_order_lag", "saturation"),

@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from numba import njit
 from scipy.linalg import expm
-from scipy.signal import csd, welch
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import least_squares, thin
 
 
 def discrete_mode(frequency_hz: float, damping: float, dt: float) -> tuple[Array, Array, Array]:
@@ -30,8 +30,8 @@ def discrete_mode(frequency_hz: float, damping: float, dt: float) -> tuple[Array
 
 @njit(cache=True)
 def mode(x, ad, g0, g1, starts):
-    """Response z (n,) settled on x at each start."""
-    y = np.empty_like(x)
+    """Response z and z'/w, (2, n), settled on x at each start."""
+    y = np.empty((2, x.size))
     s = 0
     a = 0.0
     b = 0.0
@@ -44,7 +44,8 @@ def mode(x, ad, g0, g1, starts):
             c = ad[0, 0] * a + ad[0, 1] * b + g0[0] * x[i - 1] + g1[0] * x[i]
             b = ad[1, 0] * a + ad[1, 1] * b + g0[1] * x[i - 1] + g1[1] * x[i]
             a = c
-        y[i] = a
+        y[0, i] = a
+        y[1, i] = b
     return y
 
 
@@ -58,42 +59,46 @@ def _parts(settings: Settings) -> Parts:
         (
             Parameter("frequency_Hz", "Hz", 3 / span, 0.8 / dt, log=True, scale=1 / span),
             Parameter("damping_ratio", "1", 1e-4, 2.0, log=True, scale=0.01),
-            Parameter("share", "1", -1.0, 2.0, scale=0.05),
+            Parameter("share", "1", -3.0, 3.0, scale=0.05),
+            Parameter("rate_share", "1", -3.0, 3.0, scale=0.05),
         )
     )
 
 
+def _mode_of(x: Array, ctx: Context, frequency: float, damping: float) -> Array:
+    ad, g0, g1 = discrete_mode(frequency, damping, ctx.dt)
+    return mode(x, ad, np.ascontiguousarray(g0), g1, np.array(ctx.starts))
+
+
 def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    ad, g0, g1 = discrete_mode(q[0], q[1], ctx.dt)
-    z = mode(x, ad, g0, g1, np.array(ctx.starts))
-    return x + q[2] * (z - x)
+    z = _mode_of(x, ctx, q[0], q[1])
+    return x + q[2] * (z[0] - x) + q[3] * z[1]
 
 
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    bounds = _parts(settings).nonlinear[0]
-    model = ctx.to_output(x - x.mean())
-    n = x.size
-    length = int(min(n, max(256, n // 16)))
-    f, cross = csd(model, residual, 1 / ctx.dt, nperseg=length)
-    _, power = welch(model, 1 / ctx.dt, nperseg=length)
-    explained = np.abs(cross) ** 2 / np.maximum(power, 1e-12 * power.max())
-    explained[:2] = 0.0
-    found: list[tuple[float, float, float]] = []
-    order = np.argsort(explained)[::-1]
-    peaks: list[float] = []
-    for i in order:
-        if all(abs(f[i] - g) > 3 * f[1] for g in peaks):
-            peaks.append(float(f[i]))
-        if len(peaks) == 2:
-            break
-    strong = f[power > 1e-4 * power.max()]
-    top = float(strong.max()) if strong.size else float(f[-1])
-    # a resonance above the excitation shows as a gain that grows with frequency
-    for g in dict.fromkeys((*peaks, 1.5 * top, 4 * top)):
-        g = float(np.clip(g, 1.01 * bounds.lo, 0.99 * bounds.hi))
-        for d in (0.03, 0.3):
-            found.append((g, d, 1.0))
-    return tuple(found)
+    bounds = _parts(settings).nonlinear
+    model = ctx.to_output(x)
+    k = thin(ctx.keep, 6000)
+    measured = (ctx.measured if ctx.measured is not None else model + residual)[k]
+    one = np.ones(k.size)
+
+    def tried(frequencies: Array, dampings: Sequence[float]) -> list[tuple[float, tuple[float, ...]]]:
+        out: list[tuple[float, tuple[float, ...]]] = []
+        for f in frequencies:
+            f = float(np.clip(f, 1.01 * bounds[0].lo, 0.99 * bounds[0].hi))
+            for d in dampings:
+                z = _mode_of(model, ctx, f, d)[:, k]
+                w, left = least_squares(np.stack([one, model[k], z[0] - model[k], z[1]], axis=1), measured)
+                g = w[1] or 1.0
+                shares = np.clip([w[2] / g, w[3] / g], -2.9, 2.9)
+                out.append((left, (f, d, float(shares[0]), float(shares[1]))))
+        return sorted(out)
+
+    first = tried(np.geomspace(4 / (ctx.dt * ctx.t.size), 0.7 / ctx.dt, 36), (0.02, 0.15))
+    near = first[0][1][0]
+    second = tried(near * np.geomspace(0.85, 1.18, 13), (0.004, 0.02, 0.07, 0.3))
+    every = sorted([*second[:2], *first[:3]])
+    return [q for _, q in every[:4]]
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
@@ -101,6 +106,7 @@ def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("frequency_Hz", float(p[0]), "Hz"),
         Human("damping_ratio", float(p[1]), "1"),
         Human("share", float(p[2]), "1"),
+        Human("rate_share", float(p[3]), "1"),
     )
 
 
@@ -110,7 +116,7 @@ RESONANCE = Effect(
     kind="linear",
     stages=("mechanics", "mounting", "sensor"),
     parts=_parts,
-    equation=r"y = x + s\,(z - x),\quad \ddot z + 2 D \omega \dot z + \omega^2 z = \omega^2 x",
+    equation=r"y = x + s\,(z - x) + b\,\dot z/\omega,\quad \ddot z + 2 D \omega \dot z + \omega^2 z = \omega^2 x",
     source="D. J. Ewins, Modal Testing, 2nd ed., eq. 2.9",
     excitation="frequencies around the mode; below it, its static part looks like a lag or a lead",
     confusable_with=("first_order_lag", "dead_time", "vibration"),
