@@ -11,9 +11,10 @@ import hashlib
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import config as numba_config
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -34,7 +35,7 @@ def cache_folder() -> Path:
 
 
 if "NUMBA_CACHE_DIR" not in os.environ:
-    numba.config.CACHE_DIR = str(cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
+    numba_config.CACHE_DIR = str(cache_folder())  # pyright: ignore[reportAttributeAccessIssue]
 
 
 def kernel(function: _Function) -> _Function:
@@ -43,4 +44,4 @@ def kernel(function: _Function) -> _Function:
     Division by zero gives inf or nan as in numpy instead of raising, so that a bad sample becomes a
     flagged sample and not an exception in the middle of a tick.
     """
-    return numba.njit(cache=True, error_model="numpy")(function)
+    return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))

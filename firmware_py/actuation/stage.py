@@ -36,7 +36,6 @@ from firmware_py.frame import (
 )
 from firmware_py.records import Record, attributes, copy_record, new_record
 
-
 # strokes are not quite linear in the displacement: each pass leaves about a hundredth of the excess
 REACH_PASSES = 4
 

@@ -41,7 +41,7 @@ def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray
     rows = []
     for zeros in (np.zeros(2), np.zeros(0)):
         z, p, k = bilinear_zpk(zeros, poles, 1.0, tick_hz)
-        b, a = np.real(k * np.poly(z)), np.real(np.poly(p))
+        b, a = np.real(k * np.poly(np.asarray(z))), np.real(np.poly(np.asarray(p)))
         rows.append([*b, a[1], a[2]])
     return np.array(rows)
 

@@ -67,8 +67,8 @@ def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
     block[:n, n:] = q
     block[n:, n:] = a.T
     e = expm(block * dt)
-    transition = e[n:, n:].T
-    return transition, transition @ e[:n, n:]
+    transition: Matrix = np.asarray(e[n:, n:].T, dtype=np.float64)
+    return transition, np.asarray(transition @ e[:n, n:], dtype=np.float64)
 
 
 def design_oscillators(config: TremorConfig) -> OscillatorModel:
