@@ -1,6 +1,6 @@
 """What the ``[emulation]`` table of a bench may say: one unit of the instrument, its hand and its room.
 
-Every value has a default, so ``provider`` and ``seed`` alone describe a complete instrument. Spreads are
+Every value has a default, so ``provider``, ``unit`` and ``seed`` alone describe a complete instrument. Spreads are
 standard deviations from which the seed draws one physical unit: the same seed is the same unit everywhere
 (bench, calibration recordings, tests). "000" is the instrument's dissertation (2004) with its errata.
 """
@@ -217,7 +217,10 @@ class EmulationConfig(_Table):
     """The whole ``[emulation]`` table."""
 
     provider: str = "sim_devices.register:provider"
+    unit: Annotated[int, Field(ge=0)] = 1
+    """Which physical instrument: its sensors' and stacks' own errors. Calibration files belong to one unit."""
     seed: Annotated[int, Field(ge=0)] = 1
+    """The hand, and everything that is noise."""
     hand: HandConfig = HandConfig()
     instrument: InstrumentConfig = InstrumentConfig()
     sensors: SensorConfig = SensorConfig()

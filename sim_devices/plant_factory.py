@@ -29,4 +29,5 @@ def make_plant(description: Mapping[str, Any], hand_file: str | None, hand_scale
     Raises ``BenchError`` (``HandFileError``) for a hand that cannot be used.
     """
     config = emulation_config(description)
-    return Instrument(config, config.seed, make_hand(config.hand, config.seed, hand_file, hand_scale))
+    hand = make_hand(config.hand, config.seed, hand_file, hand_scale)
+    return Instrument(config, config.seed, hand, unit=config.unit)

@@ -44,12 +44,12 @@ MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
 BUDGETS_US = {
     "sense": 60.0,
-    "estimate": 60.0,
-    "actuate": 480.0,
+    "estimate": 30.0,
+    "actuate": 520.0,  # 390 us of bus time at 400 kHz
     "publish": 30.0,
-    "magnetometer": 290.0,
-    "supervise": 40.0,
-    "telemetry": 40.0,
+    "magnetometer": 350.0,  # 220 us of bus time
+    "supervise": 300.0,
+    "telemetry": 300.0,
 }
 
 

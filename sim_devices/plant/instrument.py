@@ -34,13 +34,16 @@ _CHUNK_ROWS = 256 * BLOCK_MS
 class Instrument:
     """One instrument, one hand, one run.
 
-    ``seed`` draws the physical unit and its noise; ``hand`` must be fresh. ``quiet`` leaves all sensor, DAQ and room
-    noise out (a twin for arrays). Steps are 1/8 ms: between steps demands count from their own instant on, and
-    outputs follow their RC filters. Truth is recorded each millisecond, the first row at 0.
+    ``unit`` (default ``seed``) draws the physical instrument, ``seed`` its noise; ``hand`` must be fresh.
+    ``quiet`` leaves all sensor, DAQ and room noise out (a twin for arrays). Steps are 1/8 ms: between steps demands
+    count from their own instant on, and outputs follow their RC filters. Truth is recorded each millisecond, the
+    first row at 0.
     """
 
-    def __init__(self, config: EmulationConfig, seed: int, hand: Hand, *, quiet: bool = False) -> None:
-        self.unit = build_unit(config, seed)
+    def __init__(
+        self, config: EmulationConfig, seed: int, hand: Hand, *, unit: int | None = None, quiet: bool = False
+    ) -> None:
+        self.unit = build_unit(config, seed if unit is None else unit)
         self._plant, self._state = plant_arrays(config, self.unit, hand.frame)
         self._hand, self._quiet = hand, quiet
         self._rng = stream(seed, "instrument.noise")

@@ -1,4 +1,4 @@
-"""The lab's measuring instruments: calibration recordings of the same physical unit as the bench with that seed.
+"""The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
 ``python -m sim_devices.plant.lab piezo --out FOLDER [--axis 0] [--profile sawtooth|sine|tremor] [--rate-hz F]`` drives
 one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a contract recording.
@@ -85,7 +85,7 @@ def measure_piezo(
         raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
     temperature_C = start_temperature_C(config)
     volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
-    params, state = drive_channel(stack_unit(config.stack, config.seed, axis), config.amplifier, STEP_S, temperature_C)
+    params, state = drive_channel(stack_unit(config.stack, config.unit, axis), config.amplifier, STEP_S, temperature_C)
     extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
     drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
     noise = INTERFEROMETER_RMS_UM * stream(config.seed, f"lab.piezo.{axis}.{profile}").standard_normal(len(volts))
@@ -95,7 +95,7 @@ def measure_piezo(
         "temperature_C": np.full(len(volts), temperature_C),
     }
     descriptor = f"""format = 1
-title = "piezo stack {axis} of unit {config.seed}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
+title = "piezo stack {axis} of unit {config.unit}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
 data = "data.npz"
 rate_hz = {RATE_HZ}
 
@@ -152,7 +152,7 @@ def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> t
     angles, frames = tumble_attitudes(positions)
     analog, magnet = np.empty((positions, 8)), np.empty((positions, 3))
     samples = round(seconds / NODE_S)
-    plant, state = plant_arrays(config, build_unit(config, config.seed), frames[0])
+    plant, state = plant_arrays(config, build_unit(config, config.unit), frames[0])
     spread_V = _mean_noise_V(config, samples)
     rng = stream(config.seed, "lab.tumble")
     still, truth = np.zeros(18), np.zeros(TRUTH_COLUMNS)
@@ -169,7 +169,7 @@ def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> t
         "magnetometer_V": magnet,
     }
     descriptor = f"""format = 1
-title = "tumble of unit {config.seed}: {positions} positions, mean of {samples} samples each"
+title = "tumble of unit {config.unit}: {positions} positions, mean of {samples} samples each"
 data = "data.npz"
 gravity_m_s2 = {config.environment.gravity_m_s2}
 # attitude (n, 3, 3): body to world = Ry(stage_y) Rz(stage_z)
@@ -190,22 +190,22 @@ def _mean_noise_V(config: EmulationConfig, samples: int) -> Array:
     return spread
 
 
-def load_config(bench: Path | None, seed: int | None) -> EmulationConfig:
-    """The ``[emulation]`` table of a bench file, or the defaults; ``seed`` overrides."""
+def load_config(bench: Path | None, unit: int | None) -> EmulationConfig:
+    """The ``[emulation]`` table of a bench file, or the defaults; ``unit`` overrides."""
     table: dict[str, object] = {}
     if bench is not None:
         try:
             table = dict(tomllib.loads(bench.read_text()).get("emulation", {}))
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             raise LabError(f"{bench}: {error}") from error
-    if seed is not None:
-        table["seed"] = seed
+    if unit is not None:
+        table["unit"] = unit
     try:
         return EmulationConfig.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(v) for v in first["loc"])
-        raise LabError(f"{bench or '--seed'}: [emulation] {where}: {first['msg']}") from error
+        raise LabError(f"{bench or '--unit'}: [emulation] {where}: {first['msg']}") from error
 
 
 def write_recording(folder: Path, columns: dict[str, Array], descriptor: str) -> None:
@@ -232,10 +232,10 @@ def main(arguments: list[str] | None = None) -> int:
     for command in (piezo, tumble):
         command.add_argument("--out", type=Path, required=True, help="folder to write to")
         command.add_argument("--bench", type=Path, help="bench file whose [emulation] table describes the unit")
-        command.add_argument("--seed", type=int, help="the unit, if not the bench's")
+        command.add_argument("--unit", type=int, help="the unit, if not the bench's")
     given = parser.parse_args(arguments)
     try:
-        config = load_config(given.bench, given.seed)
+        config = load_config(given.bench, given.unit)
         if given.what == "piezo":
             columns, descriptor = measure_piezo(
                 config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V

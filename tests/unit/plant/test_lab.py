@@ -23,7 +23,7 @@ from .stand import Still
 
 def test_the_stack_in_the_lab_is_the_one_in_the_instrument():
     """Same demands, same extension: lab bench against the instrument's own truth."""
-    config = EmulationConfig(seed=4)
+    config = EmulationConfig(unit=4, seed=4)
     unit = Instrument(config, 4, Still(), quiet=True)
     demand = drive_profile("sine", 20.0, 0.2, 40.0, 4)
     for k, volts in enumerate(demand):
@@ -61,7 +61,7 @@ def test_piezo_recording_on_disk(tmp_path, capsys):
 
 def test_tumble_gives_back_the_units_bias_and_scale():
     """A straight-line fit over the attitudes finds the true axes; what is left is the cross-axis curvature."""
-    config = EmulationConfig(seed=6, sensors=SensorConfig(supply_wander_mV=0.0))
+    config = EmulationConfig(unit=6, seed=6, sensors=SensorConfig(supply_wander_mV=0.0))
     columns, _ = measure_tumble(config, 60, 5.0)
     up = columns["attitude"][:, 2, :]  # world z in body axes
     design = np.column_stack([up * config.environment.gravity_m_s2 / 9.80665, np.ones(60)])
@@ -96,7 +96,7 @@ def test_attitudes_are_rotations_that_cover_the_sphere():
         (["tumble", "--positions", "3"], "12 to 10000"),
         (["tumble", "--seconds", "nan"], "0.01 to 60 s"),
         (["piezo", "--bench", "missing.toml"], "missing.toml"),
-        (["piezo", "--seed", "-1"], "seed"),
+        (["piezo", "--unit", "-1"], "unit"),
     ],
 )
 def test_wrong_orders_end_with_status_2_and_write_nothing(tmp_path, capsys, arguments, message):
