@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate, doctor, recordings, replay, run
+from tools.cli import calibrate, doctor, mismatch, recordings, replay, run
 
 app = typer.Typer(
     name="micron",
@@ -40,6 +40,7 @@ app.command("doctor")(doctor.doctor)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")
+app.add_typer(mismatch.app, name="mismatch")
 
 
 def main() -> None:

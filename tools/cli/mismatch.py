@@ -1,0 +1,258 @@
+"""``micron mismatch``: where simulation and recording differ, and which physics is missing."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from tools.cli.common import (
+    Exit,
+    InputError,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+    write_text_atomic,
+)
+
+if TYPE_CHECKING:
+    from tools.mismatch.engine.report import Report
+
+# what a command needs is imported inside it: `micron --help` shall not wait for the engine
+
+app = typer.Typer(no_args_is_help=True, help="Where simulation and recording differ, and which physics is missing.")
+
+RecordingArgument = Annotated[
+    Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Same recording and seed: same answer.")]
+
+
+@contextmanager
+def _clear_errors() -> Iterator[None]:
+    """As ``clear_errors``; a bad recording is bad input."""
+    from tools.mismatch.recording import RecordingError
+
+    with clear_errors():
+        try:
+            yield
+        except RecordingError as error:
+            raise InputError(str(error)) from error
+
+
+def _check_targets(*files: str | Path | None) -> None:
+    """Refuse what cannot be written before any work is done."""
+    check_writable(*files)
+    for file in files:
+        if file is None or str(file) == "-":
+            continue
+        path = Path(file)
+        if path.is_dir():
+            raise InputError(f"{file}: is a folder; name a file in it")
+        if not os.access(path.absolute().parent, os.W_OK):
+            raise InputError(f"{file}: the folder {path.absolute().parent} is not writable")
+
+
+def _check_folder(folder: Path | None) -> None:
+    if folder is None:
+        return
+    check_writable(folder)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"--out {folder}: is a file; name a folder")
+    if not os.access(folder if folder.exists() else folder.absolute().parent, os.W_OK):
+        raise InputError(f"--out {folder}: is not writable")
+
+
+@app.command()
+def diagnose(
+    recording: RecordingArgument,
+    json_file: JsonOption = None,
+    html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report with pictures.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="report.json and report.html there, per recording.")
+    ] = None,
+    held_out: Annotated[
+        float, typer.Option(min=0.1, max=0.6, help="Share of the record that no fit sees, unless it brings a split.")
+    ] = 0.3,
+    seed: SeedOption = 0,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    dask: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="With a folder: run on this Dask cluster (extra 'dask').")
+    ] = None,
+) -> None:
+    """Locate the mismatch, name the physics that is missing, fit it, and show the fit improve on unseen data.
+
+    Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
+    """
+    with _clear_errors():
+        _check_targets(json_file, html)
+        _check_folder(out)
+        from tools.mismatch.batch import is_folder_of_recordings
+
+        processes = jobs or os.cpu_count() or 1
+        if is_folder_of_recordings(recording):
+            if html is not None:
+                raise InputError(f"--html is for one recording; {recording} is a folder of them: use --out FOLDER")
+            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask)
+            return
+        if dask is not None:
+            raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
+        report = _diagnose_one(recording, held_out, seed, processes)
+        _show(report, json_file, html, out)
+
+
+def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+    from tools.mismatch.engine.diagnose import diagnose as engine
+    from tools.mismatch.recording import load
+
+    loaded = load(path)
+    for note in loaded.warnings:
+        console().print(f"[yellow]note:[/] {note}", markup=True, soft_wrap=True)
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
+        console=console(), transient=True,
+    ) as progress:  # fmt: skip
+        bar = progress.add_task("noise and base parameters", total=None)
+
+        def show(what: str, done: int, total: int) -> None:
+            progress.update(bar, description=what, completed=done, total=total)
+
+        return engine(loaded, held_out=held_out, seed=seed, jobs=jobs, progress=show)
+
+
+def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
+    from tools.mismatch.report.terminal import print_report
+
+    page = None
+    if html is not None:
+        from tools.mismatch.report.page import html_page
+
+        page = html_page(report)
+    if out is not None:
+        from tools.mismatch.batch import write_reports
+
+        write_reports(report, out)
+    if html is not None and page is not None:
+        write_text_atomic(html, page)
+    # with '--json -' standard output belongs to the JSON
+    print_report(report, console() if json_file == "-" else data_console())
+    write_json(report.to_json(), json_file)
+
+
+def _diagnose_folder(
+    folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None
+) -> None:
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    from tools.mismatch import batch
+    from tools.mismatch.report.terminal import batch_table
+
+    work = batch.jobs_for(batch.find(folder), out, held_out, seed)
+    stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
+    rows: list[batch.Row] = []
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        console=console(), transient=True,
+    ) as progress:  # fmt: skip
+        bar = progress.add_task("recordings", total=len(work))
+        for row in stream:
+            rows.append(row)
+            progress.update(bar, advance=1, description=row.name)
+    rows.sort(key=lambda row: row.name)
+    (console() if json_file == "-" else data_console()).print(batch_table([row.cells for row in rows]))
+    write_json(batch.to_json(folder, rows), json_file)
+    bad = [row for row in rows if row.error]
+    if bad:
+        console().print(f"[bold red]micron:[/] {len(bad)} of {len(rows)} recordings have no report")
+        raise typer.Exit(Exit.BAD_INPUT if all(row.bad_input for row in bad) else Exit.FAILED)
+
+
+@app.command()
+def physics(json_file: JsonOption = None) -> None:
+    """The vocabulary: every effect with formula, parameters, source, and what excitation shows it.
+
+    Example: micron mismatch physics --json -
+    """
+    with _clear_errors():
+        _check_targets(json_file)
+        from tools.mismatch.report.vocabulary import entries, print_vocabulary, to_json
+
+        found = entries()
+        if json_file != "-":
+            print_vocabulary(found, data_console())
+        write_json(to_json(found), json_file)
+
+
+@app.command()
+def prove(
+    cases: Annotated[int, typer.Option(min=1, help="Recordings to draw.")] = 40,
+    seed: Annotated[int | None, typer.Option(min=0, help="A fresh one if left out; it is printed.")] = None,
+    json_file: JsonOption = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep recordings, sealed answers and reports there.")
+    ] = None,
+) -> None:
+    """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
+
+    Example: micron mismatch prove --cases 40 --seed 1
+    """
+    with _clear_errors():
+        _check_targets(json_file)
+        _check_folder(keep)
+        from tools.mismatch.prove import prove as run_proof
+        from tools.mismatch.prove.table import show
+
+        if keep is not None:
+            keep.mkdir(exist_ok=True)
+        err = console()
+        result = run_proof(
+            cases, seed, jobs or os.cpu_count() or 1, keep, progress=lambda text: err.print(text, markup=False)
+        )
+        show(result, err if json_file == "-" else data_console())
+        write_json(result.to_json(), json_file)
+
+
+@app.command()
+def apply(
+    recording: RecordingArgument,
+    report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],
+    out: Annotated[Path, typer.Option("--out", metavar="TWIN.toml", help="The corrected twin.")],
+) -> None:
+    """Write the corrected twin: base parameters re-fitted beside the effects, and the effects themselves.
+
+    A recording refers to it by [twin] file = "TWIN.toml". Example: micron mismatch apply rec rec.json --out twin.toml
+    """
+    with _clear_errors():
+        _check_targets(out)
+        from tools.mismatch.apply import corrected_twin
+
+        twin = corrected_twin(recording, _report(report))
+        write_text_atomic(out, twin.text)
+        for note in twin.notes:
+            console().print(f"[yellow]note:[/] {note}", soft_wrap=True)
+        carried = ", ".join(twin.effects) or "no effects"
+        console().print(f"{out}: {twin.kind} with {carried}")
+
+
+def _report(path: Path) -> dict[str, Any]:
+    import json
+
+    try:
+        body = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); give what diagnose --json wrote") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not JSON ({error}); give what diagnose --json wrote") from error
+    if not isinstance(body, dict):
+        raise InputError(f"{path}: not a mismatch report; give what diagnose --json wrote")
+    return body

@@ -1,0 +1,184 @@
+"""A folder of recordings, diagnosed side by side: on this machine (joblib) or on a Dask cluster.
+
+One recording per process, one thread in each: the work inside is many small matrices, on which several threads
+of a linear algebra library only fight for the same core.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import tomllib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from tools.cli.common import InputError
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.report.wording import number, words
+
+RETRIES = 5
+"""How often a recording is tried again when the Dask worker that had it is lost."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording to diagnose; ``out`` its own folder for report.json and report.html, None: write nothing."""
+
+    name: str
+    path: Path
+    out: Path | None
+    held_out: float
+    seed: int
+
+
+@dataclass(frozen=True)
+class Row:
+    """What came of one recording. ``report`` is its JSON; ``error`` says why there is none; ``bad_input`` whether
+    the recording is to blame or the engine."""
+
+    name: str
+    path: str
+    report: dict[str, Any] | None = None
+    error: str = ""
+    bad_input: bool = False
+
+    @property
+    def cells(self) -> dict[str, str]:
+        """The columns of the table: the output with the largest residual over its noise speaks."""
+        if self.report is None:
+            return {"name": self.name, "error": self.error}
+        fit = self.report["fit"]
+        worst = max(fit["unit"], key=lambda o: fit["recalibrated_rms"][o] / max(fit["noise_floor_rms"][o], 1e-300))
+        unit = fit["unit"][worst]
+        return {
+            "name": self.name,
+            "error": "",
+            "verdict": self.report["verdict"],
+            "physics": ", ".join(words(p["name"]) for p in self.report["physics"]),
+            "output": worst,
+            "recalibrated": f"{number(fit['recalibrated_rms'][worst])} {unit}",
+            "fitted": f"{number(fit['fitted_rms'][worst])} {unit}",
+            "noise": f"{number(fit['noise_floor_rms'][worst])} {unit}",
+            "seconds": f"{self.report['seconds']:.1f}",
+        }
+
+
+Work = Callable[[Job], Row]
+
+
+def is_folder_of_recordings(path: Path) -> bool:
+    """A folder without a recording.toml of its own."""
+    return path.is_dir() and not (path / "recording.toml").is_file()
+
+
+def find(folder: Path) -> dict[str, Path]:
+    """Recordings below a folder by name: every .toml that describes channels, or that cannot be read (it must not
+    vanish). Raises InputError when there is none."""
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*.toml")):
+        try:
+            if "channels" not in tomllib.loads(path.read_text(encoding="utf-8")):
+                continue
+        except (tomllib.TOMLDecodeError, UnicodeDecodeError):
+            pass
+        name = path.relative_to(folder).with_suffix("")
+        found[str(name.parent if name.name == "recording" else name)] = path
+    if not found:
+        raise InputError(f"{folder}: no recording.toml and no other recording below it; see docs/mismatch.md")
+    return found
+
+
+def jobs_for(recordings: dict[str, Path], out: Path | None, held_out: float, seed: int) -> list[Job]:
+    """One job per recording, each with a folder of its own under ``out``."""
+    return [
+        Job(n, p.absolute(), None if out is None else (out / n).absolute(), held_out, seed)
+        for n, p in recordings.items()
+    ]
+
+
+def diagnose_one(job: Job) -> Row:
+    """Diagnose one recording in this process and write its reports. Never raises: a bad recording is a row."""
+    from tools.mismatch.engine.diagnose import diagnose
+    from tools.mismatch.recording import load
+
+    try:
+        report = diagnose(load(job.path), held_out=job.held_out, seed=job.seed, jobs=1)
+        if job.out is not None:
+            write_reports(report, job.out)
+        return Row(job.name, str(job.path), report.to_json())
+    except (RecordingError, InputError) as error:
+        return Row(job.name, str(job.path), error=str(error), bad_input=True)
+    except Exception as error:  # one recording that breaks the engine must not take the others with it
+        return Row(job.name, str(job.path), error=f"the engine failed: {type(error).__name__}: {error}")
+
+
+def write_reports(report: Any, folder: Path) -> None:
+    """``report.json`` and ``report.html`` in a folder, made if need be; both are complete before either is written."""
+    from tools.cli.common import write_json, write_text_atomic
+    from tools.mismatch.report.page import html_page
+
+    page = html_page(report)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror})") from error
+    write_json(report.to_json(), str(folder / "report.json"))
+    write_text_atomic(folder / "report.html", page)
+
+
+def run_here(jobs: Sequence[Job], processes: int, work: Work = diagnose_one) -> Iterator[Row]:
+    """Rows as they finish, from ``processes`` processes of this machine."""
+    if processes <= 1 or len(jobs) == 1:
+        yield from map(work, jobs)
+        return
+    from joblib import Parallel, delayed, parallel_config
+
+    # loky sets OMP_NUM_THREADS and its relatives in the workers before they import numpy
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        yield from Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(work)(job) for job in jobs)
+
+
+def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) -> Iterator[Row]:
+    """Rows as they finish, from the workers of a Dask cluster.
+
+    They need this package and the same file system. A recording whose worker is lost goes to another one.
+    Raises InputError when the extra is missing or nobody answers at ``address``.
+    """
+    if importlib.util.find_spec("distributed") is None:
+        raise InputError("--dask needs the Dask client: pip install 'micron-bench[dask]'")
+    from distributed import Client, as_completed
+
+    try:
+        client = Client(address, timeout="10s", set_as_default=False)
+    except (OSError, TimeoutError, ValueError) as error:
+        raise InputError(
+            f"--dask {address}: no Dask scheduler answers there ({error}); start one or fix the address"
+        ) from error
+    with client:
+        client.run(_one_thread)
+        futures = {
+            client.submit(work, job, key=f"mismatch-{job.name}", retries=RETRIES, pure=False): job for job in jobs
+        }
+        for future in as_completed(list(futures)):
+            job = futures[future]
+            if future.status == "finished":
+                yield future.result()
+            else:
+                yield Row(job.name, str(job.path), error=f"lost on the cluster: {future.exception()}")
+
+
+def _one_thread() -> None:
+    """In a worker that has not imported numpy yet; the others were started by somebody who can set this."""
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
+def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:
+    """What ``diagnose FOLDER --json`` writes."""
+    return {
+        "format": 1,
+        "folder": str(folder),
+        "recordings": [{k: v for k, v in asdict(r).items() if v not in (None, "")} for r in rows],
+    }

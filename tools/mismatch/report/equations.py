@@ -1,0 +1,48 @@
+"""TeX of the effects as one line of plain text (terminals) and as mathtext (pages)."""
+
+from __future__ import annotations
+
+import re
+
+_WORDS = {
+    "tau": "τ", "omega": "ω", "alpha": "α", "lambda": "λ", "epsilon": "ε", "varphi": "φ", "theta": "θ", "pi": "π",
+    "delta": "δ", "Delta": "Δ", "ell": "ℓ", "sum": "Σ", "times": "×", "cdot": "·", "ge": "≥", "le": "≤", "ne": "≠",
+    "sim": "~", "ln": "ln", "sin": "sin", "cos": "cos", "sgn": "sgn", "left": "", "right": "",
+}  # fmt: skip
+_ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "tilde": "\u0303"}
+_SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
+_SUBSCRIPT = str.maketrans("0123456789ijkhd", "₀₁₂₃₄₅₆₇₈₉ᵢⱼₖₕ\0")
+
+
+def plain(tex: str) -> str:
+    """One line of Unicode text, e.g. ``y = x + Σⱼ cⱼ zⱼ``."""
+    text = re.sub(r"\\quad", "   ", tex)
+    text = re.sub(r"\\(?:mathrm|text)\{([^{}]*)\}", r"\1", text)
+    text = re.sub(r"\\[,;! ]", " ", text)
+    text = re.sub(r"\\([dD])elta\s+", r"\\\1elta{}", text)
+    for accent, mark in _ACCENTS.items():
+        text = re.sub(rf"\\{accent}\s*(\\?[A-Za-z])", lambda m, k=mark: _name(m[1]) + k, text)
+    text = re.sub(r"\\([A-Za-z]+)", lambda m: _WORDS.get(m[1], m[1]), text)
+    text = re.sub(r"_\{([^{}]*)\}", lambda m: _low(m[1]), text)
+    text = re.sub(r"_(.)", lambda m: _low(m[1]), text)
+    text = re.sub(r"\^(\d)", lambda m: m[1].translate(_SUPERSCRIPT), text)
+    text = re.sub(r"\^\{([^{}]*)\}", r"^(\1)", text)
+    return re.sub(r" {3,}", "   ", text.replace("{", "").replace("}", "")).strip()
+
+
+def _name(symbol: str) -> str:
+    return _WORDS.get(symbol[1:], symbol[1:]) if symbol.startswith("\\") else symbol
+
+
+def _low(text: str) -> str:
+    short = text.translate(_SUBSCRIPT)
+    if short.isprintable() and all(ord(c) > 127 for c in short):
+        return short
+    return f"_{text}" if len(text) == 1 else f"_({text.replace(' ', '')})"
+
+
+def mathtext(tex: str) -> str:
+    """What matplotlib's mathtext reads: it knows ``\\geq`` but not ``\\ge``."""
+    for short, long in (("ge", "geq"), ("le", "leq"), ("ne", "neq")):
+        tex = re.sub(rf"\\{short}(?![A-Za-z])", rf"\\{long}", tex)
+    return f"${tex}$"

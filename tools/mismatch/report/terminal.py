@@ -1,0 +1,201 @@
+"""The report for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich.console import Console, Group, RenderableType
+from rich.padding import Padding
+from rich.panel import Panel
+from rich.table import Table
+from rich.text import Text
+
+from tools.mismatch.engine.report import PhysicsFound, Report
+from tools.mismatch.report import wording
+from tools.mismatch.report.equations import plain
+from tools.mismatch.report.next_experiment import next_experiments
+from tools.mismatch.report.wording import number, percent, words
+
+_COLOUR = {"agrees": "green", "recalibrate": "cyan", "missing_physics": "yellow", "unexplained": "magenta"}
+
+
+def _table(*columns: str, left: int = 1) -> Table:
+    t = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
+    for i, name in enumerate(columns):
+        t.add_column(name, justify="left" if i < left else "right", overflow="fold")
+    return t
+
+
+def _section(title: str, body: RenderableType) -> RenderableType:
+    return Group(Text(f"\n{title}", style="bold underline"), Padding(body, (0, 0, 0, 2)))
+
+
+def _pairs(rows: Sequence[tuple[str, str]]) -> Table:
+    t = Table.grid(padding=(0, 2, 0, 0))
+    t.add_column(style="dim", no_wrap=True)
+    t.add_column(overflow="fold")
+    for name, value in rows:
+        t.add_row(name, Text(value))
+    return t
+
+
+def _where(report: Report) -> RenderableType:
+    location = report.location
+    marked = wording.guilty_stages(report)
+    chain = Text(" › ").join(
+        Text(f"[{s}]" if s in marked else s, "bold red" if s in marked else "") for s in report.chain
+    )
+    follows = "; ".join(
+        f"{d.signal} ({d.feature}{', its history' if d.memory else ''}) {percent(d.strength)}"
+        for d in location.depends_on
+    )
+    t = Table.grid(padding=(0, 2, 0, 0))
+    t.add_column(style="dim", no_wrap=True)
+    t.add_column(overflow="fold")
+    t.add_row("outputs", Text(", ".join(location.outputs) or "none"))
+    t.add_row("chain", chain)
+    t.add_row("when", Text(wording.windows(location)))
+    t.add_row("regime", Text(location.regime))
+    t.add_row("follows", Text(follows or "nothing that was recorded"))
+    return t
+
+
+def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
+    head = Text.assemble(
+        (f"{k}. {words(p.name)}", "bold yellow"),
+        f" of {', '.join(p.outputs)}, at the {p.stage}; sure {percent(p.confidence)}",
+    )
+    t = _table("parameter", "value", "95 % interval", "unit")
+    t.columns[3].justify = "left"
+    for name, v in p.parameters.items():
+        value, lo, hi = wording.interval(v)
+        t.add_row(Text(words(name)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
+    rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, unit)), ("source", p.source)]
+    if p.note:
+        rows.append(("place", f"{p.note}: this recording cannot tell"))
+    if p.at_bound:
+        rows.append(("caution", f"at the limit of what is searched: {', '.join(p.at_bound)}"))
+    return Group(head, Padding(Group(t, _pairs(rows)), (0, 0, 0, 3)))
+
+
+def _fit(report: Report) -> Table:
+    t = _table("output", "as given", "recalibrated", "with physics", "noise floor", "unit", "explained")
+    t.columns[5].justify = "left"
+    f = report.fit
+    for o, unit in f.unit.items():
+        figures = (f.base_rms[o], f.recalibrated_rms[o], f.fitted_rms[o])
+        floor = f"{number(f.noise_floor_rms[o])} ({f.noise_method.get(o, '')})"
+        t.add_row(Text(o), *map(number, figures), floor, Text(unit), percent(wording.explained(f, o)))
+    return t
+
+
+def _base(report: Report) -> Table:
+    t = _table("parameter", "as given", "re-fitted alone", "with physics", "95 % interval", "unit")
+    t.columns[5].justify = "left"
+    for b in report.fit.base_parameters:
+        t.add_row(
+            Text(b.name), f"{b.given:.5g}", f"{b.alone:.5g}", f"{b.with_effects:.5g}",
+            f"{b.ci95[0]:.5g} .. {b.ci95[1]:.5g}", Text(b.unit),
+        )  # fmt: skip
+    return t
+
+
+def _runners_up(report: Report) -> Table:
+    t = _table("effect", "output", "held-out residual", "why not")
+    t.columns[1].justify = t.columns[3].justify = "left"
+    for a in report.alternatives:
+        rms = f"{number(a.residual_rms_after)} {report.fit.unit.get(a.output, '')}"
+        t.add_row(words(a.name), Text(a.output), Text(rms), Text(a.why_not))
+    return t
+
+
+def _limits(report: Report) -> Table:
+    rows: list[tuple[str, str]] = []
+    for o, of in report.detection_limit.items():
+        known = sorted((v, n) for n, v in of.items() if v is not None)
+        said = ", ".join(f"{words(n)} {number(v)}" for v, n in known)
+        rows.append((f"{o} ({report.fit.unit.get(o, '')} rms)", said or "none"))
+    return _pairs(rows)
+
+
+def _checks(report: Report) -> Table:
+    c = report.checks
+    white = {True: "white", False: "not white"}
+    rows = [
+        ("residual", f"{white[c.residual_white_before]} before, {white[c.residual_white_after]} after"),
+        ("by chance", f"p = {number(c.false_alarm_p_value)}"),
+    ]
+    if c.memory_p_value < 1e-3:
+        rows.append(
+            ("memory", f"history helps beyond the present (p = {number(c.memory_p_value)}): a state is missing")
+        )
+    rows += [("look at", m) for m in c.messages]
+    return _pairs(rows)
+
+
+def _split(report: Report) -> Table:
+    f = report.fit
+    dt = wording.step_s(report)
+    if dt is None:
+        return _pairs([("fitted on samples", str(list(f.fit_spans))), ("held out", str(list(f.held_out_spans)))])
+    return _pairs([("fitted on", wording.spans(f.fit_spans, dt)), ("held out", wording.spans(f.held_out_spans, dt))])
+
+
+def render(report: Report) -> RenderableType:
+    """The whole report."""
+    colour = _COLOUR[report.verdict]
+    parts: list[RenderableType] = [
+        Panel(
+            Text(report.summary),
+            title=f"[bold {colour}]{wording.VERDICTS[report.verdict]}",
+            title_align="left",
+            border_style=colour,
+        )
+    ]
+    if report.location.outputs:
+        parts.append(_section("Where", _where(report)))
+    if report.physics:
+        title = "What is missing" if report.verdict == "missing_physics" else "What was explained before"
+        units = report.fit.unit
+        parts.append(
+            _section(title, Group(*(_physics(i + 1, p, units.get(p.output, "")) for i, p in enumerate(report.physics))))
+        )
+    parts.append(_section("Residual on data that no fit has seen (rms)", _fit(report)))
+    if report.fit.base_parameters:
+        parts.append(_section("Base parameters", _base(report)))
+    if report.alternatives:
+        parts.append(_section("Runners-up", _runners_up(report)))
+    if report.equivalent:
+        rows = [(" = ".join(words(n) for n in e.names), e.tell_apart_by) for e in report.equivalent]
+        parts.append(_section("This recording cannot tell apart", _pairs(rows)))
+    parts.append(_section("Smallest effect that would have been named", _limits(report)))
+    if report.cannot_show:
+        rows = [(words(n), need) for n, need in report.cannot_show.items()]
+        parts.append(_section("This recording cannot show at all (what would)", _pairs(rows)))
+    parts.append(_section("Checks", _checks(report)))
+    parts.append(_section("Split", _split(report)))
+    rows = [(f"{i + 1}.", f"{e.what}: {e.why}") for i, e in enumerate(next_experiments(report))]
+    parts.append(_section("Record next", _pairs(rows)))
+    parts.append(
+        Text(f"\n{report.recording}, twin {report.twin}, seed {report.seed}, {report.seconds:.1f} s", style="dim")
+    )
+    return Group(*parts)
+
+
+def print_report(report: Report, console: Console) -> None:
+    """Print it."""
+    console.print(render(report))
+
+
+def batch_table(rows: Sequence[dict[str, str]]) -> Table:
+    """One line per recording of a folder; see ``batch.Row.cells``."""
+    t = _table("recording", "verdict", "physics", "output", "recalibrated", "with physics", "noise floor", "s", left=4)
+    for row in rows:
+        name = Text(row["name"])
+        if row["error"]:
+            t.add_row(name, Text("error", "red"), Text(row["error"]))
+            continue
+        verdict = Text(words(row["verdict"]), _COLOUR[row["verdict"]])
+        rest = (Text(row[k]) for k in ("physics", "output", "recalibrated", "fitted", "noise", "seconds"))
+        t.add_row(name, verdict, *rest)
+    return t

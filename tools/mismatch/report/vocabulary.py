@@ -1,0 +1,131 @@
+"""The vocabulary of physics for people: what each effect is, its formula, parameters, source and excitation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.markup import escape
+from rich.padding import Padding
+from rich.table import Table
+from rich.text import Text
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Context, Effect
+from tools.mismatch.report.equations import plain
+from tools.mismatch.report.wording import words
+
+UNITS = "units: {in} and {out} are those of the twin's input and output"
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One effect. ``equations``: TeX, one per place in the equations; ``parameters``: as reports give them."""
+
+    name: str
+    summary: str
+    stages: tuple[str, ...]
+    acts: str
+    equations: tuple[str, ...]
+    parameters: tuple[tuple[str, str], ...]
+    source: str
+    excitation: str
+    confusable_with: tuple[str, ...]
+    needs: tuple[str, ...]
+    twins: tuple[str, ...]
+
+
+_ACTS = {
+    "add": "adds to the signal",
+    "linear": "filters the signal",
+    "nonlinear": "maps the signal",
+    "feedback": "a force in the equation of motion",
+}
+
+
+def entries() -> list[Entry]:
+    """Every effect, in the contract's order."""
+    return [_entry(e) for e in EFFECTS.values()]
+
+
+def _entry(effect: Effect) -> Entry:
+    forms = (effect, *effect.variants)
+    return Entry(
+        effect.name,
+        effect.summary,
+        tuple(effect.stages),
+        "; ".join(dict.fromkeys(_ACTS[f.kind] for f in forms)),
+        tuple(dict.fromkeys(f.equation for f in forms)),
+        _parameters(effect),
+        effect.source,
+        effect.excitation,
+        effect.confusable_with,
+        effect.needs,
+        effect.twins,
+    )
+
+
+def _parameters(effect: Effect) -> tuple[tuple[str, str], ...]:
+    """Names and units under which a report gives its parameters: read from a made-up example, since several
+    effects decide on their elements by the data."""
+    t = np.arange(512) * 0.01
+    wave = np.sin(2 * np.pi * t / 1.7) + 0.3 * np.sin(2 * np.pi * t / 0.4)
+    residual = 0.1 * np.roll(wave, 5) + 0.05 * np.sin(2 * np.pi * 10 * t) + 0.02 * t
+    names = ("command", "temperature", "supply", "actuator_current", "load", "velocity")
+    vectors = tuple(f"{v}_{a}" for v in ("specific_force", "field", "angular_rate") for a in "xyz")
+    signals = {s: np.roll(wave, 20 * i) for i, s in enumerate((*names, *vectors))}
+    target = "voltage_x" if effect.name in ("misalignment", "soft_iron") else "displacement"
+    ctx = Context(
+        t, 0.01, signals, target, target, "specific_force_x" if target == "voltage_x" else "command",
+        facts={"axis": (0.0,), "position_m": (0.1, 0.0, 0.0)}, measured=wave + residual, noise=0.01,
+    )  # fmt: skip
+    settings = effect.prepare(wave, residual, ctx)
+    parts = effect.parts(settings)
+    listed = (*parts.nonlinear, *parts.weights)
+    if effect.report is None:
+        return tuple((p.name, p.unit) for p in listed)
+    middle = np.array([0.5 * (p.lo + p.hi) if np.isfinite(p.lo + p.hi) else p.scale for p in listed])
+    return tuple((h.name, h.unit) for h in effect.report(middle, settings, 1.0))
+
+
+def to_json(found: Sequence[Entry]) -> dict[str, Any]:
+    """What ``micron mismatch physics --json`` writes."""
+    return {
+        "format": 1,
+        "units": UNITS,
+        "physics": [
+            {
+                **{k: v for k, v in asdict(e).items() if k != "parameters"},
+                "formula": "; ".join(map(plain, e.equations)),
+                "parameters": [{"name": n, "unit": u} for n, u in e.parameters],
+            }
+            for e in found
+        ],
+    }
+
+
+def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
+    """For a terminal."""
+    for e in found:
+        console.print(f"[bold yellow]{e.name}[/]  {escape(e.summary)}")
+        t = Table.grid(padding=(0, 2, 0, 0))
+        t.add_column(style="dim", no_wrap=True)
+        t.add_column(overflow="fold")
+        rows = [("formula", "\n".join(map(plain, e.equations)))]
+        rows.append(("parameters", ", ".join(f"{n} ({u})" if u != "1" else n for n, u in e.parameters)))
+        rows.append(("where", f"{', '.join(e.stages)}; {e.acts}"))
+        rows.append(("shown by", e.excitation))
+        if e.needs:
+            rows.append(("needs", f"recorded {', '.join(e.needs)}"))
+        if e.twins:
+            rows.append(("only in", ", ".join(e.twins)))
+        if e.confusable_with:
+            rows.append(("looks like", ", ".join(words(n) for n in e.confusable_with)))
+        rows.append(("source", e.source))
+        for name, value in rows:
+            t.add_row(name, Text(value))
+        console.print(Padding(t, (0, 0, 1, 2)))
+    console.print(f"[dim]{UNITS}[/]", markup=True)

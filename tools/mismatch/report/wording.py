@@ -1,0 +1,99 @@
+"""Figures and phrases that the terminal and the page share."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from tools.mismatch.engine.report import FitSummary, Location, ParameterValue, PhysicsFound, Report
+
+VERDICTS: Mapping[str, str] = {
+    "agrees": "Agrees",
+    "recalibrate": "Recalibrate",
+    "missing_physics": "Missing physics",
+    "unexplained": "Unexplained",
+}
+WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
+SHOWABLE = 1.05  # residual over noise floor below which nothing is left to be explained
+
+
+def number(value: float | None) -> str:
+    """Three significant digits; '-' for what is not known."""
+    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
+
+
+def percent(share: float | None) -> str:
+    """A share as a percentage, '-' for what is not known."""
+    return "-" if share is None or not math.isfinite(share) else f"{100 * share:.0f} %"
+
+
+def words(name: str) -> str:
+    """The name of an effect in running text."""
+    return name.replace("_", " ")
+
+
+def interval(p: ParameterValue) -> tuple[str, str, str]:
+    """Value and both ends of its interval, with as many digits as the interval justifies."""
+    lo, hi = p.ci95
+    half = (hi - lo) / 2
+    if not all(map(math.isfinite, (p.value, lo, hi))) or half <= 0:
+        return f"{p.value:.4g}", number(lo), number(hi)
+    size = max(abs(p.value), abs(lo), abs(hi))
+    digits = min(max(math.floor(math.log10(size)) - math.floor(math.log10(half)) + 2, 2), 8)
+    if 1e-4 <= size < 1e6:
+        places = max(0, digits - 1 - math.floor(math.log10(size)))
+        return f"{p.value:.{places}f}", f"{lo:.{places}f}", f"{hi:.{places}f}"
+    return f"{p.value:.{digits}g}", f"{lo:.{digits}g}", f"{hi:.{digits}g}"
+
+
+def poorly_known(p: ParameterValue) -> float | None:
+    """Half the interval over the value where that is too much, else None."""
+    half = (p.ci95[1] - p.ci95[0]) / 2
+    if not math.isfinite(half) or p.value == 0:
+        return None
+    share = half / abs(p.value)
+    return share if share > WELL_KNOWN else None
+
+
+def explained(fit: FitSummary, output: str) -> float | None:
+    """Share of what re-fitting left above the noise that the physics explains; None where nothing was left."""
+    before, after = fit.recalibrated_rms[output], fit.fitted_rms[output]
+    noise = fit.noise_floor_rms[output]
+    if not before > SHOWABLE * noise:
+        return None
+    return min(max((before**2 - after**2) / (before**2 - noise**2), 0.0), 1.0)
+
+
+def windows(location: Location, most: int = 6) -> str:
+    """The time windows in one line."""
+    if not location.windows:
+        return "none"
+    shown = ", ".join(f"{number(w.start_s)} to {number(w.stop_s)} s" for w in location.windows[:most])
+    more = len(location.windows) - most
+    return shown + (f" and {more} more" if more > 0 else "")
+
+
+def guilty_stages(report: Report) -> tuple[str, ...]:
+    """Stages to mark in the chain: where physics was found, or where the leftover is guessed to sit."""
+    found = tuple(dict.fromkeys(p.stage for p in report.physics))
+    if report.verdict == "missing_physics":
+        return found
+    return tuple(dict.fromkeys((*found, report.location.stage))) if report.verdict == "unexplained" else ()
+
+
+def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:
+    """Sample ranges as times, e.g. '0 to 12.5 s, 14 to 30 s'."""
+    return ", ".join(f"{number(a * dt_s)} to {number(b * dt_s)} s" for a, b in of) or "none"
+
+
+def step_s(report: Report) -> float | None:
+    """Seconds per sample, from the pictures; None without them."""
+    p = report.pictures
+    if p is None or p.t.size < 2:
+        return None
+    return float(min(p.t[i + 1] - p.t[i] for i in range(min(p.t.size - 1, 16))))
+
+
+def before_after(p: PhysicsFound, unit: str) -> str:
+    """What one effect does to the held-out residual of its output."""
+    return f"{number(p.residual_rms_before)} without it, {number(p.residual_rms_after)} with it ({unit} rms, held out)"
