@@ -12,8 +12,7 @@ from sim_devices.physics.statistics import least_squares, thin
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    return {"span": (float(np.ptp(x[k])) or 1.0,), "rest": (float(x[0]),)}
+    return {"span": (float(np.ptp(x)) or 1.0,), "rest": (float(x[0]),)}
 
 
 def _parts(settings: Settings) -> Parts:

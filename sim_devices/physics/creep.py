@@ -31,8 +31,7 @@ def modes(x: Array, dt: float, taus: Sequence[float], rest: float, starts: tuple
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    lo, hi = float(x[k].min()), float(x[k].max())
+    lo, hi = float(x.min()), float(x.max())
     return {
         "time_constants_s": time_constants(ctx.dt, ctx.dt * ctx.t.size),
         "rest_range": (min(lo, 0.0), max(hi, 0.0) if max(hi, 0.0) > min(lo, 0.0) else min(lo, 0.0) + 1.0),

@@ -296,7 +296,7 @@ def _walk_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 def _walk_parts(settings: Settings) -> Parts:
     knots = settings.get("knots_s", (0.0, 1.0))
     n = len(knots)
-    return Parts((), tuple(Parameter(f"level{i + 1}", "{out}") for i in range(n)), 0.5 * np.diff(np.eye(n), axis=0))
+    return Parts((), tuple(Parameter(f"level{i + 1}", "{out}") for i in range(n)), 8.0 * np.diff(np.eye(n), axis=0))
 
 
 def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:

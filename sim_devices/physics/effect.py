@@ -76,8 +76,9 @@ class Context:
     ``starts``: samples where simulation starts afresh (0 first); memory is cleared there. ``mask`` (n,):
     where the residual may be looked at (None = everywhere); ``noise``: rms of the output's noise if known.
     ``facts``: constants of the twin that some effects need (sensor positions, axis of a channel).
-    For guesses only: ``measured`` (n,) the output's recording; ``everywhere`` (n,) the residual beyond the mask too,
-    for nothing but locating single events (bursts); ``through`` carries a small change of the signal
+    For guesses only: ``believed`` (n,) the output by the engineer's own base parameters (a re-fit may have bent
+    them to cover an effect); ``measured`` (n,) the output's recording; ``everywhere`` (n,) the residual beyond the
+    mask too, for nothing but locating single events (bursts); ``through`` carries a small change of the signal
     that the effect sits on to the output (linear, compiled).
     """
 
@@ -93,6 +94,7 @@ class Context:
     facts: Mapping[str, tuple[float, ...]] = field(default_factory=dict[str, tuple[float, ...]])
     measured: Array | None = None
     everywhere: Array | None = None
+    believed: Array | None = None
     through: Callable[[Array], Array] | None = None
 
     @property

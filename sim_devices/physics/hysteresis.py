@@ -180,8 +180,7 @@ def choose_form(x: Array, residual: Array, ctx: Context, lo: float, hi: float, f
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    lo, hi = float(x[k].min()), float(x[k].max())
+    lo, hi = float(x.min()), float(x.max())
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
     form = choose_form(x, residual, ctx, lo, hi)
@@ -227,8 +226,7 @@ def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
 
 
 def _force_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    half = 0.5 * float(np.ptp(x[k])) or 1.0
+    half = 0.5 * float(np.ptp(x)) or 1.0
     return {"thresholds": tuple(float(half * f) for f in (0.01, 0.03, 0.1, 0.3, 0.6))}
 
 

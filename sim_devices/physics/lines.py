@@ -15,15 +15,12 @@ MAINS_HZ = (50.0, 60.0)
 MOST_KNOTS = 24
 
 
-def tones(t: Array, frequency: float, harmonics: int) -> Array:
-    """Sine and cosine of each harmonic, (n, 2 * harmonics)."""
-    phase = 2 * np.pi * frequency * t
-    first = np.exp(1j * phase)
+def tones(t: Array, frequency: float, orders: Sequence[float] = (1.0,)) -> Array:
+    """Sine and cosine of each harmonic, (n, 2 * orders)."""
     cols: list[Array] = []
-    power = np.ones_like(first)
-    for _ in range(harmonics):
-        power = power * first
-        cols += [power.imag.copy(), power.real.copy()]
+    for h in orders:
+        z = np.exp(2j * np.pi * h * frequency * t)
+        cols += [z.imag.copy(), z.real.copy()]
     return np.stack(cols, axis=1)
 
 
@@ -81,11 +78,10 @@ def _excited(x: Array, ctx: Context, f: Array) -> Array:
         if float(np.ptp(s)) == 0 or name.startswith(("temperature", "supply")):
             continue
         g, p = periodogram(s, np.ones(s.size, bool), ctx.dt)
-        line = p > 1e-3 * p.max()
-        bad |= np.interp(f, g, line.astype(np.float64)) > 0
-        # and twice, three times as much: distortion
-        for h in (2, 3):
-            bad |= np.interp(f / h, g, line.astype(np.float64)) > 0
+        # a line: strong, and far above its own neighbourhood (a broad spectrum is no line)
+        line = ((p > 1e-4 * p.max()) & (p > 50.0 * local_floor(p, 400))).astype(np.float64)
+        for h in (1, 2, 3):  # twice and three times as much: distortion
+            bad |= np.interp(f / h, g, line) > 0
     return bad
 
 
@@ -105,7 +101,20 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
             if wander > max(1.5 * rough, 0.01 * power):
                 knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
     grid = tuple(float(v) for v in np.linspace(0, span, knots)) if knots > 1 else (0.0,)
-    return {"nominal": (f0,), "harmonics": (float(harmonics),), "span": (span,), "knots_s": grid}
+    return {"nominal": (f0,), "orders": _orders(residual, ctx, f0, harmonics), "span": (span,), "knots_s": grid}
+
+
+def _orders(residual: Array, ctx: Context, f0: float, harmonics: int) -> tuple[float, ...]:
+    """The fundamental and those harmonics that stand out of the spectrum."""
+    f, p = periodogram(residual, ctx.keep, ctx.dt)
+    z = p / np.maximum(local_floor(p, 400), 1e-300)
+    out = [1.0]
+    reach = 2.0 / (ctx.dt * ctx.t.size)
+    for h in range(2, harmonics + 1):
+        near = np.abs(f - h * f0) <= h * reach
+        if near.any() and float(z[near].max()) > 30.0:
+            out.append(float(h))
+    return tuple(out)
 
 
 def _mains_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -121,11 +130,12 @@ def _mains_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 def _line_parts(settings: Settings) -> Parts:
     f0 = settings.get("nominal", (50.0,))[0]
-    h = int(settings.get("harmonics", (1.0,))[0])
+    orders = settings.get("orders", (1.0,))
+    h = len(orders)
     span = settings.get("span", (1.0,))[0]
     knots = len(settings.get("knots_s", (0.0,)))
     reach = max(2.0 / span, 2e-4 * f0)
-    names = [f"{p}{i}" for i in range(1, h + 1) for p in ("sin", "cos")]
+    names = [f"{p}{int(i)}" for i in orders for p in ("sin", "cos")]
     if knots > 1:
         names = [f"{m}_{k + 1}" for m in names for k in range(knots)]
     penalty = 0.02 * np.eye(len(names))
@@ -140,7 +150,7 @@ def _line_parts(settings: Settings) -> Parts:
 
 
 def _line_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    c = tones(ctx.t, q[0], int(settings.get("harmonics", (1.0,))[0]))
+    c = tones(ctx.t, q[0], settings.get("orders", (1.0,)))
     knots = np.array(settings.get("knots_s", (0.0,)))
     if knots.size == 1:
         return c
@@ -154,12 +164,13 @@ def _line_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     knots = len(settings.get("knots_s", (0.0,)))
-    h = int(settings["harmonics"][0])
+    orders = settings["orders"]
+    h = len(orders)
     w = p[1:].reshape(2 * h, knots)
     amplitudes = np.sqrt(np.mean(w[0::2] ** 2 + w[1::2] ** 2, axis=1))
     return (
         Human("frequency_Hz", float(p[0]), "Hz"),
-        *(Human(f"amplitude_{i + 1}", float(a), "{out}") for i, a in enumerate(amplitudes)),
+        *(Human(f"amplitude_{int(i)}", float(a), "{out}") for i, a in zip(orders, amplitudes, strict=True)),
     )
 
 
@@ -168,7 +179,7 @@ def _line_signature(z: float, f: float, trials: float, residual: Array, ctx: Con
     k = thin(ctx.keep, 40_000)
     if f <= 0:
         return Signature(1.0, 0.0, "no line")
-    cols = tones(ctx.t[k], f, 1)
+    cols = tones(ctx.t[k], f)
     e = residual[k] - residual[k].mean()
     w = np.linalg.lstsq(cols, e, rcond=None)[0]
     power = float(e @ e)

@@ -13,14 +13,13 @@ from sim_devices.physics.statistics import least_squares, rank_starts, thin
 # -- dead zone --------------------------------------------------------------------------------------
 
 
-def _range(x: Array, ctx: Context) -> tuple[float, float]:
-    k = ctx.keep
-    lo, hi = float(x[k].min()), float(x[k].max())
+def _range(x: Array) -> tuple[float, float]:
+    lo, hi = float(x.min()), float(x.max())
     return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)
 
 
 def _range_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    return {"range": _range(x, ctx)}
+    return {"range": _range(x)}
 
 
 def _dead_parts(settings: Settings) -> Parts:
@@ -108,7 +107,7 @@ def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
 
 
 def _curve_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    lo, hi = _range(x, ctx)
+    lo, hi = _range(x)
     k = thin(ctx.keep, 8000)
     r = residual[k]
     straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
@@ -253,20 +252,28 @@ SLEW_LIMIT = Effect(
 # -- quantisation -----------------------------------------------------------------------------------
 
 
+GRID_TOLERANCE = 0.06  # of a step: a finer grid may lie over the coarse one
+
+
 def find_step(y: Array) -> float:
     """The grid on which all values of y lie, 0 if there is none that is coarser than rounding in a text file."""
     values = np.unique(y)
+    if values.size < 2:
+        return 0.0
+    span = float(values[-1] - values[0])
+    # values that differ by print rounding are one
+    values = values[np.concatenate([[True], np.diff(values) > 1e-7 * span])]
     if values.size < 2 or values.size > 0.5 * y.size:
         return 0.0
-    d = np.diff(values)
-    step = float(d[d > 1e-9 * np.ptp(values)].min(initial=np.inf))
-    if not np.isfinite(step) or np.ptp(values) / step > 1e6:
-        return 0.0
-    # refine: the step that makes every value a whole number of steps
-    whole = np.round((values - values[0]) / step)
-    step = float((values - values[0]) @ whole / (whole @ whole))
-    off = np.abs((values - values[0]) / step - whole)
-    return step if np.max(off) < 0.02 else 0.0
+    d = np.sort(np.diff(values))
+    for step in (float(np.median(d)), float(d[0])):
+        # refine: the step that makes every value a whole number of steps
+        whole = np.round((values - values[0]) / step)
+        step = float((values - values[0]) @ whole / (whole @ whole))
+        off = np.abs((values - values[0]) / step - np.round((values - values[0]) / step))
+        if np.max(off) < GRID_TOLERANCE and span / step < 1e5:
+            return step
+    return 0.0
 
 
 def _grid_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -319,9 +326,9 @@ def _grid_test(x: Array, residual: Array, ctx: Context) -> Signature:
     if step == 0.0 or power == 0.0:
         return Signature(1.0, 0.0, "no grid")
     share = min(1.0, step * step / 12 / power)
-    # every one of the distinct values lies on the grid within 2 %: chance 0.04 each
-    values = np.unique(ctx.measured).size
-    p = max(1e-300, 0.04 ** min(values, 100)) if share > 0.02 else 1.0
+    # every distinct value but the two that fix the grid lies on it by chance of twice the tolerance
+    values = min(max(round(float(np.ptp(ctx.measured)) / step) - 1, 0), 100)
+    p = max(1e-300, (2 * GRID_TOLERANCE) ** values) if share > 0.02 else 1.0
     return Signature(p, share, f"all readings lie on a grid of {step:g}")
 
 

@@ -44,7 +44,7 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     return {
         "usual_slope": (float(np.sqrt(np.mean(slope[k] ** 2))) or 1.0,),
         "rest": (float(x[0]),),
-        "range": (float(x[k].min()), float(x[k].max())),
+        "range": (float(x.min()), float(x.max())),
         "time": (ctx.dt, ctx.dt * ctx.t.size),
     }
 

@@ -59,8 +59,8 @@ def _parts(settings: Settings) -> Parts:
         (
             Parameter("frequency_Hz", "Hz", 3 / span, 0.8 / dt, log=True, scale=1 / span),
             Parameter("damping_ratio", "1", 1e-4, 2.0, log=True, scale=0.01),
-            Parameter("share", "1", -3.0, 3.0, scale=0.05),
-            Parameter("rate_share", "1", -3.0, 3.0, scale=0.05),
+            Parameter("share", "1", -20.0, 20.0, scale=0.05),
+            Parameter("rate_share", "1", -20.0, 20.0, scale=0.05),
         )
     )
 
@@ -90,7 +90,7 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
                 z = _mode_of(model, ctx, f, d)[:, k]
                 w, left = least_squares(np.stack([one, model[k], z[0] - model[k], z[1]], axis=1), measured)
                 g = w[1] or 1.0
-                shares = np.clip([w[2] / g, w[3] / g], -2.9, 2.9)
+                shares = np.clip([w[2] / g, w[3] / g], -19.0, 19.0)
                 out.append((left, (f, d, float(shares[0]), float(shares[1]))))
         return sorted(out)
 

@@ -31,8 +31,7 @@ def limit(x, lo, hi, soft):
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    return {"range": (float(x[k].min()), float(x[k].max()))}
+    return {"range": (float(x.min()), float(x.max()))}
 
 
 def _parts(settings: Settings) -> Parts:
@@ -56,9 +55,15 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     span = hi - lo
     measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
     cut = (-0.4, 0.02, 0.1, 0.2, 0.35)
+    # a limit that was not reached is taken to mirror the other one
+    centres = (0.0, 0.5 * (lo + hi)) if lo < 0.0 < hi else (0.5 * (lo + hi),)
     grid: list[tuple[float, ...]] = [
-        (lo + a * span, hi - b * span, w * span) for a in cut for b in cut for w in (0.005, 0.1) if a > 0 or b > 0
+        (c - r, c + r, w * span)
+        for c in centres
+        for r in np.linspace(0.15, 1.0, 10) * max(hi - c, c - lo)
+        for w in (0.005, 0.1)
     ]
+    grid += [(lo + a * span, hi - b * span, w * span) for a in cut for b in cut for w in (0.005, 0.1) if a > 0 or b > 0]
     # a gentle bend whose limits lie outside what was reached
     grid += [
         (lo + a * span, hi - b * span, w * span) for a, b in ((-0.1, -0.1), (-0.4, 0.0), (0.0, -0.4)) for w in (0.3,)

@@ -108,6 +108,10 @@ def affine_misfit(candidate: Array, measured: Array) -> float:
 def rank_starts(
     candidates: list[tuple[float, ...]], output_of: Callable[[tuple[float, ...]], Array], measured: Array, k: Array
 ) -> list[tuple[float, ...]]:
-    """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first."""
+    """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first.
+
+    Of candidates within half a percent, the one that is listed first.
+    """
     found = [(affine_misfit(output_of(q)[k], measured[k]), i) for i, q in enumerate(candidates)]
-    return [candidates[i] for _, i in sorted(found)]
+    steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found]
+    return [candidates[i] for _, i in sorted(steps)]

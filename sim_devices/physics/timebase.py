@@ -262,15 +262,21 @@ MOST_SHIFT = 60
 MOST_DROPS = 40
 
 
-def find_drops(model: Array, measured: Array, gain_free: bool = True) -> tuple[list[int], list[int], float]:
-    """(sample, total shift from there on, share of the error explained) for a record that lost or repeats samples."""
+def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], float, float]:
+    """Where a record lost or repeats samples, by the cheapest path of shifts over windows.
+
+    (samples, total shift from there on, share of the error explained, sum of squares left).
+    """
     n = model.size
     y = measured - measured.mean()
     x = model - model.mean()
+    power = float(x @ x)
+    if power > 0:
+        x = x * float(np.sqrt((y @ y) / power))
     window = int(np.clip(n // 400, 16, 400))
     count = n // window
     if count < 4:
-        return [], [], 0.0
+        return [], [], 0.0, np.inf
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
     shifts = shifts[np.abs(shifts) < n // 8]
     costs = np.empty((count, shifts.size))
@@ -286,7 +292,7 @@ def find_drops(model: Array, measured: Array, gain_free: bool = True) -> tuple[l
     before = float(costs[:, zero].sum())
     change = np.flatnonzero(np.diff(path)) + 1
     if not change.size or change.size > MOST_DROPS or before <= 0:
-        return [], [], 0.0
+        return [], [], 0.0, before
     at: list[int] = []
     total: list[int] = []
     for w in change:
@@ -300,13 +306,19 @@ def find_drops(model: Array, measured: Array, gain_free: bool = True) -> tuple[l
     if shifts[path[0]] != 0:
         at.insert(0, 0)
         total.insert(0, int(shifts[path[0]]))
-    return at, total, max(0.0, 1 - best / before)
+    keep = [i for i in range(len(at)) if i + 1 == len(at) or at[i + 1] > at[i]]
+    return [at[i] for i in keep], [total[i] for i in keep], max(0.0, 1 - best / before), float(best)
 
 
 def _drops(x: Array, residual: Array, ctx: Context) -> tuple[list[int], list[int], float]:
     if ctx.measured is None:
         return [], [], 0.0
-    return find_drops(ctx.to_output(x), ctx.measured)
+    found = find_drops(ctx.to_output(x), ctx.measured)
+    if ctx.believed is not None:
+        other = find_drops(ctx.believed, ctx.measured)
+        if other[3] < 0.9 * found[3]:
+            found = other
+    return found[:3]
 
 
 def _drop_prepare(x: Array, residual: Array, ctx: Context) -> Settings:

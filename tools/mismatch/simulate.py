@@ -447,6 +447,10 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
         signals=signals,
     )
     base = theta[: model.n_base]
+    if pl.effect.kind == "linear":
+        given = theta.copy()
+        given[: model.n_base] = twin.start(view.recording)
+        ctx = replace(ctx, believed=model._flow(run, given, True)[output].value)
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
         ctx = replace(ctx, through=through)
@@ -458,11 +462,21 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
-    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view."""
-    output = pl.outputs[0]
-    x, ctx = probe_signals(model, view, theta, pl, output)
-    residual = full_residual(model, view, theta)[output]
-    return replace(pl, settings=pl.effect.prepare(x, residual, ctx))
+    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view.
+
+    An effect of several outputs that has a test of its own reads them off the output that shows it best.
+    """
+    best: tuple[float, Settings] | None = None
+    outputs = pl.outputs if pl.effect.test is not None and not pl.effect.shared else pl.outputs[:1]
+    for output in outputs:
+        x, ctx = probe_signals(model, view, theta, pl, output)
+        residual = full_residual(model, view, theta)[output]
+        settings = pl.effect.prepare(x, residual, ctx)
+        share = pl.effect.test(x, residual, ctx).share if pl.effect.test is not None and len(outputs) > 1 else 0.0
+        if best is None or share > best[0]:
+            best = (share, settings)
+    assert best is not None
+    return replace(pl, settings=best[1])
 
 
 def _frozen(settings: Settings) -> tuple[object, ...]:

@@ -1,0 +1,99 @@
+"""A model as plain text values and back: the ``[twin]`` table of a corrected twin."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast, get_args
+
+import numpy as np
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Array, Effect, Stage
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.make import make
+
+
+def describe(model: Model, theta: Array) -> dict[str, Any]:
+    """The ``[twin]`` table: kind, parameters under the contract's names, one table per effect."""
+    effects: list[dict[str, Any]] = []
+    for k, pl in enumerate(model.placed):
+        a, b = model.slices(k)
+        values = [*theta[a].tolist(), *theta[b].tolist()]
+        names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
+        effects.append(
+            {
+                "name": pl.effect.name,
+                "site": pl.site,
+                "target": pl.target,
+                "stage": pl.stage,
+                "outputs": list(pl.outputs),
+                "settings": {n: list(v) for n, v in pl.settings.items()},
+                "parameters": dict(zip(names, values, strict=True)),
+            }
+        )
+    base = theta[: model.n_base]
+    return {"kind": model.twin.kind, "parameters": model.twin.to_text(base), "effects": effects}
+
+
+def restore(recording: Recording) -> tuple[Model, Array]:
+    """The model that a recording's ``[twin]`` names, effects included, and its parameters.
+
+    Raises RecordingError naming the effect and key that cannot be used.
+    """
+    twin = make(recording)
+    placed: list[Placed] = []
+    values: list[Array] = []
+    for i, entry in enumerate(recording.twin.effects):
+        where = f"{recording.path}: [[twin.effects]] {i + 1}"
+        pl, p = _one(where, entry, twin)
+        placed.append(pl)
+        values.append(p)
+    model = Model(twin, placed)
+    theta = model.start(recording)
+    for k, p in enumerate(values):
+        a, b = model.slices(k)
+        theta[a], theta[b] = p[: a.stop - a.start], p[a.stop - a.start :]
+    return model, theta
+
+
+def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Array]:
+    name, site = entry.get("name"), entry.get("site", "output")
+    effect = EFFECTS.get(name) if isinstance(name, str) else None
+    if effect is None:
+        raise RecordingError(f"{where}: name '{name}' is not in the vocabulary; see 'micron mismatch physics'")
+    effect = _variant(where, effect, site)
+    stage = entry.get("stage", effect.stages[0])
+    if stage not in get_args(Stage):
+        raise RecordingError(f"{where}: stage must be one of {', '.join(get_args(Stage))}, got {stage!r}")
+    target = entry.get("target", "")
+    outputs = entry.get("outputs", [target])
+    if not isinstance(outputs, Sequence) or not outputs or any(o not in twin.outputs for o in outputs):
+        raise RecordingError(f"{where}: outputs {outputs!r} are not among {', '.join(twin.outputs)}")
+    if site == "input" and target not in twin.inputs:
+        raise RecordingError(f"{where}: target '{target}' is not an input of the twin")
+    try:
+        settings = {k: tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
+    except (TypeError, ValueError):
+        raise RecordingError(f"{where}: settings must be lists of numbers") from None
+    pl = Placed(effect, site, target, cast(Stage, stage), tuple(outputs), settings)
+    given = entry.get("parameters", {})
+    names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
+    missing = [n for n in names if not _finite(given.get(n))]
+    if missing:
+        raise RecordingError(f"{where}: parameters {', '.join(missing[:5])} missing or not finite numbers")
+    return pl, np.array([float(given[n]) for n in names])
+
+
+def _variant(where: str, effect: Effect, site: object) -> Effect:
+    if site not in ("input", "output", "feedback"):
+        raise RecordingError(f"{where}: site must be input, output or feedback, got {site!r}")
+    for one in (effect, *effect.variants):
+        if (one.kind == "feedback") == (site == "feedback"):
+            return one
+    raise RecordingError(f"{where}: {effect.name} cannot sit at '{site}'")
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
