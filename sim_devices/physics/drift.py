@@ -255,6 +255,13 @@ def hats(t: Array, knots: Array) -> Array:
     return out
 
 
+def knots_over(t: Array, keep: np.ndarray, count: int) -> tuple[float, ...]:
+    """Knots evenly spread over the kept samples, so that every hat sees data; a gap has one at each edge."""
+    kept = t[keep]
+    at = np.unique(np.round(np.linspace(0, kept.size - 1, count)).astype(int))
+    return tuple(float(v) for v in kept[at])
+
+
 def increments(residual: Array, keep: np.ndarray, dt: float) -> tuple[float, float, float, int]:
     """(white rms per sample, walk in unit/sqrt(s), z of the walk, block length) from block-mean differences.
 
@@ -288,9 +295,8 @@ def increments(residual: Array, keep: np.ndarray, dt: float) -> tuple[float, flo
 
 def _walk_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     white, walk, _, _ = increments(residual, ctx.keep, ctx.dt)
-    span = ctx.dt * ctx.t.size
     n = int(np.clip(KNOTS, 4, max(4, ctx.t.size // 20)))
-    return {"walk": (walk,), "white": (white,), "knots_s": tuple(float(v) for v in np.linspace(0, span, n))}
+    return {"walk": (walk,), "white": (white,), "knots_s": knots_over(ctx.t, ctx.keep, n)}
 
 
 def _walk_parts(settings: Settings) -> Parts:

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.special import gammaincc
 
-from sim_devices.physics.drift import hats
+from sim_devices.physics.drift import hats, knots_over
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
 from sim_devices.physics.statistics import thin
 
@@ -100,7 +100,7 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
             wander = float(np.var(z[whole]))
             if wander > max(1.5 * rough, 0.01 * power):
                 knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
-    grid = tuple(float(v) for v in np.linspace(0, span, knots)) if knots > 1 else (0.0,)
+    grid = knots_over(ctx.t, ctx.keep, knots) if knots > 1 else (0.0,)
     return {"nominal": (f0,), "orders": _orders(residual, ctx, f0, harmonics), "span": (span,), "knots_s": grid}
 
 

@@ -74,16 +74,22 @@ def _cog_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tuple[float, float]]:
-    """(misfit, period) over a grid fine enough that phase turns by less than a quarter over the travel."""
+    """(misfit, period), best first, over a grid on which the phase turns by a quarter over the travel, then finer."""
     k = thin(ctx.keep, 4000)
-    line = np.stack([np.ones(k.size), ctx.to_output(np.ones(x.size))[k]], axis=1)
-    tried: list[tuple[float, float]] = []
-    turns = np.concatenate([np.arange(0.5, 12, 0.25), np.geomspace(12, 300, 90)])
-    for period in travel / turns:
-        a = 2 * np.pi * x / period
-        cols = np.stack([ctx.to_output(np.sin(a)), ctx.to_output(np.cos(a))], axis=1)[k]
-        tried.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
-    return sorted(tried)
+    line = np.stack([np.ones(k.size), x[k], ctx.to_output(np.ones(x.size))[k]], axis=1)
+
+    def tried(turns: Array) -> list[tuple[float, float]]:
+        out: list[tuple[float, float]] = []
+        for period in travel / turns:
+            a = 2 * np.pi * x / period
+            cols = np.stack([ctx.to_output(np.sin(a)), ctx.to_output(np.cos(a))], axis=1)[k]
+            out.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
+        return sorted(out)
+
+    coarse = tried(np.concatenate([np.arange(0.5, 16, 0.25), np.geomspace(16, 300, 80)]))
+    near = travel / coarse[0][1]
+    fine = tried(near + np.linspace(-0.3, 0.3, 13) * max(1.0, near / 16))
+    return sorted([*fine[:2], *coarse[:2]])
 
 
 def _cog_prepare(x: Array, residual: Array, ctx: Context) -> Settings:

@@ -24,6 +24,7 @@ from sim_devices.physics.effect import (
     Settings,
     Stage,
 )
+from sim_devices.physics.statistics import least_squares, thin
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
 
@@ -199,9 +200,15 @@ class Model:
         residual = full_residual(rest, view, without)[output]
         x, ctx = probe_signals(rest, view, without, pl, output)
         out: list[Array] = []
+        a, b = self._slices[k]
+        searched = b.stop > b.start and b.start not in self.linear
         for q in pl.effect.guess(x, residual, ctx, pl.settings):
             th = theta.copy()
-            th[self._slices[k][0]] = q
+            th[a] = q
+            if searched:
+                th[b] = first_weights(pl, x, residual, ctx, th[a])
+                out.append(th.copy())
+                th[b] *= 0.3
             out.append(th)
         return out
 
@@ -375,6 +382,19 @@ class Model:
             flow = self._flow(run, theta, False, folded)
         found = {j for s in flow.values() for j in s.columns}
         return found - folded
+
+
+def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array) -> Array:
+    """Weights that meet the residual best to first order, on the recorded course of ``x``."""
+    basis = pl.effect.basis
+    assert basis is not None
+    columns = basis(x, ctx, q, pl.settings)
+    if pl.site != "output":
+        columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
+    k = thin(ctx.keep, 20_000)
+    line = np.stack([np.ones(k.size), x[k]], axis=1)
+    w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
+    return w[: columns.shape[1]]
 
 
 def view_run(twin: Twin, view: View) -> Run:

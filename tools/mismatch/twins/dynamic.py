@@ -9,10 +9,11 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.twins.base import Force, Run, Signal, remember
-from tools.mismatch.twins.feedback import pack, run_feedback
+from tools.mismatch.twins.feedback import Rows, pack, run_feedback
 from tools.mismatch.twins.linear import Discrete, Hold, StartState, discretise, run_states, start_state
 
 CONSTANT = ""  # the input "1"
+MOST_SUBSTEPS = 24
 LEAST_WINDOW = 20  # samples that set a state when nothing else is said
 
 
@@ -204,12 +205,24 @@ class DynamicTwin:
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
         return start_state(ad, rows, run.measured, run.starts, run.t.size, window, run.memo)
 
+    def _substeps(self, run: Run, packed: Rows) -> int:
+        """Steps per sample: four to a radian of the fastest mode, eight to a period of cogging."""
+        sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
+        if packed.cogging[0] > 0:
+            course = run.measured[self.feedback_on]
+            travel = float(np.quantile(np.abs(np.diff(course)), 0.99))
+            if self.feedback_on == "velocity":
+                travel = float(np.quantile(np.abs(course), 0.99)) * run.dt
+            sub = max(sub, int(np.ceil(8 * travel / packed.cogging[0])))
+        return int(np.clip(sub, 1, MOST_SUBSTEPS))
+
     def _with_forces(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
     ) -> dict[str, Signal]:
         source = self.inputs[0]
         plant = self.plant_of(theta)
-        sub = max(1, int(np.ceil(run.dt * self.fastest_per_s / 0.25))) if self.hold != "discrete" else 1
+        packed = pack(forces)
+        sub = 1 if self.hold == "discrete" else self._substeps(run, packed)
         d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
         g = self.input_gain(source, theta)
         drive = inputs[source]
@@ -237,7 +250,6 @@ class DynamicTwin:
             cv = cp @ plant.a if abs(cp @ plant.b) < 1e-12 * (np.abs(cp) @ np.abs(plant.b) + 1e-300) else cp
         if "velocity" in self.outputs and self.feedback_on == "position":
             cv = rows["velocity"]
-        packed = pack(forces)
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
         held = self.hold != "linear"
