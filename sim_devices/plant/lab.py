@@ -1,7 +1,7 @@
 """The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
-``python -m sim_devices.plant.lab piezo --out FOLDER [--axis 0] [--profile sawtooth|sine|tremor] [--rate-hz F]`` drives
-one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a contract recording.
+``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops]``
+drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a contract recording.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
 """
@@ -66,7 +66,14 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
         hand.fill(pose, parts)
         wave = grow * parts[:, 5]
         return 50.0 + amplitude_V * wave / np.max(np.abs(wave))
-    raise LabError(f"profile '{profile}': it is sawtooth, sine or tremor")
+    if profile == "loops":
+        # two full sweeps, then loops that shrink again and again about a centre that wanders: every minor loop once
+        rest = np.maximum(t / seconds - 0.1, 0.0) / 0.9
+        size = amplitude_V * 0.04 ** ((4.0 * rest) % 1.0)
+        wander = (amplitude_V - size) * np.sin(2.0 * math.pi * 0.031 * rate_hz * t)
+        loops = 50.0 + size * np.sin(2.0 * math.pi * phase) + 0.9 * wander
+        return np.where(rest > 0.0, loops, 50.0 - amplitude_V * np.cos(4.0 * math.pi * t / (0.1 * seconds)))
+    raise LabError(f"profile '{profile}': it is sawtooth, sine, tremor or loops")
 
 
 def measure_piezo(
@@ -222,7 +229,7 @@ def main(arguments: list[str] | None = None) -> int:
     what = parser.add_subparsers(dest="what", required=True)
     piezo = what.add_parser("piezo", help="one stack under the interferometer")
     piezo.add_argument("--axis", type=int, default=0)
-    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor"), default="sine")
+    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor", "loops"), default="sine")
     piezo.add_argument("--rate-hz", type=float, default=10.0)
     piezo.add_argument("--seconds", type=float, default=10.0)
     piezo.add_argument("--amplitude-V", type=float, default=41.7, help="half of peak to peak, about 50 V")
