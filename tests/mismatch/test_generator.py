@@ -18,7 +18,7 @@ from tools.mismatch.recording import load
 
 
 def _case(twin: str, effects: tuple[str, ...], severity: float, seed: int = 3, kind: str = "single") -> draw.Case:
-    return draw.make([seed], draw.Plan(kind, twin, effects, severity), max_samples=4000)
+    return draw.make([seed], draw.Plan(kind, twin, effects, severity), max_samples=1500)
 
 
 @pytest.mark.parametrize(
@@ -60,7 +60,7 @@ def test_severity_on_an_axis_against_an_independent_fit() -> None:
     start = np.array([p0["mass"], p0["damping"], p0["stiffness"], p0["offset_force"], *s.hidden.values()])
     unit = np.maximum(np.abs(start), [1, 1, 1, 0.1 * np.max(np.abs(f)), np.max(np.abs(y)), np.max(np.abs(y))])
     sigma = case.noise_rms[out]
-    done = least_squares(lambda q: (model(q * unit) - y) / sigma, start / unit, max_nfev=15)
+    done = least_squares(lambda q: (model(q * unit) - y) / sigma, start / unit, max_nfev=8)
     assert np.sqrt(np.mean(done.fun**2) - 1.0) == pytest.approx(case.truths[0].rms_after_refit, rel=0.1)
 
 

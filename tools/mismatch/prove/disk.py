@@ -69,8 +69,23 @@ def _toml(value: Any) -> str:
         return "{ " + ", ".join(f"{json.dumps(k)} = {_toml(v)}" for k, v in value.items()) + " }"
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(_toml(v) for v in value) + "]"
+    if isinstance(value, int):
+        return str(value)
     text = f"{float(value):.12g}"
     return text if any(c in text for c in ".en") else text + ".0"
+
+
+def toml_text(head: dict[str, Any]) -> str:
+    """A descriptor as TOML: plain keys first, then [twin], [split] and the channels."""
+    lines = [f"{k} = {_toml(v)}" for k, v in head.items() if not isinstance(v, (dict, list))]
+    twin = head["twin"]
+    lines += ["", "[twin]", f"kind = {_toml(twin['kind'])}", "[twin.parameters]"]
+    lines += [f"{k} = {_toml(v)}" for k, v in twin.get("parameters", {}).items()]
+    if "split" in head:
+        lines += ["", "[split]", *(f"{k} = {_toml(v)}" for k, v in head["split"].items())]
+    for channel in head["channels"]:
+        lines += ["", "[[channels]]", *(f"{k} = {_toml(v)}" for k, v in channel.items())]
+    return "\n".join(lines) + "\n"
 
 
 def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
@@ -78,7 +93,7 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     scene = case.scene
     columns: dict[str, Array] = {}
-    tables: list[str] = []
+    tables: list[dict[str, Any]] = []
     style = str(rng.choice(["plain", "named"]))
     signals = [("input", k, v) for k, v in scene.inputs.items()]
     signals += [("output", k, v) for k, v in case.recorded.items()]
@@ -94,28 +109,25 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
         unit, factor, shift = chosen[family]
         name = f"ch{number}" if style == "plain" else f"{signal}_{unit.replace('/', '_per_').replace('^', '')}"
         columns[name] = values[: scene.keep] * factor + shift
-        lines = [f"column = {json.dumps(name)}", f'role = "{role}"', f'signal = "{signal}"', f'unit = "{unit}"']
+        table: dict[str, Any] = {"column": name, "role": role, "signal": signal, "unit": unit}
         if role == "output" and case.declared:
-            lines.append(f"noise_rms = {_toml(case.noise_rms[signal] * factor)}")
-        tables.append("[[channels]]\n" + "\n".join(lines))
-    head = ["format = 1", f"title = {json.dumps(title)}"]
+            table["noise_rms"] = case.noise_rms[signal] * factor
+        tables.append(table)
+    head: dict[str, Any] = {"format": 1, "title": title}
     timed = rng.random() < 0.3
     if timed:
         columns = {"t_s": scene.t[: scene.keep], **columns}
-        head.append('time_column = "t_s"')
+        head["time_column"] = "t_s"
     if not timed or rng.random() < 0.5:
-        head.append(f"rate_hz = {_toml(1.0 / scene.dt)}")
+        head["rate_hz"] = 1.0 / scene.dt
     if rng.random() < 0.5:
-        head.append('data = "data.csv"')
-        text = ",".join(columns)
-        np.savetxt(
-            folder / "data.csv", np.stack(list(columns.values()), axis=1), "%.10g", ",", header=text, comments=""
-        )
+        head["data"] = "data.csv"
+        rows = np.stack(list(columns.values()), axis=1)
+        np.savetxt(folder / "data.csv", rows, "%.10g", ",", header=",".join(columns), comments="")
     else:
-        head.append('data = "data.npz"')
+        head["data"] = "data.npz"
         np.savez(folder / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
-    given = "\n".join(f"{k} = {_toml(v)}" for k, v in case.given.items())
-    text = "\n".join(head) + f'\n\n[twin]\nkind = "{scene.twin}"\n[twin.parameters]\n{given}\n\n'
+    head |= {"twin": {"kind": scene.twin, "parameters": case.given}, "channels": tables}
     path = folder / "recording.toml"
-    path.write_text(text + "\n\n".join(tables) + "\n")
+    path.write_text(toml_text(head))
     return path

@@ -92,7 +92,8 @@ def unknown(rng: Rng, scene: Scene, signal: str | None) -> Bound:
     if signal is None:
         return product_of_history(rng, scene)
     pick = rng.random()
-    if pick < 0.6:
+    stepped = scene.excitation in ("staircase", "rotary", "slow", "slow3")  # a rate that is zero nearly always
+    if pick < 0.6 or (pick >= 0.85 and stepped):
         return gain_follows_context(rng, scene, signal)
     if pick < 0.85:
         return offset_follows_context(rng, scene, signal)
