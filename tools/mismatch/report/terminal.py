@@ -45,10 +45,6 @@ def _where(report: Report) -> RenderableType:
     chain = Text(" › ").join(
         Text(f"[{s}]" if s in marked else s, "bold red" if s in marked else "") for s in report.chain
     )
-    follows = "; ".join(
-        f"{d.signal} ({d.feature}{', its history' if d.memory else ''}) {percent(d.strength)}"
-        for d in location.depends_on
-    )
     t = Table.grid(padding=(0, 2, 0, 0))
     t.add_column(style="dim", no_wrap=True)
     t.add_column(overflow="fold")
@@ -56,7 +52,7 @@ def _where(report: Report) -> RenderableType:
     t.add_row("chain", chain)
     t.add_row("when", Text(wording.windows(location)))
     t.add_row("regime", Text(location.regime))
-    t.add_row("follows", Text(follows or "nothing that was recorded"))
+    t.add_row("follows", Text(wording.follows(location)))
     return t
 
 
@@ -83,20 +79,19 @@ def _fit(report: Report) -> Table:
     t.columns[5].justify = "left"
     f = report.fit
     for o, unit in f.unit.items():
-        figures = (f.base_rms[o], f.recalibrated_rms[o], f.fitted_rms[o])
-        floor = f"{number(f.noise_floor_rms[o])} ({f.noise_method.get(o, '')})"
-        t.add_row(Text(o), *map(number, figures), floor, Text(unit), percent(wording.explained(f, o)))
+        factor, shown = wording.scaled(f.recalibrated_rms[o], unit)
+        figures = (f.base_rms[o] * factor, f.recalibrated_rms[o] * factor, f.fitted_rms[o] * factor)
+        floor = f"{number(f.noise_floor_rms[o] * factor)} ({f.noise_method.get(o, '')})"
+        t.add_row(Text(o), *map(number, figures), floor, Text(shown), percent(wording.explained(f, o)))
     return t
 
 
 def _base(report: Report) -> Table:
     t = _table("parameter", "as given", "re-fitted alone", "with physics", "95 % interval", "unit")
     t.columns[5].justify = "left"
-    for b in report.fit.base_parameters:
-        t.add_row(
-            Text(b.name), f"{b.given:.5g}", f"{b.alone:.5g}", f"{b.with_effects:.5g}",
-            f"{b.ci95[0]:.5g} .. {b.ci95[1]:.5g}", Text(b.unit),
-        )  # fmt: skip
+    for b in wording.base_rows(report):
+        value, lo, hi = wording.interval_of(b.with_effects, b.ci95)
+        t.add_row(Text(b.name), f"{b.given:.5g}", f"{b.alone:.5g}", value, f"{lo} .. {hi}", Text(b.unit))
     return t
 
 
@@ -104,17 +99,21 @@ def _runners_up(report: Report) -> Table:
     t = _table("effect", "output", "held-out residual", "why not")
     t.columns[1].justify = t.columns[3].justify = "left"
     for a in report.alternatives:
-        rms = f"{number(a.residual_rms_after)} {report.fit.unit.get(a.output, '')}"
-        t.add_row(words(a.name), Text(a.output), Text(rms), Text(a.why_not))
+        factor, unit = wording.scaled(a.residual_rms_after, report.fit.unit.get(a.output, ""))
+        t.add_row(words(a.name), Text(a.output), f"{number(a.residual_rms_after * factor)} {unit}", Text(a.why_not))
     return t
 
 
 def _limits(report: Report) -> Table:
+    """All of them where nothing was found: 'agrees' says nothing without them. Else the range."""
     rows: list[tuple[str, str]] = []
     for o, of in report.detection_limit.items():
         known = sorted((v, n) for n, v in of.items() if v is not None)
-        said = ", ".join(f"{words(n)} {number(v)}" for v, n in known)
-        rows.append((f"{o} ({report.fit.unit.get(o, '')} rms)", said or "none"))
+        factor, unit = wording.scaled(report.fit.noise_floor_rms.get(o, 1.0), report.fit.unit.get(o, ""))
+        said = [f"{words(n)} {number(v * factor)}" for v, n in known]
+        if report.verdict in ("missing_physics", "unexplained") and len(said) > 3:
+            said = [f"{said[0]} .. {said[-1]} (all in --json and --html)"]
+        rows.append((f"{o} ({unit} rms)", ", ".join(said) or "none"))
     return _pairs(rows)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tools.mismatch.engine.report import FitSummary, Location, ParameterValue, PhysicsFound, Report
+from tools.mismatch.engine.report import BaseShift, FitSummary, Location, ParameterValue, PhysicsFound, Report
 
 VERDICTS: Mapping[str, str] = {
     "agrees": "Agrees",
@@ -22,6 +22,18 @@ def number(value: float | None) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
 
 
+_PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n"))
+_SCALABLE = {"V", "A", "N", "m", "g", "rad", "m/s", "m/s^2", "rad/s"}
+
+
+def scaled(typical: float, unit: str) -> tuple[float, str]:
+    """A factor and a unit in which ``typical`` is at least 1 where an SI prefix can do it, e.g. (1e3, "mV")."""
+    if unit not in _SCALABLE or not math.isfinite(typical) or typical <= 0:
+        return 1.0, unit
+    factor, prefix = next(((f, p) for f, p in _PREFIXES if typical * f >= 1.0), _PREFIXES[-1])
+    return (factor, prefix + unit) if typical < 0.1 else (1.0, unit)
+
+
 def percent(share: float | None) -> str:
     """A share as a percentage, '-' for what is not known."""
     return "-" if share is None or not math.isfinite(share) else f"{100 * share:.0f} %"
@@ -33,17 +45,22 @@ def words(name: str) -> str:
 
 
 def interval(p: ParameterValue) -> tuple[str, str, str]:
-    """Value and both ends of its interval, with as many digits as the interval justifies."""
-    lo, hi = p.ci95
+    """See ``interval_of``."""
+    return interval_of(p.value, p.ci95)
+
+
+def interval_of(value: float, ci95: tuple[float, float]) -> tuple[str, str, str]:
+    """A value and both ends of its interval, with as many digits as the interval justifies."""
+    lo, hi = ci95
     half = (hi - lo) / 2
-    if not all(map(math.isfinite, (p.value, lo, hi))) or half <= 0:
-        return f"{p.value:.4g}", number(lo), number(hi)
-    size = max(abs(p.value), abs(lo), abs(hi))
+    if not all(map(math.isfinite, (value, lo, hi))) or half <= 0:
+        return f"{value:.4g}", number(lo), number(hi)
+    size = max(abs(value), abs(lo), abs(hi))
     digits = min(max(math.floor(math.log10(size)) - math.floor(math.log10(half)) + 2, 2), 8)
     if 1e-4 <= size < 1e6:
         places = max(0, digits - 1 - math.floor(math.log10(size)))
-        return f"{p.value:.{places}f}", f"{lo:.{places}f}", f"{hi:.{places}f}"
-    return f"{p.value:.{digits}g}", f"{lo:.{digits}g}", f"{hi:.{digits}g}"
+        return f"{value:.{places}f}", f"{lo:.{places}f}", f"{hi:.{places}f}"
+    return f"{value:.{digits}g}", f"{lo:.{digits}g}", f"{hi:.{digits}g}"
 
 
 def poorly_known(p: ParameterValue) -> float | None:
@@ -73,6 +90,19 @@ def windows(location: Location, most: int = 6) -> str:
     return shown + (f" and {more} more" if more > 0 else "")
 
 
+def follows(location: Location) -> str:
+    """What the residual follows, by signal, e.g. 'load (value 49 %, recent history 22 %)'."""
+    by: dict[str, list[str]] = {}
+    for d in location.depends_on:
+        by.setdefault(d.signal, []).append(f"{d.feature} {percent(d.strength)}")
+    return "; ".join(f"{s} ({', '.join(v)})" for s, v in by.items()) or "nothing that was recorded"
+
+
+def base_rows(report: Report) -> tuple[BaseShift, ...]:
+    """Base parameters under the names that a bench engineer knows, if the engine gave them."""
+    return getattr(report.fit, "base_human", ()) or report.fit.base_parameters
+
+
 def guilty_stages(report: Report) -> tuple[str, ...]:
     """Stages to mark in the chain: where physics was found, or where the leftover is guessed to sit."""
     found = tuple(dict.fromkeys(p.stage for p in report.physics))
@@ -96,4 +126,6 @@ def step_s(report: Report) -> float | None:
 
 def before_after(p: PhysicsFound, unit: str) -> str:
     """What one effect does to the held-out residual of its output."""
-    return f"{number(p.residual_rms_before)} without it, {number(p.residual_rms_after)} with it ({unit} rms, held out)"
+    factor, unit = scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
+    without, within = number(p.residual_rms_before * factor), number(p.residual_rms_after * factor)
+    return f"{without} without it, {within} with it ({unit} rms, held out)"

@@ -1,0 +1,174 @@
+"""One self-contained HTML page: everything inline, nothing fetched, readable in light and dark."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from sim_devices.physics.catalogue import EFFECTS
+from tools.mismatch.engine.report import PhysicsFound, Report
+from tools.mismatch.report import figures, series, svg, wording
+from tools.mismatch.report.equations import plain
+from tools.mismatch.report.next_experiment import next_experiments
+from tools.mismatch.report.wording import number, percent, words
+
+BASE_EQUATIONS: Mapping[str, str] = MappingProxyType(
+    {
+        "piezo_stack": r"z = g\,u + z_0",
+        "accelerometer": r"V_i = b_i + s_i f_i",
+        "magnetometer": r"V_i = b_i + s_i B_i",
+        "accelerometer_cluster": r"a = e \cdot (f + \alpha \times r)",
+        "mechanical_axis": r"m\ddot x + c\dot x + k x = F + F_0",
+        "state_space": r"\dot x = A x + B u,\quad y = C x + D u + y_0",
+    }
+)
+"""The contract's base physics (section 2), in TeX."""
+
+
+def html_page(report: Report) -> str:
+    """The page. Needs ``report.pictures``; without them only text and tables are shown."""
+    from jinja2 import Environment, StrictUndefined
+
+    source = Path(__file__).with_name("page.html.j2").read_text(encoding="utf-8")
+    template = Environment(
+        autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    ).from_string(source)
+    return template.render(
+        report=report,
+        verdict=wording.VERDICTS[report.verdict],
+        name=_name(report),
+        chain=_chain(report),
+        windows=wording.windows(report.location),
+        base_equation=_base_equation(report),
+        effects=[_effect(report, p) for p in report.physics],
+        bars=_bars(report),
+        base=_base_rows(report),
+        pictures=_pictures(report),
+        limits=_limits(report),
+        experiments=next_experiments(report),
+        split=_split(report),
+        number=number,
+        percent=percent,
+        words=words,
+        scaled=wording.scaled,
+    )
+
+
+def _name(report: Report) -> str:
+    path = Path(report.recording)
+    return path.parent.name if path.name == "recording.toml" else str(Path(path.parent.name) / path.stem)
+
+
+def _chain(report: Report) -> str:
+    guilty = dict.fromkeys(wording.guilty_stages(report), "")
+    for stage in guilty:
+        named = [words(p.name) for p in report.physics if p.stage == stage]
+        guilty[stage] = " + ".join(dict.fromkeys(named)) or "unexplained"
+    inputs = list(report.pictures.signals)[-1:] if report.pictures else []
+    outputs = list(report.fit.unit)
+    ends = ("input" if len(inputs) != 1 else inputs[0], outputs[0] if len(outputs) == 1 else f"{len(outputs)} outputs")
+    return svg.chain(report.chain, guilty, ends)
+
+
+def _base_equation(report: Report) -> str:
+    tex = BASE_EQUATIONS.get(report.twin)
+    return svg.equation(tex) if tex else ""
+
+
+def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
+    unit = report.fit.unit.get(p.output, "")
+    factor, shown = wording.scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
+    known = EFFECTS.get(p.name)
+    return {
+        "found": p,
+        "title": words(p.name),
+        "summary": known.summary if known else "",
+        "equation": svg.equation(p.equation),
+        "parameters": [
+            (words(n), *wording.interval(v), "" if v.unit == "1" else v.unit) for n, v in p.parameters.items()
+        ],
+        "before": number(p.residual_rms_before * factor),
+        "after": number(p.residual_rms_after * factor),
+        "unit": shown,
+        "confidence": percent(p.confidence),
+        "plain": plain(p.equation),
+    }
+
+
+def _bars(report: Report) -> list[dict[str, Any]]:
+    """Per output the four figures of the fit as bars; one scale per output."""
+    f = report.fit
+    out: list[dict[str, Any]] = []
+    for o, unit in f.unit.items():
+        values = [("as given", "given", f.base_rms[o]), ("recalibrated", "before", f.recalibrated_rms[o])]
+        if report.physics:
+            values.append(("with physics", "after", f.fitted_rms[o]))
+        values.append((f"noise floor ({f.noise_method.get(o, '')})", "noise", f.noise_floor_rms[o]))
+        finite = [v for _, _, v in values if math.isfinite(v)]
+        longest = max(finite, default=1.0) or 1.0
+        # one hopeless figure (an unstable twin) must not hide the others
+        second = sorted(finite)[-2] if len(finite) > 1 else longest
+        top = min(longest, 4 * second) or 1.0
+        factor, shown = wording.scaled(second, unit)
+        rows = [
+            (label, kind, number(v * factor), min(100.0, 100 * v / top) if math.isfinite(v) else 100.0, not v <= top)
+            for label, kind, v in values
+        ]
+        out.append({"output": o, "unit": shown, "rows": rows, "explained": percent(wording.explained(f, o))})
+    return out
+
+
+def _base_rows(report: Report) -> list[tuple[str, ...]]:
+    out: list[tuple[str, ...]] = []
+    for b in wording.base_rows(report):
+        value, lo, hi = wording.interval_of(b.with_effects, b.ci95)
+        out.append(
+            (b.name, f"{b.given:.5g}", f"{b.alone:.5g}", value, f"{lo} to {hi}", "" if b.unit == "1" else b.unit)
+        )
+    return out
+
+
+def _pictures(report: Report) -> list[dict[str, str]]:
+    p = report.pictures
+    if p is None or p.t.size < 16:
+        return []
+    return [
+        {
+            "output": o,
+            "overlay": figures.overlay(report, p, o, f"overlay{i}"),
+            "residual": figures.residual(report, p, o, f"residual{i}"),
+            "follows": figures.follows(report, p, o, f"follows{i}"),
+            "spectra": figures.spectra(report, p, o, f"spectra{i}"),
+            "autocorrelation": figures.autocorrelations(report, p, o, f"acf{i}"),
+        }
+        for i, o in enumerate(series.drawn_outputs(report))
+    ]
+
+
+def _limits(report: Report) -> dict[str, Any]:
+    """Effects by output; a row per effect, least output first."""
+    outputs = list(report.detection_limit)
+    names = dict.fromkeys(n for of in report.detection_limit.values() for n in of)
+    units = {o: wording.scaled(report.fit.noise_floor_rms.get(o, 1.0), report.fit.unit.get(o, "")) for o in outputs}
+
+    def shown(o: str, n: str) -> str:
+        v = report.detection_limit[o].get(n)
+        return "-" if v is None else number(v * units[o][0])
+
+    first = outputs[0] if outputs else ""
+    order = sorted(names, key=lambda n: report.detection_limit[first].get(n) or math.inf)
+    return {
+        "outputs": [(o, units[o][1]) for o in outputs],
+        "rows": [(words(n), [shown(o, n) for o in outputs]) for n in order],
+    }
+
+
+def _split(report: Report) -> tuple[str, str]:
+    dt = wording.step_s(report)
+    f = report.fit
+    if dt is None:
+        return f"samples {list(f.fit_spans)}", f"samples {list(f.held_out_spans)}"
+    return wording.spans(f.fit_spans, dt), wording.spans(f.held_out_spans, dt)
