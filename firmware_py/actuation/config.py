@@ -54,7 +54,7 @@ class ActuationConfig(BaseModel):
     tick_hz: Positive = 1000.0
     gain: Annotated[float, Field(ge=0.0, le=2.0)] = 1.0
     ramp_s: Positive = 0.5
-    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.3
+    min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
 
     ball_circle_m: Positive = 0.005  # R = r, 000 (6.11)
     shaft_m: Positive = 0.040  # ball plane to tip

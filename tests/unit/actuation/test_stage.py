@@ -81,7 +81,7 @@ def test_compensation_fades_in_and_out_with_trust() -> None:
     frames = trembling(2500)
     frames[:, LAYOUT["tremor_ahead"]] = 10e-6
     frames[:100, STATUS] = SETTLING
-    frames[1500:, CONFIDENCE + 1] = 0.1
+    frames[1500:, CONFIDENCE + 1] = 0.05
     run(ActuationConfig(ramp_s=0.5), frames)
     wish = -frames[:, LAYOUT["desired_tip"]] / 10e-6
     assert np.all(wish[:100] == 0.0)
