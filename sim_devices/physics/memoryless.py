@@ -85,9 +85,12 @@ KNOTS = 9
 
 
 def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
-    """Columns of a curve without its straight part. ``shape`` 2..5: Legendre polynomials up to that degree, continued
+    """Columns of a curve without its straight part. ``shape`` 1: the sign is lost, |x| - x (a sensor of magnitude);
+    2..5: Legendre polynomials up to that degree, continued
     by their tangents outside [lo, hi]; 0: hinges |x - knot| on a uniform grid and at zero (piecewise linear)."""
     half = 0.5 * (hi - lo)
+    if shape == 1:
+        return (np.abs(x) - x)[:, None]
     z = (x - 0.5 * (lo + hi)) / half
     if shape > 0:
         inside = np.clip(z, -1.0, 1.0)
@@ -106,29 +109,37 @@ def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
     return np.stack([np.abs(z - k) for k in knots], axis=1)
 
 
-def _curve_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+def _curve_choose(x: Array, target: Array, ctx: Context) -> tuple[float, int, float, float]:
+    """(score, shape, lo, hi): the curve over x that meets the target best for its size."""
     lo, hi = _range(x)
     k = thin(ctx.keep, 8000)
-    r = residual[k]
     straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
-    best: tuple[float, int] | None = None
     # effective samples: residuals are coloured, so one in ten counts
     n = max(k.size / 10.0, 20.0)
-    for shape in (2, 3, 5, 0):
+    best = (np.inf, 2)
+    for shape in (1, 2, 3, 5, 0) if lo < 0.0 < hi else (2, 3, 5, 0):
         cols = curve_basis(x, lo, hi, shape)
         if ctx.through is not None:
             cols = np.stack([ctx.to_output(c) for c in cols.T], axis=1)
-        rss = least_squares(np.column_stack([straight, cols[k]]), r)[1]
-        score = n * np.log(max(rss, 1e-300)) + cols.shape[1] * np.log(n)
-        if best is None or score < best[0]:
-            best = (score, shape)
-    assert best is not None
-    return {"range": (lo, hi), "shape": (float(best[1]),)}
+        rss = least_squares(np.column_stack([straight, cols[k]]), target[k])[1]
+        best = min(best, (n * np.log(max(rss, 1e-300)) + cols.shape[1] * np.log(n), shape))
+    return best[0], best[1], lo, hi
+
+
+def _curve_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    score, shape, lo, hi = _curve_choose(x, residual, ctx)
+    if ctx.believed is not None and ctx.measured is not None:
+        other = _curve_choose(ctx.believed, ctx.measured, ctx)
+        if other[0] < score:
+            _, shape, lo, hi = other
+    return {"range": (lo, hi), "shape": (float(shape),)}
 
 
 def _curve_parts(settings: Settings) -> Parts:
     shape = int(settings.get("shape", (3.0,))[0])
-    n = shape - 1 if shape > 0 else KNOTS
+    n = max(shape - 1, 1) if shape > 0 else KNOTS
+    if shape == 1:
+        return Parts((), (Parameter("sign_lost", "{out}/{in}"),))
     names = [f"legendre{d}" for d in range(2, shape + 1)] if shape > 0 else [f"hinge{i + 1}" for i in range(n)]
     return Parts((), tuple(Parameter(m, "{out}") for m in names), 0.05 * np.eye(n))
 

@@ -210,6 +210,14 @@ class Model:
                 out.append(th.copy())
                 th[b] *= 0.3
             out.append(th)
+        if not self.twin.static:
+            # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
+            given = self.twin.start(view.recording)
+            if not np.allclose(given, theta[: self.n_base], rtol=1e-3, atol=0.0):
+                for th in out[:2]:
+                    other = th.copy()
+                    other[: self.n_base] = given
+                    out.append(other)
         return out
 
     def human(self, theta: Array) -> dict[str, list[Human]]:
@@ -467,7 +475,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
         signals=signals,
     )
     base = theta[: model.n_base]
-    if pl.effect.kind == "linear":
+    if pl.site == "output" and not (twin.static and pl.effect.kind == "add"):
         given = theta.copy()
         given[: model.n_base] = twin.start(view.recording)
         ctx = replace(ctx, believed=model._flow(run, given, True)[output].value)

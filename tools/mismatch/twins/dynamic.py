@@ -256,8 +256,9 @@ class DynamicTwin:
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0
 
         def go(x0: Array, stop: Array) -> Array:
+            some = u[: int(stop.max())]
             return run_feedback(
-                d.ad, d.g0, d.g1, cp, cv, u, held, sub, x0, starts, stop,
+                d.ad, d.g0, d.g1, cp, cv, some, held, sub, x0, starts, stop,
                 packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,
             )  # fmt: skip
 
@@ -270,9 +271,10 @@ class DynamicTwin:
         ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
         stop = np.minimum(starts + window, ends)
+        m = int(stop.max())
         for _ in range(3):
             x = go(x0, stop)
-            x0 = x0 + ss.states({o: run.measured[o] - extra[o] - x @ rows[o] for o in self.outputs})
+            x0 = x0 + ss.states({o: run.measured[o][:m] - extra[o][:m] - x @ rows[o] for o in self.outputs})
         x = go(x0, ends)
         return {o: Signal(x @ rows[o] + extra[o]) for o in self.outputs}
 

@@ -13,10 +13,19 @@ from tools.mismatch.twins.vocabulary import user_kinds
 
 
 def make(recording: Recording) -> Twin:
-    """The twin of a recording, without the effects of a corrected twin (``simulate_text.restore`` adds those).
+    """The twin of a recording; effects of a corrected twin are part of its base physics.
 
-    Unknown kinds and parameters are RecordingErrors.
+    Unknown kinds, parameters and effects are RecordingErrors.
     """
+    if recording.twin.effects:
+        from tools.mismatch.twins.corrected import corrected_twin
+
+        return corrected_twin(recording)
+    return core(recording)
+
+
+def core(recording: Recording) -> Twin:
+    """The twin without the effects of a corrected one (``simulate_text.restore`` adds those)."""
     kind = recording.twin.kind
     match kind:
         case "piezo_stack" | "accelerometer" | "magnetometer":
