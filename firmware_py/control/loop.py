@@ -19,6 +19,7 @@ from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import (
+    CLIP,
     COMMAND,
     COUNTS,
     MAGNETOMETER_FRESH,
@@ -62,7 +63,7 @@ class Recorder(Protocol):
 
 @dataclass
 class LoopCounts:
-    """What the loop counted besides the scheduler's figures."""
+    """What the loop counted besides the scheduler's figures. ``clipped``: commands that ran into a limit."""
 
     expected: int = 0
     received: int = 0
@@ -281,7 +282,7 @@ class InstrumentLoop:
                 return
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1
-            self.counts.clipped += clipped != 0
+            self.counts.clipped += clipped != 0 or self._frame[CLIP] != 0
         else:
             self.supervisor.step()
 

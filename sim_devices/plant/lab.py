@@ -1,7 +1,8 @@
 """The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
 ``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops]``
-drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a contract recording.
+drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
+contract.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
 """

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate, doctor, mismatch, recordings, replay, run
+from tools.cli import calibrate, doctor, hands, mismatch, recordings, replay, run
 
 app = typer.Typer(
     name="micron",
@@ -37,6 +37,7 @@ def options(
 app.command("run")(run.run)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
+app.command("hands")(hands.hands)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")

@@ -1,0 +1,57 @@
+"""``micron hands``: the closed loop on recorded tremor, as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from firmware_py.recording.revision import git_revision
+from hal.bench import load_bench
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import (
+    InputError,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    write_json,
+    write_text_atomic,
+)
+from tools.reports.hands import HandRow, markdown, run_hands
+
+
+def hands(
+    bench: BenchOption = None,
+    data: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the real recordings.")] = Path(
+        "../shared/data"
+    ),
+    seconds: Annotated[float, typer.Option(min=4.0, max=600.0)] = 15.0,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Run the instrument in every recorded hand, with each estimator, in virtual time.
+
+    Example: micron hands --out docs/first-results.md
+    """
+    with clear_errors():
+        check_writable(json_file, out)
+        if not data.is_dir():
+            raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
+        load_bench(bench_path(bench))
+        rows: list[HandRow] = []
+        with Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(), transient=True
+        ) as progress:
+            task = progress.add_task("starting")
+            rows.extend(
+                run_hands(bench_path(bench), data, seconds, lambda text: progress.update(task, description=text))
+            )
+        page = markdown(rows, seconds, git_revision() or "unknown")
+        if out is not None:
+            write_text_atomic(out, page)
+        if json_file != "-":
+            typer.echo(page)
+        write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
