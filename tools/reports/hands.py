@@ -93,16 +93,22 @@ def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
     ]
     for row in rows:
         band, whole = row.figures.vector, row.figures.whole_band
-        lines.append(
-            f"| {row.hand} | {row.method} | {band.uncompensated_rms_um:.2f} | {band.compensated_rms_um:.2f} "
-            f"| {band.reduction_percent:.1f} | {row.limited_percent:.1f} | {whole.uncompensated_rms_um:.1f} -> {whole.compensated_rms_um:.1f} |"
+        cells = (
+            row.hand,
+            row.method,
+            f"{band.uncompensated_rms_um:.2f}",
+            f"{band.compensated_rms_um:.2f}",
+            f"{band.reduction_percent:.1f}",
+            f"{row.limited_percent:.1f}",
+            f"{whole.uncompensated_rms_um:.1f} -> {whole.compensated_rms_um:.1f}",
         )
+        lines.append(f"| {' | '.join(cells)} |")
     lines += [
         "",
         "Published for comparison: 69 % with WFLC alone in one dimension, sensing excluded (000, section 5.2).",
         "All bands: error against the intended path. It holds what the instrument does not try to cancel: drift, jerks",
-        "and everything below the tremor band. At a limit: the wanted displacement was out of the manipulator's reach or",
-        "the amplifier's range; a hand whose motion just below the band is large (participant 5) drives it there.",
+        "and everything below the tremor band. At a limit: the wanted displacement was out of the manipulator's reach",
+        "or the amplifier's range; a hand whose motion just below the band is large (participant 5) drives it there.",
         "",
     ]
     return "\n".join(lines)
