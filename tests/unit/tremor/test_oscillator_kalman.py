@@ -42,7 +42,7 @@ def euler_model(white, k, substeps):  # type: ignore[no-untyped-def]
 
 @pytest.fixture(scope="module")
 def config() -> TremorConfig:
-    return TremorConfig(kalman=KalmanConfig(frequencies_hz=(9.0, 11.0), bandwidth_hz=1.0))
+    return TremorConfig(loop_delay_s=0.004, kalman=KalmanConfig(frequencies_hz=(9.0, 11.0), bandwidth_hz=1.0))
 
 
 def test_the_filter_is_stable_and_its_rows_are_its_models(config: TremorConfig) -> None:
