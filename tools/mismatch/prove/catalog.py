@@ -64,7 +64,7 @@ def _one_signal(where: str) -> dict[str, Entry]:
     moving = (*WIDE, *STEPPED)
     return {
         "hysteresis": Entry(
-            _shape("hysteresis", where), (*moving, "slow"), "several amplitudes or speeds, else it is a phase"
+            _shape("hysteresis", where), (*moving, "slow", "sine"), "several amplitudes or speeds, else it is a phase"
         ),
         "rate_dependent_hysteresis": Entry(
             _shape("rate_dependent_hysteresis", where), ("sines", "chirp", "multisine", "sawtooth"), "several speeds"
@@ -138,7 +138,13 @@ def _table() -> dict[str, dict[str, Entry]]:
     axis = {
         **_anytime(axis_under),
         **_temperature(axis_under),
-        **{k: inside[k] for k in ("saturation", "dead_zone", "first_order_lag", "dead_time")},
+        **{k: inside[k] for k in ("saturation", "dead_zone", "first_order_lag", "dead_time", "slew_limit")},
+        "resonance": Entry(
+            _shape("resonance", "one_out"),
+            ("staircase", "chirp", "multisine", "sines"),
+            "steps or content near the mode",
+            fast_only=True,
+        ),
         "backlash": Entry(_shape("backlash", "one_out"), axis_under, "reversals"),
         "coulomb_friction": Entry(ax.coulomb_friction, axis_under, "motion with reversals"),
         "stribeck_friction": Entry(ax.stribeck_friction, axis_under, "slow and fast motion"),
@@ -147,7 +153,7 @@ def _table() -> dict[str, dict[str, Entry]]:
         "hysteresis": Entry(ax.hysteresis, axis_under, "several amplitudes"),
     }
     ss_under = ("sines", "multisine", "tremor", "chirp", "staircase", "sawtooth")
-    ss = {**_one_signal("drive"), **_anytime(ss_under), **_temperature(ss_under)}
+    ss = {**_one_signal("either"), **_anytime(ss_under), **_temperature(ss_under)}
     acc = {
         **_vector_sensor(),
         "misalignment": Entry(fs.misalignment, VECTOR_ALL, "several axes excited", needs_all_axes=True),
@@ -174,6 +180,8 @@ def _table() -> dict[str, dict[str, Entry]]:
         "dead_time": Entry(_shape("dead_time", "out_all"), BODY, "fast motion", fast_only=True),
         "first_order_lag": Entry(_shape("first_order_lag", "out_all"), BODY, "fast motion", fast_only=True),
         "saturation": Entry(_shape("saturation", "one_out"), BODY, "reaches the limit"),
+        "misalignment": Entry(fs.misalignment_of_cluster, BODY, "gravity and motion on several axes"),
+        "resonance": Entry(_shape("resonance", "one_out"), BODY, "content near the mode", fast_only=True),
     }
     cluster.pop("random_walk")
     return {

@@ -53,6 +53,33 @@ def misalignment(rng: Rng, scene: Scene) -> Bound:
     return _matrix_effect("misalignment", "skewed_axes", scene, m, None)
 
 
+def misalignment_of_cluster(rng: Rng, scene: Scene) -> Bound:
+    """One location sits turned: each of its outputs takes a share of the other axes there."""
+    places = sorted({o[len("accel_") : -1] for o in scene.outputs})
+    where = str(rng.choice(places))
+    turn = rng.normal(size=3)
+    turn /= np.linalg.norm(turn)
+    outs = tuple(o for o in scene.outputs if o[len("accel_") : -1] == where)
+
+    def after(flow: Flow, s: float) -> None:
+        f = np.stack([flow.drive[f"specific_force_{a}"] for a in AXES], axis=1)
+        alpha = np.stack([flow.drive[f"_alpha_{a}"] for a in AXES], axis=1)
+        here = f + np.cross(alpha, np.asarray(scene.parameters["positions_m"][where], float))
+        moved = here @ Rotation.from_rotvec(s * turn).as_matrix() - here
+        for out in outs:
+            flow.out[out] = flow.out[out] + moved[:, AXES.index(out[-1])]
+
+    return Bound(
+        "misalignment",
+        "turned_location",
+        on_out=after,
+        outputs=outs,
+        stages=SENSOR,
+        depends=tuple(f"specific_force_{a}" for a in AXES) + tuple(f"angular_rate_{a}" for a in AXES),
+        strength=(1e-5, 0.5),
+    )
+
+
 def soft_iron(rng: Rng, scene: Scene) -> Bound:
     if rng.random() < 0.5:
         g = rng.normal(size=(3, 3))

@@ -54,7 +54,9 @@ def main_drive(scene: Scene) -> str:
 
 
 def shaped(name: str, rng: Rng, scene: Scene, where: str) -> Bound:
-    """A one-signal effect at the drive ('drive') or at outputs ('out', 'out_all', 'one_out')."""
+    """A one-signal effect at the drive ('drive'), at outputs ('out', 'out_all', 'one_out') or at 'either' end."""
+    if where == "either":
+        where = "drive" if rng.random() < 0.6 else "one_out"
     shape = SHAPES[name](rng)
     zero = name in CENTRED_AT_ZERO
     if where == "drive":

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -47,9 +47,15 @@ class ProofResult:
 
 def _generate(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[str, dict[str, Any], str] | None:
     seed, index, plan, folder, max_samples, noise_kind = job
-    try:
-        case = draw.make([seed, index], plan, max_samples, noise_kind)
-    except draw.NotVisible:
+    case = None
+    # where no scene shows the effect at this severity, a larger one takes its place
+    for severity in (plan.severity, *(s for s in draw.SEVERITIES if s > plan.severity)):
+        try:
+            case = draw.make([seed, index], replace(plan, severity=severity), max_samples, noise_kind)
+            break
+        except draw.NotVisible:
+            continue
+    if case is None:
         return None
     name = f"r{index:03d}"
     path = write(case, folder / name, f"recording {index}", np.random.default_rng([seed, index, 99]))
