@@ -215,7 +215,11 @@ class InstrumentLoop:
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
 
     def _read(self, timeout_s: float) -> ScanBlock:
-        block = self._devices.daq.read_scans(self._rows, timeout_s)
+        try:
+            block = self._devices.daq.read_scans(self._rows, timeout_s)
+        except HalError as error:
+            self._trip_for(self._devices.daq.name, error)
+            raise
         self._block = block
         self.counts.received += block.n
         self.counts.lost += block.lost
@@ -247,6 +251,10 @@ class InstrumentLoop:
         if self._recorder is not None:
             self._recorder.event({"t_ns": t_ns, "tick": tick, "event": "safe state", "reason": reason})
 
+    def _trip_for(self, device: str, error: HalError) -> None:
+        """Trip with the bench's name of the device in front: a port knows only its path."""
+        self._trip(f"{error}" if str(error).startswith(device) else f"{device}: {error}")
+
     # -- tasks --------------------------------------------------------------------------------------------
 
     def _sense(self, info: TickInfo) -> None:
@@ -277,8 +285,7 @@ class InstrumentLoop:
                 clipped = self._devices.amplifier.write(self.stages.command_V)
             except HalError as error:
                 self.error = error
-                name = self._devices.amplifier.name
-                self._trip(f"{error}" if str(error).startswith(name) else f"{name}: {error}")
+                self._trip_for(self._devices.amplifier.name, error)
                 return
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1
