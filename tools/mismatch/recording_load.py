@@ -45,7 +45,7 @@ def load_recording(path: Path) -> Recording:
     data_name = text.get("data")
     if not isinstance(data_name, str):
         raise RecordingError(f"{where}: 'data' must name the data file (.csv, .npz, .mcap), got {data_name!r}")
-    twin, words = _twin(where, text.get("twin"))
+    twin, words = _twin(where, _twin_table(path, text.get("twin")))
     notes = [f"key '{k}' is unknown and not used" for k in text if k not in _TOP]
     channels = _channels(where, text["channels"], words, twin.kind, notes)
     rate = _number(where, "rate_hz", text.get("rate_hz"))
@@ -131,6 +131,22 @@ def _number(where: str, key: str, value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise RecordingError(f"{where}: {key} must be a finite number, got {value!r}")
     return float(value)
+
+
+def _twin_table(path: Path, value: object) -> object:
+    """The [twin] table itself, or that of the twin file which it names."""
+    if not isinstance(value, Mapping) or "file" not in value:
+        return value
+    name = value["file"]
+    if not isinstance(name, str) or len(value) > 1:
+        raise RecordingError(f"{path}: [twin] file must be the name of a twin file, and stand alone")
+    other = path.parent / name
+    if not other.is_file():
+        raise RecordingError(f"{path}: [twin] file: {other} does not exist")
+    table = _toml(other).get("twin")
+    if not isinstance(table, Mapping):
+        raise RecordingError(f"{other}: no [twin] table; write one with 'micron mismatch apply'")
+    return table
 
 
 def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:

@@ -214,10 +214,25 @@ class Model:
             # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
             given = self.twin.start(view.recording)
             if not np.allclose(given, theta[: self.n_base], rtol=1e-3, atol=0.0):
-                for th in out[:2]:
-                    other = th.copy()
-                    other[: self.n_base] = given
-                    out.append(other)
+                out += self._from_believed(k, view, out[:2], given)
+        return out
+
+    def _from_believed(self, k: int, view: View, starts: Sequence[Array], given: Array) -> list[Array]:
+        """The same starts on the engineer's base, searched weights met anew there."""
+        pl = self.placed[k]
+        a, b = self._slices[k]
+        rest = Model(self.twin, [p for j, p in enumerate(self.placed) if j != k])
+        out: list[Array] = []
+        for th in starts:
+            other = th.copy()
+            other[: self.n_base] = given
+            if b.stop > b.start and b.start not in self.linear:
+                without = rest.carry(self, other, view.recording)
+                output = pl.outputs[0]
+                residual = full_residual(rest, view, without)[output]
+                x, ctx = probe_signals(rest, view, without, pl, output)
+                other[b] = first_weights(pl, x, residual, ctx, other[a])
+            out.append(other)
         return out
 
     def human(self, theta: Array) -> dict[str, list[Human]]:
@@ -278,21 +293,43 @@ class Model:
         return Design(constant, columns, linear, self._penalty())
 
     def _penalty(self) -> Array:
-        at = {j: i for i, j in enumerate(self.linear)}
-        rows: list[Array] = []
+        rows = self.smoothness()
+        others = np.ones(len(self.parameters), np.bool_)
+        others[list(self.linear)] = False
+        solved = ~np.any(rows[:, others] != 0.0, axis=1)
+        return rows[solved][:, list(self.linear)]
+
+    def smoothness(self) -> Array:
+        """Smoothness rows over all parameters, (rows, len(parameters)): those of the twin and of each effect."""
+        n = len(self.parameters)
+        own = getattr(self.twin, "penalty", None)
+        blocks = [np.zeros((0, n))]
+        if own is not None:
+            blocks.append(np.pad(own, ((0, 0), (0, n - own.shape[1]))))
         for k, pl in enumerate(self.placed):
             penalty = pl.parts.penalty
-            w = self._slices[k][1]
-            if penalty is None or any(j not in at for j in range(w.start, w.stop)):
-                continue
-            block = np.zeros((penalty.shape[0], len(self.linear)))
-            block[:, [at[j] for j in range(w.start, w.stop)]] = penalty
-            rows.append(block)
-        return np.concatenate(rows) if rows else np.zeros((0, len(self.linear)))
+            if penalty is not None:
+                w = self._slices[k][1]
+                blocks.append(np.pad(penalty, ((0, 0), (w.start, n - w.stop))))
+        return np.concatenate(blocks)
 
-    def _flow(self, run: Run, theta: Array, join: bool, folded: set[int] | None = None) -> dict[str, Signal]:
+    def flow(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """The outputs for given inputs and further forces: this model as the base physics of another."""
+        return self._flow(run, theta, join, None, inputs, forces)
+
+    def _flow(
+        self,
+        run: Run,
+        theta: Array,
+        join: bool,
+        folded: set[int] | None = None,
+        given: Mapping[str, Signal] | None = None,
+        beside: Sequence[Force] = (),
+    ) -> dict[str, Signal]:
         theta = np.asarray(theta, np.float64)
-        inputs = {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
+        inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
         for k in self.order:
             pl = self.placed[k]
             if pl.site == "input":
@@ -301,7 +338,7 @@ class Model:
         if folded is not None and forces:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
-        outputs = self.twin.respond(run, inputs, theta, forces, join)
+        outputs = self.twin.respond(run, inputs, theta, [*forces, *beside], join)
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
         for k in self.order:
@@ -400,7 +437,7 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
     if pl.site != "output":
         columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
     k = thin(ctx.keep, 20_000)
-    line = np.stack([np.ones(k.size), x[k]], axis=1)
+    line = np.ones((k.size, 1)) if pl.site == "output" else np.stack([np.ones(k.size), x[k]], axis=1)
     w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
     return w[: columns.shape[1]]
 

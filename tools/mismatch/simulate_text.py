@@ -8,11 +8,11 @@ from typing import Any, cast, get_args
 import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.effect import Array, Effect, Stage
+from sim_devices.physics.effect import Array, Effect, Settings, Stage
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model, Placed
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.make import make
+from tools.mismatch.twins.make import core
 
 
 def describe(model: Model, theta: Array) -> dict[str, Any]:
@@ -42,7 +42,7 @@ def restore(recording: Recording) -> tuple[Model, Array]:
 
     Raises RecordingError naming the effect and key that cannot be used.
     """
-    twin = make(recording)
+    twin = core(recording)
     placed: list[Placed] = []
     values: list[Array] = []
     for i, entry in enumerate(recording.twin.effects):
@@ -63,11 +63,13 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
     effect = EFFECTS.get(name) if isinstance(name, str) else None
     if effect is None:
         raise RecordingError(f"{where}: name '{name}' is not in the vocabulary; see 'micron mismatch physics'")
-    effect = _variant(where, effect, site)
+    given = entry.get("parameters", {})
+    if not isinstance(given, Mapping):
+        raise RecordingError(f"{where}: parameters must be a table")
     stage = entry.get("stage", effect.stages[0])
     if stage not in get_args(Stage):
         raise RecordingError(f"{where}: stage must be one of {', '.join(get_args(Stage))}, got {stage!r}")
-    target = entry.get("target", "")
+    target = str(entry.get("target", ""))
     outputs = entry.get("outputs", [target])
     if not isinstance(outputs, Sequence) or not outputs or any(o not in twin.outputs for o in outputs):
         raise RecordingError(f"{where}: outputs {outputs!r} are not among {', '.join(twin.outputs)}")
@@ -77,8 +79,8 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
         settings = {k: tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
     except (TypeError, ValueError):
         raise RecordingError(f"{where}: settings must be lists of numbers") from None
+    effect = _variant(where, effect, site, settings, given)
     pl = Placed(effect, site, target, cast(Stage, stage), tuple(outputs), settings)
-    given = entry.get("parameters", {})
     names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
     missing = [n for n in names if not _finite(given.get(n))]
     if missing:
@@ -86,13 +88,21 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
     return pl, np.array([float(given[n]) for n in names])
 
 
-def _variant(where: str, effect: Effect, site: object) -> Effect:
+def _variant(where: str, effect: Effect, site: object, settings: Settings, given: Mapping[str, Any]) -> Effect:
+    """The form of an effect that sits at ``site`` and has these parameters."""
     if site not in ("input", "output", "feedback"):
         raise RecordingError(f"{where}: site must be input, output or feedback, got {site!r}")
-    for one in (effect, *effect.variants):
-        if (one.kind == "feedback") == (site == "feedback"):
-            return one
-    raise RecordingError(f"{where}: {effect.name} cannot sit at '{site}'")
+    forms = [e for e in (effect, *effect.variants) if (e.kind == "feedback") == (site == "feedback")]
+    if not forms:
+        raise RecordingError(f"{where}: {effect.name} cannot sit at '{site}'")
+    try:
+        parts = [e.parts(settings) for e in forms]
+    except (KeyError, IndexError, ValueError) as error:
+        raise RecordingError(f"{where}: settings do not fit {effect.name} ({error!r})") from None
+    fitting = [
+        e for e, p in zip(forms, parts, strict=True) if {q.name for q in (*p.nonlinear, *p.weights)} == set(given)
+    ]
+    return fitting[0] if fitting else forms[0]
 
 
 def _finite(value: object) -> bool:

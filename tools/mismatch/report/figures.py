@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tools.mismatch.engine.report import Pictures, Report
 from tools.mismatch.report import series
 from tools.mismatch.report.svg import AFTER, BEFORE, GIVEN, HELD, INK, MEASURED, NOISE, figure
+from tools.mismatch.report.wording import scaled
 
 Array = NDArray[np.float64]
 WIDTH_IN = 11.6
@@ -36,9 +37,15 @@ def _residuals(report: Report, p: Pictures, output: str) -> list[tuple[str, str,
     return [before, ("with physics", AFTER, p.measured[output] - p.fitted[output])]
 
 
+def _legend(ax: Any) -> None:
+    """Above the axes, beside the title: it hides nothing."""
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 0.985), ncols=5, fontsize=9, borderaxespad=0.2)
+
+
 def overlay(report: Report, p: Pictures, output: str, name: str) -> str:
     """Measured, as given, recalibrated and fitted: the whole record, and a few held-out cycles close up."""
-    unit = report.fit.unit[output]
+    measured = p.measured[output]
+    factor, unit = scaled(float(np.ptp(measured)), report.fit.unit[output])
     a, b = series.zoom(p, output)
     with figure(name, (WIDTH_IN, 5.6)) as (fig, out):
         whole, close = fig.subplots(2, 1)
@@ -46,25 +53,28 @@ def overlay(report: Report, p: Pictures, output: str, name: str) -> str:
         lines = [("as given", GIVEN, p.as_given[output], 1.0), ("recalibrated", BEFORE, p.recalibrated[output], 1.2)]
         if _improved(report):
             lines.append(("with physics", AFTER, p.fitted[output], 1.3))
-        whole.plot(*series.envelope_line(p.t, p.measured[output]), color=MEASURED, lw=0.9, label="measured")
-        whole.plot(*series.envelope_line(p.t, lines[-1][2]), color=lines[-1][1], lw=0.8, label=lines[-1][0])
-        whole.set_title(f"{output}: the whole recording")
-        close.plot(p.t[a:b], p.measured[output][a:b], color=MEASURED, lw=2.4, alpha=0.55, label="measured")
+        t, y = series.envelope_line(p.t, measured)
+        whole.plot(t, y * factor, color=MEASURED, lw=2.2, alpha=0.5, label="measured")
+        t, y = series.envelope_line(p.t, lines[-1][2])
+        whole.plot(t, y * factor, color=lines[-1][1], lw=0.8, label=lines[-1][0])
+        whole.set_title("the whole recording")
+        close.plot(p.t[a:b], measured[a:b] * factor, color=MEASURED, lw=2.6, alpha=0.5, label="measured")
         for label, colour, y, wide in lines:
             style = "--" if label == "as given" else "-"
-            close.plot(p.t[a:b], y[a:b], style, color=colour, lw=wide, label=label)
-        close.set_title(f"held-out data, {p.t[a]:.4g} to {p.t[b - 1]:.4g} s, where the recalibrated twin is worst")
+            close.plot(p.t[a:b], y[a:b] * factor, style, color=colour, lw=wide, label=label)
+        close.set_title("close up: held-out data where the recalibrated twin is worst")
         for ax in (whole, close):
-            ax.set_ylabel(unit)
+            ax.set_ylabel(f"{output} ({unit})")
             ax.margins(x=0)
-            ax.legend(loc="upper right", ncols=5, fontsize=9)
+            _legend(ax)
         close.set_xlabel("time (s)")
     return out[0]
 
 
 def residual(report: Report, p: Pictures, output: str, name: str) -> str:
     """Residual before and after over time; held-out data in full colour, fitted data faint."""
-    noise, unit = report.fit.noise_floor_rms[output], report.fit.unit[output]
+    noise = report.fit.noise_floor_rms[output]
+    factor, unit = _residual_unit(report, output)
     with figure(name, (WIDTH_IN, 2.9)) as (fig, out):
         ax = fig.subplots()
         _shade_held_out(ax, p)
@@ -73,13 +83,15 @@ def residual(report: Report, p: Pictures, output: str, name: str) -> str:
                 for i, (a, b) in enumerate(series.runs(mask, p.t)):
                     share = max(20, int(900 * (b - a) / p.t.size))
                     t, y = series.envelope_line(p.t[a:b], e[a:b], share)
-                    ax.plot(t, y, color=colour, lw=0.8, alpha=alpha, label=tag if i == 0 else None)
-        ax.axhspan(-2 * noise, 2 * noise, color=NOISE, alpha=0.3, lw=0, label="± 2 noise floor", zorder=3)
-        ax.set_title(f"{output}: residual, measured minus simulated")
-        ax.set_ylabel(unit)
+                    ax.plot(t, y * factor, color=colour, lw=0.8, alpha=alpha, label=tag if i == 0 else None)
+        ax.axhspan(
+            -2 * noise * factor, 2 * noise * factor, color=NOISE, alpha=0.3, lw=0, label="± 2 noise floor", zorder=3
+        )
+        ax.set_title("residual: measured minus simulated")
+        ax.set_ylabel(f"residual ({unit})")
         ax.set_xlabel("time (s)")
         ax.margins(x=0)
-        ax.legend(loc="upper right", ncols=4, fontsize=9)
+        _legend(ax)
     return out[0]
 
 
@@ -89,7 +101,7 @@ def follows(report: Report, p: Pictures, output: str, name: str) -> str:
     for d in report.location.depends_on:
         found = series.axis_of(p, d)
         if found is not None and found[0] not in (label for label, _, _ in axes):
-            axes.append((*found, f"follows it by {100 * d.strength:.0f} %"))
+            axes.append((*found, f": {100 * d.strength:.0f} %"))
     if not axes:
         axes = [(s, x, "") for s, x in p.signals.items() if np.ptp(x) > 0][:2]
     axes = axes[:2]
@@ -97,34 +109,47 @@ def follows(report: Report, p: Pictures, output: str, name: str) -> str:
         return ""
     rows = np.nonzero(p.held_out)[0] if p.held_out.any() else np.arange(p.t.size)
     pick = rows[np.linspace(0, rows.size - 1, min(POINTS, rows.size)).astype(int)]
+    factor, unit = _residual_unit(report, output)
     with figure(name, (WIDTH_IN, 3.4)) as (fig, out):
         panels = fig.subplots(1, len(axes), squeeze=False)[0]
         for ax, (label, x, strength) in zip(panels, axes, strict=True):
             for tag, colour, e in _residuals(report, p, output):
-                ax.plot(x[pick], e[pick], ".", color=colour, ms=3, alpha=0.35)
-                ax.plot(*series.binned(x[rows], e[rows]), "-", color=colour, lw=2, label=f"{tag}, median")
+                _dots(ax, x[pick], e[pick] * factor, colour)
+                x_mid, e_mid = series.binned(x[rows], e[rows])
+                ax.plot(x_mid, e_mid * factor, "-", color=colour, lw=2, label=f"{tag}, median")
             ax.axhline(0, color=INK, lw=0.6)
             ax.set_xlabel(label)
-            ax.set_title(
-                f"{output}: residual against {label.removesuffix(' (s)')}" + (f" ({strength})" if strength else "")
-            )
-            ax.legend(loc="upper right", fontsize=9)
-        panels[0].set_ylabel(report.fit.unit[output])
+            ax.set_title(f"against {label.removesuffix(' (s)')}{strength}")
+            _legend(ax)
+        panels[0].set_ylabel(f"residual ({unit})")
     return out[0]
+
+
+def _residual_unit(report: Report, output: str) -> tuple[float, str]:
+    return scaled(report.fit.recalibrated_rms[output], report.fit.unit[output])
+
+
+def _dots(ax: Any, x: Array, y: Array, colour: str) -> None:
+    """A cloud as one path of points with round ends: a tenth of the page that one element per dot would take."""
+    width = 1e-4 * (float(np.ptp(x)) or 1.0)
+    gap = np.full(x.size, np.nan)
+    line = (np.column_stack([x, x + width, gap]).ravel(), np.column_stack([y, y, gap]).ravel())
+    ax.plot(*line, color=colour, lw=2.6, alpha=0.35, solid_capstyle="round")
 
 
 def spectra(report: Report, p: Pictures, output: str, name: str) -> str:
     """Amplitude density of the held-out residual before and after, and of the noise floor if it were white."""
-    dt, unit = series.step_s(p), report.fit.unit[output]
+    dt = series.step_s(p)
+    factor, unit = _residual_unit(report, output)
     spans = series.runs(p.held_out, p.t) or series.runs(~p.held_out, p.t)
     with figure(name, (HALF_IN, 3.2)) as (fig, out):
         ax = fig.subplots()
         for label, colour, e in _residuals(report, p, output):
-            f, density = series.spectrum(e, spans, dt)
-            ax.loglog(*_thin(f, density), color=colour, lw=1.1, label=label)
-        white = report.fit.noise_floor_rms[output] * np.sqrt(2 * dt)
+            f, density = _thin(*series.spectrum(e, spans, dt))
+            ax.loglog(f, density * factor, color=colour, lw=1.1, label=label)
+        white = report.fit.noise_floor_rms[output] * np.sqrt(2 * dt) * factor
         ax.axhline(white, color=NOISE, lw=2, label="noise floor, if white")
-        ax.set_title(f"{output}: spectrum of the residual")
+        ax.set_title("spectrum of the residual")
         ax.set_xlabel("frequency (Hz)")
         ax.set_ylabel(f"{unit}/√Hz")
         ax.legend(loc="best", fontsize=9)
@@ -152,7 +177,7 @@ def autocorrelations(report: Report, p: Pictures, output: str, name: str) -> str
             ax.plot(np.arange(r.size) * dt, r, color=colour, lw=1.3, label=label)
         ax.axhspan(-band, band, color=NOISE, alpha=0.3, lw=0, label="white: 95 % band")
         ax.axhline(0, color=INK, lw=0.6)
-        ax.set_title(f"{output}: autocorrelation of the residual")
+        ax.set_title("autocorrelation of the residual")
         ax.set_xlabel("lag (s)")
         ax.margins(x=0)
         ax.set_ylim(None, 1.02)

@@ -67,10 +67,11 @@ def _chain(report: Report) -> str:
     for stage in guilty:
         named = [words(p.name) for p in report.physics if p.stage == stage]
         guilty[stage] = " + ".join(dict.fromkeys(named)) or "unexplained"
-    inputs = list(report.pictures.signals)[-1:] if report.pictures else []
+    signals = list(report.pictures.signals) if report.pictures else []
     outputs = list(report.fit.unit)
-    ends = ("input" if len(inputs) != 1 else inputs[0], outputs[0] if len(outputs) == 1 else f"{len(outputs)} outputs")
-    return svg.chain(report.chain, guilty, ends)
+    begin = signals[0] if len(signals) == 1 else "inputs"
+    end = outputs[0] if len(outputs) == 1 else f"{len(outputs)} outputs"
+    return svg.chain(report.chain, guilty, (begin, end))
 
 
 def _base_equation(report: Report) -> str:
@@ -117,7 +118,8 @@ def _bars(report: Report) -> list[dict[str, Any]]:
             (label, kind, number(v * factor), min(100.0, 100 * v / top) if math.isfinite(v) else 100.0, not v <= top)
             for label, kind, v in values
         ]
-        out.append({"output": o, "unit": shown, "rows": rows, "explained": percent(wording.explained(f, o))})
+        share = percent(wording.explained(f, o)) if report.physics else "-"
+        out.append({"output": o, "unit": shown, "rows": rows, "explained": share})
     return out
 
 

@@ -66,7 +66,7 @@ def zoom(p: Pictures, output: str) -> Span:
     y = p.measured[output][a:b]
     crossings = int(np.sum(np.diff(np.signbit(y - np.median(y))) != 0))
     cycle = 2 * (b - a) / max(crossings, 2)
-    length = int(min(b - a, max(6 * cycle, 120)))
+    length = int(min(b - a, max(6 * cycle, 120, (b - a) // 4)))
     energy = np.convolve(residual[a:b] ** 2, np.ones(length), "valid")
     start = a + int(np.argmax(energy))
     return start, start + length

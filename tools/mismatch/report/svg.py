@@ -76,10 +76,16 @@ def themed(svg: str, name: str) -> str:
     svg = re.sub(r"<metadata>.*?</metadata>", "", svg, flags=re.S)
     for colour, variable in THEME.items():
         svg = svg.replace(colour, variable)
+    svg = re.sub(r' d="[^"]*"', _rounded, svg)
     svg = re.sub(r'\bid="', f'id="{name}-', svg)
     svg = re.sub(r'href="#', f'href="#{name}-', svg)
     svg = re.sub(r"url\(#", f"url(#{name}-", svg)
     return re.sub(r'^<svg([^>]*?) width="[^"]*"', r"<svg\1", re.sub(r'^(<svg[^>]*?) height="[^"]*"', r"\1", svg))
+
+
+def _rounded(path: re.Match[str]) -> str:
+    """Coordinates to a hundredth of a point."""
+    return re.sub(r"-?\d+\.\d{3,}", lambda m: f"{float(m[0]):.2f}", path[0]).replace("\n", " ")
 
 
 def equation(tex: str) -> str:
