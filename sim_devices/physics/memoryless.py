@@ -132,7 +132,9 @@ def _curve_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
         other = _curve_choose(ctx.believed, ctx.measured, ctx)
         if other[0] < score:
             _, shape, lo, hi = other
-    return {"range": (lo, hi), "shape": (float(shape),)}
+    # behind a dynamic twin the curve needs a slope of its own: the base gain sets where on the curve one is
+    behind = ctx.believed is not None
+    return {"range": (lo, hi), "shape": (float(shape),), "slope": (1.0 if behind and shape != 1 else 0.0,)}
 
 
 def _curve_parts(settings: Settings) -> Parts:
@@ -141,18 +143,24 @@ def _curve_parts(settings: Settings) -> Parts:
     if shape == 1:
         return Parts((), (Parameter("sign_lost", "{out}/{in}"),))
     names = [f"legendre{d}" for d in range(2, shape + 1)] if shape > 0 else [f"hinge{i + 1}" for i in range(n)]
-    return Parts((), tuple(Parameter(m, "{out}") for m in names), 0.05 * np.eye(n))
+    if settings.get("slope", (0.0,))[0]:
+        names.append("slope")
+    return Parts((), tuple(Parameter(m, "{out}") for m in names), 0.05 * np.eye(len(names)))
 
 
 def _curve_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
-    return curve_basis(x, lo, hi, int(settings.get("shape", (3.0,))[0]))
+    cols = curve_basis(x, lo, hi, int(settings.get("shape", (3.0,))[0]))
+    if settings.get("slope", (0.0,))[0]:
+        cols = np.column_stack([cols, (x - 0.5 * (lo + hi)) / (0.5 * (hi - lo))])
+    return cols
 
 
 def _curve_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     lo, hi = settings["range"]
     x = np.linspace(lo, hi, 201)
-    bend = curve_basis(x, lo, hi, int(settings["shape"][0])) @ p
+    cols = curve_basis(x, lo, hi, int(settings["shape"][0]))
+    bend = cols @ p[: cols.shape[1]]
     line = np.polynomial.Polynomial.fit(x, bend, 1)
     out = [Human("deviation_from_line", float(np.max(np.abs(bend - line(x)))), "{out}")]
     span = abs(scale) * (hi - lo)
