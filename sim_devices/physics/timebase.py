@@ -295,14 +295,15 @@ def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], flo
         return [], [], 0.0, before
     at: list[int] = []
     total: list[int] = []
-    for w in change:
-        a, b = max(0, (w - 1) * window), min(n, (w + 1) * window)
-        k = np.arange(a, b)
-        e0 = (y[k] - x[np.clip(k + shifts[path[w - 1]], 0, n - 1)]) ** 2
-        e1 = (y[k] - x[np.clip(k + shifts[path[w]], 0, n - 1)]) ** 2
+    # a window that straddles a jump may settle between: changes next to each other are one jump
+    for group in np.split(change, np.flatnonzero(np.diff(change) > 2) + 1):
+        first, last = int(group[0]), int(group[-1])
+        k = np.arange(max(0, (first - 1) * window), min(n, (last + 1) * window))
+        e0 = (y[k] - x[np.clip(k + shifts[path[first - 1]], 0, n - 1)]) ** 2
+        e1 = (y[k] - x[np.clip(k + shifts[path[last]], 0, n - 1)]) ** 2
         split = np.concatenate([[0.0], np.cumsum(e0)]) + (e1.sum() - np.concatenate([[0.0], np.cumsum(e1)]))
-        at.append(int(a + np.argmin(split)))
-        total.append(int(shifts[path[w]]))
+        at.append(int(k[0] + np.argmin(split)))
+        total.append(int(shifts[path[last]]))
     if shifts[path[0]] != 0:
         at.insert(0, 0)
         total.insert(0, int(shifts[path[0]]))

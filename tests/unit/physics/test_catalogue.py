@@ -1,0 +1,116 @@
+"""Every name of the contract is there, complete, and its columns agree with its parameters."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import STAGES, Context, Effect
+
+NAMES = [
+    "hysteresis",
+    "rate_dependent_hysteresis",
+    "creep",
+    "backlash",
+    "dead_zone",
+    "saturation",
+    "static_nonlinearity",
+    "slew_limit",
+    "first_order_lag",
+    "ac_coupling",
+    "resonance",
+    "dead_time",
+    "misalignment",
+    "cross_axis_nonlinearity",
+    "scale_factor_variation",
+    "thermal_drift",
+    "temperature_sensitivity",
+    "supply_sensitivity",
+    "current_coupling",
+    "soft_iron",
+    "mains_interference",
+    "vibration",
+    "spikes",
+    "step_shift",
+    "random_walk",
+    "clock_skew",
+    "dropped_samples",
+    "quantization",
+    "coulomb_friction",
+    "stribeck_friction",
+    "cubic_stiffness",
+    "cogging",
+    "centripetal_acceleration",
+    "sensor_position_error",
+    "channel_delay",
+]
+ALL = [(e.name + "/" + e.kind, e) for one in EFFECTS.values() for e in (one, *one.variants)]
+
+
+def test_the_vocabulary_is_complete() -> None:
+    assert list(EFFECTS) == NAMES
+
+
+@pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])
+def test_an_effect_is_described(effect: Effect) -> None:
+    assert effect.summary
+    assert effect.equation
+    assert re.search(r"\d", effect.source), "a source names an edition, section, page or equation"
+    assert effect.excitation
+    assert effect.stages
+    assert set(effect.stages) <= set(STAGES)
+    assert set(effect.confusable_with) <= set(NAMES) - {effect.name}
+    if effect.kind in ("linear", "nonlinear"):
+        assert effect.apply is not None
+    else:
+        assert effect.basis is not None
+    assert (effect.fill is not None) == (effect.kind == "feedback")
+
+
+@pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])
+def test_prepare_guess_and_forward_agree(effect: Effect) -> None:
+    rng = np.random.default_rng(0)
+    n, dt = 1500, 0.004
+    t = np.arange(n) * dt
+
+    def move(k: int) -> np.ndarray:
+        return np.sin(2 * np.pi * (0.5 + 0.37 * k) * t + k) + 0.3 * np.sin(2 * np.pi * (3.1 + k) * t)
+
+    names = [f"{v}_{a}" for v in ("specific_force", "angular_rate") for a in "xyz"]
+    signals = {s: move(i) for i, s in enumerate([*names, "temperature", "supply", "actuator_current"])}
+    x = signals["specific_force_x"]
+    y = 2 * x + 0.02 * rng.standard_normal(n) + 0.3 * (t > 3)
+    facts = {"axis": (0.0,), "position_m": (0.1, 0.2, -0.1)}
+    ctx = Context(t, dt, signals, "accel_1x", "accel_1x", "specific_force_x", facts=facts, measured=y)
+    residual = y - 1.9 * x
+    settings = effect.prepare(x, residual, ctx)
+    assert all(isinstance(v, float) for values in settings.values() for v in values), "settings are plain numbers"
+    parts = effect.parts(settings)
+    starts = effect.guess(x, residual, ctx, settings)
+    assert len(starts) >= 1
+    for q in starts:
+        assert len(q) == len(parts.nonlinear)
+        for p, v in zip(parts.nonlinear, q, strict=True):
+            assert p.lo <= v <= p.hi, (p.name, v)
+    q = np.array(starts[0], np.float64)
+    if effect.kind in ("linear", "nonlinear"):
+        assert effect.apply is not None
+        out = effect.apply(x, ctx, q, settings)
+        assert out.shape == x.shape
+    else:
+        assert effect.basis is not None
+        out = effect.basis(x, ctx, q, settings)
+        assert out.shape == (n, len(parts.weights))
+    assert np.all(np.isfinite(out))
+    if parts.penalty is not None:
+        assert parts.penalty.shape[1] == len(parts.weights)
+    if effect.report is not None:
+        found = effect.report(np.concatenate([q, 0.1 * np.ones(len(parts.weights))]), settings, 2.0)
+        assert all(np.isfinite(h.value) for h in found)
+    if effect.test is not None:
+        signature = effect.test(x, residual, ctx)
+        assert 0.0 <= signature.p_value <= 1.0
+        assert 0.0 <= signature.share <= 1.0

@@ -1,0 +1,154 @@
+"""Filters, delays, limits and grids against closed forms and independent simulations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.signal import lsim
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Context
+from sim_devices.physics.lag import low_pass
+from sim_devices.physics.memoryless import curve_basis, find_step, mean_of_steps, slew
+from sim_devices.physics.resonance import discrete_mode, mode
+from sim_devices.physics.saturation import limit
+from sim_devices.physics.timebase import best_shifts, delay_by_correlation, find_drops, resample, shift_by
+
+Array = NDArray[np.float64]
+ONE = np.zeros(1, np.int64)
+DT = 1e-3
+
+
+def wave(n: int = 3000) -> tuple[Array, Array]:
+    t = np.arange(n) * DT
+    return t, np.sin(2 * np.pi * 3 * t) + 0.4 * np.sin(2 * np.pi * 11.3 * t + 1)
+
+
+def apply(name: str, x: Array, q: list[float], dt: float = DT) -> Array:
+    effect = EFFECTS[name]
+    assert effect.apply is not None
+    t = np.arange(x.size) * dt
+    return effect.apply(x, Context(t, dt, {}, "y"), np.array(q), {})
+
+
+def test_lag_against_lsim() -> None:
+    t, x = wave()
+    _, y, _ = lsim(([1.0], [0.02, 1.0]), x - x[0], t)
+    np.testing.assert_allclose(low_pass(x, DT, 0.02, ONE), y + x[0], atol=1e-9)
+
+
+def test_resonance_against_lsim() -> None:
+    t, x = wave()
+    w, d = 2 * np.pi * 25.0, 0.1
+    _, y, _ = lsim(([w * w], [1.0, 2 * d * w, w * w]), x - x[0], t)
+    np.testing.assert_allclose(apply("resonance", x, [25.0, d, 1.0, 0.0]), y + x[0], atol=1e-8)
+    _, v, _ = lsim(([w, 0.0], [1.0, 2 * d * w, w * w]), x - x[0], t)
+    got = apply("resonance", x, [25.0, d, 0.0, 1.0]) - x
+    np.testing.assert_allclose(got, v, atol=1e-8)
+
+
+def test_ac_coupling_against_lsim() -> None:
+    t, x = wave()
+    _, y, _ = lsim(([0.3, 0.0], [0.3, 1.0]), x + 2.0, t)
+    # from rest at zero: nothing settled
+    np.testing.assert_allclose(apply("ac_coupling", x + 2.0, [0.3, 0.0])[5:], y[5:], atol=1e-6)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.003, 0.01234])
+def test_delay_of_a_sine(delay: float) -> None:
+    t = np.arange(2000) * DT
+    y = apply("dead_time", np.sin(2 * np.pi * 4 * t), [delay])
+    np.testing.assert_allclose(y[30:], np.sin(2 * np.pi * 4 * (t[30:] - delay)), atol=2e-6)
+
+
+def test_delay_is_found() -> None:
+    _, x = wave()
+    late = resample(x, -37.4, 1.0)
+    assert delay_by_correlation(x, late, 200) == pytest.approx(37.4, abs=0.1)
+
+
+def test_skew_of_a_sine() -> None:
+    t = np.arange(5000) * DT
+    y = apply("clock_skew", np.sin(2 * np.pi * 2 * t), [400.0])
+    np.testing.assert_allclose(y[5:-10], np.sin(2 * np.pi * 2 * t * 1.0004)[5:-10], atol=1e-6)
+
+
+def test_lost_and_repeated_samples_are_found() -> None:
+    rng = np.random.default_rng(1)
+    x = np.convolve(rng.standard_normal(8000), np.hanning(25), "same")
+    index = np.concatenate([np.arange(2500), np.arange(2507, 6000), np.repeat(6000, 4), np.arange(6000, 7990)])
+    y = x[index]
+    at, total, share, _ = find_drops(x[: y.size], y + 0.01 * rng.standard_normal(y.size))
+    assert total == [7, 3]
+    assert abs(at[0] - 2500) <= 2
+    assert abs(at[1] - 5997) <= 3
+    assert share > 0.99
+    np.testing.assert_allclose(shift_by(x, np.array(at), np.array(total))[3000:5900], y[3000:5900])
+
+
+def test_hard_and_soft_limits() -> None:
+    x = np.linspace(-3, 3, 601)
+    np.testing.assert_array_equal(limit(x, -1.0, 2.0, 0.0), np.clip(x, -1.0, 2.0))
+    soft = limit(x, -1.0, 2.0, 0.1)
+    assert np.all((soft > -1.0) & (soft < 2.0))
+    assert np.max(np.abs(soft - np.clip(x, -1.0, 2.0))) == pytest.approx(0.1 * np.log(2), rel=1e-2)
+    assert np.all(np.diff(soft) > 0)
+
+
+def test_slew_of_a_step() -> None:
+    x = np.concatenate([np.zeros(1), np.ones(50)])
+    y = slew(x, 0.05, 0.1, 1.0, ONE)
+    np.testing.assert_allclose(y, np.minimum(0.1 * np.arange(51), 1.0), atol=1e-12)
+    np.testing.assert_allclose(slew(-x, 0.05, 0.1, 1.0, ONE), -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
+
+
+def test_quantiser_mean_against_monte_carlo() -> None:
+    rng = np.random.default_rng(0)
+    x = np.linspace(0, 3, 40)
+    for dither in (0.1, 0.3):
+        sampled = np.mean(np.round(x + dither * rng.standard_normal((40_000, 40))), axis=0)
+        np.testing.assert_allclose(mean_of_steps(x, 1.0, 0.0, dither), sampled, atol=0.012)
+
+
+def test_grid_is_found_and_noise_has_none() -> None:
+    rng = np.random.default_rng(0)
+    x = np.cumsum(rng.standard_normal(4000))
+    assert find_step(0.25 * np.round(x / 0.25) + 0.1) == pytest.approx(0.25, rel=1e-9)
+    assert find_step(x) == 0.0
+
+
+def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:
+    x = np.linspace(-2, 6, 401)
+    cols = curve_basis(x, 0.0, 4.0, 3)
+    z = (x - 2) / 2
+    inside = np.abs(z) <= 1
+    np.testing.assert_allclose(cols[inside, 0], (3 * z[inside] ** 2 - 1) / 2, atol=1e-12)
+    beyond = z > 1
+    np.testing.assert_allclose(cols[beyond, 0], 1 + 3 * (z[beyond] - 1), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "args"),
+    [
+        (low_pass, (DT, 0.01, np.array([0, 70]))),
+        (mode, (*(np.ascontiguousarray(m) for m in discrete_mode(30.0, 0.2, DT)), np.array([0, 70]))),
+        (limit, (-0.5, 0.7, 0.05)),
+        (slew, (0.02, 0.03, 0.5, np.array([0, 70]))),
+        (resample, (-3.3, 1.001)),
+        (shift_by, (np.array([20, 90]), np.array([3, -1]))),
+    ],
+    ids=["low_pass", "mode", "limit", "slew", "resample", "shift_by"],
+)
+def test_compiled_equals_python(kernel: Callable[..., Array], args: tuple[object, ...]) -> None:
+    x = wave(150)[1]
+    np.testing.assert_allclose(kernel(x, *args), kernel.py_func(x, *args), atol=1e-13)  # pyright: ignore
+
+
+def test_cheapest_path_compiled_equals_python() -> None:
+    costs = np.random.default_rng(2).random((12, 5))
+    a, b = best_shifts(costs, 0.4), best_shifts.py_func(costs, 0.4)
+    np.testing.assert_array_equal(a[0], b[0])
+    assert a[1] == pytest.approx(b[1])
