@@ -1,0 +1,292 @@
+"""What every inertial sensor of the bench looks like, whatever chip it is.
+
+SI units: m/s^2 (specific force, +g on an axis that points up), rad/s (right-hand rule), degC, T. Ranges are
+chosen by the data sheets' names (2 g, 250 deg/s), because a chip has a handful of them and no others.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from enum import Enum
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.contracts import Float64Array
+from hal.errors import BenchError
+from hal.scan_time import ScanTimeline
+from hal.types import ChannelInfo, Status, TimeSource
+
+STANDARD_GRAVITY = 9.80665  # m/s^2 per g, the data sheets' unit
+RAD_PER_DEG = math.pi / 180.0
+AXES = ("x", "y", "z")
+LATE = 0.02  # periods; a read this much short of two periods after the last one has still missed a sample
+
+Mode = Literal["data ready", "fifo"]
+Triple = tuple[float, float, float]
+Int32Array = NDArray[np.int32]
+
+
+class PowerMode(Enum):
+    """``LOW_POWER`` duty-cycles or lowers the noise performance; what is left of the rates the driver says."""
+
+    NORMAL = "normal"
+    LOW_POWER = "low power"
+    ACCEL_ONLY = "accelerometer only"
+    SLEEP = "sleep"
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSetup:
+    """What the chip really does. Steps are per count; bandwidths are the -3 dB ones of the data sheet."""
+
+    rate_hz: float
+    accel_range_g: float
+    gyro_range_dps: float
+    accel_lsb_mps2: float
+    gyro_lsb_rad_s: float
+    accel_bandwidth_hz: float
+    gyro_bandwidth_hz: float
+
+
+@dataclass(slots=True)
+class ImuSample:
+    """One instant, filled in place. ``raw`` (7,) holds counts: accelerometer, gyro, temperature.
+
+    ``seq`` counts the chip's samples; ``lost`` samples are known to be missing before this one. A sample with
+    ``Status.STALE`` repeats the last one: its ``t_ns`` and ``seq`` too. ``field_T`` is NaN without magnetometer.
+    """
+
+    accel_mps2: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
+    gyro_rad_s: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
+    field_T: Float64Array = field(default_factory=lambda: np.full(3, np.nan))
+    temperature_C: float = math.nan
+    raw: Int32Array = field(default_factory=lambda: np.zeros(7, np.int32))
+    t_ns: int = 0
+    seq: int = -1
+    lost: int = 0
+    source: TimeSource = TimeSource.HOST
+    status: Status = Status.STALE
+
+
+class ImuBlock:
+    """What one emptying of a FIFO delivered: ``n`` rows, oldest first, ``dt_ns`` apart from ``t0_ns`` on."""
+
+    def __init__(self, capacity: int = 512) -> None:
+        self.accel_mps2: Float64Array = np.full((capacity, 3), np.nan)
+        self.gyro_rad_s: Float64Array = np.full((capacity, 3), np.nan)
+        self.raw: Int32Array = np.zeros((capacity, 6), np.int32)
+        self.temperature_C = math.nan
+        self.capacity = capacity
+        self.n = 0
+        self.t0_ns = 0
+        self.dt_ns = 0
+        self.seq0 = 0
+        self.lost = 0
+        self.source = TimeSource.DEVICE_CLOCK
+        self.status = Status.OK
+
+
+@dataclass(frozen=True, slots=True)
+class ImuOffsets:
+    """What the chip adds to its readings (so minus the error found), in m/s^2 and rad/s."""
+
+    accel_mps2: Triple = (0.0, 0.0, 0.0)
+    gyro_rad_s: Triple = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class AxisTest:
+    """One axis of a self-test: the reaction ``value`` must lie in ``lo``..``hi`` (``unit``)."""
+
+    axis: str
+    value: float
+    lo: float
+    hi: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        return self.lo <= self.value <= self.hi
+
+
+@dataclass(frozen=True, slots=True)
+class SelfTestReport:
+    """All axes of a self-test with the data sheet's limits and its place in the data sheet."""
+
+    axes: tuple[AxisTest, ...]
+    source: str
+
+    @property
+    def passed(self) -> bool:
+        return all(axis.passed for axis in self.axes)
+
+
+class Imu(Protocol):
+    """Order of use: ``probe``, ``reset``, ``configure``, ``start``, then ``read`` or ``read_fifo``.
+
+    Every wait goes through the bench clock and has a limit. ``lost`` and ``stale`` count since ``start``.
+    """
+
+    name: str
+    lost: int
+    stale: int
+
+    def probe(self) -> str:
+        """Identity. Raises ``WrongDevice``, or ``I2cNack`` when nobody answers."""
+        ...
+
+    def reset(self, limit_s: float = 0.1) -> None:
+        """Back to the data sheet's reset state; ``HalTimeout`` after ``limit_s``."""
+        ...
+
+    def configure(
+        self, *, rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None = None
+    ) -> ImuSetup:
+        """Ranges must be the chip's own; rate: the chip's lowest that is not below; bandwidth: its highest that
+        is not above (``None``: half the rate). The answer is what the chip does. ``BenchError`` otherwise."""
+        ...
+
+    def start(self, mode: Mode = "data ready", limit_s: float = 0.5) -> None:
+        """Begin to measure and wait for the first sample; ``HalTimeout`` after ``limit_s``."""
+        ...
+
+    def read(self, out: ImuSample) -> Status:
+        """The newest sample, all of one instant. Never waits. Needs mode "data ready"."""
+        ...
+
+    def read_fifo(self, out: ImuBlock) -> int:
+        """Everything that the FIFO holds, as far as ``out`` has room; returns ``out.n``. Needs mode "fifo"."""
+        ...
+
+    def read_offsets(self) -> ImuOffsets: ...
+
+    def write_offsets(self, offsets: ImuOffsets) -> ImuOffsets:
+        """Write and read back; the answer is what the chip keeps (its own steps). ``BenchError`` out of range."""
+        ...
+
+    def persist_offsets(self, limit_s: float = 0.5) -> int:
+        """Keep the offsets over power-off; returns how many more times. ``BenchError`` where the chip cannot."""
+        ...
+
+    def self_test(self, limit_s: float = 3.0) -> SelfTestReport:
+        """The data sheet's own; the instrument must rest. Ends configured and started as before."""
+        ...
+
+    def power(self, mode: PowerMode) -> None: ...
+    def channels(self) -> Sequence[ChannelInfo]: ...
+
+
+def pick_range(value: float, codes: dict[float, int], what: str, name: str) -> int:
+    """The chip's code of a range. ``BenchError`` lists what there is."""
+    if value not in codes:
+        raise BenchError(f"{what} = {value:g} is not one of {', '.join(f'{v:g}' for v in sorted(codes))}", device=name)
+    return codes[value]
+
+
+def pick_rate(rate_hz: float, codes: dict[float, int], name: str) -> tuple[float, int]:
+    """The lowest rate of the chip that is not below ``rate_hz``, and its code."""
+    good = [rate for rate in sorted(codes) if rate >= rate_hz * 0.999]
+    if not good or rate_hz <= 0:
+        raise BenchError(f"rate_hz = {rate_hz:g} is outside 0 .. {max(codes):g} Hz", device=name)
+    return good[0], codes[good[0]]
+
+
+def pick_bandwidth(bandwidth_hz: float, codes: dict[float, int]) -> tuple[float, int]:
+    """The highest bandwidth of the chip that is not above ``bandwidth_hz`` (or its lowest), and its code."""
+    good = [b for b in sorted(codes) if b <= bandwidth_hz] or [min(codes)]
+    return good[-1], codes[good[-1]]
+
+
+class SampleCounter:
+    """Sequence and losses where the chip only says "new" or "not new": a chip with period T that is asked again
+    after t has made at least floor(t/T) samples, of which one was read."""
+
+    def __init__(self) -> None:
+        self.restart(1)
+
+    def restart(self, period_ns: int) -> None:
+        self.seq = -1
+        self.lost = 0
+        self.stale = 0
+        self.t_ns = 0
+        self._period_ns = period_ns
+
+    def fresh(self, t_ns: int) -> int:
+        """A new sample at ``t_ns``: returns how many were surely lost before it."""
+        lost = 0
+        if self.seq >= 0:
+            lost = max(0, math.floor((t_ns - self.t_ns) / self._period_ns + LATE) - 1)
+        self.seq += 1 + lost
+        self.lost += lost
+        self.t_ns = t_ns
+        return lost
+
+
+class FifoTimeline:
+    """Times, numbers and losses of FIFO frames; ``period_ns`` apart as far as the chip's clock is good."""
+
+    def __init__(self) -> None:
+        self.restart(1)
+
+    def restart(self, period_ns: int) -> None:
+        self.next_seq = 0
+        self.lost = 0
+        self.period_ns = period_ns
+        self._line = ScanTimeline(float(period_ns))
+        self._last_ns = -1
+
+    def stamp(self, out: ImuBlock, n: int, arrival_ns: int, overrun: bool) -> None:
+        """Fill the head of ``out`` for ``n`` frames read at ``arrival_ns``; ``overrun``: older ones are gone.
+
+        The chips do not say how many; the time since the last emptying does, within one frame."""
+        lost = 0
+        if overrun:
+            elapsed = (arrival_ns - self._last_ns) / self.period_ns if self._last_ns >= 0 else 0.0
+            lost = max(1, round(elapsed) - n)
+            self._line.restart()
+        out.n = n
+        out.dt_ns = self.period_ns
+        out.t0_ns = self._line.stamp(n, arrival_ns)[0] if n else arrival_ns
+        out.seq0 = self.next_seq + lost
+        out.lost = lost
+        out.source = TimeSource.DEVICE_CLOCK
+        out.status = Status.OVERRUN if overrun else Status.OK if n else Status.STALE
+        self.next_seq = out.seq0 + n
+        self.lost += lost
+        self._last_ns = arrival_ns
+
+
+def imu_channels(
+    name: str, setup: ImuSetup, temperature: tuple[float, float, float], field_range_T: Sequence[float] = ()
+) -> Sequence[ChannelInfo]:
+    """Channels of a sensor; ``temperature`` is lo, hi and step, ``field_range_T`` (x, y, z, step) or empty."""
+    accel = setup.accel_range_g * STANDARD_GRAVITY
+    gyro = setup.gyro_range_dps * RAD_PER_DEG
+    channels = [ChannelInfo(f"{name}.accel_{a}", "m/s^2", -accel, accel, setup.accel_lsb_mps2) for a in AXES]
+    channels += [ChannelInfo(f"{name}.gyro_{a}", "rad/s", -gyro, gyro, setup.gyro_lsb_rad_s) for a in AXES]
+    channels.append(ChannelInfo(f"{name}.temperature", "degC", *temperature))
+    for axis, limit in zip(AXES, field_range_T, strict=False):
+        channels.append(ChannelInfo(f"{name}.field_{axis}", "T", -limit, limit, field_range_T[3]))
+    return channels
+
+
+def offset_counts(wanted: Triple, step: float, lowest: int, highest: int, what: str, name: str) -> list[int]:
+    """Offsets in register steps. ``BenchError`` when one does not fit."""
+    counts = [round(value / step) for value in wanted]
+    for axis, count in zip(AXES, counts, strict=True):
+        if not lowest <= count <= highest:
+            raise BenchError(
+                f"{what} offset of {axis} is {count} steps of {step:.3g}, the register holds {lowest} .. {highest}",
+                device=name,
+            )
+    return counts
+
+
+def require_mode(mode: Mode | None, wanted: Mode, name: str) -> None:
+    """``BenchError`` unless the sensor was started in ``wanted``."""
+    if mode != wanted:
+        raise BenchError(f"started in mode {mode!r}; this call needs start(mode={wanted!r})", device=name)
