@@ -95,11 +95,8 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
         sure = float(norm.cdf(min(c.z, 8.0)))
-        if step is not None and selection.rivals[step]:
-            others = [t for t in selection.rivals[step] if t.name != placed.effect.name]
-            if others:
-                t = paired_t(others[0].energy, selection.steps[step].energy)
-                sure *= float(norm.cdf(max(t, 0.0)))
+        if step is not None:
+            sure *= against_rivals(selection.steps[step], selection.rivals[step])
         a, b = fitted.model.slices(k)
         raw = {
             fitted.model.parameters[i].name.rsplit(".", 1)[-1]: float(fitted.theta[i])
@@ -130,6 +127,19 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
             )
         )
     return out
+
+
+def against_rivals(step: Trial, rivals: Sequence[Trial]) -> float:
+    """How sure the named effect is against the best other name: a simpler one's lead counts in full, a family with more
+    freedom that fits as well only casts some doubt.
+    """
+    sure = 1.0
+    for t in rivals:
+        if t.name == step.name or not set(t.placed.outputs) & set(step.placed.outputs):
+            continue
+        lead = float(norm.cdf(paired_t(t.energy, step.energy)))
+        sure = min(sure, lead if t.parameters <= step.parameters else max(lead, 0.8))
+    return sure
 
 
 def alternatives(problem: Problem, selection: Selection, rule: Rule) -> tuple[list[Alternative], list[Equivalent]]:
@@ -248,7 +258,11 @@ def assemble(
         else (guilty and guess_stage(twin.chain, depends)) or ""
     )
     noise_filters = {o: fit_whitener(fitted.residual[o], stretches=problem.held_spans) for o in twin.outputs}
-    limits = detection(problem, fitted, effects, noise_filters, z=rule.z, gain=rule.gain)
+    screened = {
+        (t.name, t.placed.effect.kind, t.placed.site, t.placed.target): (t.placed, t.candidate.starts)
+        for t in selection.first
+    }
+    limits = detection(problem, base, effects, noise_filters, z=rule.z, gain=rule.gain, known=screened)
     held = problem.split.held_out_mask()[problem.index]
     rows = problem.held_rows
     simulated = lambda f: {o: problem.measured[o] - f.residual[o] for o in twin.outputs}  # noqa: E731

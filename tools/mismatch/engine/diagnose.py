@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
@@ -16,7 +17,6 @@ from tools.mismatch.engine.fit import Fit, fit_base, residuals
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Report
-from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split
 from tools.mismatch.engine.unexplained import leftover
@@ -101,7 +101,21 @@ def diagnose(
     (but for ``seconds``).
     """
     began = time.perf_counter()
-    rule = rule or Rule()
+    # threads of the linear algebra spin against each other on small matrices: ten times slower, measured
+    with threadpool_limits(1):
+        report = _diagnose(recording, held_out, seed, jobs, progress, effects, rule or Rule())
+    return replace(report, seconds=time.perf_counter() - began)
+
+
+def _diagnose(
+    recording: Recording,
+    held_out: float,
+    seed: int,
+    jobs: int,
+    progress: Progress | None,
+    effects: Iterable[Effect] | None,
+    rule: Rule,
+) -> Report:
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     twin = make(recording)
     split = make_split(recording, held_out, seed)
@@ -121,8 +135,7 @@ def diagnose(
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
     left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
     said = gross(recording, twin, raw)
-    report = assemble(problem, raw, base, selection, left, catalogue, rule, said)
-    return replace(report, seconds=time.perf_counter() - began)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, said)
 
 
-__all__ = ["diagnose", "misfit"]
+__all__ = ["diagnose"]

@@ -73,6 +73,11 @@ class _Projected:
         self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
         self.evaluations = 0
 
+    @property
+    def usual_count(self) -> float:
+        """How many squares the cost sums."""
+        return float(sum(u.sum() for u in self.usual.values()))
+
     def reweight(self, residual: dict[str, Array]) -> None:
         for o in self.outputs:
             r = residual[o][self.pick]
@@ -239,15 +244,18 @@ def fit(
     rounds: int = 2,
     tolerance: float = 1e-5,
     tries: int = 3,
+    hopeless: float = np.inf,
 ) -> Fit:
     """Best fit over ``starts``. Each start is tried coarsely on thinned rows; the best two are refined.
 
-    ``stride`` thins the fit rows (the simulation itself keeps every sample).
+    ``stride`` thins the fit rows (the simulation itself keeps every sample). When the coarse search ends above
+    ``hopeless`` (weighted mean square), it is not refined.
     """
     coarse = max(problem.stride, stride or 1)
     evaluations = 0
     ranked: list[tuple[float, int, Array]] = []
-    if len(starts) > 1 and model.nonlinear:
+    give_up = False
+    if model.nonlinear and (len(starts) > 1 or np.isfinite(hopeless)):
         for i, theta in enumerate(starts[: 3 * tries]):
             projected = _Projected(problem, model, theta, 3 * coarse)
             residual, solved = projected.evaluate(theta)
@@ -265,14 +273,19 @@ def fit(
         best = [t[2] for t in tried[:2]]
         if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
+        kept = max(1.0, projected.usual_count)
+        give_up = tried[0][0] / kept > hopeless
     else:
         best = starts[:1]
     found: tuple[float, Array, dict[str, Array]] | None = None
     for theta in best:
         projected = _Projected(problem, model, theta, coarse)
         cost = np.inf
+        if give_up:
+            found = (np.inf if found is None else found[0], theta, residuals(problem, model, theta))
+            continue
         for round_ in range(rounds):
-            theta, cost = _search(projected, theta, iterations if round_ == 0 else 6, tolerance)
+            theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)
             if not np.isfinite(cost):
                 break
             if round_ + 1 < rounds:
@@ -282,7 +295,7 @@ def fit(
             found = (cost, theta, residuals(problem, model, theta))
     assert found is not None
     cost, theta, residual = found
-    ok = bool(np.isfinite(cost)) and all(np.all(np.abs(r) < 1e11) for r in residual.values())
+    ok = (give_up or bool(np.isfinite(cost))) and all(np.all(np.abs(r) < 1e11) for r in residual.values())
     return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,13 +80,17 @@ class Limits:
     cannot: dict[str, str]
 
 
-def directions(problem: Problem, current: Fit, placed: Placed, most: int = 4) -> list[dict[str, Array]]:
+def directions(
+    problem: Problem, current: Fit, placed: Placed, starts: Sequence[Array] | None = None, most: int = 3
+) -> list[dict[str, Array]]:
     """How the simulated outputs move for a weak effect: per start and weight, output -> (m,) on the view."""
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
     out: list[dict[str, Array]] = []
     weights = model.slices(len(model.placed) - 1)[1]
-    for start in model.starts(len(model.placed) - 1, problem.fit_view, theta)[:most]:
+    if not starts or starts[0].size != theta.size:
+        starts = model.starts(len(model.placed) - 1, problem.fit_view, theta)
+    for start in starts[:most]:
         if weights.stop > weights.start:
             design = model.design(problem.view, start)
             for j in range(weights.start, weights.stop):
@@ -118,11 +122,13 @@ def detection(
     *,
     z: float,
     gain: float,
+    known: Mapping[tuple[str, ...], tuple[Placed, Sequence[Array]]] | None = None,
 ) -> Limits:
     """Smallest effect rms per output and effect that would have been named beside ``current``.
 
     From the noncentrality of the held-out score test at its threshold (plus one standard deviation, so that it is
-    named five times in six) and from the least gain, after what the base parameters would absorb.
+    named five times in six) and from the least gain, after what the base parameters would absorb. ``known``: places
+    that were screened already, with their settings and starts, by (name, kind, site, target).
     """
     limit: dict[str, dict[str, float]] = {o: {} for o in problem.twin.outputs}
     cannot: dict[str, str] = {}
@@ -138,8 +144,13 @@ def detection(
         for place in places(problem, (effect,), ()):
             tried = True
             with np.errstate(all="ignore"):
-                placed = prepare(current.model, problem.fit_view, current.theta, place)
-                moves = directions(problem, current, placed)
+                key = (effect.name, place.effect.kind, place.site, place.target)
+                if known and key in known:
+                    placed, starts = known[key]
+                else:
+                    placed, starts = prepare(current.model, problem.fit_view, current.theta, place), None
+                moves = directions(problem, current, placed, starts)
+            moves = moves[:: max(1, -(-len(moves) // 5))]
             for o in placed.outputs:
                 values: list[float] = []
                 for move in moves:

@@ -44,9 +44,24 @@ def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, .
     return out
 
 
-def one_step(problem: Problem, current: Fit, place: Placed) -> Candidate:
+def bend(problem: Problem, current: Fit) -> dict[str, Array]:
+    """How the outputs move with each searched parameter of the current model: output -> (m, k) on the view."""
+    model, theta = current.model, current.theta
+    out = {o: np.zeros((problem.index.size, len(model.nonlinear))) for o in problem.twin.outputs}
+    for c, i in enumerate(model.nonlinear):
+        p = model.parameters[i]
+        h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
+        shifted = theta.copy()
+        shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
+        there = model.simulate(problem.view, shifted)
+        for o in out:
+            out[o][:, c] = (there[o] - (problem.measured[o] - current.residual[o])) / (shifted[i] - theta[i])
+    return out
+
+
+def one_step(problem: Problem, current: Fit, place: Placed, bends: dict[str, Array]) -> Candidate:
     """Score test of one candidate: the simulator's output moved by the effect at each of its starting points,
-    regressed on the residual together with the base parameters.
+    regressed on the residual together with everything that is free already (``bends`` from ``bend``).
     """
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
@@ -62,60 +77,81 @@ def one_step(problem: Problem, current: Fit, place: Placed) -> Candidate:
         full[index] = current.residual[o][problem.row_of_sample[index]]
         signature = placed.effect.test(x, full, ctx)
         share, p_value, tested = signature.share, signature.p_value, True
-    thin = max(1, problem.fit_rows.size // 15000)
+    thin = max(1, problem.fit_rows.size // 12000)
     rows = problem.fit_rows[::thin]
     for start in starts[:6]:
-        gained, p = _step_gain(problem, current, model, start, rows)
+        gained, p = _step_gain(problem, current, model, start, rows, bends)
         share = max(share, gained)
         if not tested:
             p_value = min(p_value, min(1.0, p * len(starts)))
     return Candidate(placed, share, p_value, tested, tuple(starts))
 
 
-def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, rows: Array) -> tuple[float, float]:
+def _step_gain(
+    problem: Problem, current: Fit, model: Model, theta: Array, rows: Array, bends: dict[str, Array]
+) -> tuple[float, float]:
+    """(share of the mean square taken, p-value of the F test) by one linear step from ``theta``."""
     design = model.design(problem.view, theta)
-    target: list[Array] = []
-    columns: list[Array] = []
-    linear = {j: i for i, j in enumerate(model.linear)}
     n_old = {p.name for p in current.model.parameters}
-    moved_theta = theta.copy()
-    moved = None
-    if model.nonlinear:
-        moved = model.simulate(problem.view, moved_theta)
+    new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
+    moved = model.simulate(problem.view, theta) if model.nonlinear else None
+    pushed: list[dict[str, Array]] = []
+    for j in new_weights:
+        other = theta.copy()
+        other[j] += 0.05 * model.parameters[j].scale
+        pushed.append(model.simulate(problem.view, other))
+    old_linear = [j for j in model.linear if model.parameters[j].name in n_old]
+    new_linear = [j for j in model.linear if model.parameters[j].name not in n_old]
+    target: list[Array] = []
+    old: list[Array] = []
+    new: list[Array] = []
     for o in problem.twin.outputs:
         s = problem.sigma(o)
-        r = current.residual[o][rows] / s
-        block = np.zeros((rows.size, len(linear) + 1))
-        for i, j in enumerate(design.linear[o]):
-            block[:, linear[j]] = design.columns[o][rows, i] / s
+        target.append(current.residual[o][rows] / s)
+        at = {j: i for i, j in enumerate(design.linear[o])}
+
+        def columns(js: list[int], at: dict[int, int] = at, o: str = o, s: float = s) -> Array:
+            block = np.zeros((rows.size, len(js)))
+            for c, j in enumerate(js):
+                if j in at:
+                    block[:, c] = design.columns[o][rows, at[j]] / s
+            return block
+
+        old.append(np.column_stack([columns(old_linear), bends[o][rows] / s]))
+        extra = [columns(new_linear)]
         if moved is not None:
             before = problem.measured[o][rows] - current.residual[o][rows]
-            block[:, -1] = (moved[o][rows] - before) / s
-        target.append(r)
-        columns.append(block)
-    e = np.concatenate(target)
-    x = np.concatenate(columns)
-    if not np.all(np.isfinite(x)):
+            extra.append(((moved[o][rows] - before) / s)[:, None])
+            extra += [((p[o][rows] - moved[o][rows]) / s)[:, None] for p in pushed]
+        new.append(np.column_stack(extra))
+    e, base, more = np.concatenate(target), np.concatenate(old), np.concatenate(new)
+    if not (np.all(np.isfinite(base)) and np.all(np.isfinite(more))):
         return 0.0, 1.0
+    e0, base_q = _without(e, base)
+    more = more - base_q @ (base_q.T @ more)
+    size = np.linalg.norm(more, axis=0)
+    more = more[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
+    before_ = float(e0 @ e0)
+    if before_ <= 0 or more.shape[1] == 0:
+        return 0.0, 1.0
+    left, _ = _without(e0, more)
+    after = float(left @ left)
+    dof = max(e.size - more.shape[1] - base.shape[1], 1)
+    f = (before_ - after) / more.shape[1] / max(after / dof, 1e-300)
+    return max(0.0, 1 - after / before_), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
+
+
+def _is_weight(model: Model, j: int) -> bool:
+    return any(w.start <= j < w.stop for _, w in (model.slices(k) for k in range(len(model.placed))))
+
+
+def _without(e: Array, x: Array) -> tuple[Array, Array]:
+    """``e`` less its projection on the columns of ``x``, and an orthonormal basis of them."""
     size = np.linalg.norm(x, axis=0)
     x = x[:, size > 0] / size[size > 0]
-    old = np.array([model.parameters[j].name in n_old for j in model.linear] + [False])[size > 0]
-    gram = x.T @ x
-    gram[np.diag_indices_from(gram)] += 1e-9
-    weight = np.linalg.solve(gram, x.T @ e)
-    left = float(np.sum((e - x @ weight) ** 2))
-    base = x[:, old]
-    if base.shape[1]:
-        g = base.T @ base
-        g[np.diag_indices_from(g)] += 1e-9
-        e0 = e - base @ np.linalg.solve(g, base.T @ e)
-    else:
-        e0 = e
-    before_ = float(np.sum(e0**2))
-    extra = int((~old).sum())
-    if before_ <= 0 or extra == 0:
-        return 0.0, 1.0
-    share = max(0.0, 1 - left / before_)
-    dof = max(e.size - x.shape[1], 1)
-    f = (before_ - left) / extra / max(left / dof, 1e-300)
-    return share, float(f_distribution.sf(max(f, 0.0), extra, dof))
+    if x.shape[1] == 0:
+        return e, x
+    values, vectors = np.linalg.eigh(x.T @ x)
+    keep = values > 1e-9 * values[-1]
+    q = x @ (vectors[:, keep] / np.sqrt(values[keep]))
+    return e - q @ (q.T @ e), q

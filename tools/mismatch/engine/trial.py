@@ -8,20 +8,21 @@ from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
-from tools.mismatch.engine.screen import Candidate, one_step
+from tools.mismatch.engine.screen import Candidate, bend, one_step
 from tools.mismatch.simulate import Model, Placed
 
 Array = np.ndarray
 Progress = Callable[[str, int, int], None]
 
 LEAST_SHARE = 0.004  # of the residual's mean square, by one step
-LEAST_FITS = 5  # per output, whatever their share
-MOST_FITS = 14
-NEAR_TOP = 0.25
+LEAST_FITS = 3  # per output, whatever their share
+MOST_FITS = 7
+NEAR_TOP = 0.3
 CLEAR_P = 1e-7
 
 
@@ -59,18 +60,25 @@ def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Arr
     return model, model.carry(current.model, current.theta, problem.recording)
 
 
-def screen_one(problem: Problem, current: Fit, place: Placed) -> Candidate:
+def screen_one(problem: Problem, current: Fit, place: Placed, bends: dict[str, Array]) -> Candidate:
     """One step of one candidate."""
-    with np.errstate(all="ignore"):
-        return one_step(problem.fresh(), current, place)
+    with np.errstate(all="ignore"), threadpool_limits(1):
+        return one_step(problem.fresh(), current, place, bends)
 
 
-def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int) -> Trial:
-    """Fit one candidate jointly with everything that is there, compare on held-out samples."""
+def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, tops: dict[str, float]) -> Trial:
+    """Fit one candidate jointly with everything that is there, compare on held-out samples.
+
+    ``tops``: the best one-step share per output; who stays far below it is not refined.
+    """
     problem = problem.fresh()
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"), threadpool_limits(1):
         model, _ = extended(problem, current, candidate.placed)
-        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=10)
+        rows = problem.fit_rows
+        now = {o: float(np.mean((r[rows] / problem.sigma(o)) ** 2)) for o, r in current.residual.items()}
+        gone = max(0.5 * tops[o] * now[o] for o in candidate.placed.outputs)
+        limit = (sum(now.values()) - gone) / len(now)
+        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=10, hopeless=limit)
         comparison = compare(problem, current, fitted)
         value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
@@ -78,18 +86,28 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int) -
     return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added)
 
 
+def freedom(candidate: Candidate) -> int:
+    """How many parameters an effect brings."""
+    parts = candidate.placed.parts
+    return len(parts.nonlinear) + len(parts.weights)
+
+
 def hopeful(candidates: Sequence[Candidate]) -> list[bool]:
-    """Which candidates deserve a fit: per output the best by their one-step share, and whatever has a clear test."""
+    """Which candidates deserve a fit: per output the best by their one-step share, specific effects and flexible
+    families ranked apart (one step flatters the latter), and whatever has a clear test of its own.
+    """
     keep = [False] * len(candidates)
-    outputs = {o for c in candidates for o in c.placed.outputs}
+    outputs = sorted({o for c in candidates for o in c.placed.outputs})
     for o in outputs:
-        here = [i for i, c in enumerate(candidates) if o in c.placed.outputs]
-        here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
-        top = candidates[here[0]].share if here else 0.0
-        for rank, i in enumerate(here):
-            share = candidates[i].share
-            if share > LEAST_SHARE and (rank < LEAST_FITS or (share > NEAR_TOP * top and rank < MOST_FITS)):
-                keep[i] = True
+        for flexible in (False, True):
+            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and (freedom(c) > 4) == flexible]
+            here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
+            top = candidates[here[0]].share if here else 0.0
+            for rank, i in enumerate(here):
+                share = candidates[i].share
+                near = share > NEAR_TOP * top and rank < MOST_FITS
+                if share > LEAST_SHARE and (rank < LEAST_FITS or near):
+                    keep[i] = True
     for i, c in enumerate(candidates):
         if c.tested and c.p_value < CLEAR_P:
             keep[i] = True
@@ -123,10 +141,16 @@ def try_all(
                 progress(label, len(found), len(items))
         return found
 
-    screened: list[Candidate] = run(screen_one, candidates, (), f"{what}: screen")
+    with np.errstate(all="ignore"):
+        bends = bend(problem, current)
+    screened: list[Candidate] = run(screen_one, candidates, (bends,), f"{what}: screen")
     keep = hopeful(screened)
     chosen = [c for c, k in zip(screened, keep, strict=True) if k]
-    fitted = iter(run(fit_one, chosen, (stride,), f"{what}: fit"))
+    tops = dict.fromkeys(problem.twin.outputs, 0.0)
+    for c in chosen:
+        for o in c.placed.outputs:
+            tops[o] = max(tops[o], c.share / len(c.placed.outputs))
+    fitted = iter(run(fit_one, chosen, (stride, tops), f"{what}: fit"))
     return [
         next(fitted) if k else Trial(c.placed, c, None, None, {}, np.empty((0, 0)), 0)
         for c, k in zip(screened, keep, strict=True)
