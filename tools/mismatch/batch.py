@@ -12,7 +12,7 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from tools.cli.common import InputError
 from tools.mismatch.recording import RecordingError
@@ -137,7 +137,8 @@ def run_here(jobs: Sequence[Job], processes: int, work: Work = diagnose_one) -> 
 
     # loky sets OMP_NUM_THREADS and its relatives in the workers before they import numpy
     with parallel_config(backend="loky", inner_max_num_threads=1):
-        yield from Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(work)(job) for job in jobs)
+        rows = Parallel(n_jobs=processes, return_as="generator_unordered")(delayed(work)(job) for job in jobs)
+        yield from cast(Iterator[Row], rows)
 
 
 def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) -> Iterator[Row]:

@@ -35,7 +35,7 @@ def figure(name: str, size_in: tuple[float, float], **kwargs: Any) -> Iterator[t
     from matplotlib.figure import Figure
 
     out: list[str] = []
-    style = {
+    style: dict[Any, Any] = {
         "svg.hashsalt": name,
         "svg.fonttype": "none",
         "font.family": "sans-serif",

@@ -71,7 +71,7 @@ def _entry(effect: Effect) -> Entry:
 def _parameters(effect: Effect) -> tuple[tuple[str, str], ...]:
     """Names and units under which a report gives its parameters: read from a made-up example, since several
     effects decide on their elements by the data."""
-    t = np.arange(512) * 0.01
+    t = np.arange(512, dtype=np.float64) * 0.01
     wave = np.sin(2 * np.pi * t / 1.7) + 0.3 * np.sin(2 * np.pi * t / 0.4)
     residual = 0.1 * np.roll(wave, 5) + 0.05 * np.sin(2 * np.pi * 10 * t) + 0.02 * t
     names = ("command", "temperature", "supply", "actuator_current", "load", "velocity")

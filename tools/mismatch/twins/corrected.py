@@ -1,7 +1,8 @@
 """A corrected twin: base physics with effects that an earlier diagnosis found, as one twin.
 
 The engine sees an ordinary twin with more base parameters, so that effects that are known already are re-fitted
-like a gain is (verdict ``recalibrate``) and are not found a second time.
+like a gain is (verdict ``recalibrate``) and are not found a second time. The weights of an effect that is made of
+many elements (hysteresis, creep) are re-fitted by one common factor: a new recording need not excite each of them.
 """
 
 from __future__ import annotations
@@ -18,9 +19,14 @@ from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
 
 
+MOST_FREE = 3  # weights of an effect that are re-fitted one by one
+
+
 @dataclass(frozen=True)
 class CorrectedTwin:
-    """``inner`` is the core twin with its effects, ``begin`` its parameters: those of the core first."""
+    """``inner`` is the core twin with its effects at ``found`` (its own theta). ``of[j]`` is the parameter of this
+    twin that moves parameter ``j`` of the inner model, ``factor[j]`` says that it does so by multiplying it.
+    """
 
     kind: str
     inputs: tuple[str, ...]
@@ -29,12 +35,14 @@ class CorrectedTwin:
     chain: tuple[Stage, ...]
     parameters: tuple[Parameter, ...]
     inner: Model
-    begin: tuple[float, ...]
+    found: tuple[float, ...]
+    of: tuple[int, ...]
+    factor: tuple[bool, ...]
     static: bool
     restart: bool
     feedback_on: str
     penalty: Array
-    """Smoothness rows of the effects, (rows, len(parameters))."""
+    """Smoothness rows of weights that are free, (rows, len(parameters))."""
 
     @property
     def core(self) -> Twin:
@@ -50,7 +58,16 @@ class CorrectedTwin:
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
-        return np.array(self.begin)
+        out = np.ones(len(self.parameters))
+        for j, i in enumerate(self.of):
+            if not self.factor[j]:
+                out[i] = self.found[j]
+        return out
+
+    def inside(self, theta: Array) -> Array:
+        """Theta of the inner model for parameters of this twin (further ones are ignored)."""
+        moved = theta[list(self.of)]
+        return np.where(self.factor, moved * np.array(self.found), moved)
 
     def drive(self, output: str) -> str:
         """See Twin."""
@@ -77,21 +94,26 @@ class CorrectedTwin:
     ) -> dict[str, Signal]:
         """See Twin. Columns of the inputs are folded: behind the effects they would not stay linear."""
         folded = {s: fold(x, theta, self.input_gain(s, theta)) for s, x in inputs.items()}
-        flow = self.inner.flow(run, folded, theta, forces, join)
-        keep = set(self.inner.linear)
+        inside = self.inside(theta)
+        flow = self.inner.flow(run, folded, inside, forces, join)
+        linear = set(self.inner.linear)
         out: dict[str, Signal] = {}
         for o, signal in flow.items():
-            lost = {j: c for j, c in signal.columns.items() if j not in keep}
-            value, token = signal.value, signal.token
-            for j, c in lost.items():
-                value = value + theta[j] * c
-                token = (*token, (j, float(theta[j])))
-            out[o] = Signal(value, {j: c for j, c in signal.columns.items() if j in keep}, token)
+            value, token = signal.value, (*signal.token, "corrected")
+            columns: dict[int, Array] = {}
+            for j, c in signal.columns.items():
+                if j not in linear:
+                    value, token = value + inside[j] * c, (*token, j, float(inside[j]))
+                    continue
+                column = self.found[j] * c if self.factor[j] else c
+                i = self.of[j]
+                columns[i] = columns[i] + column if i in columns else column
+            out[o] = Signal(value, columns, token)
         return out
 
     def human(self, theta: Array) -> Sequence[Human]:
         """See Twin."""
-        groups = self.inner.human(theta[: len(self.parameters)])
+        groups = self.inner.human(self.inside(theta))
         return [
             Human(h.name if group == "base" else f"{group}.{h.name}", h.value, h.unit)
             for group, values in groups.items()
@@ -100,7 +122,7 @@ class CorrectedTwin:
 
     def to_text(self, theta: Array) -> dict[str, object]:
         """See Twin; the key ``effects`` holds the effects, re-fitted."""
-        text = describe(self.inner, theta[: len(self.parameters)])
+        text = describe(self.inner, self.inside(theta))
         return {**text["parameters"], "effects": text["effects"]}
 
 
@@ -115,18 +137,41 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
                 " which this recording does not have"
             )
     twin = model.twin
-    parameters = tuple(Parameter(f.name, f.unit, f.lo, f.hi, f.log, f.scale) for f in model.parameters)
+    parameters: list[Parameter] = []
+    of: list[int] = []
+    factor: list[bool] = []
+    banks = [model.slices(k)[1] for k in range(len(model.placed))]
+    common = {j: w.start for w in banks if w.stop - w.start > MOST_FREE for j in range(w.start, w.stop)}
+    for j, f in enumerate(model.parameters):
+        first = common.get(j)
+        factor.append(first is not None)
+        if first is not None and first != j:
+            of.append(of[first])
+            continue
+        of.append(len(parameters))
+        if first is None:
+            parameters.append(Parameter(f.name, f.unit, f.lo, f.hi, f.log, f.scale))
+        else:
+            parameters.append(Parameter(f"{f.name.rsplit('.', 1)[0]}.strength", "1", scale=0.05))
+    rows = model.smoothness()
+    rows = rows[~np.any(rows[:, np.array(factor)] != 0.0, axis=1)]
+    penalty = np.zeros((rows.shape[0], len(parameters)))
+    for j, i in enumerate(of):
+        if not factor[j]:
+            penalty[:, i] = rows[:, j]
     return CorrectedTwin(
         twin.kind,
         twin.inputs,
         twin.outputs,
         twin.units,
         twin.chain,
-        parameters,
+        tuple(parameters),
         model,
         tuple(theta.tolist()),
+        tuple(of),
+        tuple(factor),
         twin.static,
         twin.restart,
         twin.feedback_on,
-        model.smoothness(),
+        penalty,
     )

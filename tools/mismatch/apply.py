@@ -1,0 +1,153 @@
+"""From a report to a corrected twin: a ``[twin]`` table with re-fitted base parameters and the effects found."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim_devices.physics.catalogue import EFFECTS
+from tools.cli.common import InputError
+from tools.mismatch.recording import Recording, RecordingError, TwinText, load
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_text import describe, restore
+from tools.mismatch.twins.make import make
+
+EVENTS = ("spikes", "step_shift", "random_walk", "dropped_samples")
+"""What happened in one recording and will not happen again at the same time: no part of a twin."""
+
+
+@dataclass(frozen=True)
+class Corrected:
+    """``text`` of the twin file, its ``effects`` in order, ``notes`` on what was left out and why."""
+
+    kind: str
+    text: str
+    effects: tuple[str, ...]
+    notes: tuple[str, ...]
+
+
+def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
+    """The twin file for a recording and the JSON report of its diagnosis.
+
+    Raises InputError for a report that is not one or belongs to another recording, RecordingError for the recording.
+    """
+    recording = load(path)
+    found = _physics(report)
+    _belongs(recording, report, found)
+    base = dict(report["corrected_base"])
+    before = list(base.pop("effects", []))
+    kept = [p for p in found if p["name"] not in EVENTS]
+    notes = [f"{p['name']} is an event of that recording and no part of the twin" for p in found if p["name"] in EVENTS]
+    effects = [*before, *(_entry(p) for p in kept)]
+    with_effects = replace(recording, twin=TwinText(recording.twin.kind, base, tuple(effects)))
+    try:
+        model, theta = restore(with_effects)
+    except RecordingError as error:
+        raise InputError(f"the report does not fit the recording: {error}") from error
+    theta = _same_weight(recording, report, model, theta)
+    table = describe(model, theta)
+    head = (
+        f"# Corrected twin of {recording.path}: {report['verdict']}.\n# Refer to it from a recording: [twin] file = ..."
+    )
+    return Corrected(
+        recording.twin.kind,
+        f"{head}\nformat = 1\n\n{twin_toml(table)}",
+        tuple(str(e["name"]) for e in table["effects"]),
+        tuple(notes),
+    )
+
+
+def _physics(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    if report.get("format") != 1:
+        raise InputError(f"the report has format {report.get('format')!r}, expected 1; run diagnose --json again")
+    missing = [k for k in ("verdict", "physics", "fit", "twin", "corrected_base") if k not in report]
+    if missing:
+        raise InputError(f"the report has no {', '.join(missing)}; give the whole JSON that diagnose wrote")
+    found = report["physics"]
+    if not isinstance(found, list) or not isinstance(report["corrected_base"], Mapping):
+        raise InputError("the report's physics or corrected_base is not what diagnose writes")
+    for i, p in enumerate(found):
+        where = f"the report's physics {i + 1}"
+        if not isinstance(p, Mapping) or not isinstance(p.get("name"), str):
+            raise InputError(f"{where} has no name")
+        if p["name"] not in EFFECTS:
+            raise InputError(f"{where}: '{p['name']}' is not in the vocabulary; see 'micron mismatch physics'")
+        absent = [k for k in ("site", "target", "stage", "outputs", "settings", "raw") if k not in p]
+        if absent:
+            raise InputError(f"{where} ({p['name']}) has no {', '.join(absent)}; give the JSON that diagnose wrote")
+    return found
+
+
+def _belongs(recording: Recording, report: Mapping[str, Any], found: Sequence[Mapping[str, Any]]) -> None:
+    if report["twin"] != recording.twin.kind:
+        raise InputError(f"the report is of a {report['twin']}, {recording.path} of a {recording.twin.kind}")
+    fit = report["fit"]
+    outputs = set(fit.get("unit", {})) if isinstance(fit, Mapping) else set[str]()
+    if outputs != set(recording.outputs):
+        said, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
+        raise InputError(f"the report's outputs ({said}) are not those of {recording.path} ({have})")
+
+
+def _entry(p: Mapping[str, Any]) -> dict[str, Any]:
+    keys = ("name", "site", "target", "stage", "outputs", "settings")
+    return {**{k: p[k] for k in keys}, "parameters": p["raw"]}
+
+
+def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, theta: np.ndarray) -> np.ndarray:
+    """Weights of effects in front of the base physics carry its input gain (``Twin.input_gain``). A twin that is
+    written down and read again may have other state coordinates, hence another gain: the effect must stay the same.
+    """
+    shifts = {b["name"]: float(b["with_effects"]) for b in report["fit"].get("base_parameters", [])}
+    old = make(recording)
+    if set(shifts) != {p.name for p in old.parameters}:
+        return theta
+    fitted = np.array([shifts[p.name] for p in old.parameters])
+    theta = theta.copy()
+    for k, placed in enumerate(model.placed):
+        if placed.site == "output":
+            continue
+        signal = placed.target if placed.site == "input" else model.twin.inputs[0]
+        was, now = old.input_gain(signal, fitted), model.twin.input_gain(signal, theta[: model.n_base])
+        if was != 0.0:
+            theta[model.slices(k)[1]] *= now / was
+    return theta
+
+
+def twin_toml(table: Mapping[str, Any]) -> str:
+    """The ``[twin]`` table as TOML; figures as exact as they are in memory."""
+    lines = ["[twin]", f"kind = {_value(table['kind'])}", "", "[twin.parameters]"]
+    lines += [f"{_key(k)} = {_value(v)}" for k, v in table["parameters"].items()]
+    for effect in table["effects"]:
+        lines += ["", "[[twin.effects]]"]
+        lines += [f"{_key(k)} = {_value(v)}" for k, v in effect.items() if not isinstance(v, Mapping)]
+        for name in ("settings", "parameters"):
+            lines += ["", f"[twin.effects.{name}]"]
+            lines += [f"{_key(k)} = {_value(v)}" for k, v in effect[name].items()]
+    return "\n".join(lines) + "\n"
+
+
+def _key(name: str) -> str:
+    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value)
+    if isinstance(value, Mapping):
+        return "{ " + ", ".join(f"{_key(str(k))} = {_value(v)}" for k, v in value.items()) + " }"
+    if isinstance(value, Sequence):
+        return "[" + ", ".join(_value(v) for v in value) + "]"
+    if isinstance(value, int | np.integer):
+        return str(int(value))
+    if not math.isfinite(value):
+        raise InputError(f"the report holds {value}, which no twin can use")
+    return repr(float(value))
