@@ -53,7 +53,8 @@ def bench_with_method(bench: Path, method: str, folder: Path) -> Path:
     copy = folder / f"{bench.stem}-{method}.toml"
     calibration = bench.parent / "calibration"
     text = text.replace('"calibration/', f'"{calibration}/')
-    copy.write_text(text + f'\n[firmware.tremor]\nmethod = "{method}"\n', encoding="utf-8")
+    text = text.replace("[firmware.tremor]\n", f'[firmware.tremor]\nmethod = "{method}"\n')
+    copy.write_text(text, encoding="utf-8")
     return copy
 
 
