@@ -10,7 +10,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import STAGES, Context, Effect
 
-NAMES = [
+NAMES = (
     "hysteresis",
     "rate_dependent_hysteresis",
     "creep",
@@ -46,12 +46,12 @@ NAMES = [
     "centripetal_acceleration",
     "sensor_position_error",
     "channel_delay",
-]
+)
 ALL = [(e.name + "/" + e.kind, e) for one in EFFECTS.values() for e in (one, *one.variants)]
 
 
 def test_the_vocabulary_is_complete() -> None:
-    assert list(EFFECTS) == NAMES
+    assert tuple(EFFECTS) == NAMES
 
 
 @pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -137,7 +138,7 @@ def test_dahl_against_small_steps() -> None:
     x = np.array([0.0, 0.7, -0.9, 0.2, 0.15, 1.4])
     r, g = 0.5, 0.4
     z, out = 0.0, [0.0]
-    for a, b in zip(x[:-1], x[1:], strict=True):
+    for a, b in pairwise(x):
         d = (b - a) / 20000
         for _ in range(20000):
             z += d - (abs(d) * z + g * d * abs(z)) / r

@@ -100,10 +100,12 @@ def _number(recording: Recording, key: str, value: object) -> float | None:
 
 
 def _begin(recording: Recording, given: dict[str, float | None], sprung: bool) -> tuple[float, float, float, float]:
-    """Given values; missing ones by regression on filtered derivatives (state variable filter)."""
+    """Given values; no offset where none is named; missing mass and damping by regression on filtered derivatives
+    (state variable filter)."""
     known = {k: v for k, v in given.items() if v is not None}
     if not sprung:
         known["stiffness"] = 0.0
+    known.setdefault("offset_force", 0.0)
     missing = [k for k in ("mass", "damping", "stiffness", "offset_force") if k not in known]
     if missing:
         y = recording.outputs.get("position")

@@ -18,7 +18,6 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
 
-
 MOST_FREE = 3  # weights of an effect that are re-fitted one by one
 
 

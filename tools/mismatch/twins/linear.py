@@ -159,8 +159,12 @@ def start_state(
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
     longest = max(b - a for a, b in spans)
     free = {o: free_response(ad, c, longest) for o, c in rows.items()}
-    weight = {o: 1.0 / (float(np.std(measured[o])) or 1.0) for o in rows}
     windows = tuple(min(window, b - a) for a, b in spans)
+    weight = dict.fromkeys(rows, 1.0)
+    if len(rows) > 1:
+        # outputs of different units weigh alike over the samples that may set the state
+        seen = np.concatenate([np.arange(a, a + w) for (a, _), w in zip(spans, windows, strict=True)])
+        weight = {o: 1.0 / (float(np.std(measured[o][seen])) or 1.0) for o in rows}
     solvers: dict[int, Array] = {}
     for w in set(windows):
         stacked = np.concatenate([free[o][:w] * weight[o] for o in rows])

@@ -1,0 +1,244 @@
+"""Twins against scipy's simulations and closed forms."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.signal import StateSpace, dlsim, lsim
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_model.made import recording
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.simulate import Model, Placed, View
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.twins import make
+from tools.mismatch.twins.feedback import run_feedback
+from tools.mismatch.twins.linear import discretise, run_output, run_states
+
+Array = NDArray[np.float64]
+AXIS = {"force": "N", "position": "m", "velocity": "m/s"}
+
+
+def force(n: int, dt: float) -> Array:
+    t = np.arange(n) * dt
+    return 3 * np.sin(2 * np.pi * 1.3 * t) + 2 * np.sin(2 * np.pi * 4.1 * t + 1)
+
+
+def as_given(rec: Recording, init: int = 0) -> dict[str, Array]:
+    model = Model(make(rec))
+    return model.simulate(View.whole(rec, init), model.start(rec))
+
+
+def space(matrices: dict[str, Any], u: dict[str, Array], outputs: tuple[str, ...], dt: float) -> Recording:
+    n = next(iter(u.values())).size
+    # outputs are stand-ins: with x0 given nothing of them is used
+    noise = np.random.default_rng(0).standard_normal(n)
+    return recording("state_space", dt, u, dict.fromkeys(outputs, noise), {}, matrices)
+
+
+@pytest.mark.parametrize("hold", ["zero", "linear"])
+def test_state_space_against_lsim(hold: str) -> None:
+    dt, n = 0.01, 400
+    a = [[0.0, 1.0, 0.0], [-400.0, -6.0, 30.0], [0.0, 0.0, -9.0]]
+    b, c, d = [[0.0, 0.1], [5.0, 0.0], [1.0, 2.0]], [[1.0, 0.0, 0.0], [0.0, 0.2, 1.0]], [[0.0, 0.0], [0.5, 0.0]]
+    u = {"p": force(n, dt), "q": np.cos(np.arange(n) * 0.05)}
+    x0 = [0.3, -1.0, 0.2]
+    rec = space({"A": a, "B": b, "C": c, "D": d, "x0": x0, "y0": [0.1, -0.2], "hold": hold}, u, ("y", "z"), dt)
+    stacked = np.stack(list(u.values()), axis=1)
+    t = np.arange(n) * dt
+    _, want, _ = lsim(StateSpace(a, b, c, d), stacked, t, X0=x0, interp=hold == "linear")
+    got = as_given(rec)
+    np.testing.assert_allclose(got["y"], want[:, 0] + 0.1, atol=1e-7)
+    np.testing.assert_allclose(got["z"], want[:, 1] - 0.2, atol=1e-7)
+
+
+def test_discrete_state_space_against_dlsim() -> None:
+    dt, n = 0.02, 300
+    a, b, c, d = [[1.5, -0.7], [1.0, 0.0]], [[1.0], [0.0]], [[0.2, 0.1]], [[0.05]]
+    u = {"u": force(n, dt)}
+    rec = space({"A": a, "B": b, "C": c, "D": d, "discrete": True}, u, ("y",), dt)
+    _, want, _ = dlsim((*map(np.array, (a, b, c, d)), dt), u["u"])
+    np.testing.assert_allclose(as_given(rec)["y"], np.ravel(want), atol=1e-9)
+
+
+def test_state_space_round_trip() -> None:
+    """What a corrected twin writes simulates the same."""
+    dt, n = 0.01, 300
+    a, b, c = [[-1.0, 2.0], [-8.0, -3.0]], [[1.0], [0.5]], [[2.0, -1.0]]
+    u = {"u": force(n, dt)}
+    rec = space({"A": a, "B": b, "C": c}, u, ("y",), dt)
+    twin = make(rec)
+    text = twin.to_text(twin.start(rec))
+    again = space(dict(text), u, ("y",), dt)
+    np.testing.assert_allclose(as_given(again)["y"], as_given(rec)["y"], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("A", [[1.0, 2.0]], "A has shape"),
+        ("B", [[1.0]], "B has shape"),
+        ("C", [[float("nan"), 0.0]], "C has shape"),
+        ("hold", "cubic", "hold must be"),
+        ("discrete", 1, "discrete must be"),
+        ("Q", 1, "'Q' is not a parameter"),
+    ],
+)
+def test_state_space_errors(key: str, value: object, message: str) -> None:
+    good: dict[str, Any] = {"A": [[0.0, 1.0], [-4.0, -1.0]], "B": [[0.0], [1.0]], "C": [[1.0, 0.0]]}
+    with pytest.raises(RecordingError, match=message):
+        make(space({**good, key: value}, {"u": np.ones(60)}, ("y",), 0.1))
+
+
+def test_axis_against_lsim() -> None:
+    dt, n, m, c, k = 1e-3, 4000, 2.0, 8.0, 900.0
+    f, t = force(n, dt), np.arange(n) * dt
+    _, want, _ = lsim(StateSpace([[0, 1], [-k / m, -c / m]], [[0], [1 / m]], np.eye(2), np.zeros((2, 1))), f + 0.7, t)
+    rec = recording(
+        "mechanical_axis", dt, {"force": f}, {"position": want[:, 0], "velocity": want[:, 1]}, AXIS,
+        {"mass": m, "damping": c, "stiffness": k, "offset_force": 0.7},
+    )  # fmt: skip
+    got = as_given(rec, 40)
+    np.testing.assert_allclose(got["position"], want[:, 0], atol=1e-9)
+    np.testing.assert_allclose(got["velocity"], want[:, 1], atol=1e-8)
+
+
+def test_axis_parameters_are_estimated() -> None:
+    dt, n, m, c, k = 1e-3, 8000, 2.0, 8.0, 900.0
+    f, t = force(n, dt), np.arange(n) * dt
+    _, want, _ = lsim(([1 / m], [1, c / m, k / m]), f, t)
+    y = want + 1e-6 * np.random.default_rng(0).standard_normal(n)
+    rec = recording("mechanical_axis", dt, {"force": f}, {"position": y}, AXIS, {"stiffness": 900.0})
+    values = {h.name: h.value for h in make(rec).human(make(rec).start(rec))}
+    assert values["mass"] == pytest.approx(m, rel=0.02)
+    assert values["damping"] == pytest.approx(c, rel=0.1)
+    assert values["offset_force"] == 0.0
+
+
+def with_effect(rec: Recording, name: str, weights: list[float], q: list[float]) -> dict[str, Array]:
+    twin = make(rec)
+    place = next(p for p in sites(twin, rec, EFFECTS[name]) if p.site == "feedback")
+    model = Model(twin, [Placed(place.effect, place.site, place.target, place.stage, place.outputs, {})])
+    theta = model.start(rec)
+    a, b = model.slices(0)
+    theta[a], theta[b] = q, weights
+    return model.simulate(View.whole(rec, 30), theta)
+
+
+def test_coulomb_decay_closed_form() -> None:
+    """Mass on a spring with dry friction: every half cycle loses 2 F/k, then it sticks (Den Hartog, 1931)."""
+    dt, n, w, level = 5e-4, 6000, 20.0, 10.0
+    t = np.arange(n) * dt
+    x0, shift = 0.2, level / w**2  # metres; level in N/kg
+    want = np.empty(n)
+    amplitude, sign = x0, 1.0
+    for k in range(n):
+        half, phase = divmod(w * t[k], np.pi)
+        amplitude = x0 - (2 * half + 1) * shift
+        sign = 1.0 if half % 2 == 0 else -1.0
+        want[k] = sign * (amplitude * np.cos(phase) + shift) if amplitude > 0 else np.nan
+    last = int(np.argmax(np.isnan(want)))
+    want[last:] = want[last - 1]
+    rec = recording(
+        "mechanical_axis", dt, {"force": np.zeros(n)}, {"position": want}, AXIS,
+        {"mass": 1.0, "damping": 0.0, "stiffness": w * w},
+    )  # fmt: skip
+    got = with_effect(rec, "coulomb_friction", [level, 0.0, 0.0], [])
+    np.testing.assert_allclose(got["position"], want, atol=2e-3 * x0)
+    assert np.ptp(got["position"][-500:]) < 1e-9
+
+
+def test_duffing_against_an_ode_solver() -> None:
+    dt, n = 2e-3, 2000
+    f, t = force(n, dt), np.arange(n) * dt
+    k3, k2 = 4e4, 300.0
+
+    def rhs(s: float, y: Array) -> list[float]:
+        u = np.interp(s, t, f)
+        return [y[1], u - 3 * y[1] - 400 * y[0] - k3 * y[0] ** 3 - k2 * y[0] ** 2]
+
+    want = solve_ivp(rhs, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=dt).y[0]
+    rec = recording(
+        "mechanical_axis", dt, {"force": f}, {"position": want}, AXIS, {"mass": 1.0, "damping": 3.0, "stiffness": 400.0}
+    )
+    got = with_effect(rec, "cubic_stiffness", [k3, k2], [])["position"]
+    assert np.max(np.abs(got - want)) < 2e-3 * np.ptp(want)
+
+
+def test_cluster_against_rigid_body() -> None:
+    dt, n = 1e-3, 2000
+    t = np.arange(n) * dt
+    w = np.stack([np.sin(5 * t), 0.5 * np.cos(3 * t), np.sin(7 * t + 1)], axis=1)
+    alpha = np.stack([5 * np.cos(5 * t), -1.5 * np.sin(3 * t), 7 * np.cos(7 * t + 1)], axis=1)
+    f = np.stack([np.sin(t), np.cos(t), 9.8 + 0 * t], axis=1)
+    r = np.array([0.1, -0.2, 0.05])
+    inputs = {f"specific_force_{a}": f[:, i] for i, a in enumerate("xyz")}
+    inputs |= {f"angular_rate_{a}": w[:, i] for i, a in enumerate("xyz")}
+    noise = np.random.default_rng(0).standard_normal(n)
+    rec = recording(
+        "accelerometer_cluster", dt, inputs, {"accel_1x": noise, "accel_1z": noise}, {},
+        {"positions_m": {"1": list(r)}},
+    )  # fmt: skip
+    want = f + np.cross(alpha, r)
+    got = as_given(rec)
+    np.testing.assert_allclose(got["accel_1x"][2:-2], want[2:-2, 0], atol=2e-4)
+    np.testing.assert_allclose(got["accel_1z"][2:-2], want[2:-2, 2], atol=2e-4)
+    effect = EFFECTS["centripetal_acceleration"]
+    model = Model(make(rec), sites(make(rec), rec, effect))
+    theta = model.start(rec)
+    theta[-1] = 1.0
+    full = want + np.cross(w, np.cross(w, r))
+    np.testing.assert_allclose(model.simulate(View.whole(rec), theta)["accel_1z"][2:-2], full[2:-2, 2], atol=2e-4)
+
+
+def test_user_twin_from_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Squarer:
+        def simulate(self, inputs: dict[str, Array], parameters: dict[str, Any]) -> dict[str, Array]:
+            return {"y": parameters["gain"] * inputs["u"] ** 2}
+
+    class Entry:
+        name, value = "squarer", "here:Squarer"
+
+        def load(self) -> type:
+            return Squarer
+
+    module = importlib.import_module("tools.mismatch.twins.make")
+    monkeypatch.setattr(module, "user_kinds", lambda: {"squarer": Entry()})
+    u = np.linspace(-1, 1, 60)
+    rec = recording("squarer", 0.1, {"u": u}, {"y": u}, {}, {"gain": 3.0, "label": "x"})
+    np.testing.assert_allclose(as_given(rec)["y"], 3 * u**2)
+    broken = recording("squarer", 0.1, {"u": u}, {"y": u, "z": u}, {}, {"gain": 3.0})
+    with pytest.raises(RecordingError, match="returned no output 'z'"):
+        as_given(broken)
+
+
+def test_fmu_needs_its_extra(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    import sys
+
+    monkeypatch.setitem(sys.modules, "fmpy", None)
+    (tmp_path / "m.fmu").write_bytes(b"")
+    u = np.ones(60)
+    rec = recording("fmu", 0.1, {"u": u}, {"y": u}, {}, {"path": str(tmp_path / "m.fmu")})
+    with pytest.raises(RecordingError, match="extra 'fmu'"):
+        make(rec)
+
+
+def test_linear_kernels_equal_python() -> None:
+    d = discretise(np.array([[0.0, 1.0], [-30.0, -2.0]]), np.array([0.0, 1.0]), 0.01, "linear")
+    u = np.random.default_rng(0).standard_normal(80)
+    starts, x0 = np.array([0, 40]), np.array([[0.1, 0.0], [0.0, 1.0]])
+    states = run_states(d.ad, d.g0, d.g1, u, x0, starts)
+    np.testing.assert_allclose(states, run_states.py_func(d.ad, d.g0, d.g1, u, x0, starts), atol=1e-14)
+    c = np.array([1.0, 0.5])
+    args = (d.ad, d.g0, d.g1, c, u, starts)
+    np.testing.assert_allclose(run_output(*args), run_output.py_func(*args), atol=1e-14)
+    rows = (np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]), np.array([3.0, 0.5]), np.array([0.1, 0.2, 0.1, 0.0, 0.05]))
+    more = (np.array([0.01]), np.array([2.0]))
+    cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    args = (d.ad, d.g0, d.g1, cp, cv, u, False, 2, x0, starts, np.array([40, 80]), *rows, *more, True)
+    np.testing.assert_allclose(run_feedback(*args), run_feedback.py_func(*args), atol=1e-13)
