@@ -7,7 +7,7 @@ standard deviations from which the seed draws one physical unit: the same seed i
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -213,6 +213,47 @@ class EnvironmentConfig(_Table):
     """How long the instrument has been switched on when the run starts."""
 
 
+class ImuConfig(_Table):
+    """``[emulation.imu.DEVICE]``: how the IMU of that name is mounted, and how good a specimen it is."""
+
+    position_mm: Vector = (0.0, 0.0, 0.0)
+    """In the body frame; on the instrument, from the base of the back suite."""
+    turn_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw of the sensor's axes in the body."""
+    errors: NotNegative = 1.0
+    """Scales bias, scale, misalignment and temperature errors; 0 is an ideal chip."""
+    noise: NotNegative = 1.0
+
+
+class EndoscopeConfig(_Table):
+    """``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
+
+    scenario: Literal["rest", "turntable", "fall", "poses", "hand"] = "hand"
+    attitude_deg: Vector = (0.0, 0.0, 0.0)
+    """Roll, pitch, yaw at the start."""
+
+    rate_dps: float = 90.0
+    start_s: NotNegative = 1.0
+    ramp_s: NotNegative = 0.5
+    radius_m: NotNegative = 0.0
+    """Of the turntable, from its axis to the body's origin along the world's x at the start."""
+
+    fall_at_s: NotNegative = 1.0
+    fall_m: Positive = 1.0
+
+    poses: tuple[tuple[NotNegative, float, float, float, Positive], ...] = ()
+    """Start s, roll, pitch, yaw deg, duration s of each move."""
+
+    sweep_deg: NotNegative = 15.0
+    tremor_deg: NotNegative = 0.2
+    tremor_um: NotNegative = 100.0
+
+    start_C: float = 25.0
+    end_C: float = 25.0
+    thermal_s: Positive = 300.0
+    """The room goes from ``start_C`` to ``end_C`` with this time constant."""
+
+
 class EmulationConfig(_Table):
     """The whole ``[emulation]`` table."""
 
@@ -228,3 +269,5 @@ class EmulationConfig(_Table):
     amplifier: AmplifierConfig = AmplifierConfig()
     manipulator: ManipulatorConfig = ManipulatorConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
+    endoscope: EndoscopeConfig | None = None
+    imu: dict[str, ImuConfig] = Field(default_factory=dict)

@@ -7,6 +7,7 @@ from typing import Any
 
 from sim_devices.devices.can_stop_button import CanStopButton
 from sim_devices.devices.di4108 import Di4108
+from sim_devices.devices.motion_card import MotionCard
 from sim_devices.world import World
 
 FAULTS = (
@@ -16,7 +17,7 @@ FAULTS = (
     "stuck / free: SDA of an I2C bus is held low / released",
     "silence / speak: a CAN node or CAN bus goes silent / comes back",
     "overflow: the DAQ's FIFO overflows now",
-    "press / release: the stop button",
+    "press / release: the stop button, or the button of the motion card named",
 )
 
 
@@ -35,11 +36,12 @@ def inject(
         unplug[bus]()
         return
     if fault in ("press", "release"):
-        for device in world.devices.values():
-            if isinstance(device, CanStopButton):
+        named = world.devices.get(target)
+        for device in (named,) if isinstance(named, MotionCard) else world.devices.values():
+            if isinstance(device, CanStopButton | MotionCard):
                 device.press() if fault == "press" else device.release()
                 return
-        raise UnknownFault("there is no stop button on this bench; add a can_telemetry device")
+        raise UnknownFault("there is no button on this bench; add a can_telemetry device or a motion card")
     where = _target(world, target)
     flags = {
         "freeze": ("frozen", True),

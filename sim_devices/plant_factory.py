@@ -12,6 +12,7 @@ from hal.errors import BenchError
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
+from sim_devices.plant.scanner import Scanner
 from sim_devices.world import Plant
 
 
@@ -24,10 +25,12 @@ def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
 
 
 def make_plant(description: Mapping[str, Any], hand_file: str | None, hand_scale: float | None) -> Plant:
-    """An ``Instrument`` in somebody's hand: synthetic, or recorded in ``hand_file``.
+    """An ``Instrument`` in somebody's hand: synthetic, or recorded in ``hand_file``; or the endoscope bench's scanner.
 
     Raises ``BenchError`` (``HandFileError``) for a hand that cannot be used.
     """
     config = emulation_config(description)
+    if config.endoscope is not None:
+        return Scanner(config)
     hand = make_hand(config.hand, config.seed, hand_file, hand_scale)
     return Instrument(config, config.seed, hand, unit=config.unit)

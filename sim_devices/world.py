@@ -15,14 +15,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import BenchError
+from sim_devices.config import ImuConfig
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.devices.ads1115 import Ads1115
+from sim_devices.devices.bmx055 import Bmx055Accelerometer, Bmx055Gyroscope
+from sim_devices.devices.bmx055_magnetometer import Bmx055Magnetometer
 from sim_devices.devices.can_piezo_node import CanPiezoNode
 from sim_devices.devices.can_stop_button import CanStopButton
 from sim_devices.devices.can_telemetry_listener import CanTelemetryListener
 from sim_devices.devices.di4108 import Di4108
 from sim_devices.devices.e727 import E727
 from sim_devices.devices.faces import ByteFace, TimedFace, Volts
+from sim_devices.devices.lsm6ds3 import Lsm6ds3
+from sim_devices.devices.motion_card import MotionCard
+from sim_devices.devices.mpu6050 import Mpu6050
+from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
+from sim_devices.plant.imu import BMX055_SPEC, LSM6DS3_SPEC, MPU6050_SPEC, Imu, ImuSpec
 from sim_devices.transports.can_hub import CanHub
 from sim_devices.transports.i2c_line import I2cLine
 
@@ -42,6 +50,7 @@ class Plant(Protocol):
     def advance_to(self, t_ns: int) -> None: ...
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None: ...
     def strap(self, pulse: Literal["set", "reset"]) -> None: ...
+    def motion(self) -> BodyMotion: ...
     def truth(self) -> Truth: ...
     def truth_row(self) -> Mapping[str, NDArray[np.float64]]: ...
 
@@ -117,6 +126,10 @@ class World:
         self.plant.advance_to(t_ns - self.epoch_ns)
         return self.plant.analog_V
 
+    def _motion(self, t_ns: int) -> BodyMotion:
+        self.plant.advance_to(t_ns - self.epoch_ns)
+        return self.plant.motion()
+
     def _magnetometer_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
         self._adc_volts[self._adc_wiring[:3]] = self.plant.magnetometer_V
@@ -151,7 +164,14 @@ class World:
             "e727": self._add_e727,
             "can_amplifier": self._add_can_amplifier,
             "can_telemetry": self._add_can_telemetry,
+            "mpu6050": self._add_mpu6050,
+            "lsm6ds3": self._add_lsm6ds3,
+            "bmx055": self._add_bmx055,
+            "motion_card": self._add_motion_card,
         }
+        emulation = description.get("emulation", {})
+        self._seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
+        self._baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
         for name, bus in description["bus"].items():
             if not str(bus["uri"]).startswith(SIM_SCHEME):
                 continue
@@ -192,7 +212,10 @@ class World:
         self._rest_at(controller.output_V)
 
     def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
-        self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
+        try:
+            self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
+        except ValueError as error:
+            raise BenchError(f"[device.{name}.address] {error}") from error
         self.devices[name] = face
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
@@ -222,6 +245,45 @@ class World:
     def _add_can_telemetry(self, name: str, device: Mapping[str, Any]) -> None:
         self._add_can(name, device, CanTelemetryListener())
         self._add_can(f"{name}.stop_button", device, CanStopButton(start_ns=self.epoch_ns))
+
+    def _specimen(self, name: str) -> dict[str, Any]:
+        """Keywords of the IMU that the bench file calls ``name``."""
+        wish = ImuConfig.model_validate(self._imus.get(name, {}))
+        mount = Mount(np.array(wish.position_mm) * 1e-3, rotation(wish.turn_deg))
+        return {"seed": self._seed, "name": name, "mount": mount, "errors": wish.errors, "noise": wish.noise}
+
+    def _imu(self, name: str, spec: ImuSpec) -> Imu:
+        return Imu(spec, self._motion, **self._specimen(name))
+
+    def _add_chip(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        self._add_i2c(name, device, face)
+        self._timed.append(face)
+
+    def _add_mpu6050(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_chip(name, device, Mpu6050(self._imu(name, MPU6050_SPEC)))
+
+    def _add_lsm6ds3(self, name: str, device: Mapping[str, Any]) -> None:
+        self._add_chip(name, device, Lsm6ds3(self._imu(name, LSM6DS3_SPEC)))
+
+    def _add_bmx055(self, name: str, device: Mapping[str, Any]) -> None:
+        """Three dies; ``NAME.gyro`` and ``NAME.magnetometer`` are the further two, for fault injection."""
+        imu = self._imu(name, BMX055_SPEC)
+        self._add_chip(name, device, Bmx055Accelerometer(imu, start_ns=self.epoch_ns))
+        gyro = {"bus": device["bus"], "address": device.get("gyro_address", 0x68)}
+        self._add_chip(f"{name}.gyro", gyro, Bmx055Gyroscope(imu, start_ns=self.epoch_ns))
+        magnetometer = {"bus": device["bus"], "address": device.get("magnetometer_address", 0x10)}
+        self._add_chip(f"{name}.magnetometer", magnetometer, Bmx055Magnetometer(imu, seed=self._seed))
+
+    def _add_motion_card(self, name: str, device: Mapping[str, Any]) -> None:
+        card = MotionCard(
+            self._motion,
+            baud=self._baud[device["bus"]],
+            rate_hz=float(device.get("rate_hz", 100.0)),
+            scaled=device.get("fields") == "scaled",
+            start_ns=self.epoch_ns,
+            **self._specimen(name),
+        )
+        self._add_serial(name, device["bus"], card)
 
     def _wire_magnetometer(self, adc: str, description: Mapping[str, Any]) -> None:
         """Bridge outputs x, y, z go to the inputs that the bench file names."""

@@ -35,7 +35,10 @@ class ByteFace(TimedFace, Protocol):
 
 
 class I2cFace(TimedFace, Protocol):
-    """A device on an I2C bus; every call happens at the end of what it describes."""
+    """A device on an I2C bus; every call happens at the end of what it describes.
+
+    A device may also have ``start(t_ns, byte_ns)`` and ``stop()``: the line calls them around each transfer to it.
+    """
 
     def acknowledges(self) -> bool:
         """Answer to its own address."""

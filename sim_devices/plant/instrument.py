@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.config import EmulationConfig
+from sim_devices.plant.body_motion import BodyMotion
 from sim_devices.plant.hand import Hand
 from sim_devices.plant.kernel import (
     NOISES,
@@ -46,6 +47,7 @@ class Instrument:
         self.unit = build_unit(config, seed if unit is None else unit)
         self._plant, self._state = plant_arrays(config, self.unit, hand.frame)
         self._hand, self._quiet = hand, quiet
+        self._tip_m = np.array(config.instrument.tip_mm) * 1e-3
         self._rng = stream(seed, "instrument.noise")
         self._nodes, self._parts = np.zeros((BLOCK_MS + 1, 18)), np.zeros((BLOCK_MS, 6))
         self._noise, self._slow = np.zeros((_BLOCK_STEPS, NOISES)), np.zeros((BLOCK_MS, SLOW_NOISES))
@@ -120,6 +122,15 @@ class Instrument:
             raise ValueError(f"strap pulse {pulse!r}: it is 'set' or 'reset'")
         self._state[0]["strap"] = 1.0 if pulse == "set" else -1.0
         outputs(self._plant[0], self._state[0], 0.0)
+
+    def motion(self) -> BodyMotion:
+        """Of the body at the last step; the specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""
+        p, s = self._plant[0], self._state[0]
+        attitude = s["attitude"].copy()
+        force = (s["pose"][12:15] + np.array([0.0, 0.0, p["gravity"]])) @ attitude
+        rate, alpha = s["rate"].copy(), s["angular_acceleration"].copy()
+        field_uT = p["field_G"] * 100.0
+        return BodyMotion(attitude, rate, force, alpha, self._tip_m, field_uT, float(s["temperature_C"]))
 
     @property
     def clipped(self) -> NDArray[np.int64]:

@@ -62,6 +62,9 @@ class I2cLine:
             status = I2cStatus.BUS_ERROR
         elif not (address == 0 if face is None else face.acknowledges()):
             status = I2cStatus.ADDRESS_NACK
+        begin, end = getattr(face, "start", None), getattr(face, "stop", None)  # devices that hold data meanwhile
+        if begin is not None and status is I2cStatus.OK:
+            begin(t_ns, 9 * bit_ns)
         for op in ops:
             bits += 10
             if status is not I2cStatus.OK:
@@ -87,6 +90,8 @@ class I2cLine:
                     status = I2cStatus.ADDRESS_NACK  # nobody answers a read from address 0
                     break
                 data += face.read(op.n, end_ns)
+        if end is not None:
+            end()
         busy_ns = int((bits + 1) * bit_ns)
         self.busy_ns += busy_ns
         yield t_ns + busy_ns
