@@ -113,6 +113,17 @@ class RegisterFile:
         self.write(field.register, byte)
         return byte
 
+    def update_checked(self, field: Field, value: int) -> None:
+        """``update``, then read the field back: reserved bits of the register may read as they like."""
+        self.update(field, value)
+        found = field.take(self.read(field.register))
+        if found != value:
+            raise ProtocolError(
+                f"a field of {field.register.name} (0x{field.register.address:02X}) was set to {value} and reads "
+                f"back {found}; check supply, wiring and that nobody else drives this address",
+                device=self.name,
+            )
+
     def identify(self, register: Register, part: str) -> None:
         """Compare an identity register with its fixed value. Raises ``WrongDevice``."""
         found = self.read(register)
