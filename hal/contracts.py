@@ -84,6 +84,28 @@ class CanBus(Protocol):
     def close(self) -> None: ...
 
 
+class GattClient(Protocol):
+    """A connection to one Bluetooth Low Energy peripheral. Characteristics are named by their 128-bit UUID."""
+
+    def subscribe(self, characteristic: str, timeout_s: float) -> None:
+        """Switch notifications on; they queue from now on. ``DeviceNotFound`` without such a characteristic."""
+        ...
+
+    def receive(self, timeout_s: float) -> tuple[str, bytes, int] | None:
+        """Oldest notification as characteristic, value and time of arrival (bench clock, ns), or ``None``.
+
+        Raises ``Disconnected`` when the link is gone and nothing is left in the queue.
+        """
+        ...
+
+    def read(self, characteristic: str, timeout_s: float) -> bytes:
+        """Ask for a value. Raises ``HalTimeout``."""
+        ...
+
+    def info(self) -> PortInfo: ...
+    def close(self) -> None: ...
+
+
 class AnalogInputScan(Protocol):
     """Hardware-timed scans of several channels."""
 
