@@ -30,7 +30,7 @@ from tools.mismatch.engine.report import (
     Window,
 )
 from tools.mismatch.engine.revise import reduced
-from tools.mismatch.engine.score import compare, held_rms, paired_t
+from tools.mismatch.engine.score import compare, held_rms, misfits, paired_t
 from tools.mismatch.engine.select import Rule, Selection, as_good
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover
@@ -148,14 +148,15 @@ def alternatives(problem: Problem, selection: Selection, rule: Rule) -> tuple[li
     groups: list[Equivalent] = []
     named = {p.effect.name for p in selection.fitted.model.placed}
     rows = problem.held_rows
+    before = misfits(problem, selection.base)
     for step, rivals in zip(selection.steps, selection.rivals, strict=True):
         alike: list[Trial] = []
         for t in rivals[:6]:
             if t.fitted is None or t.name in named:
                 continue
-            o = t.placed.outputs[0]
+            o = next(q for q in t.placed.outputs if q in step.placed.outputs)
             rms = _rms(t.fitted.residual[o][rows])
-            same = as_good(t, step, rule)
+            same = as_good(t, step, rule, o, before[o])
             if same:
                 why = f"fits as well; {step.name} is simpler" if t.parameters > step.parameters else "fits as well"
                 if t.name not in (a.name for a in alike):

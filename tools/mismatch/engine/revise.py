@@ -45,20 +45,24 @@ def total(problem: Problem, fitted: Fit) -> float:
     return sum(misfits(problem, fitted).values())
 
 
-def better(problem: Problem, old: Fit, new: Fit, *, margin: float, t_limit: float = 3.0) -> bool:
-    """Is ``new`` better than ``old`` on held-out blocks: by more than ``margin`` of the excess, and by a paired test."""
+def better(problem: Problem, old: Fit, new: Fit, *, margin: float, least: float, t_limit: float = 3.0) -> bool:
+    """Is ``new`` better than ``old`` on held-out blocks: by more than ``margin`` of the excess and by ``least`` (noise
+    variances; three times that when it has more parameters), and by a paired test.
+    """
     if not new.ok:
         return False
     a, b = total(problem, old), total(problem, new)
     room = a - len(problem.twin.outputs)
-    if a - b < margin * max(room, 0.0) + 0.02:
+    if len(new.model.parameters) > len(old.model.parameters):
+        least *= 3
+    if a - b < max(margin * max(room, 0.0), least) + 0.02:
         return False
     blocks = problem.held_blocks
     return paired_t(block_energy(problem, old, blocks), block_energy(problem, new, blocks)) > t_limit
 
 
 def swap_pass(
-    problem: Problem, fitted: Fit, rivals: Sequence[Sequence[Trial]], *, margin: float = 0.25
+    problem: Problem, fitted: Fit, rivals: Sequence[Sequence[Trial]], *, least: float, margin: float = 0.25
 ) -> tuple[Fit, list[int]]:
     """Each effect but the last put against the best rivals of its step, now that the others are in place.
 
@@ -79,7 +83,7 @@ def swap_pass(
             tried.add(name)
             with np.errstate(all="ignore"):
                 candidate = replaced(problem, fitted, k, rival.placed)
-            if better(problem, fitted, candidate, margin=margin):
+            if better(problem, fitted, candidate, margin=margin, least=least):
                 # the newcomer is last in its model; keep the order of acceptance
                 fitted = _reordered(problem, candidate, k)
                 changed.append(k)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-
-import numpy as np
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
@@ -24,14 +22,16 @@ class Rule:
     ``z`` whitened held-out correlation in standard deviations, over all candidates and places; ``gain`` least
     share of the mean square; ``excess`` least share of what stands above the noise; ``form`` share of what is
     already explained below which a leftover counts as the accepted effect's own form; ``tie`` excess of a rival
-    relative to the best at which fewer parameters win; ``p_tested`` for effects with a test of their own.
+    relative to the best at which fewer parameters win, ``shape`` share of what is explained that the form of a model may
+    cost on top; ``p_tested`` for effects with a test of their own.
     """
 
     z: float = 5.5
     gain: float = 0.04
     excess: float = 0.25
-    form: float = 0.015
+    form: float = 0.05
     tie: float = 1.3
+    shape: float = 0.004
     p_tested: float = 1e-7
     most: int = 4
 
@@ -114,24 +114,26 @@ def search(
             break
         # bursts taken out of the comparison make no model: only where no model does better
         models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
-        best = choose(models or good, rule)
+        best = choose(models or good, rule, now, frozenset(t.name for t in steps))
         refined = refine(problem, current, best)
         steps.append(refined)
-        rivals.append(tuple(sorted((t for t in good if t is not best), key=lambda t: -t.improvement)))
+        shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
+        rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))
         assert refined.fitted is not None
         current = refined.fitted
         touched = set(best.placed.outputs)
         known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
     if len(steps) > 1:
-        current, steps, rivals = second_thoughts(problem, current, steps, rivals, rule)
+        current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, rule)
     return Selection(base, current, tuple(steps), tuple(rivals), first)
 
 
 def second_thoughts(
-    problem: Problem, current: Fit, steps: list[Trial], rivals: list[tuple[Trial, ...]], rule: Rule
+    problem: Problem, base: Fit, current: Fit, steps: list[Trial], rivals: list[tuple[Trial, ...]], rule: Rule
 ) -> tuple[Fit, list[Trial], list[tuple[Trial, ...]]]:
     """Swaps, then pruning; the accepted trials follow."""
-    current, changed = swap_pass(problem, current, rivals)
+    taken = sum(misfits(problem, base).values()) - sum(misfits(problem, current).values())
+    current, changed = swap_pass(problem, current, rivals, least=0.01 * taken)
     for k in changed:
         placed = current.model.placed[k]
         steps[k] = replace(steps[k], placed=placed, fitted=current, misfits=misfits(problem, current))
@@ -141,38 +143,49 @@ def second_thoughts(
     return current, steps, rivals
 
 
+def _left(rival: Trial, best: Trial) -> float:
+    """What a rival leaves on the outputs that both serve."""
+    return sum(rival.misfits[o] for o in best.placed.outputs if o in rival.placed.outputs)
+
+
 def _key(p: Placed) -> tuple[str, ...]:
     return (p.effect.name, p.effect.kind, p.site, p.target)
 
 
-def choose(good: Sequence[Trial], rule: Rule) -> Trial:
-    """The best on held-out data, or a simpler one that is as good."""
-    order = sorted(good, key=lambda t: (-t.improvement, t.label))
-    best = order[0]
-    near = [t for t in order if t is best or as_good(t, best, rule)]
-    return min(near, key=lambda t: (complexity(t), -t.improvement, t.label))
+def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: frozenset[str]) -> Trial:
+    """On the output that is worst off: the best on held-out data, or a simpler one that is as good.
+
+    ``now``: mean square over noise variance per output before this step; ``named``: effects accepted so far, which
+    are preferred among equals (the same physics on another output).
+    """
+    touched = sorted({o for t in good for o in t.placed.outputs})
+    output = max(touched, key=lambda o: now[o])
+    here = sorted((t for t in good if output in t.placed.outputs), key=lambda t: (t.misfits[output], t.label))
+    best = here[0]
+    near = [t for t in here if t is best or as_good(t, best, rule, output, now[output])]
+    return min(near, key=lambda t: (t.name not in named, complexity(t), -t.improvement, t.label))
 
 
-def excess(trial: Trial, outputs: Iterable[str]) -> float:
-    """What a trial leaves above the noise on some outputs."""
-    return sum(max(trial.misfits.get(o, np.inf) - 1.0, 0.0) for o in outputs)
-
-
-def as_good(rival: Trial, best: Trial, rule: Rule) -> bool:
-    """Is the rival within error of the best: not significantly worse over blocks, or worse by a trifle."""
-    if rival.fitted is None or not rival.fitted.ok or not set(rival.placed.outputs) & set(best.placed.outputs):
+def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -> bool:
+    """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model may
+    cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
+    """
+    if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False
-    outputs = sorted(set(rival.placed.outputs) | set(best.placed.outputs))
-    t = paired_t(rival.energy, best.energy)
-    a, b = excess(best, outputs), excess(rival, outputs)
-    trifle = b <= rule.tie * a + 0.02
-    close = b <= 2.0 * a + 0.1
-    return trifle or (close and t < 2.0)
+    a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
+    if b <= rule.tie * a + 0.02 + rule.shape * max(before - best.misfits[output], 0.0):
+        return True
+    if b > 2.0 * a + 0.1:
+        return False
+    column = best.outputs.index(output)
+    return paired_t(rival.energy[:, [column]], best.energy[:, [column]]) < 2.0
 
 
 def complexity(trial: Trial) -> float:
-    """How much freedom an effect has."""
-    return trial.parameters
+    """How much freedom an effect has, per output that it serves; events read off the data count as parameters."""
+    settings = trial.placed.settings
+    events = sum(len(settings.get(k, ())) for k in ("at", "shift", "times_s", "starts"))
+    return (trial.parameters + events) / max(len(trial.placed.outputs), 1)
 
 
 def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:

@@ -29,7 +29,8 @@ CLEAR_P = 1e-7
 @dataclass(frozen=True)
 class Trial:
     """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfits`` per output on held-out
-    samples (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds.
+    samples (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds;
+    ``outputs`` names the columns of ``energy``.
     """
 
     placed: Placed
@@ -39,6 +40,7 @@ class Trial:
     misfits: dict[str, float]
     energy: Array
     parameters: int
+    outputs: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -83,7 +85,7 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
         value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
     added = len(model.parameters) - len(current.model.parameters)
-    return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added)
+    return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added, problem.twin.outputs)
 
 
 def freedom(candidate: Candidate) -> int:
