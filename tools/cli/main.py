@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate, doctor, hands, mismatch, recordings, replay, run
+from tools.cli import calibrate, doctor, hands, mismatch, noise, recordings, replay, reproduce, run
 
 app = typer.Typer(
     name="micron",
@@ -38,6 +38,8 @@ app.command("run")(run.run)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("hands")(hands.hands)
+app.command("reproduce")(reproduce.reproduce)
+app.command("noise")(noise.noise)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")

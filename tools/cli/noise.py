@@ -1,0 +1,79 @@
+"""``micron noise``: the stochastic model of sensors at rest."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from tools.cli.common import (
+    InputError,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+)
+
+
+def noise(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .npz of a sensor at rest.")],
+    column: Annotated[list[str] | None, typer.Option(help="Column to analyse; default all.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(min=1e-6, help="Sampling rate, if the file does not say.")] = None,
+    scale: Annotated[float, typer.Option(help="Factor from counts to a unit.")] = 1.0,
+    shortest_s: Annotated[
+        float, typer.Option(min=0.0, help="Shortest averaging time of the fit: above a filter's time constant.")
+    ] = 0.0,
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the deviation.")] = Path(
+        "out/noise.png"
+    ),
+    json_file: JsonOption = None,
+) -> None:
+    """Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.
+
+    Example: micron noise rest.npz --rate-hz 100 --picture out/noise.png
+    """
+    from dataclasses import asdict
+
+    from tools.calibrate.logs import load_log
+    from tools.noise.allan import TERMS, AllanCurve, NoiseModel, allan_curve, identify
+    from tools.noise.picture import save_allan_picture
+
+    with clear_errors():
+        check_writable(json_file)
+        log = load_log(recording, rate_hz)
+        names = column or [name for name in log.columns if name not in ("t_s", "t_ns")]
+        rate = log.need_rate()
+        found: dict[str, tuple[AllanCurve, NoiseModel]] = {}
+        for name in names:
+            try:
+                curve = allan_curve(log.matrix((name,))[:, 0] * scale, rate)
+                found[name] = curve, identify(curve, shortest_s)
+            except ValueError as error:
+                if isinstance(error, InputError):
+                    raise
+                raise InputError(f"{log.path}: '{name}': {error}") from error
+        table = Table(title=f"{log.path}, {rate:g} Hz", title_justify="left")
+        for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)"):
+            table.add_column(heading)
+        for name, (_, model) in found.items():
+            cells = []
+            for term in TERMS:
+                c = getattr(model, term)
+                seen = f"{c.value:.3g} [{c.low:.2g}, {c.high:.2g}]"
+                cells.append(seen.replace("[", r"\[") if c.value > 0.0 else f"< {c.high:.2g}")
+            table.add_row(name, *cells)
+        data_console().print(table)
+        save_allan_picture(found, image)
+        console().print(f"picture: {image}")
+        write_json(
+            {
+                "format": 1,
+                "rate_hz": rate,
+                "columns": {n: {"curve": asdict(c), "model": asdict(m)} for n, (c, m) in found.items()},
+            },
+            json_file,
+        )

@@ -1,0 +1,61 @@
+"""``micron reproduce``: published figures beside ours."""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table as RichTable
+
+from tools.cli.common import JsonOption, check_writable, clear_errors, console, data_console, write_json
+
+
+def reproduce(
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="sensing, real-sensors, ... or all.")],
+    json_file: JsonOption = None,
+) -> None:
+    """Compute published figures again and print them beside ours.
+
+    Example: micron reproduce sensing --json out/sensing.json
+    """
+    from tools.reproduce.names import expand, reproduce_table
+    from tools.reproduce.rows import Table
+
+    def show(table: Table) -> None:
+        met = sum(row.meets for row in table.rows)
+        grid = RichTable(
+            title=f"{table.name}: {met} of {len(table.rows)} met, {table.seconds:.1f} s", title_justify="left"
+        )
+        grid.add_column("quantity (condition)", overflow="fold", ratio=1)
+        for column in ("published", "ours"):
+            grid.add_column(column, justify="right", no_wrap=True)
+        for column in ("unit", "met"):
+            grid.add_column(column, no_wrap=True)
+        source = ""
+        for row in table.rows:
+            if row.source != source:
+                source = row.source
+                grid.add_row(f"[bold]{escape(source)}[/]")
+            sign = {"equal": "=", "lower": "<=", "higher": ">="}[row.better]
+            why = f"\n[dim]{escape(row.why)}[/]" if row.why else ""
+            grid.add_row(
+                f"  {escape(row.quantity)} ({escape(row.condition)}; {row.kind}){why}",
+                f"{sign} {row.published:.4g}",
+                f"{row.ours:.4g}" if math.isfinite(row.ours) else "-",
+                row.unit,
+                "yes" if row.meets else "[red]no[/]",
+            )
+        data_console().print(grid)
+        for note in table.notes:
+            console().print(note, soft_wrap=True)
+
+    with clear_errors():
+        check_writable(json_file)
+        tables: list[Table] = []
+        for name in expand(names):
+            tables.append(reproduce_table(name))
+            show(tables[-1])
+        results = [table.as_dict() for table in tables]
+        write_json(results[0] if len(results) == 1 else {"format": 1, "tables": results}, json_file)

@@ -1,0 +1,1 @@
+"""Stochastic model of a sensor at rest."""

@@ -1,0 +1,1 @@
+"""Where accelerometers sit and point: error variance, propositions, optimisation."""

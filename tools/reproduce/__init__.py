@@ -1,0 +1,1 @@
+"""Published figures beside ours: one table per subject, one row per figure."""

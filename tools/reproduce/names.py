@@ -1,0 +1,28 @@
+"""Which tables there are. Each name's module is loaded when it is asked for."""
+
+from __future__ import annotations
+
+from importlib import import_module
+
+from tools.cli.common import InputError
+from tools.reproduce.rows import Table
+
+MODULES: dict[str, str] = {
+    "sensing": "tools.reproduce.sensing",
+    "real-sensors": "tools.reproduce.real_sensors",
+}
+
+
+def expand(names: list[str]) -> list[str]:
+    """``all`` is every name, in order; ``InputError`` for one that is not there."""
+    if "all" in names:
+        return list(MODULES)
+    for name in names:
+        if name not in MODULES:
+            raise InputError(f"'{name}' is no table; there are: {', '.join(MODULES)}, all")
+    return list(dict.fromkeys(names))
+
+
+def reproduce_table(name: str) -> Table:
+    """Compute one table: calls ``table()`` of its module."""
+    return import_module(MODULES[name]).table()
