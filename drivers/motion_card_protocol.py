@@ -21,7 +21,8 @@ LONG_PRESS_NS = 500_000_000
 SPIKE_NS = 20_000_000  # section 6.3: from the release on
 PACKET = struct.Struct(">7hB")
 START, END = b"#:", b"\r\n"
-LONGEST_LINE = 128  # eight fields of 15 characters; counts need 53 bytes
+LINE_BYTES = 55  # at most, with counts: '#:', seven times '-32768:', '2:', line end
+LONGEST_LINE = 128  # scaled fields need more
 _NUMBER = re.compile(rb"-?\d{1,5}(\.\d{1,8})?")
 
 IMU_SERVICE = "bf470001-767b-467d-a4c0-e8e050c0d96e"

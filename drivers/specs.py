@@ -7,40 +7,28 @@ time that each bus has per second are checked, so that an impossible bench is re
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import Field
 
-from hal.bench import BenchDescription, CanSpec, I2cSpec, validate_table
+from drivers.imu.bench import IMU_OPTIONS, ImuOptions, address_problems, bus_load
+from drivers.motion_card_protocol import LINE_BYTES
+from drivers.options import BusLoad, Options, one_of
+from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec, validate_table
 from hal.errors import BenchError
-
-
-def _one_of(*allowed: float) -> AfterValidator:
-    def check(value: float) -> float:
-        if value not in allowed:
-            raise ValueError(f"{value:g} is not one of {', '.join(f'{a:g}' for a in allowed)}")
-        return value
-
-    return AfterValidator(check)
-
-
-class _Options(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
 
 Channel = Annotated[int, Field(ge=0, le=7)]
 
 
-class Di4108Options(_Options):
+class Di4108Options(Options):
     """DATAQ DI-4108. ``rate_hz`` per channel must divide 60 MHz/375 (protocol manual, ``srate``)."""
 
     rate_hz: float = Field(gt=0, le=160_000)
     channels: tuple[Channel, ...] = Field(min_length=1, max_length=8)
-    range_V: Annotated[float, _one_of(10.0, 5.0, 2.0, 1.0, 0.5, 0.2)]
+    range_V: Annotated[float, one_of(10.0, 5.0, 2.0, 1.0, 0.5, 0.2)]
 
 
-class NiDaqOptions(_Options):
+class NiDaqOptions(Options):
     """National Instruments analog input through the ``nidaqmx`` package."""
 
     device: str
@@ -49,33 +37,33 @@ class NiDaqOptions(_Options):
     range_V: float = Field(gt=0, le=10)
 
 
-class Adxl203Options(_Options):
+class Adxl203Options(Options):
     """One ADXL-203: the DAQ channel of each of its axes, named in the instrument's body frame."""
 
     channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1, max_length=2)
 
 
-class AnalogOptions(_Options):
+class AnalogOptions(Options):
     """A plain analog quantity on one DAQ channel."""
 
     channel: Channel
 
 
-class Ads1115Options(_Options):
+class Ads1115Options(Options):
     """ADS1115, single-ended channels one after the other."""
 
     rate_hz: float = Field(default=100.0, gt=0, le=286.0)
-    full_scale_V: Annotated[float, _one_of(6.144, 4.096, 2.048, 1.024, 0.512, 0.256)] = 6.144
+    full_scale_V: Annotated[float, one_of(6.144, 4.096, 2.048, 1.024, 0.512, 0.256)] = 6.144
 
 
-class Hmc2003Options(_Options):
+class Hmc2003Options(Options):
     """HMC-2003 behind an ADC: the channels of x, y, z; the strap hangs on two digital outputs of the DAQ."""
 
     channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
     strap_daq: str = "daq"
 
 
-class DacAmplifierOptions(_Options):
+class DacAmplifierOptions(Options):
     """AD5696R and an amplifier: output volts = DAC volts x ``gain``."""
 
     gain: float = Field(default=20.0, gt=0, le=100)
@@ -85,7 +73,7 @@ class DacAmplifierOptions(_Options):
     slew_V_per_s: float = Field(default=20_000.0, gt=0)
 
 
-class E727Options(_Options):
+class E727Options(Options):
     """PI E-727 over GCS 2.0, open loop: volts are commanded as open-loop values."""
 
     lo_V: float = 0.0
@@ -95,7 +83,7 @@ class E727Options(_Options):
     rate_hz: float = Field(default=100.0, gt=0, le=200)
 
 
-class NiOutputOptions(_Options):
+class NiOutputOptions(Options):
     """National Instruments analog outputs in front of the amplifier: output volts = card volts x ``gain``."""
 
     device: str
@@ -107,20 +95,36 @@ class NiOutputOptions(_Options):
     slew_V_per_s: float = Field(default=20_000.0, gt=0)
 
 
-class CanAmplifierOptions(_Options):
+class CanAmplifierOptions(Options):
     """The CAN piezo node of ``drivers/dbc/micron.dbc``."""
 
     neutral_V: float = 50.0
     slew_V_per_s: float = Field(default=20_000.0, gt=0)
 
 
-class CanTelemetryOptions(_Options):
+class CanTelemetryOptions(Options):
     """Telemetry frames out, stop button in. ``stop_button`` says that a missing button heartbeat is a fault."""
 
     stop_button: bool = True
 
 
-OPTIONS: dict[str, type[_Options]] = {
+class MotionCardOptions(Options):
+    """Motion card behind its scanner card. ``fields``: does the text carry counts or g, deg/s and degC?"""
+
+    rate_hz: float = Field(default=100.0, gt=0, le=1000)
+    fields: Literal["raw", "scaled"] = "raw"
+    spike_filter: bool = True
+
+
+class BleMotionCardOptions(Options):
+    """Motion card over Bluetooth Low Energy (extra ``ble``): advertised name or address of the card."""
+
+    peripheral: str = "CONTROL.CMR"
+    rate_hz: float = Field(default=100.0, gt=0, le=100)
+    spike_filter: bool = True
+
+
+OPTIONS: dict[str, type[Options]] = {
     "di4108": Di4108Options,
     "nidaqmx": NiDaqOptions,
     "adxl203": Adxl203Options,
@@ -132,6 +136,9 @@ OPTIONS: dict[str, type[_Options]] = {
     "nidaqmx_ao": NiOutputOptions,
     "can_amplifier": CanAmplifierOptions,
     "can_telemetry": CanTelemetryOptions,
+    **IMU_OPTIONS,
+    "motion_card": MotionCardOptions,
+    "ble_motion_card": BleMotionCardOptions,
 }
 """Drivers by the name used in a bench file. Adding a driver adds one line here."""
 
@@ -145,17 +152,11 @@ NEEDS = {
     "e727": "bus",
     "can_amplifier": "bus",
     "can_telemetry": "bus",
+    "mpu6050": "bus",
+    "lsm6ds3": "bus",
+    "bmx055": "bus",
+    "motion_card": "bus",
 }
-
-
-@dataclass(frozen=True)
-class BusLoad:
-    """Seconds of bus time per second that one device asks for, and how that comes about."""
-
-    bus: str
-    device: str
-    share: float
-    arithmetic: str
 
 
 def device_options(description: BenchDescription, name: str, where: str) -> Any:
@@ -176,6 +177,7 @@ def check_devices(description: BenchDescription, where: str) -> dict[str, Any]:
     options = {name: device_options(description, name, where) for name in description.device}
     problems = [
         *_channel_claims(description, options),
+        *address_problems(description, options),
         *_rates(description, options),
         *_bus_time(description, options),
     ]
@@ -254,6 +256,8 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
         if isinstance(bus, I2cSpec):
             # DAC: four times address + 3 bytes, each after a START of its own (AD5696R knows one word per
             # address byte). ADC, per conversion: write 4 bytes, read 1 + 1 + 1 + 2 bytes.
+            if isinstance(options[name], ImuOptions):
+                loads.append(bus_load(options[name], spec.bus or "", bus.speed_hz, name))
             transfers = {
                 "dac_amplifier": (tick_hz, 16, 4),
                 "ads1115": (3 * getattr(options[name], "rate_hz", 0), 9, 2),
@@ -263,6 +267,11 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
                 bits = 9 * n_bytes + 3 * n_starts
                 text = f"{rate_hz:g} Hz x {bits} bit / {bus.speed_hz} Hz"
                 loads.append(BusLoad(spec.bus or "", name, rate_hz * bits / bus.speed_hz, text))
+        elif isinstance(bus, SerialSpec) and isinstance(options[name], MotionCardOptions):
+            rate_hz: float = options[name].rate_hz
+            text = f"{rate_hz:g} Hz x {LINE_BYTES} byte x 10 bit / {bus.baud} bit/s"
+            share = rate_hz * LINE_BYTES * 10 / bus.baud
+            loads.append(BusLoad(spec.bus or "", name, share, text))
         elif isinstance(bus, CanSpec):
             frames_hz = {"can_amplifier": tick_hz + 100 + 10 + 50, "can_telemetry": 50 * 3 + 10}.get(spec.driver)
             if frames_hz:

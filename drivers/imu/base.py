@@ -132,9 +132,11 @@ class Imu(Protocol):
     """
 
     name: str
-    lost: int
-    stale: int
 
+    @property
+    def lost(self) -> int: ...
+    @property
+    def stale(self) -> int: ...
     def probe(self) -> str:
         """Identity. Raises ``WrongDevice``, or ``I2cNack`` when nobody answers."""
         ...

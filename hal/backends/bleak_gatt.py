@@ -41,6 +41,7 @@ class BleakGatt:
     def __init__(self, peripheral: str, clock: Clock, *, timeout_s: float = 10.0) -> None:
         bleak = load()
         self.dropped = 0
+        self._failures = (bleak.exc.BleakError, OSError, EOFError)
         self._peripheral = peripheral
         self._clock = clock
         self._lost = threading.Event()
@@ -93,9 +94,12 @@ class BleakGatt:
                 f"no peripheral {self._peripheral!r} advertises within {timeout_s} s; is it switched on, in reach "
                 "and not connected to another central?"
             )
-        client = bleak.BleakClient(device, disconnected_callback=lambda _: self._lost.set())
+        client = bleak.BleakClient(device, disconnected_callback=self._disconnected)
         await client.connect()
         return client
+
+    def _disconnected(self, _: Any) -> None:
+        self._lost.set()
 
     def _taker(self, characteristic: str) -> Callable[[Any, bytearray], None]:
         def take(_: Any, value: bytearray) -> None:
@@ -123,7 +127,7 @@ class BleakGatt:
         except FutureTimeout as error:
             future.cancel()
             raise HalTimeout(f"{what} took longer than {timeout_s} s", device=self._peripheral) from error
-        except (OSError, EOFError) as error:
+        except self._failures as error:
             raise BusError(f"{what} failed: {error}", device=self._peripheral) from error
 
     def _stop_loop(self) -> None:

@@ -10,6 +10,10 @@ from drivers.base import HasChannels
 from drivers.can_telemetry import CanTelemetry
 from drivers.daq.di4108 import Di4108
 from drivers.hmc2003 import Hmc2003
+from drivers.imu.bmx055 import Bmx055
+from drivers.imu.lsm6ds3 import Lsm6ds3
+from drivers.imu.mpu6050 import Mpu6050
+from drivers.motion_card import MotionCard
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
@@ -19,7 +23,8 @@ from hal.clock import VirtualClock
 from hal.types import ScanConfig
 from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, ScriptedSerial
 
-NOT_PARTS = {"analog", "nidaqmx"}  # a bare voltage, and any of NI's devices
+# a bare voltage, any of NI's devices, a part of another sheet
+NOT_PARTS = {"analog", "nidaqmx", "nidaqmx_ao", "ble_motion_card"}
 
 
 class Strap:
@@ -44,6 +49,10 @@ def drivers() -> dict[str, HasChannels]:
         "e727": E727(serial, clock),
         "can_amplifier": CanAmplifier(can, clock),
         "can_telemetry": CanTelemetry(can, clock),
+        "mpu6050": Mpu6050(i2c, clock),
+        "lsm6ds3": Lsm6ds3(i2c, clock),
+        "bmx055": Bmx055(i2c, clock),
+        "motion_card": MotionCard(serial, clock),
     }
 
 
