@@ -215,6 +215,9 @@ class Lsm6ds3(RegisterFace):
             self._busy_until_ns = -1
             self.registers[CTRL3_C] &= 0x7E
         clocks = (*self._clocks, self._fifo_clock)  # at one instant the FIFO comes last
+        if self.frozen:
+            for clock in clocks:
+                clock.skip_past(t_ns)
         while True:
             running = [c for c in clocks if c.due_ns is not None and c.due_ns <= t_ns]
             if not running:
@@ -222,8 +225,6 @@ class Lsm6ds3(RegisterFace):
             clock = min(running, key=lambda c: c.due_ns or 0)
             due_ns = clock.due_ns or 0
             clock.tick()
-            if self.frozen:
-                continue
             if clock is self._fifo_clock:
                 self._write_fifo()
             else:

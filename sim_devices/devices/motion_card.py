@@ -145,13 +145,14 @@ class MotionCard:
         return due_ns
 
     def advance_to(self, t_ns: int) -> None:
+        if self.frozen:
+            self._clock.skip_past(t_ns)
         while self._clock.due_ns is not None and self._clock.due_ns <= t_ns:
             due_ns = self._clock.due_ns
             self._clock.tick()
             self._now_ns = max(self._now_ns, due_ns)
-            if not self.frozen:
-                self._transmit(due_ns)
-                self._sample(due_ns)
+            self._transmit(due_ns)
+            self._sample(due_ns)
         self._now_ns = max(self._now_ns, t_ns)
         if not self.frozen:
             self._transmit(t_ns)

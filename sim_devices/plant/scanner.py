@@ -14,16 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.config import EmulationConfig, EndoscopeConfig
-from sim_devices.plant.body_motion import BodyMotion, rotation
-from sim_devices.plant.rigid_body import body_rates, quaternion
+from sim_devices.plant.body_motion import BodyMotion
+from sim_devices.plant.rigid_body import attitude, body_rates, quaternion
 from sim_devices.plant.streams import stream
 
 Array = NDArray[np.float64]
 Pose = tuple[Array, Array, Array, Array]
 """Angles (roll, pitch, yaw) rad with first and second derivative, and acceleration of the origin in the world."""
 
-TRUTH_STEP_NS = 1_000_000
+TRUTH_STEP_NS = 10_000_000
 IMPACT_S = 4e-3
+_LEVEL = np.eye(3)
 
 
 class Scanner:
@@ -71,7 +72,7 @@ class Scanner:
         }
 
     def truth(self) -> dict[str, NDArray]:
-        """Columns, one row per millisecond: ``t_ns``, ``quaternion`` (n, 4), ``rate_rad_s`` (n, 3),
+        """Columns, one row per 10 ms: ``t_ns``, ``quaternion`` (n, 4), ``rate_rad_s`` (n, 3),
         ``specific_force_m_s2`` (n, 3), ``temperature_C`` (n,)."""
         t_ns = np.arange(0, self.now_ns + 1, TRUTH_STEP_NS, dtype=np.int64)
         q, rate, force, warm = np.zeros((len(t_ns), 4)), np.zeros((len(t_ns), 3)), np.zeros((len(t_ns), 3)), t_ns * 0.0
@@ -92,9 +93,8 @@ class Scanner:
         """At plant time ``t_ns``; any time, in any order."""
         t_s = t_ns * 1e-9
         angles, rates, accelerations, a = self._paths[self._config.scenario](t_s)
-        roll, pitch, yaw = np.degrees(angles)
-        c = rotation((float(roll), float(pitch), float(yaw)))
-        omega, alpha = np.zeros(3), np.zeros(3)
+        c, omega, alpha = np.empty((3, 3)), np.empty(3), np.empty(3)
+        attitude(_LEVEL, angles, c)
         body_rates(angles, rates, accelerations, omega, alpha)
         weight = a + np.array([0.0, 0.0, self._gravity])
         if self._config.scenario == "fall":
