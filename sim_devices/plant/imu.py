@@ -214,8 +214,16 @@ class Imu:
         self.magnetometer = None
         if spec.magnetometer is not None:
             self.magnetometer = Triad(triad_unit(spec.magnetometer, units, errors, noise), self._field, hiss)
+        self._load_kernels()
         self.self_test_gain = 1.0 + 0.05 * units.standard_normal(6).clip(-2.0, 2.0) * errors
         """How this chip's self-test responses differ from the factory's, accelerometer then gyroscope."""
+
+    def _load_kernels(self) -> None:
+        """Compile or load now, not when the first sample is due in real time."""
+        self._mount.felt(BodyMotion(np.eye(3), np.zeros(3), np.zeros(3)))
+        unit, zeros = self.accelerometer.unit, np.zeros(3)
+        vectors = (unit.gain, unit.bias, unit.bias_per_K, unit.scale_per_K, unit.per_m_s2, zeros, zeros)
+        _triad_step(*vectors, 0.0, np.zeros((4, 3)), np.zeros(6), (0.0, 0.0, 1.0, 0.0, 1.0, 0.0), np.empty(3))
 
     def temperature_C(self, t_ns: int) -> float:
         """Of the die, as its own sensor sees it."""
