@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.exponential import exponential
 from sim_devices.physics.statistics import least_squares, thin
 
 
@@ -24,7 +24,7 @@ def discrete_mode(frequency_hz: float, damping: float, dt: float) -> tuple[Array
     m[1, 1] = -2 * damping * w * dt
     m[1, 2] = w * dt
     m[2, 3] = 1.0
-    e = expm(m)
+    e = exponential(m)
     return np.ascontiguousarray(e[:2, :2]), e[:2, 2] - e[:2, 3], np.ascontiguousarray(e[:2, 3])
 
 
@@ -94,9 +94,9 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
                 out.append((left, (f, d, float(shares[0]), float(shares[1]))))
         return sorted(out)
 
-    first = tried(np.geomspace(4 / (ctx.dt * ctx.t.size), 0.7 / ctx.dt, 36), (0.02, 0.15))
+    first = tried(np.geomspace(4 / (ctx.dt * ctx.t.size), 0.7 / ctx.dt, 26), (0.02, 0.15))
     near = first[0][1][0]
-    second = tried(near * np.geomspace(0.85, 1.18, 13), (0.004, 0.02, 0.07, 0.3))
+    second = tried(near * np.geomspace(0.8, 1.25, 13), (0.005, 0.03, 0.2))
     every = sorted([*second[:2], *first[:3]])
     return [q for _, q in every[:4]]
 

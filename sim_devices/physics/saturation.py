@@ -54,13 +54,13 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     lo, hi = settings["range"]
     span = hi - lo
     measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
-    cut = (-0.4, 0.02, 0.1, 0.2, 0.35)
+    cut = (-0.4, 0.03, 0.12, 0.3)
     # a limit that was not reached is taken to mirror the other one
     centres = (0.0, 0.5 * (lo + hi)) if lo < 0.0 < hi else (0.5 * (lo + hi),)
     grid: list[tuple[float, ...]] = [
         (c - r, c + r, w * span)
         for c in centres
-        for r in np.linspace(0.15, 1.0, 10) * max(hi - c, c - lo)
+        for r in np.linspace(0.2, 1.0, 7) * max(hi - c, c - lo)
         for w in (0.005, 0.1)
     ]
     grid += [(lo + a * span, hi - b * span, w * span) for a in cut for b in cut for w in (0.005, 0.1) if a > 0 or b > 0]

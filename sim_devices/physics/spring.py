@@ -86,7 +86,7 @@ def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tu
             out.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
         return sorted(out)
 
-    coarse = tried(np.concatenate([np.arange(0.5, 16, 0.25), np.geomspace(16, 300, 80)]))
+    coarse = tried(np.concatenate([np.arange(0.5, 16, 0.3), np.geomspace(16, 300, 50)]))
     near = travel / coarse[0][1]
     fine = tried(near + np.linspace(-0.3, 0.3, 13) * max(1.0, near / 16))
     return sorted([*fine[:2], *coarse[:2]])

@@ -7,10 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.linalg import expm
 from scipy.signal import lsim
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
+from sim_devices.physics.exponential import exponential
 from sim_devices.physics.lag import low_pass
 from sim_devices.physics.memoryless import curve_basis, find_step, mean_of_steps, slew
 from sim_devices.physics.resonance import discrete_mode, mode
@@ -145,6 +147,14 @@ def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:
 def test_compiled_equals_python(kernel: Callable[..., Array], args: tuple[object, ...]) -> None:
     x = wave(150)[1]
     np.testing.assert_allclose(kernel(x, *args), kernel.py_func(x, *args), atol=1e-13)  # pyright: ignore
+
+
+def test_exponential_against_scipy() -> None:
+    rng = np.random.default_rng(0)
+    for size, scale in ((2, 1e-3), (4, 1.0), (6, 5.0)):
+        m = scale * rng.standard_normal((size, size))
+        np.testing.assert_allclose(exponential(m), expm(m), rtol=1e-11, atol=1e-13)
+        np.testing.assert_allclose(exponential.py_func(m), expm(m), rtol=1e-11, atol=1e-13)
 
 
 def test_cheapest_path_compiled_equals_python() -> None:

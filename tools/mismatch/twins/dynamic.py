@@ -104,7 +104,8 @@ class DynamicTwin:
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
         """See Twin."""
-        if forces:
+        # one state and one input: a single run from the right start state does, without columns
+        if forces or (join and len(self.inputs) == 1 and len(self.groups) == 1):
             return self._with_forces(run, inputs, theta, forces)
         n = run.t.size
         plant = self.plant_of(theta)
@@ -222,7 +223,7 @@ class DynamicTwin:
         source = self.inputs[0]
         plant = self.plant_of(theta)
         packed = pack(forces)
-        sub = 1 if self.hold == "discrete" else self._substeps(run, packed)
+        sub = 1 if self.hold == "discrete" or not forces else self._substeps(run, packed)
         d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
         g = self.input_gain(source, theta)
         drive = inputs[source]
@@ -233,13 +234,16 @@ class DynamicTwin:
         rows: dict[str, Array] = {o: np.zeros(plant.a.shape[0]) for o in self.outputs}
         extra: dict[str, Array] = {o: np.zeros(run.t.size) for o in self.outputs}
         normal = self._gain_index(source) >= 0
+        direct = u
+        for j in {link.j for link in self.links if link.source == CONSTANT and link.row != -2}:
+            u = u + theta[j]
         for link in self.links:
             if link.row == -2:
                 extra[link.output] = extra[link.output] + theta[link.j]
             elif link.source == CONSTANT:
-                u = u + theta[link.j]
+                continue
             elif link.row == -1:
-                extra[link.output] = extra[link.output] + theta[link.j] * drive.value
+                extra[link.output] = extra[link.output] + theta[link.j] * direct
             else:
                 rows[link.output][link.row] = 1.0 if normal else theta[link.j]
         u = _once(u)
@@ -268,11 +272,11 @@ class DynamicTwin:
             x = go(np.zeros((1, plant.a.shape[0])), ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o]) for o in self.outputs}
         full = np.linalg.matrix_power(d.ad, sub)
-        ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo)
+        ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
         stop = np.minimum(starts + window, ends)
         m = int(stop.max())
-        for _ in range(3):
+        for _ in range(3 if forces else 1):
             x = go(x0, stop)
             x0 = x0 + ss.states({o: run.measured[o][:m] - extra[o][:m] - x @ rows[o] for o in self.outputs})
         x = go(x0, ends)

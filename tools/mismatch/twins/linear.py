@@ -7,9 +7,9 @@ from typing import Literal
 
 import numpy as np
 from numba import njit
-from scipy.linalg import expm
 
 from sim_devices.physics.effect import Array
+from sim_devices.physics.exponential import exponential
 
 Hold = Literal["zero", "linear", "discrete"]
 
@@ -36,7 +36,7 @@ def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
     m[:s, :s] = a * dt
     m[:s, s] = b * dt
     m[s, s + 1] = 1.0
-    e = expm(m)
+    e = exponential(m)
     held, ramp = e[:s, s], e[:s, s + 1]
     ad = np.ascontiguousarray(e[:s, :s])
     if hold == "zero":
@@ -150,14 +150,18 @@ def start_state(
     n: int,
     window: int,
     memo: dict[object, object],
+    whole: bool = True,
 ) -> StartState:
-    """Prepare the least squares for output rows c (s,) of the outputs that may set the state."""
-    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, window)
+    """Prepare the least squares for output rows c (s,) of the outputs that may set the state.
+
+    Without ``whole``, free responses reach over the windows only: states can be had, responses cannot.
+    """
+    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, window, whole)
     found = memo.get(key)
     if isinstance(found, StartState):
         return found
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
-    longest = max(b - a for a, b in spans)
+    longest = max(b - a for a, b in spans) if whole else window
     free = {o: free_response(ad, c, longest) for o, c in rows.items()}
     windows = tuple(min(window, b - a) for a, b in spans)
     weight = dict.fromkeys(rows, 1.0)
