@@ -251,7 +251,8 @@ def assemble(
             ) not in seen:
                 seen.add((d.signal, d.feature))
                 depends.append(DependsOn(d.signal, d.feature, d.strength, d.p_value, d.memory))
-    depends.sort(key=lambda d: -d.strength)
+    if verdict != "unexplained":
+        depends.sort(key=lambda d: -d.strength)
     span = windows(problem, looked, guilty) if guilty else []
     stage = (
         physics[0].stage

@@ -19,7 +19,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split
-from tools.mismatch.engine.unexplained import leftover
+from tools.mismatch.engine.unexplained import leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import View
 from tools.mismatch.twins.base import Twin
@@ -133,7 +133,13 @@ def _diagnose(
     base = fit_base(problem)
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
+    strange = next((f for o in twin.outputs if (f := stranger(problem, base, selection.fitted, o))), None)
+    if strange is not None:
+        # the effects only imitated it: nothing is named
+        selection = replace(selection, fitted=base, steps=(), rivals=())
     left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
+    if strange is not None:
+        left[strange.output] = left[strange.output].led_by(strange)
     said = gross(recording, twin, raw)
     return assemble(problem, raw, base, selection, left, catalogue, rule, said)
 

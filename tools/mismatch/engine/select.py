@@ -89,7 +89,8 @@ def search(
         pool = [
             p
             for p in places(problem, effects, current.model.placed)
-            if any(now[o] - 1 > max(0.5 * rule.gain, rule.form * (start[o] - now[o])) for o in p.outputs)
+            if p.effect.claims is not None
+            or any(now[o] - 1 > max(0.5 * rule.gain, rule.form * (start[o] - now[o])) for o in p.outputs)
         ]
         todo = [p for p in pool if _key(p) not in known]
         for t in try_all(
