@@ -129,6 +129,16 @@ def test_null_harness_counts_and_bounds(tmp_path: Path) -> None:
     assert clopper_pearson(0, 300)[1] == pytest.approx(0.0122, abs=1e-4)  # 1 - 0.025**(1/300)
 
 
+def test_null_run_continues_where_it_was_interrupted(tmp_path: Path) -> None:
+    rows = tmp_path / "rows.json"
+    more = {"doc": None, "rows_file": rows, "max_samples": 1500, "diagnose": silent, "say": lambda text: None}
+    nulls(2, 3, 1, **more)
+    first = json.loads(rows.read_text())["rows"]
+    r = nulls(4, 9, 1, **more)
+    assert list(r.rows[:2]) == first
+    assert [x["seed"] for x in r.rows] == [3, 3, 11, 11]
+
+
 def test_sealed_answers_come_back(tmp_path: Path) -> None:
     digest = seal.close({"r0": {"kind": "agrees"}}, tmp_path)
     assert seal.opened(tmp_path, digest) == {"r0": {"kind": "agrees"}}

@@ -59,37 +59,25 @@ def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
     return plans, kinds
 
 
-def nulls(
-    n: int = 300,
-    seed: int | None = None,
-    jobs: int = 2,
-    *,
-    doc: Path | None = DOC,
-    max_samples: int = 12_000,
-    diagnose: Diagnose = tool,
-    say: Callable[[str], None] | None = None,
-) -> NullResult:
-    """Run ``n`` null recordings; write ``doc`` unless None."""
-    start = time.perf_counter()
-    tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
-    seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
-    plans, kinds = null_plans(n)
-    rows: list[dict[str, Any]] = []
+BATCH = 12
+
+
+def _batch(
+    seed: int, plans: Sequence[draw.Plan], kinds: Sequence[str], jobs: int, max_samples: int, diagnose: Diagnose
+) -> list[dict[str, Any]]:
     with tempfile.TemporaryDirectory(prefix="micron-nulls-") as tmp:
-        tell(f"seed {seed}, {n} null recordings")
         paths, answers = generate(
             seed, plans, Path(tmp) / "recordings", jobs=jobs, max_samples=max_samples, each_noise=kinds
         )
         digest = seal.close(answers, Path(tmp) / "sealed")
-        reports: dict[str, dict[str, Any]] = {}
-        for name, report, _ in diagnose_all(paths, jobs, diagnose):
-            reports[name] = report
-            if len(reports) % 20 == 0:
-                tell(f"{len(reports)}/{len(paths)}")
+        reports = {name: report for name, report, _ in diagnose_all(paths, jobs, diagnose)}
+        rows: list[dict[str, Any]] = []
         for name, answer in sorted(seal.opened(Path(tmp) / "sealed", digest).items()):
             verdict = str(reports[name]["verdict"])
             rows.append(
                 {
+                    "seed": seed,
+                    "case": name,
                     "twin": answer["twin"],
                     "noise": answer["noise_kind"],
                     "kind": answer["kind"],
@@ -102,7 +90,43 @@ def nulls(
                     "failed": verdict == "error",
                 }
             )
-    result = NullResult(seed, tuple(rows), time.perf_counter() - start)
+    return rows
+
+
+def nulls(
+    n: int = 300,
+    seed: int | None = None,
+    jobs: int = 2,
+    *,
+    doc: Path | None = DOC,
+    rows_file: Path | None = None,
+    max_samples: int = 12_000,
+    diagnose: Diagnose = tool,
+    say: Callable[[str], None] | None = None,
+) -> NullResult:
+    """Run ``n`` null recordings; write ``doc`` unless None.
+
+    ``rows_file`` (JSON) keeps the rows after every batch; what it already holds counts, so that a run of hours may be
+    interrupted and continued. It must come from the same state of the tool: remove it when the tool changes.
+    """
+    start = time.perf_counter()
+    tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
+    seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
+    rows: list[dict[str, Any]] = []
+    before = 0.0
+    if rows_file is not None and rows_file.exists():
+        kept = json.loads(rows_file.read_text())
+        rows, before = kept["rows"], float(kept["seconds"])
+    plans, kinds = null_plans(n)
+    tell(f"seed {seed}, {n} null recordings, {len(rows)} of them done before")
+    for first in range(len(rows), n, BATCH):
+        part = slice(first, min(first + BATCH, n))
+        rows += _batch(seed + first, plans[part], kinds[part], jobs, max_samples, diagnose)
+        seconds = before + time.perf_counter() - start
+        if rows_file is not None:
+            rows_file.write_text(json.dumps({"seconds": seconds, "rows": rows}, indent=1))
+        tell(f"{len(rows)}/{n}, {sum(r['alarm'] for r in rows)} false alarms, {seconds:.0f} s")
+    result = NullResult(seed, tuple(rows), before + time.perf_counter() - start)
     if doc is not None:
         doc.parent.mkdir(parents=True, exist_ok=True)
         doc.write_text(document(result))
@@ -143,7 +167,7 @@ def document(result: NullResult) -> str:
         "one third needs recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
         "Intervals are Clopper-Pearson, 95 %.",
         "",
-        f"Seed {result.seed}, {n} recordings, {result.seconds:.0f} s.",
+        f"{n} recordings, {result.seconds:.0f} s; seeds {', '.join(sorted({str(r['seed']) for r in result.rows}))}.",
         "",
         f"- false alarms: {_cell(k, n)}",
         f"- of these with a false name: {_cell(false_names, n)}",
@@ -174,12 +198,9 @@ def main() -> None:
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--max-samples", type=int, default=12_000)
     p.add_argument("--doc", type=Path, default=DOC)
-    p.add_argument("--json", type=Path, default=None)
+    p.add_argument("--rows", type=Path, default=None, help="JSON kept after every batch, and continued from")
     a = p.parse_args()
-    result = nulls(a.n, a.seed, a.jobs, doc=a.doc, max_samples=a.max_samples)
-    print(document(result))
-    if a.json:
-        a.json.write_text(json.dumps({"seed": result.seed, "rows": list(result.rows)}, indent=1))
+    print(document(nulls(a.n, a.seed, a.jobs, doc=a.doc, rows_file=a.rows, max_samples=a.max_samples)))
 
 
 if __name__ == "__main__":
