@@ -93,7 +93,7 @@ class Mpu6050:
     def configure(
         self, *, rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None = None
     ) -> ImuSetup:
-        """See ``Imu.configure``. Rates are 1 kHz / (1 + n), 3.9 Hz at least."""
+        """See ``Imu.configure``. Rates are 1 kHz / (1 + n), 3.9 Hz at least; the bandwidth is the gyro's."""
         self.setup, self._settings = _setup(rate_hz, accel_range_g, gyro_range_dps, bandwidth_hz, self.name)
         self._chip.write_checked(m.SMPLRT_DIV, *self._settings)
         self._configured = True
@@ -317,7 +317,7 @@ def _setup(
         raise BenchError(f"rate_hz = {rate_hz:g} is outside {BASE_RATE_HZ / 256:.1f} .. 1000 Hz", device=name)
     actual_hz = BASE_RATE_HZ / (1 + divider)
     wish_hz = actual_hz / 2 if bandwidth_hz is None else bandwidth_hz
-    _, dlpf = pick_bandwidth(wish_hz, {max(pair): code for code, pair in m.DLPF.items()})
+    _, dlpf = pick_bandwidth(wish_hz, {gyro: code for code, (_, gyro) in m.DLPF.items()})
     setup = ImuSetup(
         rate_hz=actual_hz,
         accel_range_g=accel_range_g,
