@@ -157,7 +157,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
         raise InputError(
             f"--dask {address}: no Dask scheduler answers there ({error}); start one or fix the address"
         ) from error
-    with client:
+    with client, client.as_current():
         client.run(_one_thread)
         futures = {
             client.submit(work, job, key=f"mismatch-{job.name}", retries=RETRIES, pure=False): job for job in jobs

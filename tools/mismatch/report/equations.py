@@ -16,10 +16,11 @@ _SUBSCRIPT = str.maketrans("0123456789ijkhd", "₀₁₂₃₄₅₆₇₈₉ᵢ
 
 def plain(tex: str) -> str:
     """One line of Unicode text, e.g. ``y = x + Σⱼ cⱼ zⱼ``."""
-    text = re.sub(r"\\quad", "   ", tex)
+    # a command swallows the space behind it
+    text = re.sub(r"\\([dD])elta\s+(?=[A-Za-z])", r"\\\1elta{}", tex)
+    text = re.sub(r"\\quad", "   ", text)
     text = re.sub(r"\\(?:mathrm|text)\{([^{}]*)\}", r"\1", text)
     text = re.sub(r"\\[,;! ]", " ", text)
-    text = re.sub(r"\\([dD])elta\s+", r"\\\1elta{}", text)
     for accent, mark in _ACCENTS.items():
         text = re.sub(rf"\\{accent}\s*(\\?[A-Za-z])", lambda m, k=mark: _name(m[1]) + k, text)
     text = re.sub(r"\\([A-Za-z]+)", lambda m: _WORDS.get(m[1], m[1]), text)

@@ -49,7 +49,8 @@ def next_experiments(report: Report) -> list[Experiment]:
             )
         )
     if report.verdict in ("agrees", "recalibrate"):
-        found += [Experiment(need, f"shows {words(name)}") for name, need in list(report.cannot_show.items())[:3]]
+        unseen = [(name, need) for name, need in report.cannot_show.items() if not need.startswith("none")]
+        found += [Experiment(need, f"shows {words(name)}, which this recording cannot") for name, need in unseen[:3]]
     if not found or report.verdict == "missing_physics":
         found.append(
             Experiment(

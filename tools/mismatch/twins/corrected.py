@@ -140,6 +140,8 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
     of: list[int] = []
     factor: list[bool] = []
     banks = [model.slices(k)[1] for k in range(len(model.placed))]
+    # a step that suits the size that the weights have; their unit says nothing about it
+    step = {j: 0.02 * float(np.max(np.abs(theta[w]))) for w in banks for j in range(w.start, w.stop)}
     common = {j: w.start for w in banks if w.stop - w.start > MOST_FREE for j in range(w.start, w.stop)}
     for j, f in enumerate(model.parameters):
         first = common.get(j)
@@ -149,7 +151,7 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
             continue
         of.append(len(parameters))
         if first is None:
-            parameters.append(Parameter(f.name, f.unit, f.lo, f.hi, f.log, f.scale))
+            parameters.append(Parameter(f.name, f.unit, f.lo, f.hi, f.log, step.get(j) or f.scale))
         else:
             parameters.append(Parameter(f"{f.name.rsplit('.', 1)[0]}.strength", "1", scale=0.05))
     rows = model.smoothness()

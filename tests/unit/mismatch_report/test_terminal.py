@@ -1,0 +1,93 @@
+"""The terminal report says everything that the contract's JSON holds, and at any width."""
+
+import io
+from dataclasses import replace
+
+import pytest
+from rich.cells import cell_len
+from rich.console import Console
+
+from tests.unit.mismatch_report.canned import all_verdicts, creep, missing_physics, unexplained
+from tools.mismatch.batch import Row
+from tools.mismatch.report.terminal import batch_table, print_report
+
+
+def printed(report, width: int = 140) -> str:
+    out = io.StringIO()
+    print_report(report, Console(file=out, width=width, highlight=False))
+    return out.getvalue()
+
+
+def test_missing_physics_says_what_where_how_much_and_what_next():
+    text = printed(missing_physics())
+    for said in (
+        "Missing physics",
+        "amplifier › [actuator] › mechanics",
+        "command (recent history 83 %)",
+        "1. creep of displacement, at the actuator; sure 97 %",
+        "0.0213",
+        "0.0190 .. 0.0236",
+        "y = x + Σⱼ cⱼ zⱼ",
+        "K. Kuhnen, 2003 <eq. 6> & others",
+        "0.41 without it, 0.023 with it (um rms, held out)",
+        "at the limit of what is searched",
+        "leaves 8.3 times the residual of creep",
+        "creep = ac coupling  two steps of opposite sign",
+        "resonance 0.02 .. dead time 0.4",
+        "spikes  none; the longer the record",
+        "not white before, white after",
+        "p = 1e-09",
+        "a state is missing",
+        "exact limits in 12 samples",
+        "0 to 1.9 s, 3 to 3.9 s",
+        "2 to 3 s, 4 to 5 s",
+        "Record next",
+        "noise_rms in the recording",
+        "/data/stack/recording.toml, twin piezo_stack, seed 0, 8.4 s",
+    ):
+        assert said in text, said
+
+
+def test_explained_share_is_of_what_stands_above_the_noise():
+    # (0.41^2 - 0.023^2) / (0.41^2 - 0.02^2) = 0.99923
+    row = next(line for line in printed(missing_physics()).splitlines() if "(spectrum)" in line)
+    assert row.split() == ["displacement", "0.55", "0.41", "0.023", "0.02", "(spectrum)", "um", "100", "%"]
+    assert "(spectrum)" in row
+
+
+def test_agrees_lists_every_detection_limit():
+    text = printed(all_verdicts()["agrees"])
+    assert "resonance 0.02, creep 0.03, backlash 0.05, dead time 0.4" in text
+    assert "What is missing" not in text
+    assert "Where" not in text
+
+
+def test_unexplained_keeps_what_was_explained_before():
+    text = printed(replace(unexplained(), physics=(creep(),)))
+    assert "What was explained before" in text
+    assert "[mechanics]" in text
+    assert "[actuator]" in text
+    assert "the same path of command at three speeds" in text
+
+
+@pytest.mark.parametrize("width", [60, 80, 200])
+@pytest.mark.parametrize("verdict", ["agrees", "recalibrate", "missing_physics", "unexplained"])
+def test_every_width_is_kept(width: int, verdict: str):
+    assert max(map(cell_len, printed(all_verdicts()[verdict], width).splitlines())) <= width
+
+
+def test_brackets_in_names_are_text_and_not_markup():
+    r = missing_physics()
+    found = replace(creep(), source="[bold]x[/] [eq. 3]", note="[red]")
+    assert "[bold]x[/] [eq. 3]" in printed(replace(r, physics=(found,), summary="Left in [a/b]."))
+
+
+def test_a_folder_is_one_table():
+    good = Row("a", "/x/a", missing_physics().to_json())
+    bad = Row("b [1]", "/x/b", error="b.toml: no [twin] with a 'kind'", bad_input=True)
+    out = io.StringIO()
+    Console(file=out, width=160, highlight=False).print(batch_table([good.cells, bad.cells]))
+    a, b = out.getvalue().splitlines()[1:3]
+    assert " ".join(a.split()) == "a missing physics creep displacement 0.41 um 0.023 um 0.02 um 8.4"
+    assert "b [1]" in b
+    assert "no [twin] with a 'kind'" in b

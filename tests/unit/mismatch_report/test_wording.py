@@ -1,0 +1,72 @@
+"""Figures as people read them."""
+
+import math
+from dataclasses import replace
+
+import pytest
+
+from tests.unit.mismatch_report.canned import agrees, creep, missing_physics
+from tools.mismatch.engine.report import ParameterValue
+from tools.mismatch.report import wording
+
+
+@pytest.mark.parametrize(
+    ("value", "ci", "shown"),
+    [
+        (0.021345, (0.0191, 0.0236), ("0.0213", "0.0191", "0.0236")),
+        (1234.5678, (1234.0, 1235.1), ("1234.57", "1234.00", "1235.10")),
+        (-3893.2, (-3963.0, -3822.0), ("-3893", "-3963", "-3822")),
+        (2.5e-7, (2.4e-7, 2.6e-7), ("2.5e-07", "2.4e-07", "2.6e-07")),
+        (6.0, (6.0, 6.0), ("6", "6", "6")),
+        (1.5, (-math.inf, math.inf), ("1.5", "-", "-")),
+        (1.5, (math.nan, math.nan), ("1.5", "-", "-")),
+        (0.0, (-0.01, 0.01), ("0.000", "-0.010", "0.010")),
+    ],
+)
+def test_an_interval_sets_the_digits(value: float, ci: tuple[float, float], shown: tuple[str, str, str]):
+    assert wording.interval(ParameterValue(value, "V", ci)) == shown
+
+
+@pytest.mark.parametrize(
+    ("typical", "unit", "factor", "shown"),
+    [
+        (3.2e-5, "m", 1e6, "um"),
+        (0.0328, "V", 1e3, "mV"),
+        (0.5, "V", 1.0, "V"),
+        (2e-12, "V", 1e9, "nV"),
+        (1e-5, "um", 1.0, "um"),  # has a prefix already
+        (1e-5, "V/g", 1.0, "V/g"),
+        (0.0, "V", 1.0, "V"),
+        (math.nan, "V", 1.0, "V"),
+    ],
+)
+def test_a_prefix_for_small_figures(typical: float, unit: str, factor: float, shown: str):
+    assert wording.scaled(typical, unit) == (factor, shown)
+
+
+def test_explained_is_not_asked_where_nothing_was_left():
+    assert wording.explained(agrees().fit, "displacement") is None
+
+
+def test_explained_stays_a_share_when_a_fit_harms_or_dips_below_the_noise():
+    fit = missing_physics().fit
+    assert wording.explained(replace(fit, fitted_rms={"displacement": 0.9}), "displacement") == 0.0
+    assert wording.explained(replace(fit, fitted_rms={"displacement": 0.001}), "displacement") == 1.0
+
+
+def test_windows_are_few():
+    location = missing_physics().location
+    assert wording.windows(location) == "0 to 3.5 s, 4 to 6 s"
+    assert wording.windows(replace(location, windows=location.windows * 5)).endswith("and 4 more")
+    assert wording.windows(agrees().location) == "none"
+
+
+def test_poorly_known_is_more_than_thirty_percent():
+    assert wording.poorly_known(ParameterValue(1.0, "s", (0.8, 1.2))) is None
+    assert wording.poorly_known(ParameterValue(1.0, "s", (0.5, 1.5))) == pytest.approx(0.5)
+    assert wording.poorly_known(ParameterValue(1.0, "s", (-math.inf, math.inf))) is None
+
+
+def test_before_and_after_share_a_unit():
+    p = replace(creep(), residual_rms_before=8.27e-5, residual_rms_after=4.34e-6)
+    assert wording.before_after(p, "m") == "82.7 without it, 4.34 with it (um rms, held out)"
