@@ -69,10 +69,11 @@ class CardQueue:
             t_ns, reading = self._waiting.popleft()
             out.lost, self._dropped = self._dropped, 0
             self.lost += out.lost
+            first = self._seq < 0
             self._seq += 1 + out.lost
             self._t_ns = t_ns
             status = Status.OVERRUN if out.lost else Status.OK
-            changed = reading.status != self.card_status
+            changed = not first and reading.status != self.card_status
             self.card_status = reading.status
             self.clicks += changed
             if self.spikes is None or self.spikes.admit(changed, t_ns):
