@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import gammaincc
 
 from sim_devices.physics.drift import hats, knots_over
@@ -19,8 +20,8 @@ def tones(t: Array, frequency: float, orders: Sequence[float] = (1.0,)) -> Array
     """Sine and cosine of each harmonic, (n, 2 * orders)."""
     cols: list[Array] = []
     for h in orders:
-        z = np.exp(2j * np.pi * h * frequency * t)
-        cols += [z.imag.copy(), z.real.copy()]
+        phase = 2 * np.pi * h * frequency * t
+        cols += [np.sin(phase), np.cos(phase)]
     return np.stack(cols, axis=1)
 
 
@@ -33,18 +34,18 @@ def carrier(t: Array, e: Array, frequency: float, width: float) -> Array:
     return 2 * z.reshape(-1, m).mean(axis=1)
 
 
-def carrier_kept(keep: np.ndarray, dt: float, width: float) -> np.ndarray:
+def carrier_kept(keep: NDArray[np.bool_], dt: float, width: float) -> NDArray[np.bool_]:
     """Windows of ``carrier`` that lie in the mask altogether, (windows,) bool."""
     m = max(1, round(width / dt))
     c = (keep.size // m) * m
-    return keep[:c].reshape(-1, m).all(axis=1)
+    return np.all(keep[:c].reshape(-1, m), axis=1)
 
 
 def periodogram(e: Array, keep: np.ndarray, dt: float) -> tuple[Array, Array]:
     """Frequencies and power of the kept residual (gaps as zeros), finely spaced."""
     clean = np.where(keep, e - e[keep].mean(), 0.0)
     n = 1 << int(np.ceil(np.log2(2 * e.size)))
-    return np.fft.rfftfreq(n, dt), np.abs(np.fft.rfft(clean, n)) ** 2
+    return np.asarray(np.fft.rfftfreq(n, dt), np.float64), np.asarray(np.abs(np.fft.rfft(clean, n)) ** 2, np.float64)
 
 
 def local_floor(power: Array, around: int) -> Array:
@@ -71,7 +72,7 @@ def _peak(x: Array, residual: Array, ctx: Context, lo: float, hi: float, driven:
     return float(f[i]), float(z[i])
 
 
-def _excited(x: Array, ctx: Context, f: Array) -> Array:
+def _excited(x: Array, ctx: Context, f: Array) -> NDArray[np.bool_]:
     """Frequencies where an input has a line of its own (a residual line there is a wrong response, not a visitor)."""
     bad = np.zeros(f.size, bool)
     for name, s in ctx.signals.items():
@@ -141,7 +142,7 @@ def _line_parts(settings: Settings) -> Parts:
     penalty = 0.02 * np.eye(len(names))
     if knots > 2:
         bend = np.diff(np.eye(knots), axis=0)
-        penalty = np.concatenate([penalty, 0.2 * np.kron(np.eye(2 * h), bend)])
+        penalty = np.concatenate([penalty, np.asarray(0.2 * np.kron(np.eye(2 * h), bend), np.float64)])
     return Parts(
         (Parameter("frequency_Hz", "Hz", f0 - reach, f0 + reach, scale=0.1 / span),),
         tuple(Parameter(m, "{out}") for m in names),

@@ -32,11 +32,11 @@ def autoregression(x: Array, order: int) -> Array:
         return np.ones(1)
     size = 1 << int(np.ceil(np.log2(2 * n)))
     f = np.fft.rfft(x - x.mean(), size)
-    r = np.fft.irfft(f * np.conj(f), size)[: order + 1] / n
+    r = np.asarray(np.fft.irfft(f * np.conj(f), size)[: order + 1] / n, np.float64)
     if r[0] <= 0:
         return np.ones(1)
     r[0] *= 1 + 1e-6
-    return np.concatenate([[1.0], -solve_toeplitz(r[:-1], r[1:])])
+    return np.concatenate([[1.0], -np.asarray(solve_toeplitz(r[:-1], r[1:]))])
 
 
 def whiten(x: Array, mask: Bool | None = None, order: int = 10) -> Array:
@@ -46,7 +46,7 @@ def whiten(x: Array, mask: Bool | None = None, order: int = 10) -> Array:
     a = autoregression(np.clip(x[slice(*longest)], *_fences(x[slice(*longest)])), order)
     out = np.zeros_like(x)
     for b, e in stretches:
-        w = lfilter(a, 1.0, x[b:e])
+        w = np.asarray(lfilter(a, 1.0, x[b:e]), np.float64)
         w[: a.size - 1] = 0.0
         out[b:e] = w
     return out
@@ -72,7 +72,7 @@ def long_run_rms(x: Array, blocks: int = 64) -> float:
 
 def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array, float]:
     """Coefficients and the residual sum of squares; columns (n, k) are scaled first, ``ridge`` is relative."""
-    size = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    size = np.sqrt(np.sum(columns * columns, axis=0))
     size[size == 0] = 1.0
     q = columns / size
     gram = q.T @ q
@@ -106,7 +106,10 @@ def affine_misfit(candidate: Array, measured: Array) -> float:
 
 
 def rank_starts(
-    candidates: list[tuple[float, ...]], output_of: Callable[[tuple[float, ...]], Array], measured: Array, k: Array
+    candidates: list[tuple[float, ...]],
+    output_of: Callable[[tuple[float, ...]], Array],
+    measured: Array,
+    k: NDArray[np.int64],
 ) -> list[tuple[float, ...]]:
     """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first.
 

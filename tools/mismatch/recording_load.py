@@ -93,7 +93,7 @@ def load_recording(path: Path) -> Recording:
     return Recording(
         path=path,
         title=str(text.get("title", path.stem)),
-        t=np.arange(n) * dt,
+        t=np.asarray(np.arange(n) * dt, np.float64),
         dt=dt,
         inputs=parts["input"],
         outputs=parts["output"],

@@ -408,8 +408,8 @@ class Model:
     def _find_linear(self) -> set[int]:
         """Which parameters stay linear, found by one pass over a short made-up stretch."""
         n = 64
-        t = np.arange(n) * 1e-2
-        wave = np.sin(2 * np.pi * t / t[-1])
+        t = np.asarray(np.arange(n) * 1e-2, np.float64)
+        wave: Array = np.sin(2 * np.pi * t / t[-1])
         names = {*self.twin.inputs, *(s for pl in self.placed for s in pl.effect.needs)}
         run = Run(
             t,

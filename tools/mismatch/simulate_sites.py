@@ -52,7 +52,8 @@ def _here(effect: Effect, recording: Recording, output: str) -> str:
 
 
 def _stage(twin: Twin, effect: Effect) -> Stage:
-    return next((s for s in effect.stages if s in twin.chain), effect.stages[0])
+    fitting: list[Stage] = [s for s in effect.stages if s in twin.chain]
+    return fitting[0] if fitting else effect.stages[0]
 
 
 def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed]) -> list[Placed]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.signal import cont2discrete, lfilter
+from scipy.signal import bilinear, lfilter
 
 from sim_devices.physics.effect import Array, Human, Parameter
 from tools.mismatch.recording import Recording, RecordingError
@@ -130,7 +130,7 @@ def _filtered(u: Array, y: Array, velocity: bool, dt: float) -> Array:
     spectrum = np.abs(np.fft.rfft(u - u.mean())) ** 2
     cut = np.searchsorted(np.cumsum(spectrum), 0.98 * spectrum.sum())
     corner = 2 * np.pi * min(max(cut / (u.size * dt), 5 / (u.size * dt)), 0.1 / dt)
-    den = np.polymul(np.polymul([1 / corner, 1.0], [1 / corner, 1.0]), [1 / corner, 1.0])
+    den = [float(v) / corner**3 for v in np.poly([-corner] * 3)]
     cols: list[Array] = []
     for order in (2, 1, 0):
         power = order - 1 if velocity else order
@@ -138,10 +138,13 @@ def _filtered(u: Array, y: Array, velocity: bool, dt: float) -> Array:
             cols.append(np.cumsum(cols[-1]) * dt)
             continue
         num = [1.0] + [0.0] * power
-        b, a, _ = cont2discrete((num, den), dt, method="bilinear")
-        cols.append(lfilter(np.ravel(b), a, y - y[0]))
+        cols.append(_filter(num, den, dt, y - y[0]))
     cols.append(-np.ones(u.size))
-    b, a, _ = cont2discrete(([1.0], den), dt, method="bilinear")
-    cols.append(lfilter(np.ravel(b), a, u))
+    cols.append(_filter([1.0], den, dt, u))
     skip = min(u.size // 4, int(10 / (corner * dt)))
     return np.stack(cols, axis=1)[skip:]
+
+
+def _filter(num: list[float], den: list[float], dt: float, x: Array) -> Array:
+    b, a = bilinear(num, den, fs=1 / dt)
+    return np.asarray(lfilter(b, a, x), np.float64)

@@ -69,18 +69,50 @@ class Run:
 class Twin(Protocol):
     """The simulator before anything is added. Frozen; ``theta`` are the base parameters, in order."""
 
-    kind: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    chain: tuple[Stage, ...]
-    parameters: tuple[Parameter, ...]
-    static: bool
-    """Output depends on the present input alone: additive effects then sit at the output, driven by the input."""
-    restart: bool
-    """Free-run drifts (an integrator, a slow pole): each range of a view starts from a state set by data."""
-    feedback_on: str
-    """The output that feedback effects act on ("" when the twin has no equation of motion)."""
+    @property
+    def kind(self) -> str:
+        """The contract's name."""
+        ...
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Input signals that were recorded."""
+        ...
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Output signals that were recorded."""
+        ...
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Contract unit of each signal."""
+        ...
+
+    @property
+    def chain(self) -> tuple[Stage, ...]:
+        """Its stages, in order."""
+        ...
+
+    @property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Base parameters, in the order of theta."""
+        ...
+
+    @property
+    def static(self) -> bool:
+        """Output depends on the present input alone: additive effects then sit at the output, driven by the input."""
+        ...
+
+    @property
+    def restart(self) -> bool:
+        """Free-run drifts (an integrator, a slow pole): each range of a view starts from a state set by data."""
+        ...
+
+    @property
+    def feedback_on(self) -> str:
+        """The output that feedback effects act on ("" when the twin has no equation of motion)."""
+        ...
 
     def start(self, recording: Recording) -> Array:
         """Base parameters as the engineer gave them; what is missing is estimated from the data."""

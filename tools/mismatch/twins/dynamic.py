@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.twins.base import Force, Run, Signal, remember
@@ -259,7 +260,7 @@ class DynamicTwin:
         held = self.hold != "linear"
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0
 
-        def go(x0: Array, stop: Array) -> Array:
+        def go(x0: Array, stop: NDArray[np.int64]) -> Array:
             some = u[: int(stop.max())]
             return run_feedback(
                 d.ad, d.g0, d.g1, cp, cv, some, held, sub, x0, starts, stop,
@@ -274,7 +275,7 @@ class DynamicTwin:
         full = np.linalg.matrix_power(d.ad, sub)
         ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
-        stop = np.minimum(starts + window, ends)
+        stop = np.asarray(np.minimum(starts + window, ends), np.int64)
         m = int(stop.max())
         for _ in range(3 if forces else 1):
             x = go(x0, stop)

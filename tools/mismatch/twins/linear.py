@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal
 
@@ -145,7 +146,7 @@ class StartState:
 def start_state(
     ad: Array,
     rows: dict[str, Array],
-    measured: dict[str, Array],
+    measured: Mapping[str, Array],
     starts: tuple[int, ...],
     n: int,
     window: int,
@@ -172,7 +173,7 @@ def start_state(
     solvers: dict[int, Array] = {}
     for w in set(windows):
         stacked = np.concatenate([free[o][:w] * weight[o] for o in rows])
-        solvers[w] = np.linalg.pinv(stacked, rcond=1e-9)
+        solvers[w] = np.asarray(np.linalg.pinv(stacked, rcond=1e-9), np.float64)
     made = StartState(tuple(rows), free, weight, spans, solvers, windows)
     memo[key] = made
     return made

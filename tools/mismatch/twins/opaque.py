@@ -107,7 +107,8 @@ class OpaqueTwin:
 
     def to_text(self, theta: Array) -> dict[str, object]:
         """See Twin."""
-        return dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=True)}
+        out: dict[str, object] = dict(self.given)
+        return out | {k: float(v) for k, v in zip(self.free, theta, strict=True)}
 
 
 def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:

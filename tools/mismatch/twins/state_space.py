@@ -10,14 +10,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human, Parameter
+from sim_devices.physics.exponential import exponential
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete")
 MAX_ORDER = 12
+
+
+Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
     m = _matrices(recording)
     inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
     dt, s = recording.dt, m.a.shape[0]
-    poles = np.linalg.eigvals(m.a)
+    poles = np.asarray(np.linalg.eigvals(m.a), np.complex128)
     modes, fixed = _modes(poles, m.discrete, dt)
     # companion states are scaled by omega^k so that they are of one size
     omega = 1.0 / dt if m.discrete else _omega(poles, recording.n * dt)
@@ -74,7 +79,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         if m.discrete:
             done = roots[len(fixed) :]
             roots = [*fixed, *(np.exp(p * dt) for p in done)]
-        return np.real(np.poly(roots)) if roots else np.ones(1)
+        return np.asarray(np.real(np.poly(roots)), np.float64) if roots else np.ones(1)
 
     def plant_of(theta: Array) -> Plant:
         den = denominator(theta)
@@ -113,11 +118,9 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
     def fixed_free(n: int) -> Mapping[str, Array]:
         y = np.zeros((n, len(outputs)))
         if np.any(m.x0 != 0):
-            from scipy.linalg import expm
-
             from tools.mismatch.twins.linear import free_response
 
-            ad = np.ascontiguousarray(m.a if m.discrete else expm(m.a * dt))
+            ad = np.ascontiguousarray(m.a if m.discrete else exponential(m.a * dt))
             for k in range(len(outputs)):
                 y[:, k] = free_response(ad, np.ascontiguousarray(m.c[k]), n) @ m.x0
         return {o: y[:, k] for k, o in enumerate(outputs)}
@@ -218,13 +221,13 @@ def _matrices(recording: Recording) -> Matrices:
     )
 
 
-def _omega(poles: Array, span: float) -> float:
+def _omega(poles: Complex, span: float) -> float:
     sizes = np.abs(poles)
     sizes = sizes[sizes > 1e-9 * (sizes.max() if sizes.size else 1.0)]
     return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0 / span
 
 
-def _modes(poles: Array, discrete: bool, dt: float) -> tuple[list[tuple[str, complex]], list[complex]]:
+def _modes(poles: Complex, discrete: bool, dt: float) -> tuple[list[tuple[str, complex]], list[complex]]:
     """Free modes ("pair" or "real") in continuous terms, and poles that stay as given (integrators, z <= 0)."""
     modes: list[tuple[str, complex]] = []
     fixed: list[complex] = []
@@ -258,16 +261,18 @@ def _numerators(m: Matrices, plant: Plant) -> dict[tuple[int, int], tuple[Array,
     out: dict[tuple[int, int], tuple[Array, float]] = {}
     size = float(np.max(np.abs(np.linalg.eigvals(plant.a)))) if s else 1.0
     points = (size or 1.0) * (1.5 + 0.5 * np.arange(s)) * np.exp(1j * (0.3 + 0.9 * np.arange(s)))
-    basis = np.array([np.linalg.solve(p * np.eye(s) - plant.a, plant.b) for p in points]) if s else np.zeros((0, 0))
+    rows = [np.linalg.solve(p * np.eye(s) - plant.a, plant.b) for p in points]
+    basis = np.asarray(rows, np.complex128)
     for k in range(m.c.shape[0]):
         for i in range(m.b.shape[1]):
-            values = np.array([m.c[k] @ np.linalg.solve(p * np.eye(s) - m.a, m.b[:, i]) for p in points])
+            want = [m.c[k] @ np.linalg.solve(p * np.eye(s) - m.a, m.b[:, i]) for p in points]
+            values = np.asarray(want, np.complex128)
             if s:
                 both = np.concatenate([basis.real, basis.imag])
                 c = np.linalg.lstsq(both, np.concatenate([values.real, values.imag]), rcond=None)[0]
             else:
                 c = np.zeros(0)
-            out[k, i] = (c, float(m.d[k, i]))
+            out[k, i] = (np.asarray(c, np.float64), float(m.d[k, i]))
     return out
 
 
