@@ -58,7 +58,8 @@ def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
     if trial.fitted is None or c is None or not trial.fitted.ok:
         return False
     if trial.placed.effect.claims is not None:
-        return trial.candidate.p_value < rule.p_tested and trial.candidate.share > 0.2
+        p, share = trial.candidate.p_value, trial.candidate.share
+        return (p < rule.p_tested and share > 0.2) or (p < 1e-4 and share > 0.5 and c.z > rule.z and c.gain > 0.1)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
     return c.z > rule.z and c.gain > rule.gain and c.excess_gain > rule.excess and c.improvement > rule.form * explained
