@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Row:
-    """``ours`` and ``peer`` in ``unit``, measured in the same run; ``goal`` in words, ``meets`` computed (None: no goal)."""
+    """``ours`` and ``peer`` in ``unit``, measured in the same run; ``goal`` in words, ``meets`` is computed."""
 
     name: str
     what: str
