@@ -271,7 +271,7 @@ class World:
         self._add_chip(name, device, Bmx055Accelerometer(imu, start_ns=self.epoch_ns))
         gyro = {"bus": device["bus"], "address": device.get("gyro_address", 0x68)}
         self._add_chip(f"{name}.gyro", gyro, Bmx055Gyroscope(imu, start_ns=self.epoch_ns))
-        magnetometer = {"bus": device["bus"], "address": device.get("magnetometer_address", 0x10)}
+        magnetometer = {"bus": device["bus"], "address": device.get("mag_address", 0x10)}
         self._add_chip(f"{name}.magnetometer", magnetometer, Bmx055Magnetometer(imu, seed=self._seed))
 
     def _add_motion_card(self, name: str, device: Mapping[str, Any]) -> None:

@@ -11,8 +11,9 @@ In suspend (power control bit 0) only register 0x4B answers; everything else, th
 Model limits
 - The whole measurement sees the field at its end; noise is 1.8 uT / sqrt(repetitions) per axis.
 - Normal mode runs at the data rate, or as fast as the repetitions allow if that is slower.
-- Self-test, advanced self-test and the interrupt engine are stored only; of INT_STATUS only the overflow bit is
-  alive; the DRDY flag falls when any data register is read.
+- The self-test always passes, 2 ms after its command in sleep mode (bit 0 of the data LSBs); the advanced self-test
+  adds +-100 uT to z. The interrupt engine is stored only; of INT_STATUS only the overflow bit is alive; the DRDY flag
+  falls when any data register is read.
 - RHALL follows temperature linearly about dig_xyz1; channels that are switched off (0x4E) read the overflow value.
 - Soft reset takes 1 ms and ends in sleep mode; an unchanged mode write in normal mode starts the period anew.
 """
@@ -32,7 +33,8 @@ from sim_devices.plant.streams import stream
 CHIP_ID, DATA, RHALL, STATUS = 0x40, 0x42, 0x48, 0x4A
 POWER, MODE, INT, AXES, REP_XY, REP_Z = 0x4B, 0x4C, 0x4D, 0x4E, 0x51, 0x52
 RATES_HZ = (10.0, 2.0, 6.0, 8.0, 15.0, 20.0, 25.0, 30.0)
-START_UP_NS, RESET_NS = 3_000_000, 1_000_000
+START_UP_NS, RESET_NS, SELF_TEST_NS = 3_000_000, 1_000_000, 2_000_000
+ADVANCED_UT = (0.0, 0.0, -100.0, 100.0)  # self-test current off, off, negative, positive: about 200 uT of difference
 NORMAL, FORCED, SLEEP = 0, 1, 3
 OVERFLOW_XY, OVERFLOW_Z = -4096, -16384
 NOISE_UT = 1.8
@@ -91,6 +93,7 @@ class Bmx055Magnetometer(RegisterFace):
     def _set_up(self, ready_ns: int) -> None:
         self._ready_ns = ready_ns
         self._due_ns: int | None = None
+        self._test_due_ns: int | None = None
         self._read_ns, self._burst_fresh = -1, False
         self._overflow = False
         self._outputs.clear()
@@ -150,6 +153,8 @@ class Bmx055Magnetometer(RegisterFace):
     def _begin(self, t_ns: int) -> None:
         mode = self.registers[MODE] >> 1 & 3
         self._due_ns = t_ns + self.conversion_ns if mode in (NORMAL, FORCED) else None
+        if mode == SLEEP and self.registers[MODE] & 0x01:
+            self._test_due_ns = t_ns + SELF_TEST_NS
 
     # ------------------------------------------------------------------ sampling
 
@@ -157,6 +162,13 @@ class Bmx055Magnetometer(RegisterFace):
         return None if self.frozen else self._due_ns
 
     def advance_to(self, t_ns: int) -> None:
+        if self._test_due_ns is not None and self._test_due_ns <= t_ns and not self.frozen:
+            block = self._outputs.at(t_ns)[1]
+            passed = bytes(byte | (0x01 if i in (0, 2, 4) else 0) for i, byte in enumerate(block))
+            self._outputs.push(self._test_due_ns, passed)
+            self._read_ns = self._test_due_ns  # that is no new measurement
+            self._test_due_ns = None
+            self.registers[MODE] &= 0xFE
         while self._due_ns is not None and self._due_ns <= t_ns:
             due_ns = self._due_ns
             if self.registers[MODE] >> 1 & 3 == NORMAL:
@@ -173,6 +185,7 @@ class Bmx055Magnetometer(RegisterFace):
         n_xy, n_z = 1 + 2 * self.registers[REP_XY], 1 + self.registers[REP_Z]
         sigma = NOISE_UT / np.sqrt([n_xy, n_xy, n_z])
         field_uT = self._sensor.sample(t_ns, 1e3) + sigma * self._noise()
+        field_uT[2] += ADVANCED_UT[self.registers[MODE] >> 6]
         rhall = min(0x3FFF, max(1, round(self.trim.xyz1 * (1.0 + 5e-4 * (self._imu.temperature_C(t_ns) - 25.0)))))
         words: list[int] = []
         self._overflow = False

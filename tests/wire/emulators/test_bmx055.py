@@ -328,3 +328,27 @@ def test_magnetometer_overflow() -> None:
     put(device, 0x4C, 0x02, t_ns=5 * MS)
     assert words(get(device, 0x42, 50 * MS, 2), "little")[0] >> 3 == -4096
     assert get(device, 0x4A, 50 * MS)[0] & 0x40
+
+
+def test_magnetometer_self_test_bits() -> None:
+    """Section 10.4: bit 0 of 4Ch clears when done; bit 0 of the x, y and z LSBs say that the channel passed."""
+    device, _ = magnetometer()
+    put(device, 0x4B, 0x01, t_ns=0)
+    put(device, 0x4C, 0x07, t_ns=5 * MS)
+    assert get(device, 0x4C, 6 * MS)[0] & 1
+    assert get(device, 0x4C, 7 * MS) == b"\x06"
+    data = get(device, 0x42, 7 * MS, 8)
+    assert [byte & 1 for byte in data[:6:2]] == [1, 1, 1]
+    assert data[6] & 1 == 0  # no new data
+
+
+def test_magnetometer_advanced_self_test() -> None:
+    """Difference of z between both currents: about 200 uT."""
+    device, _ = magnetometer()
+    put(device, 0x4B, 0x01, t_ns=0)
+    put(device, 0x52, 14, t_ns=5 * MS)
+    z: list[float] = []
+    for k, current in enumerate((0xC0, 0x80)):
+        put(device, 0x4C, current | 0x02, t_ns=(10 + 50 * k) * MS)
+        z.append(compensated(device, get(device, 0x42, (40 + 50 * k) * MS, 8))[2])
+    assert z[0] - z[1] == pytest.approx(200.0, abs=1.0)
