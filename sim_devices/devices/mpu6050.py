@@ -83,11 +83,17 @@ class Mpu6050(RegisterFace):
     """One MPU-6050. The AD0 strap is the address that the bus puts it at.
 
     ``rate_error`` = 0.01 makes its clock 1 % fast. ``factory_offsets`` is what the accelerometer offset registers hold
-    at power-up: the factory's own correction, which moves with them when they are written.
+    at power-up: the factory's own correction, which moves with them when they are written. The application note says
+    4096 LSB/g for those registers, users of real chips have measured 2048: ``accel_offset_lsb_per_g`` makes either.
     """
 
     def __init__(
-        self, imu: Imu, *, rate_error: float = 0.0, factory_offsets: tuple[int, int, int] = (-1320, 846, 1788)
+        self,
+        imu: Imu,
+        *,
+        rate_error: float = 0.0,
+        factory_offsets: tuple[int, int, int] = (-1320, 846, 1788),
+        accel_offset_lsb_per_g: float = ACCEL_OFFSET_LSB_PER_G,
     ) -> None:
         if not -0.01 <= rate_error <= 0.01:
             raise ValueError(f"rate_error {rate_error} is outside +-1 % (PS 6.6)")
@@ -96,6 +102,7 @@ class Mpu6050(RegisterFace):
         for axis, offset in enumerate(factory_offsets):
             reset[XA_OFFS_H + 2 * axis], reset[XA_OFFS_H + 2 * axis + 1] = (offset & 0xFFFE).to_bytes(2, "big")
         self._imu, self._rate_error = imu, rate_error
+        self._offset_lsb_per_g = accel_offset_lsb_per_g
         self._factory_lsb = np.array([offset & ~1 for offset in factory_offsets], dtype=np.float64)
         self._self_test = np.array(response) * imu.self_test_gain
         self.samples, self.overflows = 0, 0
@@ -241,7 +248,7 @@ class Mpu6050(RegisterFace):
         dps = np.degrees(self._gyro) + WAKE_TRANSIENT_DPS * math.exp(-(t_ns - self._awake_ns) / WAKE_TAU_NS)
         g = self._accel / STANDARD_GRAVITY
         for axis in range(3):
-            g[axis] += ((self._word(XA_OFFS_H + 2 * axis) & ~1) - self._factory_lsb[axis]) / ACCEL_OFFSET_LSB_PER_G
+            g[axis] += ((self._word(XA_OFFS_H + 2 * axis) & ~1) - self._factory_lsb[axis]) / self._offset_lsb_per_g
             dps[axis] += self._word(XG_OFFS_H + 2 * axis) / GYRO_OFFSET_LSB_PER_DPS
             if r[ACCEL_CONFIG] & 0x80 >> axis:
                 g[axis] += self._self_test[axis]

@@ -267,3 +267,11 @@ def test_clock_error() -> None:
     assert device.samples == 1010
     with pytest.raises(ValueError, match="1 %"):
         make(rate_error=0.02)
+
+
+def test_accelerometer_offsets_at_the_scale_that_users_have_measured() -> None:
+    device, _ = make(factory_offsets=(0, 0, 0), accel_offset_lsb_per_g=2048.0)
+    put(device, 0x19, 9, 3, t_ns=0)
+    put(device, 0x6B, 0, t_ns=0)
+    put(device, 0x06, 0x02, 0x00, t_ns=0)
+    assert words(get(device, 0x3B, 400 * MS, 2)) == [4096]
