@@ -240,19 +240,22 @@ class FifoTimeline:
         self.period_ns = period_ns
         self._line = ScanTimeline(float(period_ns))
         self._last_ns = -1
+        self._left = 0
 
-    def stamp(self, out: ImuBlock, n: int, arrival_ns: int, overrun: bool) -> None:
+    def stamp(self, out: ImuBlock, n: int, arrival_ns: int, overrun: bool, left: int = 0) -> None:
         """Fill the head of ``out`` for ``n`` frames read at ``arrival_ns``; ``overrun``: older ones are gone.
 
-        The chips do not say how many; the time since the last emptying does, within one frame."""
+        ``left`` newer frames stayed in the FIFO for want of room. How many are gone the chips do not say; the
+        time since the last emptying does, within one frame."""
         lost = 0
         if overrun:
             elapsed = (arrival_ns - self._last_ns) / self.period_ns if self._last_ns >= 0 else 0.0
-            lost = max(1, round(elapsed) - n)
+            lost = max(1, round(elapsed) + self._left - n - left)
             self._line.restart()
+        self._left = left
         out.n = n
         out.dt_ns = self.period_ns
-        out.t0_ns = self._line.stamp(n, arrival_ns)[0] if n else arrival_ns
+        out.t0_ns = self._line.stamp(n, arrival_ns - left * self.period_ns)[0] if n else arrival_ns
         out.seq0 = self.next_seq + lost
         out.lost = lost
         out.source = TimeSource.DEVICE_CLOCK

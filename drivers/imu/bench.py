@@ -60,12 +60,12 @@ IMU_OPTIONS: dict[str, type[ImuOptions]] = {
     "lsm6ds3": Lsm6ds3Options,
     "bmx055": Bmx055Options,
 }
-DEFAULT_ADDRESS = {"mpu6050": 0x68, "lsm6ds3": 0x6A, "bmx055": 0x18}
+LOWEST_ADDRESS = {"mpu6050": 0x68, "lsm6ds3": 0x6A, "bmx055": 0x18}  # the other one is one higher
 
 
 def make_imu(spec: DeviceSpec, options: ImuOptions, bus: I2cBus, clock: Clock, name: str) -> Imu:
     """The driver of a bench entry, nothing sent yet. ``open_imu`` also sets it up."""
-    address = spec.address or DEFAULT_ADDRESS[spec.driver]
+    address = spec.address or LOWEST_ADDRESS[spec.driver]
     match options:
         case Mpu6050Options():
             return Mpu6050(bus, clock, address, name=name)
@@ -108,9 +108,12 @@ def address_problems(description: BenchDescription, options: dict[str, Any]) -> 
             continue
         option = options[name]
         if isinstance(option, ImuOptions):
-            address = spec.address or DEFAULT_ADDRESS[spec.driver]
+            if spec.address is None:
+                lowest = LOWEST_ADDRESS[spec.driver]
+                problems.append(f"[device.{name}.address] is missing; it is 0x{lowest:02x} or 0x{lowest + 1:02x}")
+                continue
             try:
-                claimed = _claims(option, address, name)
+                claimed = _claims(option, spec.address, name)
             except BenchError as error:
                 problems.append(f"[device.{name}] {error}")
                 continue
@@ -140,7 +143,7 @@ def _claims(option: ImuOptions, address: int, name: str) -> list[tuple[int, str,
             found.append((option.mag_address, f"the magnetometer of '{name}' (BMX055)", sdo2))
         return found
     part, pin = ("MPU6050", "AD0") if isinstance(option, Mpu6050Options) else ("LSM6DS3", "SA0")
-    lowest = 0x68 if part == "MPU6050" else 0x6A
+    lowest = LOWEST_ADDRESS["mpu6050" if part == "MPU6050" else "lsm6ds3"]
     if address not in (lowest, lowest + 1):
         raise BenchError(f"address 0x{address:02x} is not 0x{lowest:02x} or 0x{lowest + 1:02x}, which {pin} selects")
     return [(address, f"'{name}' ({part})", _strap(pin, name, address))]

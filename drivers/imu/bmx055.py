@@ -327,7 +327,8 @@ class Bmx055:
         out.temperature_C = signed(head[0], 8) * 0.5 + 23.0
         accel_status, gyro_status = head[6], self._gyro_head()[0] if self._gyro_on else 0
         n_accel, n_gyro = accel_status & m.FIFO_FRAMES, gyro_status & m.FIFO_FRAMES
-        n = min(n_gyro if self._gyro_on else n_accel, out.capacity)
+        waiting = n_gyro if self._gyro_on else n_accel
+        n = min(waiting, out.capacity)
         overrun = bool((accel_status | gyro_status) & m.FIFO_OVERRUN)
         if n:
             accel = self._frames(self._accel, m.ACC_FIFO_DATA, n_accel) >> 4
@@ -342,7 +343,7 @@ class Bmx055:
         if overrun:
             self.overruns += 1
             self._empty()
-        self._timeline.stamp(out, n, arrival_ns, overrun)
+        self._timeline.stamp(out, n, arrival_ns, overrun, left=0 if overrun else waiting - n)
         if n and self._saturated(out.raw[:n]):
             out.status |= Status.SATURATED
         return n

@@ -176,7 +176,7 @@ class Lsm6ds3:
                 done += 1
         temperature = self._chip.read_block(m.STATUS_REG, STATUS_TO_DATA + 2)
         out.temperature_C = celsius(struct.unpack_from("<h", temperature, STATUS_TO_DATA)[0])
-        self._timeline.stamp(out, n, arrival_ns, overrun)
+        self._timeline.stamp(out, n, arrival_ns, overrun, left=words // FIFO_WORDS - n)
         raw = out.raw[:n]
         out.accel_mps2[:n] = raw[:, :3] * self.setup.accel_lsb_mps2 + self._accel_offset
         out.gyro_rad_s[:n] = raw[:, 3:] * self.setup.gyro_lsb_rad_s + self._gyro_offset

@@ -45,7 +45,7 @@ FRAME = struct.Struct(">7h")  # accelerometer, temperature, gyro: in the registe
 FIFO_BYTES = 1024
 FRAMES_PER_TRANSFER = 18  # 252 bytes
 CYCLE_RATE_HZ = 40.0
-OFFSET_LSB_PER_G = 2048  # 16 g scale; InvenSense's Motion Driver 6.12, against the note's "8 g"
+OFFSET_LSB_PER_G = 2048  # 16 g scale, as InvenSense's Motion Driver 6 has it; the note's "8 g" is off by two
 GYRO_OFFSET_LSB_PER_DPS = 32.8
 TRIM_LIMIT = 14.0  # PS 6.1, 6.2: +-14 % of the factory trim
 SELF_TEST_SAMPLES = 20
@@ -156,7 +156,8 @@ class Mpu6050:
             self._empty_fifo(on=True)
             self._timeline.stamp(out, 0, arrival_ns, overrun=True)
             return 0
-        n = min(count // FRAME.size, out.capacity)
+        waiting = count // FRAME.size
+        n = min(waiting, out.capacity)
         done = 0
         while done < n:
             frames = min(n - done, FRAMES_PER_TRANSFER)
@@ -165,7 +166,7 @@ class Mpu6050:
                 out.raw[done] = (ax, ay, az, gx, gy, gz)
                 out.temperature_C = celsius(temperature)
                 done += 1
-        self._timeline.stamp(out, n, arrival_ns, overrun=False)
+        self._timeline.stamp(out, n, arrival_ns, overrun=False, left=waiting - n)
         raw = out.raw[:n]
         out.accel_mps2[:n] = raw[:, :3] * self.setup.accel_lsb_mps2
         out.gyro_rad_s[:n] = raw[:, 3:] * self.setup.gyro_lsb_rad_s

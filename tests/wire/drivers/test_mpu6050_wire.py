@@ -196,6 +196,19 @@ def test_fifo_frames_in_register_order():
     bus.done()
 
 
+def test_what_does_not_fit_stays_for_the_next_time():
+    script = [r("3a", "01"), r("72", "002a"), r("74", "0001" * 14), r("3a", "01"), r("72", "000e"), r("74", "0002" * 7)]
+    imu, bus, clock = running(*script, fifo=True)
+    clock.burn_ns(30_000_000)
+    now_ns = clock.now_ns()
+    out = ImuBlock(2)
+    assert imu.read_fifo(out) == 2
+    assert out.t0_ns == now_ns - 20_000_000  # the third was taken just now
+    assert imu.read_fifo(out) == 1
+    assert (out.t0_ns, out.seq0, out.lost) == (now_ns, 2, 0)
+    bus.done()
+
+
 def test_fifo_overflow_is_emptied_and_counted():
     script = [r("3a", "00"), r("72", "0000"), r("3a", "11"), r("72", "0400"), w("6a 04"), w("6a 40")]
     imu, bus, clock = running(*script, r("3a", "01"), r("72", "000e"), r("74", "0000" * 7), fifo=True)
