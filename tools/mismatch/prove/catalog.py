@@ -62,6 +62,8 @@ def _anytime(under: tuple[str, ...]) -> dict[str, Entry]:
 
 def _one_signal(where: str) -> dict[str, Entry]:
     moving = (*WIDE, *STEPPED)
+    # a dozen levels of a staircase cannot tell one curve from another
+    many_levels = (*WIDE, "sawtooth", "sine")
     return {
         "hysteresis": Entry(
             _shape("hysteresis", where), (*moving, "slow", "sine"), "several amplitudes or speeds, else it is a phase"
@@ -71,9 +73,9 @@ def _one_signal(where: str) -> dict[str, Entry]:
         ),
         "creep": Entry(_shape("creep", where), ("staircase", "slow"), "levels held for at least a second", 15.0),
         "backlash": Entry(_shape("backlash", where), (*moving, "sine"), "reversals"),
-        "dead_zone": Entry(_shape("dead_zone", where), (*WIDE, *STEPPED, "sine"), "the input crosses zero"),
-        "saturation": Entry(_shape("saturation", where), SCALAR_ALL, "the input reaches the limit"),
-        "static_nonlinearity": Entry(_shape("static_nonlinearity", where), SCALAR_ALL, "a range of inputs"),
+        "dead_zone": Entry(_shape("dead_zone", where), many_levels, "the input crosses zero"),
+        "saturation": Entry(_shape("saturation", where), (*many_levels, "slow"), "the input reaches the limit"),
+        "static_nonlinearity": Entry(_shape("static_nonlinearity", where), (*many_levels, "slow"), "a range of inputs"),
         "slew_limit": Entry(
             _shape("slew_limit", where),
             ("sines", "chirp", "multisine", "staircase"),
