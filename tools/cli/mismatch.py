@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
 
 from tools.cli.common import (
     Exit,
@@ -116,7 +117,7 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
 
     loaded = load(path)
     for note in loaded.warnings:
-        console().print(f"[yellow]note:[/] {note}", markup=True, soft_wrap=True)
+        console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
     with Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
         console=console(), transient=True,
@@ -132,17 +133,15 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
     from tools.mismatch.report.terminal import print_report
 
-    page = None
-    if html is not None:
+    if html is not None or out is not None:
+        from tools.mismatch.batch import write_reports
         from tools.mismatch.report.page import html_page
 
         page = html_page(report)
-    if out is not None:
-        from tools.mismatch.batch import write_reports
-
-        write_reports(report, out)
-    if html is not None and page is not None:
-        write_text_atomic(html, page)
+        if out is not None:
+            write_reports(report, out, page)
+        if html is not None:
+            write_text_atomic(html, page)
     # with '--json -' standard output belongs to the JSON
     print_report(report, console() if json_file == "-" else data_console())
     write_json(report.to_json(), json_file)
@@ -223,6 +222,34 @@ def prove(
 
 
 @app.command()
+def real(
+    json_file: JsonOption = None,
+    doc: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path(
+        "docs/mismatch-on-real-data.md"
+    ),
+    data: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="The measured recordings; default: beside the project.")
+    ] = None,
+    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only sets whose name has this in it.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+) -> None:
+    """Measured recordings with published figures: what the naive twin lacks, and the error on the official split.
+
+    Example: micron mismatch real --only emps --doc emps.md
+    """
+    with _clear_errors():
+        _check_targets(json_file, doc)
+        from tools.mismatch.prove.real import DATA, reproduce
+
+        try:
+            result = reproduce(data or DATA, only=only or (), jobs=jobs or os.cpu_count() or 1, doc=doc)
+        except FileNotFoundError as error:
+            raise InputError(str(error)) from error
+        console().print(f"page: {doc}")
+        write_json(result, json_file)
+
+
+@app.command()
 def apply(
     recording: RecordingArgument,
     report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],
@@ -239,7 +266,7 @@ def apply(
         twin = corrected_twin(recording, _report(report))
         write_text_atomic(out, twin.text)
         for note in twin.notes:
-            console().print(f"[yellow]note:[/] {note}", soft_wrap=True)
+            console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
         carried = ", ".join(twin.effects) or "no effects"
         console().print(f"{out}: {twin.kind} with {carried}")
 

@@ -12,11 +12,14 @@ import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 
 from tools.cli.common import InputError
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.report.wording import number, words
+
+if TYPE_CHECKING:
+    from tools.mismatch.engine.report import Report
 
 RETRIES = 5
 """How often a recording is tried again when the Dask worker that had it is lost."""
@@ -114,12 +117,13 @@ def diagnose_one(job: Job) -> Row:
         return Row(job.name, str(job.path), error=f"the engine failed: {type(error).__name__}: {error}")
 
 
-def write_reports(report: Any, folder: Path) -> None:
-    """``report.json`` and ``report.html`` in a folder, made if need be; both are complete before either is written."""
+def write_reports(report: Report, folder: Path, page: str | None = None) -> None:
+    """``report.json`` and ``report.html`` (``page`` if it is made already) in a folder, made if need be; both are
+    complete before either is written."""
     from tools.cli.common import write_json, write_text_atomic
     from tools.mismatch.report.page import html_page
 
-    page = html_page(report)
+    page = html_page(report) if page is None else page
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

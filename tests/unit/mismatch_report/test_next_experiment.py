@@ -12,7 +12,7 @@ def said(report) -> list[str]:
 
 
 def test_twins_of_an_effect_come_first():
-    assert said(missing_physics())[0] == "two steps of opposite sign: tells creep from ac coupling"
+    assert said(missing_physics())[0] == "two steps of opposite sign: tells apart creep, ac coupling"
 
 
 def test_a_vague_parameter_asks_for_the_excitation_that_shows_it():

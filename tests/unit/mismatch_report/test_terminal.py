@@ -32,7 +32,7 @@ def test_missing_physics_says_what_where_how_much_and_what_next():
         "0.41 without it, 0.023 with it (um rms, held out)",
         "at the limit of what is searched",
         "leaves 8.3 times the residual of creep",
-        "creep = ac coupling  two steps of opposite sign",
+        "creep = ac coupling: two steps of opposite sign",
         "resonance 0.02 .. dead time 0.4",
         "spikes  none; the longer the record",
         "not white before, white after",

@@ -22,7 +22,7 @@ _COLOUR = {"agrees": "green", "recalibrate": "cyan", "missing_physics": "yellow"
 def _table(*columns: str, left: int = 1) -> Table:
     t = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     for i, name in enumerate(columns):
-        t.add_column(name, justify="left" if i < left else "right", overflow="fold")
+        t.add_column(name, justify="left" if i < left else "right", overflow="fold", no_wrap=i == 0)
     return t
 
 
@@ -165,8 +165,8 @@ def render(report: Report) -> RenderableType:
     if report.alternatives:
         parts.append(_section("Runners-up", _runners_up(report)))
     if report.equivalent:
-        rows = [(" = ".join(words(n) for n in e.names), e.tell_apart_by) for e in report.equivalent]
-        parts.append(_section("This recording cannot tell apart", _pairs(rows)))
+        lines = [f"{' = '.join(words(n) for n in e.names)}: {e.tell_apart_by}" for e in report.equivalent]
+        parts.append(_section("This recording cannot tell apart (what would)", Text("\n".join(lines))))
     parts.append(_section("Smallest effect that would have been named", _limits(report)))
     if report.cannot_show:
         rows = [(words(n), need) for n, need in report.cannot_show.items()]

@@ -56,11 +56,11 @@ def interval_of(value: float, ci95: tuple[float, float]) -> tuple[str, str, str]
     if not all(map(math.isfinite, (value, lo, hi))) or half <= 0:
         return f"{value:.4g}", number(lo), number(hi)
     size = max(abs(value), abs(lo), abs(hi))
-    digits = min(max(math.floor(math.log10(size)) - math.floor(math.log10(half)) + 2, 2), 8)
+    digits = min(max(math.floor(math.log10(size)) - math.floor(math.log10(half)) + 2, 2), 6)
     if 1e-4 <= size < 1e6:
         places = max(0, digits - 1 - math.floor(math.log10(size)))
         return f"{value:.{places}f}", f"{lo:.{places}f}", f"{hi:.{places}f}"
-    return f"{value:.{digits}g}", f"{lo:.{digits}g}", f"{hi:.{digits}g}"
+    return f"{value:.{max(digits, 3)}g}", f"{lo:.{digits}g}", f"{hi:.{digits}g}"
 
 
 def poorly_known(p: ParameterValue) -> float | None:
