@@ -242,6 +242,7 @@ STEP_SHIFT = Effect(
 # -- random walk ------------------------------------------------------------------------------------
 
 KNOTS = 48
+MOST_VALUES = 60_000_000  # columns times samples: half a gigabyte
 
 
 def hats(t: Array, knots: Array) -> Array:
@@ -295,7 +296,7 @@ def increments(residual: Array, keep: np.ndarray, dt: float) -> tuple[float, flo
 
 def _walk_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     white, walk, _, _ = increments(residual, ctx.keep, ctx.dt)
-    n = int(np.clip(KNOTS, 4, max(4, ctx.t.size // 20)))
+    n = int(np.clip(min(KNOTS, MOST_VALUES // ctx.t.size), 4, max(4, ctx.t.size // 20)))
     return {"walk": (walk,), "white": (white,), "knots_s": knots_over(ctx.t, ctx.keep, n)}
 
 

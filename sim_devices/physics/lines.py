@@ -14,6 +14,7 @@ from sim_devices.physics.statistics import thin
 
 MAINS_HZ = (50.0, 60.0)
 MOST_KNOTS = 24
+MOST_VALUES = 60_000_000  # columns times samples: half a gigabyte
 
 
 def tones(t: Array, frequency: float, orders: Sequence[float] = (1.0,)) -> Array:
@@ -101,8 +102,10 @@ def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Setting
             wander = float(np.var(z[whole]))
             if wander > max(1.5 * rough, 0.01 * power):
                 knots = int(np.clip(np.ceil(span / (4 * width)), 4, MOST_KNOTS))
+    orders = _orders(residual, ctx, f0, harmonics)
+    knots = max(1, min(knots, MOST_VALUES // (2 * len(orders) * ctx.t.size)))
     grid = knots_over(ctx.t, ctx.keep, knots) if knots > 1 else (0.0,)
-    return {"nominal": (f0,), "orders": _orders(residual, ctx, f0, harmonics), "span": (span,), "knots_s": grid}
+    return {"nominal": (f0,), "orders": orders, "span": (span,), "knots_s": grid}
 
 
 def _orders(residual: Array, ctx: Context, f0: float, harmonics: int) -> tuple[float, ...]:

@@ -185,6 +185,8 @@ def remember(memo: dict[object, object], key: object, make: Callable[[], Array])
     value = make()
     size = memo.get("bytes", 0)
     assert isinstance(size, int)
+    if value.nbytes > MEMO_BYTES // 2:
+        return value
     if size + value.nbytes > MEMO_BYTES:
         memo.clear()
         size = 0
