@@ -101,8 +101,16 @@ def test_guilty_outputs_are_drawn_worst_first():
     assert series.drawn_outputs(replace(r, fit=fit, location=replace(r.location, outputs=()))) == ["b"]
 
 
-def test_binned_medians_of_a_line():
+def test_binned_means_of_a_line():
     x = np.random.default_rng(2).permutation(np.linspace(-1, 1, 2000))
-    at, median = series.binned(x, 3 * x)
-    assert median == pytest.approx(3 * at, abs=1e-9)
+    at, mean = series.binned(x, 3 * x)
+    assert mean == pytest.approx(3 * at, abs=1e-9)
     assert np.all(np.diff(at) > 0)
+
+
+def test_an_axis_is_cut_only_for_a_few_large_samples():
+    e = np.random.default_rng(3).normal(size=5000)
+    assert series.limit([e]) is None
+    e[:10] = 60.0
+    assert series.limit([e, 0.1 * e]) == pytest.approx(1.5 * np.quantile(np.abs(e), 0.99))
+    assert series.limit([np.zeros(100)]) is None

@@ -72,3 +72,16 @@ def test_poorly_known_is_more_than_thirty_percent():
 def test_before_and_after_share_a_unit():
     p = replace(creep(), residual_rms_before=8.27e-5, residual_rms_after=4.34e-6)
     assert wording.before_after(p, "m") == "82.7 without it, 4.34 with it (um rms, held out)"
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "shown"),
+    [
+        ("time_constant_s", "s", "time constant"),
+        ("corner_hz", "Hz", "corner"),
+        ("loop_width_share", "1", "loop width share"),
+        ("k_xx", "V/g^2", "k xx"),
+    ],
+)
+def test_a_parameter_is_named_without_its_unit(name: str, unit: str, shown: str):
+    assert wording.label(name, unit) == shown

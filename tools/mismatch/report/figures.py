@@ -87,7 +87,12 @@ def residual(report: Report, p: Pictures, output: str, name: str) -> str:
         ax.axhspan(
             -2 * noise * factor, 2 * noise * factor, color=NOISE, alpha=0.3, lw=0, label="± 2 noise floor", zorder=3
         )
-        ax.set_title("residual: measured minus simulated")
+        title = "residual: measured minus simulated"
+        half = series.limit([e for _, _, e in _residuals(report, p, output)])
+        if half is not None:
+            ax.set_ylim(-max(half, 2 * noise) * factor, max(half, 2 * noise) * factor)
+            title += " (a few samples are off the scale)"
+        ax.set_title(title)
         ax.set_ylabel(f"residual ({unit})")
         ax.set_xlabel("time (s)")
         ax.margins(x=0)
@@ -96,7 +101,7 @@ def residual(report: Report, p: Pictures, output: str, name: str) -> str:
 
 
 def follows(report: Report, p: Pictures, output: str, name: str) -> str:
-    """Held-out residual against what it follows: clouds and running medians, before and after."""
+    """Held-out residual against what it follows: clouds and running means, before and after."""
     axes: list[tuple[str, Array, str]] = []
     for d in report.location.depends_on:
         found = series.axis_of(p, d)
@@ -116,7 +121,7 @@ def follows(report: Report, p: Pictures, output: str, name: str) -> str:
             for tag, colour, e in _residuals(report, p, output):
                 _dots(ax, x[pick], e[pick] * factor, colour)
                 x_mid, e_mid = series.binned(x[rows], e[rows])
-                ax.plot(x_mid, e_mid * factor, "-", color=colour, lw=2, label=f"{tag}, median")
+                ax.plot(x_mid, e_mid * factor, "-", color=colour, lw=2, label=f"{tag}, mean")
             ax.axhline(0, color=INK, lw=0.6)
             ax.set_xlabel(label)
             ax.set_title(f"against {label.removesuffix(' (s)')}{strength}")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.report import DependsOn, Report
-from tools.mismatch.report.wording import percent, poorly_known, words
+from tools.mismatch.report.wording import label, percent, poorly_known, words
 
 
 @dataclass(frozen=True)
@@ -85,5 +85,6 @@ def _poorly_known(report: Report) -> list[Experiment]:
             continue
         name, share = max(wide.items(), key=lambda item: item[1])
         known = f"within {percent(share)}" if share < 1 else "in order of magnitude, not even in sign"
-        out.append(Experiment(effect.excitation, f"{words(p.name)}: {words(name)} is only known {known}"))
+        what = label(name, p.parameters[name].unit)
+        out.append(Experiment(effect.excitation, f"{words(p.name)}: {what} is only known {known}"))
     return out

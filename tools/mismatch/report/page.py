@@ -89,7 +89,8 @@ def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
         "summary": known.summary if known else "",
         "equation": svg.equation(p.equation),
         "parameters": [
-            (words(n), *wording.interval(v), "" if v.unit == "1" else v.unit) for n, v in p.parameters.items()
+            (wording.label(n, v.unit), *wording.interval(v), "" if v.unit == "1" else v.unit)
+            for n, v in p.parameters.items()
         ],
         "before": number(p.residual_rms_before * factor),
         "after": number(p.residual_rms_after * factor),

@@ -129,7 +129,14 @@ def axis_of(p: Pictures, d: DependsOn) -> tuple[str, Array] | None:
 
 
 def binned(x: Array, y: Array, bins: int = 24) -> tuple[Array, Array]:
-    """Median of ``y`` in bins of equal count along ``x``."""
+    """Mean of ``y`` in bins of equal count along ``x``. (A median would jump between the branches of a loop.)"""
     order = np.argsort(x, kind="stable")
     parts = [i for i in np.array_split(order, min(bins, max(2, x.size // 20))) if i.size]
-    return np.array([np.median(x[i]) for i in parts]), np.array([np.median(y[i]) for i in parts])
+    return np.array([np.mean(x[i]) for i in parts]), np.array([np.mean(y[i]) for i in parts])
+
+
+def limit(residuals: list[Array]) -> float | None:
+    """Half height of a residual's axis when a few samples (a start-up, a knock) would flatten all others; else None."""
+    usual = max(float(np.quantile(np.abs(e), 0.99)) for e in residuals)
+    largest = max(float(np.max(np.abs(e))) for e in residuals)
+    return 1.5 * usual if largest > 3 * usual > 0 else None

@@ -65,7 +65,7 @@ def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
     t.columns[3].justify = "left"
     for name, v in p.parameters.items():
         value, lo, hi = wording.interval(v)
-        t.add_row(Text(words(name)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
+        t.add_row(Text(wording.label(name, v.unit)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
     rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, unit)), ("source", p.source)]
     if p.note:
         rows.append(("place", f"{p.note}: this recording cannot tell"))
@@ -75,14 +75,13 @@ def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
 
 
 def _fit(report: Report) -> Table:
-    t = _table("output", "as given", "recalibrated", "with physics", "noise floor", "unit", "explained")
-    t.columns[5].justify = "left"
+    t = _table("output", "as given", "re-fitted", "with physics", "noise floor", "explained")
     f = report.fit
     for o, unit in f.unit.items():
         factor, shown = wording.scaled(f.recalibrated_rms[o], unit)
         figures = (f.base_rms[o] * factor, f.recalibrated_rms[o] * factor, f.fitted_rms[o] * factor)
         floor = f"{number(f.noise_floor_rms[o] * factor)} ({f.noise_method.get(o, '')})"
-        t.add_row(Text(o), *map(number, figures), floor, Text(shown), percent(wording.explained(f, o)))
+        t.add_row(Text(f"{o} ({shown})"), *map(number, figures), floor, percent(wording.explained(f, o)))
     return t
 
 
@@ -100,7 +99,9 @@ def _runners_up(report: Report) -> Table:
     t.columns[1].justify = t.columns[3].justify = "left"
     for a in report.alternatives:
         factor, unit = wording.scaled(a.residual_rms_after, report.fit.unit.get(a.output, ""))
-        t.add_row(words(a.name), Text(a.output), f"{number(a.residual_rms_after * factor)} {unit}", Text(a.why_not))
+        t.add_row(
+            words(a.name), Text(a.output), f"{number(a.residual_rms_after * factor)} {unit}", Text(words(a.why_not))
+        )
     return t
 
 

@@ -44,6 +44,12 @@ def words(name: str) -> str:
     return name.replace("_", " ")
 
 
+def label(name: str, unit: str) -> str:
+    """A parameter's name without the unit that stands beside it: 'time_constant_s' in s is 'time constant'."""
+    short = name[: -len(unit) - 1] if name.lower().endswith(f"_{unit.lower()}") else name
+    return words(short)
+
+
 def interval(p: ParameterValue) -> tuple[str, str, str]:
     """See ``interval_of``."""
     return interval_of(p.value, p.ci95)
