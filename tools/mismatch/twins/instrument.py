@@ -1,14 +1,137 @@
-"""The whole emulated bench as a twin: the bench's own program, run on the recorded hand motion."""
+"""The whole emulated bench as a twin: commands and handle motion in, DAQ channels and tip position out.
+
+Signals, each optional: inputs ``command_1..3`` (V, amplifier outputs asked for; 50 V where absent), ``path_x|y|z`` (m,
+where the tip would be with the manipulator at rest, world frame) and ``angle_x|y|z`` (rad, small, about the attitude
+in which the bench's hand holds the instrument); outputs ``volts_0..7`` (V at the DAQ) and ``tip_x|y|z`` (m). These are
+the names that ``micron export`` gives. The physics is the bench file's ``[emulation]`` table without its noise.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import CubicSpline
+
+from hal.bench import load_bench
+from hal.errors import BenchError
+from sim_devices.config import EmulationConfig
+from sim_devices.plant.hand import holding_frame
+from sim_devices.plant.instrument import Instrument
+from sim_devices.plant_factory import emulation_config
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin
+from tools.mismatch.units import convert, same_dimension
+
+Array = NDArray[np.float64]
+
+NODE_S = 1e-3
+NEUTRAL_V = 50.0
+MOTION = ("path_x", "path_y", "path_z", "angle_x", "angle_y", "angle_z")
+TIP = ("tip_x", "tip_y", "tip_z")
+ALL_OUTPUTS = (*(f"volts_{i}" for i in range(8)), *TIP)
+INPUTS = re.compile(r"command_[123]|path_[xyz]|angle_[xyz]")
+OUTPUTS = re.compile(r"volts_[0-7]|tip_[xyz]")
+
+
+class GivenHand:
+    """A handle that moves as recorded: cubic splines through the samples, so that derivatives are consistent."""
+
+    def __init__(self, frame: Array, t_s: Array, coordinates: Array) -> None:
+        self.frame = frame
+        self._spline = CubicSpline(t_s - t_s[0], coordinates, axis=0)
+        self._last_s = float(t_s[-1] - t_s[0])
+        self._node = 0
+
+    def _pose(self, first: int, n: int) -> Array:
+        t = np.minimum((first + np.arange(n)) * NODE_S, self._last_s)
+        return np.hstack([self._spline(t), self._spline(t, 1), self._spline(t, 2)])
+
+    def start(self, pose: Array, parts: Array) -> None:
+        """See ``sim_devices.plant.hand.Hand``."""
+        pose[:] = self._pose(0, 1)[0]
+        parts[:] = 0.0
+
+    def fill(self, pose: Array, parts: Array) -> None:
+        """See ``sim_devices.plant.hand.Hand``."""
+        pose[:] = self._pose(self._node + 1, len(pose))
+        parts[:] = 0.0
+        self._node += len(pose)
+
+
+def simulate_instrument(
+    config: EmulationConfig, inputs: Mapping[str, Array], outputs: Sequence[str] = ALL_OUTPUTS
+) -> dict[str, Array]:
+    """One noiseless run. ``inputs`` holds ``t`` (n,) s and any of the twin's inputs (n,); ``outputs`` (n,) return."""
+    t_s = inputs["t"]
+    n = len(t_s)
+    resting = np.zeros(n)
+    hand = GivenHand(holding_frame(config.hand), t_s, np.column_stack([inputs.get(k, resting) for k in MOTION]))
+    instrument = Instrument(config, config.seed, hand, unit=config.unit, quiet=True)
+    held = np.full(n, NEUTRAL_V)
+    commands = np.column_stack([inputs.get(f"command_{i}", held) for i in (1, 2, 3)]).tolist()
+    wants_volts = any(name.startswith("volts") for name in outputs)
+    volts = np.empty((n, 8))
+    sent = [float("nan")] * 3
+    times_ns = np.round((t_s - t_s[0]) * 1e9).astype(np.int64)
+    for k, t_ns in enumerate(times_ns.tolist()):
+        instrument.advance_to(t_ns)
+        if wants_volts:
+            volts[k] = instrument.analog_V
+        for channel, wanted in enumerate(commands[k]):
+            if wanted != sent[channel]:
+                instrument.set_demand_V(channel, wanted, t_ns)
+        sent = commands[k]
+    truth = instrument.truth()
+    tip_m = [np.interp(times_ns, truth["t_ns"], truth["tip_m"][:, axis]) for axis in range(3)]
+    everything = {f"volts_{i}": volts[:, i] for i in range(8)} | dict(zip(TIP, tip_m, strict=True))
+    return {name: everything[name] for name in outputs}
+
+
+def _si_unit(signal: str) -> str:
+    return {"command": "V", "volts": "V", "path": "m", "tip": "m", "angle": "rad"}[signal.split("_")[0]]
 
 
 def instrument_twin(recording: Recording) -> OpaqueTwin:
-    """The bench that ``[twin.parameters] bench`` names. Raises RecordingError while no bench runs as a twin."""
+    """The bench that ``[twin.parameters] bench`` names. RecordingError says which signal or file is wrong."""
     bench = recording.twin.parameters.get("bench")
     if not isinstance(bench, str):
         raise RecordingError(f"{recording.path}: [twin.parameters] bench must name the bench file, got {bench!r}")
-    raise RecordingError(f"{recording.path}: [twin] kind 'instrument' is not available in this build")
+    for signals, known, role in ((recording.inputs, INPUTS, "input"), (recording.outputs, OUTPUTS, "output")):
+        for signal in signals:
+            if not known.fullmatch(signal):
+                raise RecordingError(
+                    f"{recording.path}: the instrument twin has no {role} '{signal}'; "
+                    f"it knows {known.pattern.replace('|', ', ')}; give other channels the role 'context'"
+                )
+            if not same_dimension(recording.unit[signal], _si_unit(signal)):
+                raise RecordingError(
+                    f"{recording.path}: {role} '{signal}' is in {recording.unit[signal]}, not a unit of the dimension "
+                    f"of {_si_unit(signal)}"
+                )
+    try:
+        file = load_bench((recording.path.parent / bench).resolve())
+        config = emulation_config(file.description.model_dump())
+    except BenchError as error:
+        raise RecordingError(f"{recording.path}: [twin.parameters] bench: {error}") from error
+
+    def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        si = {k: x if k == "t" else convert(x, recording.unit[k], _si_unit(k)) for k, x in inputs.items()}
+        found = simulate_instrument(config, si, tuple(recording.outputs))
+        return {k: convert(x, _si_unit(k), recording.unit[k]) for k, x in found.items()}
+
+    return OpaqueTwin(
+        kind="instrument",
+        inputs=tuple(recording.inputs),
+        outputs=tuple(recording.outputs),
+        units=recording.unit,
+        call=call,
+        free=(),
+        given={"bench": bench},
+        parameters=(),
+        source=str(Path(bench)),
+    )
