@@ -91,6 +91,58 @@ def swap_pass(
     return fitted, changed
 
 
+def simplify_pass(
+    problem: Problem, base: Fit, fitted: Fit, pool: Sequence[Placed], *, tie: float, shape: float, most: int = 6
+) -> tuple[Fit, list[int]]:
+    """Each flexible effect put against simpler ones at its place, now that the others are in place.
+
+    A family with much freedom takes parts of a second effect while that is missing; once it is there, something
+    specific may do as well. ``pool``: simpler candidates by how promising they looked; ``tie`` and ``shape`` as in
+    ``select.Rule``.
+    """
+    changed: list[int] = []
+    start = misfits(problem, base)
+    for k in range(len(fitted.model.placed)):
+        placed = fitted.model.placed[k]
+        held = [p for j, p in enumerate(fitted.model.placed) if j != k]
+        mine = size(placed)
+        now = misfits(problem, fitted)
+        room = sum(max(now[o] - 1.0, 0.0) for o in placed.outputs)
+        taken = sum(max(start[o] - now[o], 0.0) for o in placed.outputs)
+        limit = tie * room + 0.02 + shape * taken
+        elsewhere = {p.effect.name for p in held}
+        order = sorted(enumerate(pool), key=lambda r: (r[1].effect.name not in elsewhere, size(r[1]), r[0]))
+        passed: list[tuple[int, float, int, Fit]] = []
+        tried = 0
+        for i, rival in order:
+            name = rival.effect.name
+            simpler = size(rival) < 0.6 * mine or (name in elsewhere and size(rival) <= mine)
+            fits_here = set(rival.outputs) == set(placed.outputs) and simpler
+            twice = any(p.effect.name == name and p.target == rival.target for p in held)
+            if not fits_here or name == placed.effect.name or twice:
+                continue
+            tried += 1
+            if tried > most:
+                break
+            with np.errstate(all="ignore"):
+                candidate = replaced(problem, fitted, k, rival)
+            after = misfits(problem, candidate)
+            left = sum(max(after[o] - 1.0, 0.0) for o in placed.outputs)
+            if candidate.ok and left <= limit:
+                passed.append((size(rival), left, i, candidate))
+        if passed:
+            fitted = _reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
+            changed.append(k)
+    return fitted, changed
+
+
+def size(placed: Placed) -> int:
+    """How many numbers an effect brings, events read off the data included."""
+    parts = placed.parts
+    events = sum(len(placed.settings.get(key, ())) for key in ("at", "shift", "times_s", "starts"))
+    return len(parts.nonlinear) + len(parts.weights) + events
+
+
 def _reordered(problem: Problem, fitted: Fit, k: int) -> Fit:
     order = list(fitted.model.placed)
     order.insert(k, order.pop())

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import pair_search, prune, swap_pass
+from tools.mismatch.engine.revise import pair_search, prune, simplify_pass, size, swap_pass
 from tools.mismatch.engine.score import block_energy, misfits, paired_t
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
@@ -59,7 +59,7 @@ def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
         return False
     if trial.placed.effect.claims is not None:
         p, share = trial.candidate.p_value, trial.candidate.share
-        return (p < rule.p_tested and share > 0.2) or (p < 1e-4 and share > 0.5 and c.z > rule.z and c.gain > 0.1)
+        return (p < rule.p_tested and share > 0.2) or (share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
     return c.z > rule.z and c.gain > rule.gain and c.excess_gain > rule.excess and c.improvement > rule.form * explained
@@ -126,17 +126,29 @@ def search(
         touched = set(best.placed.outputs)
         known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
     if len(steps) > 1:
-        current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, rule)
+        current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, first, rule)
     return Selection(base, current, tuple(steps), tuple(rivals), first)
 
 
 def second_thoughts(
-    problem: Problem, base: Fit, current: Fit, steps: list[Trial], rivals: list[tuple[Trial, ...]], rule: Rule
+    problem: Problem,
+    base: Fit,
+    current: Fit,
+    steps: list[Trial],
+    rivals: list[tuple[Trial, ...]],
+    first: tuple[Trial, ...],
+    rule: Rule,
 ) -> tuple[Fit, list[Trial], list[tuple[Trial, ...]]]:
     """Swaps, then pruning; the accepted trials follow."""
     taken = sum(misfits(problem, base).values()) - sum(misfits(problem, current).values())
     current, changed = swap_pass(problem, current, rivals, least=0.01 * taken)
-    for k in changed:
+    seen = sorted((t for t in first if t.placed.effect.claims is None), key=lambda t: (-t.candidate.share, t.label))
+    top = {
+        o: max((t.candidate.share for t in seen if o in t.placed.outputs), default=0.0) for o in problem.twin.outputs
+    }
+    pool = [t.placed for t in seen if t.candidate.share > 0.1 * min(top[o] for o in t.placed.outputs)]
+    current, simpler = simplify_pass(problem, base, current, pool, tie=rule.tie, shape=rule.shape)
+    for k in sorted({*changed, *simpler}):
         placed = current.model.placed[k]
         steps[k] = replace(steps[k], placed=placed, fitted=current, misfits=misfits(problem, current))
     current, dropped = prune(problem, current, z=rule.z, gain=rule.gain)
@@ -165,7 +177,22 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
     here = sorted((t for t in good if output in t.placed.outputs), key=lambda t: (t.misfits[output], t.label))
     best = here[0]
     near = [t for t in here if t is best or as_good(t, best, rule, output, now[output])]
-    return min(near, key=lambda t: (t.name not in named, complexity(t), -t.improvement, t.label))
+    return min(near, key=lambda t: (t.name not in named, complexity(t), rank(t.name), -t.improvement, t.label))
+
+
+ORDER = (
+    ("saturation", "dead_zone"),
+    ("coulomb_friction", "stribeck_friction"),
+    ("mains_interference", "vibration"),
+    ("dead_time", "clock_skew"),
+    ("dead_time", "channel_delay"),
+)
+"""Where two effects serve equally well with equal freedom, the first is the plainer statement."""
+
+
+def rank(name: str) -> int:
+    """Place among equals: 1 for the less plain of a pair."""
+    return int(any(name == second for _, second in ORDER))
 
 
 def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -> bool:
@@ -185,9 +212,7 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
 
 def complexity(trial: Trial) -> float:
     """How much freedom an effect has, per output that it serves; events read off the data count as parameters."""
-    settings = trial.placed.settings
-    events = sum(len(settings.get(k, ())) for k in ("at", "shift", "times_s", "starts"))
-    return (trial.parameters + events) / max(len(trial.placed.outputs), 1)
+    return size(trial.placed) / max(len(trial.placed.outputs), 1)
 
 
 def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:

@@ -80,7 +80,7 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
         now = {o: float(np.mean((r[rows] / problem.sigma(o)) ** 2)) for o, r in current.residual.items()}
         gone = max(0.5 * tops[o] * now[o] for o in candidate.placed.outputs)
         limit = (sum(now.values()) - gone) / len(now)
-        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=10, hopeless=limit)
+        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=20, hopeless=limit)
         comparison = compare(problem, current, fitted)
         value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
