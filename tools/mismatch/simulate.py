@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -290,8 +291,9 @@ class Model:
             for i, j in enumerate(js):
                 matrix[:, i] = s.columns[j][index]
             columns[o] = matrix
-        return Design(constant, columns, linear, self._penalty())
+        return Design(constant, columns, linear, self._penalty)
 
+    @cached_property
     def _penalty(self) -> Array:
         rows = self.smoothness()
         others = np.ones(len(self.parameters), np.bool_)
