@@ -15,6 +15,9 @@ from tools.mismatch.engine.trial import Progress, Trial, try_all
 from tools.mismatch.simulate import Model, Placed
 
 
+WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
+
+
 @dataclass(frozen=True)
 class Rule:
     """The margins of a decision; calibrated on null simulations (docs/mismatch-calibration.md).
@@ -102,7 +105,7 @@ def search(
         if not steps:
             first = tuple(trials)
         good = [t for t in trials if acceptable(t, rule, sum(max(start[o] - now[o], 0.0) for o in t.placed.outputs))]
-        if not good and not steps:
+        if not good and not steps and max(now.values()) > WORTH_A_PAIR:
             pair = pair_search(problem, current, trials, z=rule.z + 1, gain=rule.gain)
             if pair is None:
                 break
