@@ -59,7 +59,7 @@ class Distribution:
 class DurationHistogram:
     """Counts durations in ns. A negative one (a due time in the future) counts as zero."""
 
-    __slots__ = ("_counts", "max_ns", "max_tick", "min_ns", "n", "total_ns")
+    __slots__ = ("_counts", "_max_ns", "_min_ns", "_total_ns", "max_tick")
 
     def __init__(self) -> None:
         self._counts = array("q", bytes(8 * _N_BUCKETS))
@@ -69,11 +69,20 @@ class DurationHistogram:
         """Forget everything."""
         for i in range(_N_BUCKETS):
             self._counts[i] = 0
-        self.n = 0
-        self.total_ns = 0
-        self.min_ns = 0
-        self.max_ns = 0
+        self._total_ns = 0
+        self._min_ns = 1 << 63
+        self._max_ns = -1
         self.max_tick = -1
+
+    @property
+    def n(self) -> int:
+        """How many values were counted."""
+        return sum(self._counts)
+
+    @property
+    def max_ns(self) -> int:
+        """The largest value; 0 when nothing was counted."""
+        return max(0, self._max_ns)
 
     def add(self, value_ns: int, tick: int) -> None:
         """Count one value, seen at ``tick``."""
@@ -86,13 +95,12 @@ class DurationHistogram:
         else:
             index = _N_BUCKETS - 1
         self._counts[index] += 1
-        if value_ns > self.max_ns or self.n == 0:
-            self.max_ns = value_ns
+        self._total_ns += value_ns
+        if value_ns > self._max_ns:
+            self._max_ns = value_ns
             self.max_tick = tick
-        if value_ns < self.min_ns or self.n == 0:
-            self.min_ns = value_ns
-        self.n += 1
-        self.total_ns += value_ns
+        if value_ns < self._min_ns:
+            self._min_ns = value_ns
 
     def counts(self) -> np.ndarray:
         """A copy of the bucket counts, int64."""
@@ -100,32 +108,32 @@ class DurationHistogram:
 
     def quantile_ns(self, q: float) -> float:
         """The value below which a share ``q`` of the counted values lies; 0 when nothing was counted."""
-        if self.n == 0:
-            return 0.0
-        return self._quantile_ns(q, np.cumsum(self.counts()))
+        cumulated = np.cumsum(self.counts())
+        return self._quantile_ns(q, cumulated) if cumulated[-1] else 0.0
 
     def _quantile_ns(self, q: float, cumulated: np.ndarray) -> float:
-        rank = max(1, int(np.ceil(q * self.n)))
+        rank = max(1, int(np.ceil(q * int(cumulated[-1]))))
         index = int(np.searchsorted(cumulated, rank))
         below = int(cumulated[index - 1]) if index else 0
         lo_ns, width_ns = bucket_bounds_ns(index)
         share = (rank - below - 0.5) / (int(cumulated[index]) - below)
         value_ns = lo_ns + share * (width_ns - 1)
-        return min(max(value_ns, float(self.min_ns)), float(self.max_ns))
+        return min(max(value_ns, float(self._min_ns)), float(self._max_ns))
 
     def distribution(self) -> Distribution:
         """Percentiles and extremes; changes nothing."""
-        if self.n == 0:
-            return Distribution(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1)
         cumulated = np.cumsum(self.counts())
+        n = int(cumulated[-1])
+        if n == 0:
+            return Distribution(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1)
         p50, p99, p99_9 = (self._quantile_ns(q, cumulated) * 1e-3 for q in (0.5, 0.99, 0.999))
         return Distribution(
-            n=self.n,
-            min_us=self.min_ns * 1e-3,
-            mean_us=self.total_ns / self.n * 1e-3,
+            n=n,
+            min_us=self._min_ns * 1e-3,
+            mean_us=self._total_ns / n * 1e-3,
             p50_us=p50,
             p99_us=p99,
             p99_9_us=p99_9,
-            max_us=self.max_ns * 1e-3,
+            max_us=self._max_ns * 1e-3,
             max_tick=self.max_tick,
         )
