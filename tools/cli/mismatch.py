@@ -153,7 +153,7 @@ def _diagnose_folder(
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     from tools.mismatch import batch
-    from tools.mismatch.report.terminal import batch_table
+    from tools.mismatch.report.terminal import batch_report
 
     work = batch.jobs_for(batch.find(folder), out, held_out, seed)
     stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
@@ -167,7 +167,7 @@ def _diagnose_folder(
             rows.append(row)
             progress.update(bar, advance=1, description=row.name)
     rows.sort(key=lambda row: row.name)
-    (console() if json_file == "-" else data_console()).print(batch_table([row.cells for row in rows]))
+    (console() if json_file == "-" else data_console()).print(batch_report([row.cells for row in rows]))
     write_json(batch.to_json(folder, rows), json_file)
     bad = [row for row in rows if row.error]
     if bad:

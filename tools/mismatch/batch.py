@@ -7,7 +7,6 @@ of a linear algebra library only fight for the same core.
 from __future__ import annotations
 
 import importlib.util
-import os
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from tools.cli.common import InputError
 from tools.mismatch.recording import RecordingError
-from tools.mismatch.report.wording import number, words
+from tools.mismatch.report.wording import number, scaled, words
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -54,17 +53,17 @@ class Row:
             return {"name": self.name, "error": self.error}
         fit = self.report["fit"]
         worst = max(fit["unit"], key=lambda o: fit["recalibrated_rms"][o] / max(fit["noise_floor_rms"][o], 1e-300))
-        unit = fit["unit"][worst]
+        factor, unit = scaled(fit["recalibrated_rms"][worst], fit["unit"][worst])
         return {
             "name": self.name,
             "error": "",
             "verdict": self.report["verdict"],
             "physics": ", ".join(words(p["name"]) for p in self.report["physics"]),
-            "output": worst,
-            "recalibrated": f"{number(fit['recalibrated_rms'][worst])} {unit}",
-            "fitted": f"{number(fit['fitted_rms'][worst])} {unit}",
-            "noise": f"{number(fit['noise_floor_rms'][worst])} {unit}",
-            "seconds": f"{self.report['seconds']:.1f}",
+            "output": f"{worst} ({unit})",
+            "recalibrated": number(fit["recalibrated_rms"][worst] * factor),
+            "fitted": number(fit["fitted_rms"][worst] * factor),
+            "noise": number(fit["noise_floor_rms"][worst] * factor),
+            "seconds": f"{self.report['seconds']:.0f}",
         }
 
 
@@ -148,7 +147,8 @@ def run_here(jobs: Sequence[Job], processes: int, work: Work = diagnose_one) -> 
 def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) -> Iterator[Row]:
     """Rows as they finish, from the workers of a Dask cluster.
 
-    They need this package and the same file system. A recording whose worker is lost goes to another one.
+    They need this package and the same file system. A recording whose worker is lost goes to another one. Dask's
+    nanny starts workers with one thread for linear algebra (its ``pre-spawn-environ``).
     Raises InputError when the extra is missing or nobody answers at ``address``.
     """
     if importlib.util.find_spec("distributed") is None:
@@ -162,7 +162,6 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
             f"--dask {address}: no Dask scheduler answers there ({error}); start one or fix the address"
         ) from error
     with client, client.as_current():
-        client.run(_one_thread)
         futures = {
             client.submit(work, job, key=f"mismatch-{job.name}", retries=RETRIES, pure=False): job for job in jobs
         }
@@ -172,12 +171,6 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
                 yield future.result()
             else:
                 yield Row(job.name, str(job.path), error=f"lost on the cluster: {future.exception()}")
-
-
-def _one_thread() -> None:
-    """In a worker that has not imported numpy yet; the others were started by somebody who can set this."""
-    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
 
 
 def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:

@@ -187,15 +187,18 @@ def print_report(report: Report, console: Console) -> None:
     console.print(render(report))
 
 
-def batch_table(rows: Sequence[dict[str, str]]) -> Table:
-    """One line per recording of a folder; see ``batch.Row.cells``."""
-    t = _table("recording", "verdict", "physics", "output", "recalibrated", "with physics", "noise floor", "s", left=4)
+def batch_report(rows: Sequence[dict[str, str]]) -> RenderableType:
+    """One line per recording of a folder (see ``batch.Row.cells``), then those without a report and why."""
+    t = _table("recording", "verdict", "physics", "worst output", "re-fit", "fitted", "noise", "s", left=4)
+    t.columns[1].no_wrap = t.columns[3].no_wrap = True
+    failed: list[RenderableType] = []
     for row in rows:
-        name = Text(row["name"])
         if row["error"]:
-            t.add_row(name, Text("error", "red"), Text(row["error"]))
+            failed.append(Text.assemble((f"{row['name']}: ", "bold red"), row["error"]))
             continue
         verdict = Text(words(row["verdict"]), _COLOUR[row["verdict"]])
         rest = (Text(row[k]) for k in ("physics", "output", "recalibrated", "fitted", "noise", "seconds"))
-        t.add_row(name, verdict, *rest)
-    return t
+        t.add_row(Text(row["name"]), verdict, *rest)
+    if failed:
+        failed.insert(0, Text("\nWithout a report", style="bold underline"))
+    return Group(*([t] if t.row_count else []), *failed)
