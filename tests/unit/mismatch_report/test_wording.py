@@ -85,3 +85,10 @@ def test_before_and_after_share_a_unit():
 )
 def test_a_parameter_is_named_without_its_unit(name: str, unit: str, shown: str):
     assert wording.label(name, unit) == shown
+
+
+def test_a_residual_far_above_the_noise_is_said_whatever_the_verdict():
+    assert wording.cautions(missing_physics()) == ["displacement sits at its exact limits in 12 samples"]
+    left = replace(agrees().fit, fitted_rms={"displacement": 0.2})
+    assert wording.cautions(replace(agrees(), fit=left)) == ["what is left in displacement is 10 times the noise floor"]
+    assert wording.cautions(replace(agrees(), verdict="unexplained", fit=left)) == []

@@ -50,6 +50,7 @@ def html_page(report: Report) -> str:
         limits=_limits(report),
         experiments=next_experiments(report),
         split=_split(report),
+        cautions=wording.cautions(report),
         number=number,
         percent=percent,
         words=words,

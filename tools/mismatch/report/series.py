@@ -132,7 +132,7 @@ def binned(x: Array, y: Array, bins: int = 24) -> tuple[Array, Array]:
     """Mean of ``y`` in bins of equal count along ``x``. (A median would jump between the branches of a loop.)"""
     order = np.argsort(x, kind="stable")
     parts = [i for i in np.array_split(order, min(bins, max(2, x.size // 20))) if i.size]
-    return np.array([np.mean(x[i]) for i in parts]), np.array([np.mean(y[i]) for i in parts])
+    return np.array([float(x[i].mean()) for i in parts]), np.array([float(y[i].mean()) for i in parts])
 
 
 def limit(residuals: list[Array]) -> float | None:

@@ -129,7 +129,7 @@ def _checks(report: Report) -> Table:
         rows.append(
             ("memory", f"history helps beyond the present (p = {number(c.memory_p_value)}): a state is missing")
         )
-    rows += [("look at", m) for m in c.messages]
+    rows += [("look at", m) for m in wording.cautions(report)]
     return _pairs(rows)
 
 

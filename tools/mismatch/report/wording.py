@@ -14,6 +14,7 @@ VERDICTS: Mapping[str, str] = {
     "unexplained": "Unexplained",
 }
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
+MUCH = 1.5  # residual over noise floor that deserves a word whatever the verdict
 SHOWABLE = 1.05  # residual over noise floor below which nothing is left to be explained
 
 
@@ -115,6 +116,17 @@ def guilty_stages(report: Report) -> tuple[str, ...]:
     if report.verdict == "missing_physics":
         return found
     return tuple(dict.fromkeys((*found, report.location.stage))) if report.verdict == "unexplained" else ()
+
+
+def cautions(report: Report) -> list[str]:
+    """What to look at before believing the verdict: the checks' messages, and a residual that no verdict covers."""
+    out = list(report.checks.messages)
+    if report.verdict != "unexplained":
+        f = report.fit
+        for o, noise in f.noise_floor_rms.items():
+            if noise > 0 and f.fitted_rms[o] > MUCH * noise:
+                out.append(f"what is left in {o} is {number(f.fitted_rms[o] / noise)} times the noise floor")
+    return out
 
 
 def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:
