@@ -14,15 +14,34 @@ which keeps the rate about the vertical bounded.
 
 from __future__ import annotations
 
-from math import atan2, exp, pi, sqrt
+from math import asin, atan2, exp, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
+from firmware_py.sensing.attitude_params import (
+    ERROR_STATE_METHOD,
+    METHODS,
+    OBSERVER,
+    error_state_params,
+    quaternion_kalman_params,
+)
 from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.error_state import (
+    ERROR_STATE,
+    ERROR_STATE_STATE,
+    error_state_step,
+    start_errors,
+)
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
+from firmware_py.sensing.quaternion_kalman import (
+    QUATERNION_KALMAN,
+    QUATERNION_KALMAN_STATE,
+    quaternion_kalman_step,
+    start_quaternion_kalman,
+)
 from firmware_py.sensing.triad import triad
 
 # closer to the corner the low-pass would eat the observer's phase margin
@@ -35,6 +54,9 @@ ATTITUDE = np.dtype(
         ("lowpass_rad_s", "f8"),
         ("align_samples", "f8"),
         ("dt_s", "f8"),
+        ("method", "i8"),
+        ("error_state", ERROR_STATE),
+        ("quaternion_kalman", QUATERNION_KALMAN),
     ]
 )
 ATTITUDE_STATE = np.dtype(
@@ -50,6 +72,8 @@ ATTITUDE_STATE = np.dtype(
         ("aligned", "i8"),
         ("samples", "f8"),
         ("sums", "f8", (3, 3)),  # force, angular acceleration and field while aligning
+        ("error_state", ERROR_STATE_STATE),
+        ("quaternion_kalman", QUATERNION_KALMAN_STATE),
     ]
 )
 
@@ -63,6 +87,9 @@ def attitude_params(config: SensingConfig) -> Record:
         lowpass_rad_s=2.0 * pi * config.attitude_lowpass_hz,
         align_samples=max(1.0, round(config.align_s * config.tick_hz)),
         dt_s=1.0 / config.tick_hz,
+        method=METHODS[config.attitude_method],
+        error_state=error_state_params(config),
+        quaternion_kalman=quaternion_kalman_params(config),
     )
 
 
@@ -108,9 +135,49 @@ def align(
         # at rest on average, so the mean angular acceleration is bias
         state.bias[i] = state.sums[1, i] / state.samples
         state.previous[i] = motion[3 + i] - state.bias[i]
+    if params.method != OBSERVER:
+        begin_filter(state, params, state.field)
     state.aligned = 1
     state.time_s = state.samples * params.dt_s
     return True
+
+
+@kernel
+def begin_filter(state: Record, params: Record, field: NDArray[np.float64]) -> None:
+    """Start both Kalman filters from the aligned attitude; ``field`` (3,) body frame, summed over the alignment."""
+    c = state.matrix
+    up = c[2, 0] * field[0] + c[2, 1] * field[1] + c[2, 2] * field[2]
+    size = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
+    dip = asin(max(-1.0, min(1.0, -up / size))) if size > 0.0 else 0.0
+    start_errors(state, params.error_state, 0.0, dip)
+    start_quaternion_kalman(state, params.quaternion_kalman, 0.0)
+
+
+@kernel
+def step_attitude(
+    state: Record,
+    params: Record,
+    motion: NDArray[np.float64],
+    field: NDArray[np.float64],
+    fresh: bool,
+    steps: int,
+) -> None:
+    """One tick of the chosen method; arguments as ``propagate``.
+
+    A gyroscope drives the same filters: its samples' difference over dt stands in ``motion[3:6]``, with
+    ``lead`` = 1 and no bias of alpha.
+    """
+    if params.method == OBSERVER:
+        propagate(state, params, motion, field, fresh, steps)
+        return
+    dt = params.dt_s * steps
+    if fresh:
+        state.field[:] = field
+    state.time_s += dt
+    if params.method == ERROR_STATE_METHOD:
+        error_state_step(state, params.error_state, motion[:3], motion[3:6], field, fresh, dt)
+    else:
+        quaternion_kalman_step(state, params.quaternion_kalman, motion[:3], motion[3:6], state.field, dt)
 
 
 @kernel

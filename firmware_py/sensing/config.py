@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from math import pi
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,12 @@ class SensingConfig(BaseModel):
     magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
     magnetometer_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
+    attitude_method: Literal["observer", "error-state", "quaternion-kalman"] = "error-state"
+    hand_velocity_m_s: Positive = 1e-3  # rms, with its correlation time: error-state filter
+    hand_velocity_s: Positive = 1.0
+    hand_acceleration_m_s2: Positive = 0.05  # rms below the tremor band: quaternion filter
+    alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
+    heading_noise_rad: Positive = 0.01  # per square root of a second
     align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.3
     attitude_start_hz: Positive = 1.0
     attitude_hz: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.5)  # about the body axes

@@ -28,8 +28,8 @@ from firmware_py.sensing.attitude import (
     ATTITUDE_STATE,
     align,
     attitude_params,
-    propagate,
     restart,
+    step_attitude,
 )
 from firmware_py.sensing.calibration import (
     CALIBRATION,
@@ -128,7 +128,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
         status |= ALIGNING
         align(attitude, param.attitude, motion, field, fresh)
     else:
-        propagate(attitude, param.attitude, motion, field, fresh, steps)
+        step_attitude(attitude, param.attitude, motion, field, fresh, steps)
     tip = frame[TIP_ACCELERATION : TIP_ACCELERATION + 3]
     if status & ALIGNING:
         tip[:] = 0.0

@@ -8,9 +8,13 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from tools.cli import calibrate_axes
 from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json, write_text_atomic
 
 calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks from calibration recordings.")
+
+calibrate.command("accelerometer")(calibrate_axes.accelerometer)
+calibrate.command("magnetometer")(calibrate_axes.magnetometer)
 
 Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration file (TOML) that a bench can name.")]
 

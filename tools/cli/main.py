@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate, doctor, hands, mismatch, noise, recordings, replay, reproduce, run
+from tools.cli import calibrate, doctor, hands, mismatch, noise, placement, recordings, replay, reproduce, run
 
 app = typer.Typer(
     name="micron",
@@ -40,6 +40,7 @@ app.command("doctor")(doctor.doctor)
 app.command("hands")(hands.hands)
 app.command("reproduce")(reproduce.reproduce)
 app.command("noise")(noise.noise)
+app.command("placement")(placement.placement)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")

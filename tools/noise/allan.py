@@ -81,7 +81,7 @@ def allan_curve(signal: Array, rate_hz: float, factors: NDArray[np.int64] | None
     freedom = degrees_of_freedom(len(phase), factors, variance)
     deviation = np.sqrt(variance)
     return AllanCurve(
-        factors * dt_s,
+        (factors * dt_s).astype(np.float64),
         deviation,
         deviation * np.sqrt(freedom / chi2.ppf(0.975, freedom)),
         deviation * np.sqrt(freedom / chi2.ppf(0.025, freedom)),
@@ -134,7 +134,7 @@ def identify(curve: AllanCurve, shortest_s: float = 0.0) -> NoiseModel:
     """N, B, K, R by non-negative least squares on the relative error of the variance; averages shorter than
     ``shortest_s`` are left out (a filter or quantisation in front of the converter bends them).
 
-    Intervals: the fit repeated on ``REPEATS`` simulated recordings of the fitted model, as long as this one (neighbouring
+    Intervals: the fit repeated on ``REPEATS`` simulated recordings of the model, as long as this one (neighbouring
     octaves share their data, so that intervals from each point's own chi-square would be too narrow).
     """
     keep = (curve.tau_s >= shortest_s) & (curve.freedom >= 2.0)
@@ -184,6 +184,7 @@ def _luck(curve: AllanCurve, value: Array, tau: Array, freedom: Array, rng: np.r
 def _fit(terms: Array, variance: Array, freedom: Array) -> Array:
     """Two passes: weights from the data, then from the first fit, so that low points do not attract it."""
     weight = np.sqrt(freedom / 2.0) / variance
+    value = np.zeros(terms.shape[1])
     for _ in range(2):
         scale = np.linalg.norm(terms * weight[:, None], axis=0)
         solution, _ = nnls(terms * weight[:, None] / scale, variance * weight)

@@ -23,14 +23,21 @@ class Placement:
 _X, _Y, _Z = np.eye(3)
 
 
-def micron_004(d1: float = 0.026, d2: float = 0.013, d3: float = 0.130, turn_deg: float = 0.0) -> Placement:
-    """004 Fig. 8 with the missing d2 (ERRATA 131); ``turn_deg`` turns the in-plane axes of all packages about z."""
+def micron_004(d1: float = 0.026, d2: float = 0.013, d3: float = 0.130) -> Placement:
+    """004 Fig. 8 with the missing d2 (ERRATA 131)."""
     first, second, third = np.array([d1 - d2, -d2, 0.0]), np.array([-d2, d1 - d2, 0.0]), np.array([0.0, 0.0, d3])
-    turn = np.radians(turn_deg)
-    c, s = np.cos(turn), np.sin(turn)
-    x, y = np.array([c, s, 0.0]), np.array([-s, c, 0.0])
-    name = "Micron" if turn_deg == 0.0 else f"Micron, axes turned {turn_deg:g} deg"
-    return Placement(name, np.array([first, first, second, second, third, third]), np.array([x, _Z, y, _Z, x, y]))
+    return Placement(
+        "Micron", np.array([first, first, second, second, third, third]), np.array([_X, _Z, _Y, _Z, _X, _Y])
+    )
+
+
+def micron_004_turned() -> Placement:
+    """004 Fig. 8 with the in-plane axes of both back packages turned by 45 degrees, across the line between them.
+
+    All packages turned the same way would leave alpha_z unseen.
+    """
+    straight, across = micron_004(), (_X + _Y) / sqrt(2.0)
+    return Placement("Micron, axes turned 45 deg", straight.positions, np.array([across, _Z, across, _Z, _X, _Y]))
 
 
 def cube_004(d1: float = 0.026) -> Placement:

@@ -1,0 +1,119 @@
+"""From the sensors' noise and the hand to the covariances of the attitude filters."""
+
+from __future__ import annotations
+
+from math import radians
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.records import Record, new_record
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.error_state import ERROR_STATE
+from firmware_py.sensing.quaternion_kalman import QUATERNION_KALMAN
+
+OBSERVER, ERROR_STATE_METHOD, QUATERNION_KALMAN_METHOD = 0, 1, 2
+METHODS = {
+    "observer": OBSERVER,
+    "error-state": ERROR_STATE_METHOD,
+    "quaternion-kalman": QUATERNION_KALMAN_METHOD,
+}
+STANDARD_GRAVITY = 9.80665
+DRIFT_S = 100.0
+
+
+def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
+    """(6,) two-sided densities of (f, alpha) from the axes' noise: what a random walk grows by per second.
+
+    The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of ERRATA 21, 44.
+    """
+    sigma = np.array(config.noise_ug_per_rtHz) * 1e-6 * STANDARD_GRAVITY / np.sqrt(2.0)
+    solve = np.linalg.pinv(config.observation() / sigma[:, None]) / sigma
+    return np.sum((solve * sigma) ** 2, axis=1)
+
+
+def error_state_params(config: SensingConfig) -> Record:
+    """Numbers of the error-state filter (dtype ``ERROR_STATE``) driven by accelerometers."""
+    density = motion_densities(config)
+    return new_record(
+        ERROR_STATE,
+        turn_density=1e-12,
+        lead=0.5,
+        rate_density=density[3:],
+        bias_density=config.alpha_drift_rad_s2**2 / DRIFT_S,
+        force_density=float(density[:3].max()),
+        still_density=config.hand_velocity_m_s**2 * config.hand_velocity_s,
+        heading_density=config.heading_noise_rad**2,
+        held_density=0.01**2,
+        disturbance_rad=radians(0.3),
+        disturbance_s=3.0,
+        start_variance=np.array([0.01**2, 0.02**2, 0.02**2, 0.002**2]),
+        # the bias is the mean over the alignment, the hand's own angular acceleration included
+        start_bias_variance=density[3:] / config.align_s + 0.05**2,
+        field_tolerance=0.2,
+        dip_tolerance_rad=radians(15.0),
+        gravity=config.gravity_m_s2,
+    )
+
+
+def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
+    """The same filter for a consumer gyroscope, accelerometer and magnetometer on a moving person (BROAD).
+
+    A sample of such a gyroscope is the mean over the interval before it, so it turns the whole interval (``lead`` 1).
+    """
+    deg = radians(1.0)
+    return new_record(
+        ERROR_STATE,
+        turn_density=(0.003 * deg) ** 2,
+        lead=1.0,
+        turn_per_rate=1e-7,
+        rate_density=(0.01 * deg) ** 2,
+        force_density=0.01**2,
+        still_density=0.1**2,
+        rest_density=(0.03 * deg) ** 2,
+        heading_density=(7.0 * deg) ** 2,
+        disturbance_rad=0.5 * deg,
+        disturbance_s=3.0,
+        start_variance=np.array([deg**2, (2.0 * deg) ** 2, (0.5 * deg) ** 2, 0.1**2]),
+        field_tolerance=0.1,
+        dip_tolerance_rad=10.0 * deg,
+        rest_rate_rad_s=2.0 * deg,
+        rest_force_m_s2=0.5,
+        rest_s=1.5,
+        gravity=gravity_m_s2,
+    )
+
+
+def quaternion_kalman_params(config: SensingConfig) -> Record:
+    """Numbers of the quaternion filter (dtype ``QUATERNION_KALMAN``) driven by accelerometers."""
+    density = motion_densities(config)
+    return new_record(
+        QUATERNION_KALMAN,
+        turn_density=1e-12,
+        # no state for the bias of alpha here: its drift is rate drift
+        rate_density=density[3:] + config.alpha_drift_rad_s2**2,
+        lead=0.5,
+        up_density=(config.hand_acceleration_m_s2 / config.gravity_m_s2) ** 2,
+        field_density=config.heading_noise_rad**2,
+        start_variance=np.array([0.01**2, 0.02**2, 0.02**2]),
+        gravity=config.gravity_m_s2,
+        force_gate_m_s2=3.0,
+        field_gate=0.2,
+    )
+
+
+def gyroscope_quaternion_kalman(gravity_m_s2: float = 9.81) -> Record:
+    """The quaternion filter for a consumer gyroscope."""
+    deg = radians(1.0)
+    return new_record(
+        QUATERNION_KALMAN,
+        turn_density=(0.02 * deg) ** 2,
+        rate_density=(0.003 * deg) ** 2,
+        lead=1.0,
+        up_density=0.03**2,
+        field_density=deg**2,
+        start_variance=np.array([deg**2, (2.0 * deg) ** 2, (0.5 * deg) ** 2]),
+        gravity=gravity_m_s2,
+        force_gate_m_s2=1.0,
+        field_gate=0.15,
+    )

@@ -1,0 +1,342 @@
+"""Multiplicative error-state Kalman filter of attitude, rate and velocity; any source of the rate's change.
+
+The rate comes as angular acceleration alpha: solved from accelerometers, or the difference of a gyroscope's samples
+(the error of the rate is then the gyroscope's bias). Errors, world frame unless said: turn theta (3,), rate (3, body),
+bias of alpha (3, body), velocity (3,), heading of the magnetic disturbance m:
+
+    C = exp(theta) C^,  theta' = C d_omega,  d_omega' = -d_bias,  d_v' = theta x (C f),  m' = -m / T
+
+Gravity is not measured as a direction: the specific force is integrated to a velocity, and what is known is that a hand
+does not travel, so v = 0 with a noise density. Accelerations of the hand thereby average out before they turn the
+attitude, where a direct comparison of f with gravity would follow each of them.
+
+The magnetic field turns the heading only; its disturbance has a state of its own with time constant T. A field
+whose size or dip is off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
+Accelerometers without a magnetometer: the last field stays where it was in the body, which holds the heading on
+average and keeps the rate about the vertical bounded.
+Sequential scalar updates in Joseph form, each gated at ``gate`` standard deviations where that is said.
+"""
+
+from __future__ import annotations
+
+from math import atan2, exp, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record
+from firmware_py.sensing.quaternion import rotate_by, to_matrix
+
+ERRORS = 13
+TURN, RATE, BIAS, VELOCITY, DISTURBANCE = 0, 3, 6, 9, 12
+
+ERROR_STATE = np.dtype(
+    [
+        ("turn_density", "f8", (3,)),  # rad^2/s, body axes: white noise of the rate
+        ("lead", "f8"),  # where in the interval the rate is taken, in intervals: 1/2 its middle, 1 its end
+        ("turn_per_rate", "f8"),  # s: the same grows by this times the squared rate (scale errors of the source)
+        ("rate_density", "f8", (3,)),  # (rad/s)^2/s, body axes: white noise of alpha
+        ("bias_density", "f8", (3,)),  # (rad/s^2)^2/s
+        ("force_density", "f8"),  # (m/s)^2/s: white noise of the specific force
+        ("still_density", "f8"),  # (m/s)^2 s: how far the velocity of a hand is from zero
+        ("rest_density", "f8"),  # (rad/s)^2 s: how far the rate is from zero at rest; 0: rest is not looked for
+        ("heading_density", "f8"),  # rad^2 s of the magnetometer's heading
+        ("held_density", "f8"),  # rad^2 s of the heading held without a magnetometer; 0: not held
+        ("disturbance_rad", "f8"),  # rms of the slow part of its error
+        ("disturbance_s", "f8"),
+        ("start_variance", "f8", (4,)),  # of tilt, heading, rate, velocity
+        ("start_bias_variance", "f8", (3,)),
+        ("field_tolerance", "f8"),  # relative deviation of the field's size that is still used
+        ("dip_tolerance_rad", "f8"),
+        ("rest_rate_rad_s", "f8"),
+        ("rest_force_m_s2", "f8"),
+        ("rest_s", "f8"),
+        ("gravity", "f8"),
+    ]
+)
+ERROR_STATE_STATE = np.dtype(
+    [
+        ("covariance", "f8", (ERRORS, ERRORS)),
+        ("work", "f8", (ERRORS, ERRORS)),
+        ("velocity", "f8", (3,)),
+        ("disturbance", "f8"),
+        ("field_size", "f8"),
+        ("field_dip", "f8"),
+        ("field_wait_s", "f8"),  # since a field was last trusted
+        ("field_fresh_s", "f8"),  # since the last conversion
+        ("candidate_size", "f8"),
+        ("candidate_dip", "f8"),
+        ("candidate_s", "f8"),
+        ("slow_rate", "f8", (3,)),  # low-passed, for the detection of rest
+        ("slow_force", "f8", (3,)),
+        ("still_s", "f8"),
+        ("rejected", "i8"),  # magnetic fields that were not used
+    ]
+)
+FIELD_LEARN_S = 5.0
+FIELD_ACCEPT_S = 10.0
+"""A new field that stays this long is accepted as the environment."""
+REST_SMOOTHING_S = 0.5
+HELD_AFTER_S = 0.2
+
+
+@kernel
+def start_errors(state: Record, params: Record, field_size: float, field_dip: float) -> None:
+    """Covariance of a filter that has just been aligned."""
+    e = state.error_state
+    p = e.covariance
+    p[:, :] = 0.0
+    variances = params.start_variance
+    for i in range(3):
+        p[TURN + i, TURN + i] = variances[0] if i < 2 else variances[1]
+        p[RATE + i, RATE + i] = variances[2]
+        p[BIAS + i, BIAS + i] = params.start_bias_variance[i]
+        p[VELOCITY + i, VELOCITY + i] = variances[3]
+        e.velocity[i] = 0.0
+        e.slow_rate[i] = state.rate[i]
+        e.slow_force[i] = 0.0
+    p[DISTURBANCE, DISTURBANCE] = params.disturbance_rad**2
+    e.disturbance = 0.0
+    e.field_size = field_size
+    e.field_dip = field_dip
+    e.field_wait_s = 0.0
+    e.field_fresh_s = 0.0
+    e.candidate_size = 0.0
+    e.candidate_dip = 0.0
+    e.candidate_s = 0.0
+    e.still_s = 0.0
+    e.rejected = 0
+
+
+@kernel
+def propagate_errors(
+    e: Record,
+    params: Record,
+    c: NDArray[np.float64],
+    up: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    dt: float,
+) -> None:
+    """P <- F P F^T + Q over ``dt`` s; ``c`` = C_WB, ``up`` (3,) = C f. F is sparse, its products are written out."""
+    p, w = e.covariance, e.work
+    fade = exp(-dt / params.disturbance_s)
+    for j in range(ERRORS):
+        for i in range(3):
+            w[TURN + i, j] = p[TURN + i, j] + dt * (
+                c[i, 0] * p[RATE, j] + c[i, 1] * p[RATE + 1, j] + c[i, 2] * p[RATE + 2, j]
+            )
+            w[RATE + i, j] = p[RATE + i, j] - dt * p[BIAS + i, j]
+            w[BIAS + i, j] = p[BIAS + i, j]
+        x, y, z = p[0, j], p[1, j], p[2, j]
+        w[VELOCITY, j] = p[VELOCITY, j] + dt * (y * up[2] - z * up[1])
+        w[VELOCITY + 1, j] = p[VELOCITY + 1, j] + dt * (z * up[0] - x * up[2])
+        w[VELOCITY + 2, j] = p[VELOCITY + 2, j] + dt * (x * up[1] - y * up[0])
+        w[DISTURBANCE, j] = fade * p[DISTURBANCE, j]
+    for i in range(ERRORS):
+        for k in range(3):
+            p[i, TURN + k] = w[i, TURN + k] + dt * (
+                c[k, 0] * w[i, RATE] + c[k, 1] * w[i, RATE + 1] + c[k, 2] * w[i, RATE + 2]
+            )
+            p[i, RATE + k] = w[i, RATE + k] - dt * w[i, BIAS + k]
+            p[i, BIAS + k] = w[i, BIAS + k]
+        x, y, z = w[i, 0], w[i, 1], w[i, 2]
+        p[i, VELOCITY] = w[i, VELOCITY] + dt * (y * up[2] - z * up[1])
+        p[i, VELOCITY + 1] = w[i, VELOCITY + 1] + dt * (z * up[0] - x * up[2])
+        p[i, VELOCITY + 2] = w[i, VELOCITY + 2] + dt * (x * up[1] - y * up[0])
+        p[i, DISTURBANCE] = fade * w[i, DISTURBANCE]
+    spin = params.turn_per_rate * (rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    for i in range(3):
+        for k in range(3):
+            turned = 0.0
+            for n in range(3):
+                turned += c[i, n] * params.turn_density[n] * c[k, n]
+            p[TURN + i, TURN + k] += turned * dt
+        p[TURN + i, TURN + i] += spin * dt
+        p[RATE + i, RATE + i] += params.rate_density[i] * dt
+        p[BIAS + i, BIAS + i] += params.bias_density[i] * dt
+        p[VELOCITY + i, VELOCITY + i] += params.force_density * dt
+    p[DISTURBANCE, DISTURBANCE] += params.disturbance_rad**2 * (1.0 - fade * fade)
+
+
+@kernel
+def correct(
+    state: Record, first: int, second: int, residual: float, variance: float, gate: float, gain: NDArray[np.float64]
+) -> bool:
+    """One scalar measurement of error ``first`` (minus error ``second``, if >= 0); Joseph form.
+
+    ``gain`` (ERRORS,) gathers the correction, which the caller applies with ``apply_correction``. False when the
+    residual, what ``gain`` already explains taken off, is beyond ``gate`` standard deviations.
+    """
+    e = state.error_state
+    p = e.covariance
+    column = np.empty(ERRORS)
+    for i in range(ERRORS):
+        column[i] = p[i, first]
+        if second >= 0:
+            column[i] -= p[i, second]
+    innovation = column[first] + variance
+    rest = residual - gain[first]
+    if second >= 0:
+        innovation -= column[second]
+        rest += gain[second]
+    if rest * rest > gate * gate * innovation:
+        return False
+    for i in range(ERRORS):
+        column[i] /= innovation
+        gain[i] += column[i] * rest
+    # (I - k h) P (I - k h)^T + k r k^T with h P = innovation k^T: symmetric and positive by construction
+    for i in range(ERRORS):
+        for j in range(i + 1):
+            value = p[i, j] - innovation * column[i] * column[j]
+            p[i, j] = value
+            p[j, i] = value
+    return True
+
+
+@kernel
+def apply_correction(state: Record, x: NDArray[np.float64]) -> None:
+    """Fold the estimated errors ``x`` (ERRORS,) into the state and clear them."""
+    c = state.matrix
+    tx = c[0, 0] * x[0] + c[1, 0] * x[1] + c[2, 0] * x[2]
+    ty = c[0, 1] * x[0] + c[1, 1] * x[1] + c[2, 1] * x[2]
+    tz = c[0, 2] * x[0] + c[1, 2] * x[1] + c[2, 2] * x[2]
+    rotate_by(state.quaternion, tx, ty, tz)
+    to_matrix(state.quaternion, state.matrix)
+    e = state.error_state
+    for i in range(3):
+        state.rate[i] += x[RATE + i]
+        state.bias[i] += x[BIAS + i]
+        e.velocity[i] += x[VELOCITY + i]
+    e.disturbance += x[DISTURBANCE]
+    for i in range(ERRORS):
+        x[i] = 0.0
+
+
+@kernel
+def error_state_step(
+    state: Record,
+    params: Record,
+    force: NDArray[np.float64],
+    alpha: NDArray[np.float64],
+    field: NDArray[np.float64],
+    fresh: bool,
+    dt: float,
+) -> None:
+    """One step of ``dt`` s: ``force`` (3,) m/s^2 and ``alpha`` (3,) rad/s^2 in the body frame, ``field`` if ``fresh``.
+
+    Updates quaternion, matrix, rate and bias in ``state``.
+    """
+    e = state.error_state
+    c = state.matrix
+    turn = np.empty(3)
+    for i in range(3):
+        now = alpha[i] - state.bias[i]
+        before = state.rate[i]
+        state.rate[i] += 0.5 * (now + state.previous[i]) * dt
+        state.previous[i] = now
+        turn[i] = (before + params.lead * (state.rate[i] - before)) * dt  # mean rate of the interval: ERRATA 42
+    rotate_by(state.quaternion, turn[0], turn[1], turn[2])
+    to_matrix(state.quaternion, c)
+    up = np.empty(3)
+    for i in range(3):
+        up[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
+        e.velocity[i] += up[i] * dt
+    e.velocity[2] -= params.gravity * dt
+    propagate_errors(e, params, c, up, state.rate, dt)
+
+    x = np.zeros(ERRORS)
+    resting = params.rest_density > 0.0 and _resting(state, params, force, dt)
+    for i in range(3):
+        correct(state, VELOCITY + i, -1, -e.velocity[i], params.still_density / dt, 1e9, x)
+    if resting:
+        for i in range(3):
+            correct(state, RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9, x)
+    e.field_fresh_s += dt
+    e.field_wait_s += dt
+    if fresh:
+        _heading(state, params, field, x)
+        e.field_fresh_s = 0.0
+    elif params.held_density > 0.0 and e.field_fresh_s > HELD_AFTER_S:
+        b = state.field
+        north = c[0, 0] * b[0] + c[0, 1] * b[1] + c[0, 2] * b[2]
+        west = c[1, 0] * b[0] + c[1, 1] * b[1] + c[1, 2] * b[2]
+        correct(state, TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9, x)
+    apply_correction(state, x)
+
+
+@kernel
+def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArray[np.float64]) -> None:
+    """Correct the heading with a field that looks like the learned one."""
+    e = state.error_state
+    c = state.matrix
+    north = c[0, 0] * field[0] + c[0, 1] * field[1] + c[0, 2] * field[2]
+    west = c[1, 0] * field[0] + c[1, 1] * field[1] + c[1, 2] * field[2]
+    up = c[2, 0] * field[0] + c[2, 1] * field[1] + c[2, 2] * field[2]
+    level = sqrt(north * north + west * west)
+    size = sqrt(level * level + up * up)
+    if size == 0.0 or level < 0.02 * size:
+        return
+    dip = atan2(-up, level)
+    since = e.field_fresh_s
+    if e.field_size == 0.0:
+        e.field_size = size
+        e.field_dip = dip
+    known = (
+        abs(size - e.field_size) < params.field_tolerance * e.field_size
+        and abs(dip - e.field_dip) < params.dip_tolerance_rad
+    )
+    if known:
+        learn = min(1.0, since / FIELD_LEARN_S)
+        e.field_size += learn * (size - e.field_size)
+        e.field_dip += learn * (dip - e.field_dip)
+        e.field_wait_s = 0.0
+        e.candidate_s = 0.0
+        correct(
+            state, TURN + 2, DISTURBANCE, e.disturbance - atan2(west, north), params.heading_density / since, 1e9, x
+        )
+        return
+    e.rejected += 1
+    # a field that has been steady elsewhere for long is the new environment
+    alike = (
+        abs(size - e.candidate_size) < params.field_tolerance * size
+        and abs(dip - e.candidate_dip) < params.dip_tolerance_rad
+    )
+    if alike:
+        e.candidate_s += since
+        learn = min(1.0, since / FIELD_LEARN_S)
+        e.candidate_size += learn * (size - e.candidate_size)
+        e.candidate_dip += learn * (dip - e.candidate_dip)
+        if e.candidate_s > FIELD_ACCEPT_S:
+            e.field_size = e.candidate_size
+            e.field_dip = e.candidate_dip
+    else:
+        e.candidate_size = size
+        e.candidate_dip = dip
+        e.candidate_s = 0.0
+
+
+@kernel
+def _resting(state: Record, params: Record, force: NDArray[np.float64], dt: float) -> bool:
+    """Whether rate and force have stayed at their slow means for ``rest_s``."""
+    e = state.error_state
+    smoothing = min(1.0, dt / REST_SMOOTHING_S)
+    away_rate = 0.0
+    away_force = 0.0
+    for i in range(3):
+        d = state.rate[i] - e.slow_rate[i]
+        away_rate += d * d
+        e.slow_rate[i] += smoothing * d
+        d = force[i] - e.slow_force[i]
+        away_force += d * d
+        e.slow_force[i] += smoothing * d
+    turning = state.rate[0] ** 2 + state.rate[1] ** 2 + state.rate[2] ** 2
+    if (
+        away_rate > params.rest_rate_rad_s**2
+        or away_force > params.rest_force_m_s2**2
+        or turning > (3.0 * params.rest_rate_rad_s) ** 2
+    ):
+        e.still_s = 0.0
+    else:
+        e.still_s += dt
+    return e.still_s > params.rest_s

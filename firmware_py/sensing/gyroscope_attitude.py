@@ -1,0 +1,79 @@
+"""The attitude filters driven by a gyroscope: a whole recording in one compiled call."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record, new_record
+from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, begin_filter, restart, step_attitude
+from firmware_py.sensing.attitude_params import METHODS, gyroscope_error_state, gyroscope_quaternion_kalman
+from firmware_py.sensing.quaternion import from_matrix
+from firmware_py.sensing.triad import triad
+
+ALIGN_S = 0.1
+
+
+@kernel
+def run_kernel(
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    align: int,
+    params: Record,
+    state: Record,
+    out: NDArray[np.float64],
+) -> None:
+    """``out`` (n, 4) from rate rad/s, force m/s^2, field (any unit; a row of nan: no conversion), all (n, 3)."""
+    s, p = state[0], params[0]
+    restart(s)
+    motion = np.zeros(6)
+    sums = np.zeros((2, 3))
+    for k in range(align):
+        for i in range(3):
+            sums[0, i] += force[k, i]
+            if np.isfinite(field[k, 0]):
+                sums[1, i] += field[k, i]
+    triad(sums[0], sums[1], s.matrix)
+    from_matrix(s.matrix, s.quaternion)
+    for i in range(3):
+        s.field[i] = sums[1, i]
+        s.rate[i] = rate[0, i]
+    begin_filter(s, p, s.field)
+    for k in range(len(rate)):
+        for i in range(3):
+            motion[i] = force[k, i]
+            change = (rate[k, i] - rate[max(k - 1, 0), i]) / p.dt_s
+            motion[3 + i] = change
+            s.previous[i] = change
+        step_attitude(s, p, motion, field[k], np.isfinite(field[k, 0]), 1)
+        for i in range(4):
+            out[k, i] = s.quaternion[i]
+
+
+def gyroscope_attitude(
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    rate_hz: float,
+    method: Literal["error-state", "quaternion-kalman"] = "error-state",
+    gravity_m_s2: float = 9.81,
+) -> NDArray[np.float64]:
+    """(n, 4) quaternions, body to world (x magnetic north, z up), starting from TRIAD over the first 0.1 s."""
+    if not len(rate) == len(force) == len(field) or len(rate) < 2:
+        raise ValueError(f"rate, force and field have {len(rate)}, {len(force)} and {len(field)} rows")
+    params = new_record(
+        ATTITUDE,
+        dt_s=1.0 / rate_hz,
+        method=METHODS[method],
+        error_state=gyroscope_error_state(gravity_m_s2),
+        quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2),
+    )
+    out = np.empty((len(rate), 4))
+    w, f, b = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, field))
+    align = max(1, min(len(rate), round(ALIGN_S * rate_hz)))
+    run_kernel(w, f, b, align, params, np.zeros(1, ATTITUDE_STATE), out)
+    return out

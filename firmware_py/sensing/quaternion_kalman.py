@@ -1,0 +1,162 @@
+"""Augmented-state quaternion Kalman filter: x = [q, b], b the error of the rate (000 sec. 4.4, 001; ERRATA 36-48).
+
+The bias-corrected rate stands in the transition of q; F = [[Phi_Q, -T/2 Phi_Q Q~], [0, I]] carries P (ERRATA 38, 39).
+The measurement is TRIAD's quaternion with Shuster's covariance; that has rank three, so the same again along q
+itself is added (ERRATA 47). Joseph form, q normalised after each step, sign of the measurement nearest the state.
+Measurements while the specific force is not g, or the field not the learned one, are left out.
+"""
+
+from __future__ import annotations
+
+from math import sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.compiled import kernel
+from firmware_py.records import Record
+from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
+from firmware_py.sensing.triad import triad, triad_covariance
+
+QUATERNION_KALMAN = np.dtype(
+    [
+        ("turn_density", "f8", (3,)),  # rad^2/s, body axes: white noise of the rate
+        ("rate_density", "f8", (3,)),  # (rad/s)^2/s: random walk of its error (Xi_alpha for accelerometers, ERRATA 44)
+        ("lead", "f8"),
+        ("up_density", "f8"),  # rad^2 s of the direction of gravity, the hand's accelerations included
+        ("field_density", "f8"),  # rad^2 s of the direction of the field
+        ("start_variance", "f8", (3,)),  # of tilt, heading, rate
+        ("gravity", "f8"),
+        ("force_gate_m_s2", "f8"),
+        ("field_gate", "f8"),  # relative
+    ]
+)
+QUATERNION_KALMAN_STATE = np.dtype([("covariance", "f8", (7, 7)), ("field_size", "f8"), ("rejected", "i8")])
+
+
+@kernel
+def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
+    """``out`` (4, 3): Q~ with Q~ B = q x (0, B) (000 (4.13), ERRATA 37)."""
+    out[0, 0], out[0, 1], out[0, 2] = -q[1], -q[2], -q[3]
+    out[1, 0], out[1, 1], out[1, 2] = q[0], -q[3], q[2]
+    out[2, 0], out[2, 1], out[2, 2] = q[3], q[0], -q[1]
+    out[3, 0], out[3, 1], out[3, 2] = -q[2], q[1], q[0]
+
+
+@kernel
+def start_quaternion_kalman(state: Record, params: Record, field_size: float) -> None:
+    """Covariance after alignment."""
+    k = state.quaternion_kalman
+    q = np.empty((4, 3))
+    tilde(state.quaternion, q)
+    angles = np.zeros((3, 3))
+    for i in range(3):
+        angles[i, i] = params.start_variance[0] if i < 2 else params.start_variance[1]
+    body = state.matrix.T.copy() @ angles @ state.matrix.copy()
+    k.covariance[:, :] = 0.0
+    k.covariance[:4, :4] = 0.25 * q @ body @ q.T
+    for i in range(3):
+        k.covariance[4 + i, 4 + i] = params.start_variance[2]
+    k.field_size = field_size
+    k.rejected = 0
+
+
+@kernel
+def quaternion_kalman_step(
+    state: Record,
+    params: Record,
+    force: NDArray[np.float64],
+    alpha: NDArray[np.float64],
+    field: NDArray[np.float64],
+    dt: float,
+) -> None:
+    """One step of ``dt`` s; arguments as ``error_state_step``, ``field`` the last one known (body frame)."""
+    k = state.quaternion_kalman
+    turn = np.empty(3)
+    for i in range(3):
+        now = alpha[i] - state.bias[i]
+        before = state.rate[i]
+        state.rate[i] += 0.5 * (now + state.previous[i]) * dt
+        state.previous[i] = now
+        turn[i] = (before + params.lead * (state.rate[i] - before)) * dt
+    # --- prediction: columns of Phi_Q are the turned unit quaternions
+    f = np.eye(7)
+    unit = np.empty(4)
+    for j in range(4):
+        unit[:] = 0.0
+        unit[j] = 1.0
+        rotate_by(unit, turn[0], turn[1], turn[2])
+        if unit[j] < 0.0:  # rotate_by reports w >= 0; a column of Phi_Q keeps its sign
+            for i in range(4):
+                unit[i] = -unit[i]
+        for i in range(4):
+            f[i, j] = unit[i]
+    q = np.empty((4, 3))
+    tilde(state.quaternion, q)
+    f[:4, 4:] = -0.5 * dt * f[:4, :4].copy() @ q
+    carried = f[:4, :4].copy() @ state.quaternion.copy()
+    rotate_by(state.quaternion, turn[0], turn[1], turn[2])
+    tilde(state.quaternion, q)
+    p = f @ k.covariance @ f.T
+    if (
+        carried[0] * state.quaternion[0]
+        + carried[1] * state.quaternion[1]
+        + carried[2] * state.quaternion[2]
+        + carried[3] * state.quaternion[3]
+    ) < 0.0:
+        # -q is reported: what is correlated with q changes sign with it
+        p[:4, 4:] *= -1.0
+        p[4:, :4] *= -1.0
+    for n in range(3):
+        p[4 + n, 4 + n] += params.rate_density[n] * dt
+        for i in range(4):
+            for j in range(4):
+                p[i, j] += 0.25 * dt * q[i, n] * params.turn_density[n] * q[j, n]
+    # --- measurement
+    size = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    strength = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
+    if k.field_size == 0.0:
+        k.field_size = strength
+    known = abs(strength - k.field_size) <= params.field_gate * k.field_size
+    if abs(size - params.gravity) > params.force_gate_m_s2 or strength == 0.0 or not known:
+        k.rejected += 1
+        k.covariance[:, :] = p
+        to_matrix(state.quaternion, state.matrix)
+        return
+    found = triad(force, field, state.matrix)
+    z = np.empty(4)
+    from_matrix(state.matrix, z)
+    angles = np.empty((3, 3))
+    if found:
+        triad_covariance(force / size, field / strength, params.up_density / dt, params.field_density / dt, angles)
+        side = z[0] * state.quaternion[0] + z[1] * state.quaternion[1]
+        side += z[2] * state.quaternion[2] + z[3] * state.quaternion[3]
+        residual = np.empty(4)
+        for i in range(4):
+            residual[i] = (z[i] if side >= 0.0 else -z[i]) - state.quaternion[i]
+        v = 0.25 * q @ angles @ q.T
+        trace = v[0, 0] + v[1, 1] + v[2, 2] + v[3, 3]
+        for i in range(4):
+            for j in range(4):
+                v[i, j] += trace / 3.0 * state.quaternion[i] * state.quaternion[j]
+        gain = np.linalg.solve(p[:4, :4].copy() + v, p[:4, :].copy()).T
+        x = gain @ residual
+        keep = np.eye(7)
+        keep[:, :4] -= gain
+        p = keep @ p @ keep.T + gain @ v @ gain.T
+        norm = 0.0
+        for i in range(4):
+            state.quaternion[i] += x[i]
+            norm += state.quaternion[i] ** 2
+        norm = sqrt(norm)
+        if state.quaternion[0] < 0.0:
+            norm = -norm
+        for i in range(4):
+            state.quaternion[i] /= norm
+        if norm < 0.0:
+            p[:4, 4:] *= -1.0
+            p[4:, :4] *= -1.0
+        for i in range(3):
+            state.rate[i] -= x[4 + i]
+    k.covariance[:, :] = 0.5 * (p + p.T)
+    to_matrix(state.quaternion, state.matrix)

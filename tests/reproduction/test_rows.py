@@ -1,0 +1,83 @@
+"""Rows judge themselves; the tables of documents come out; files that are missing are said to be."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.cli.common import InputError
+from tools.reproduce import real_sensors
+from tools.reproduce.names import MODULES, expand
+from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
+from tools.reproduce.rows import Row, build
+from tools.reproduce.sensing_drift import rows as drift_rows
+from tools.reproduce.sensing_variance import placement_tables, table_2_4
+
+
+def row(published: float, ours: float, better: str, tolerance: float = 0.0) -> Row:
+    return Row("s", "q", "1", "c", published, ours, better, "exact", tolerance)  # type: ignore[arg-type]
+
+
+def test_meets_is_computed() -> None:
+    assert row(1.0, 1.004, "equal", 0.005).meets
+    assert not row(1.0, 1.006, "equal", 0.005).meets
+    assert row(1.0, 0.9, "lower").meets
+    assert not row(1.0, 1.1, "lower").meets
+    assert row(1.0, 1.1, "higher").meets
+    assert not row(1.0, 0.9, "higher").meets
+    assert not row(1.0, math.nan, "lower").meets
+
+
+def test_the_json_has_the_keys_of_the_contract() -> None:
+    table = build("sensing", [lambda: [row(1.0, 1.0, "equal")]]).as_dict()
+    assert {"format", "name", "seconds", "rows"} <= set(table)
+    keys = {"source", "quantity", "unit", "condition", "published", "ours", "better", "kind", "meets", "why"}
+    assert keys <= set(table["rows"][0])
+
+
+def test_names() -> None:
+    assert expand(["all"]) == list(MODULES)
+    with pytest.raises(InputError, match="no table"):
+        expand(["nothing"])
+
+
+def test_the_tables_of_004_and_the_drift_orders_come_out() -> None:
+    for found in (*placement_tables(), *drift_rows()):
+        assert found.meets, found
+
+
+def test_what_table_2_4_cannot_give_says_why() -> None:
+    for found in table_2_4():
+        assert found.meets or (found.kind == "not reproducible" and found.why), found
+
+
+def test_orientation_error_of_known_turns() -> None:
+    n = 50
+    identity = np.tile([1.0, 0.0, 0.0, 0.0], (n, 1))
+    heading = np.tile([np.cos(0.05), 0.0, 0.0, np.sin(0.05)], (n, 1))
+    tilt = np.tile([np.cos(0.02), np.sin(0.02), 0.0, 0.0], (n, 1))
+    counts = np.ones(n, dtype=bool)
+    np.testing.assert_allclose(rms_errors_deg(heading, identity, counts), np.degrees([0.1, 0.1, 0.0]), atol=1e-5)
+    np.testing.assert_allclose(rms_errors_deg(tilt, identity, counts), np.degrees([0.04, 0.0, 0.04]), atol=1e-5)
+    lost = identity.copy()
+    lost[::2] = np.nan
+    assert rms_errors_deg(heading, lost, counts)[0] == pytest.approx(np.degrees(0.1))
+    # the body's x axis to north is y of east-north-up
+    np.testing.assert_allclose(east_north_up(identity)[0], [np.sqrt(0.5), 0, 0, np.sqrt(0.5)])
+
+
+def test_recordings_that_are_not_there_are_left_out(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("MICRON_DATA", str(tmp_path))
+    table = real_sensors.table()
+    assert table.rows == ()
+    assert len(table.notes) == len(real_sensors.SETS)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not real_sensors.data_folder().is_dir(), reason="the shared recordings are not here")
+def test_broad_stays_below_its_peers() -> None:
+    for found in real_sensors.broad():
+        assert found.meets, found

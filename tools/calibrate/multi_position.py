@@ -1,0 +1,137 @@
+"""Calibration of a three-axis accelerometer from poses at unknown angles (Tedaldi, Pretto, Menegatti, ICRA 2014).
+
+a = T K (raw - b), T = [[1, -t0, t1], [0, 1, -t2], [0, 0, 1]], and |a| = g in every still pose. Nine parameters, so nine
+poses at least; x keeps its direction.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.stats import t as student
+
+from tools.calibrate.still import FACTORS, find_poses, quiet_level
+from tools.cli.common import InputError
+
+Array = NDArray[np.float64]
+NAMES = ("misalignment_0", "misalignment_1", "misalignment_2", "scale_x", "scale_y", "scale_z")
+NAMES += ("bias_x", "bias_y", "bias_z")
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """``value`` with its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class MultiPosition:
+    """Scale in m/s^2 per count, bias in counts, misalignment in rad; residual of |a| over the poses, m/s^2."""
+
+    parameters: dict[str, Estimate]
+    mean_m_s2: float
+    residual_m_s2: float
+    condition: float
+    poses: int
+    missing: tuple[str, ...]
+    threshold: float
+
+    def values(self) -> Array:
+        return np.array([self.parameters[name].value for name in NAMES])
+
+    def apply(self, raw: Array) -> Array:
+        """(n, 3) m/s^2 from (n, 3) counts."""
+        return compensate(self.values(), raw)
+
+
+def compensate(p: Array, raw: Array) -> Array:
+    """(n, 3) m/s^2; ``p`` (9,) in the order of ``NAMES``."""
+    turn = np.array([[1.0, -p[0], p[1]], [0.0, 1.0, -p[2]], [0.0, 0.0, 1.0]])
+    return ((raw - p[6:]) * p[3:6]) @ turn.T
+
+
+def missing_poses(directions: Array) -> tuple[str, ...]:
+    """Which of the six axis directions no pose (unit rows, body frame) comes within 35 degrees of."""
+    missing = []
+    for axis, name in enumerate("xyz"):
+        for sign, word in ((1.0, "up"), (-1.0, "down")):
+            if not np.any(sign * directions[:, axis] > np.cos(np.radians(35.0))):
+                missing.append(f"{name} {word}")
+    return tuple(missing)
+
+
+def fit_poses(
+    mean: Array, weight: Array, gravity: float, threshold: float = 0.0, pose_noise: float = 0.0
+) -> MultiPosition:
+    """Fit the nine parameters to still means (n, 3); ``weight`` (n,) relative. ``InputError`` for too few poses.
+
+    ``pose_noise`` (counts) is the error of one mean: with hardly more poses than parameters the residual says
+    nothing of it, and intervals made from the residual alone would be far too narrow.
+    """
+    n = len(mean)
+    if n < 9:
+        raise InputError(f"{n} still poses: nine parameters need nine, and better eighteen; hold each for a second")
+    offset = 0.5 * (mean.max(axis=0) + mean.min(axis=0))
+    reach = 0.5 * (mean.max(axis=0) - mean.min(axis=0))
+    if np.any(reach <= 0.0):
+        raise InputError(f"axis {'xyz'[int(np.argmin(reach))]} never changes over {n} poses; turn it up and down")
+    # parameters of order one: scale and bias relative to a first sphere
+    unit = np.concatenate([np.ones(3), gravity / reach, reach])
+    base = np.concatenate([np.zeros(3), gravity / reach, offset])
+    root = np.sqrt(weight / weight.mean())
+
+    def residual(x: Array) -> Array:
+        return root * (np.linalg.norm(compensate(base + x * unit, mean), axis=1) - gravity)
+
+    fit = least_squares(residual, np.zeros(9), x_scale="jac", method="lm", max_nfev=2000)
+    values = base + fit.x * unit
+    condition = float(np.linalg.cond(fit.jac / np.linalg.norm(fit.jac, axis=0)))
+    freedom = max(1, n - 9)
+    sigma2 = max(float(fit.fun @ fit.fun) / freedom, (pose_noise * gravity / float(np.median(reach))) ** 2)
+    deviation = unit * np.sqrt(np.maximum(np.diag(sigma2 * np.linalg.pinv(fit.jac.T @ fit.jac)), 0.0))
+    reach95 = float(student.ppf(0.975, freedom)) * deviation
+    magnitude = np.linalg.norm(compensate(values, mean), axis=1)
+    directions = compensate(values, mean) / magnitude[:, None]
+    return MultiPosition(
+        {
+            name: Estimate(float(v), float(v - r), float(v + r))
+            for name, v, r in zip(NAMES, values, reach95, strict=True)
+        },
+        float(magnitude.mean()),
+        float(np.sqrt(np.mean((magnitude - gravity) ** 2))),
+        condition,
+        n,
+        missing_poses(directions),
+        threshold,
+    )
+
+
+def identify_poses(raw: Array, rate_hz: float, gravity: float, shortest_s: float = 0.5) -> MultiPosition:
+    """Find the still poses of a log (n, 3) and fit; of several thresholds the one with the least residual that keeps
+    at least three quarters of the most poses found (Tedaldi sec. IV-B chooses by residual too)."""
+    window = max(5, round(0.5 * rate_hz))
+    level = quiet_level(raw, window)
+    if level <= 0.0:
+        raise InputError("the log does not change at all: is it the right column?")
+    found = [find_poses(raw, window, factor * level, max(3, round(shortest_s * rate_hz))) for factor in FACTORS]
+    most = max(len(poses.mean) for poses in found)
+    fits = [
+        fit_poses(
+            poses.mean,
+            np.minimum(poses.samples, 4.0 * window).astype(np.float64),
+            gravity,
+            poses.threshold,
+            pose_noise=level / np.sqrt(3.0 * np.median(poses.samples)),
+        )
+        for poses in found
+        if len(poses.mean) >= max(9, 0.75 * most)
+    ]
+    if not fits:
+        raise InputError(f"at most {most} still poses of {shortest_s:g} s were found; nine are needed")
+    return min(fits, key=lambda fit: fit.residual_m_s2 * np.sqrt(fit.poses / max(1, fit.poses - 9)))

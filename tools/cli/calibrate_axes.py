@@ -1,0 +1,152 @@
+"""``micron calibrate accelerometer`` and ``magnetometer``: three-axis sensors from logs without a stage."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from tools.cli.common import (
+    InputError,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    data_console,
+    write_json,
+    write_text_atomic,
+)
+
+STANDARD_GRAVITY = 9.80665
+
+
+class Method(StrEnum):
+    """How the log was taken."""
+
+    POSES = "poses"
+    TURN = "turn"
+    FALL = "fall"
+    FLAT = "flat"
+
+
+class OnDrift(StrEnum):
+    """What to do when the sensor still warms up."""
+
+    REFUSE = "refuse"
+    FIT = "fit"
+
+
+Columns = Annotated[str, typer.Option(help="The three columns, with commas.")]
+
+
+def _three(columns: str) -> tuple[str, str, str]:
+    names = tuple(name.strip() for name in columns.split(","))
+    if len(names) != 3:
+        raise InputError(f"--columns {columns}: three names are needed")
+    return names  # pyright: ignore[reportReturnType]
+
+
+def _print(title: str, parameters: dict, notes: list[str]) -> None:
+    table = Table(title=title, title_justify="left")
+    for heading in ("parameter", "value", "95 % interval"):
+        table.add_column(heading, justify="left" if heading == "parameter" else "right")
+    for name, e in parameters.items():
+        table.add_row(name, f"{e.value:.6g}", f"{e.low:.6g} .. {e.high:.6g}")
+    data_console().print(table)
+    for note in notes:
+        data_console().print(note)
+
+
+def accelerometer(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .npz with three columns.")],
+    method: Annotated[Method, typer.Option(help="Still poses at unknown angles, or a quick method of 002.")] = (
+        Method.POSES
+    ),
+    columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
+    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = STANDARD_GRAVITY,
+    rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
+    counts_per_g: Annotated[float, typer.Option(min=1e-12, help="Nominal, for fall and flat.")] = 16384.0,
+    up: Annotated[str, typer.Option(help="Axis that points up in a flat log.")] = "z",
+    drift: Annotated[OnDrift, typer.Option(help="When the sensor still warms up at the first rest.")] = OnDrift.REFUSE,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Bias, scale and misalignment of a three-axis accelerometer, with intervals, condition and missing poses.
+
+    Example: micron calibrate accelerometer log.npz --gravity 9.81744
+    """
+    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.logs import load_log
+    from tools.calibrate.multi_position import identify_poses
+    from tools.calibrate.quick import flat, free_fall, turn
+    from tools.calibrate.still import remove_drift
+
+    with clear_errors():
+        check_writable(json_file, out)
+        log = load_log(recording, rate_hz)
+        raw, rate = log.matrix(_three(columns)), log.need_rate()
+        raw, warm = remove_drift(raw, rate, allowed=drift is OnDrift.FIT)
+        notes = [warm.text()]
+        if method is Method.POSES:
+            result = identify_poses(raw, rate, gravity)
+            notes.append(
+                f"{result.poses} poses, |a| {result.mean_m_s2:.4f} m/s^2, "
+                f"residual rms {result.residual_m_s2:.5f} m/s^2, condition {result.condition:.1f}"
+            )
+        elif method is Method.TURN:
+            result = turn(raw)
+        elif method is Method.FALL:
+            result = free_fall(raw, rate, counts_per_g)
+        else:
+            result = flat(raw, counts_per_g, up)
+        notes.append("missing: " + (", ".join(result.missing) or "nothing"))
+        _print(f"accelerometer, {method.value}", result.parameters, notes)
+        if out is not None:
+            values = {name: e.value for name, e in result.parameters.items()}
+            write_text_atomic(
+                out,
+                calibration_toml(
+                    "accelerometer", f"micron calibrate accelerometer {recording}", {"accelerometer": values}
+                ),
+            )
+        write_json({"format": 1, "method": method.value, **asdict(result), "warm_up": asdict(warm)}, json_file)
+
+
+def magnetometer(
+    recording: Annotated[
+        Path, typer.Argument(metavar="RECORDING", help="Folder or .npz, turned through all directions.")
+    ],
+    columns: Columns = "mag_x_raw,mag_y_raw,mag_z_raw",
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1.
+
+    Example: micron calibrate magnetometer turned.npz
+    """
+    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.ellipsoid import fit_ellipsoid
+    from tools.calibrate.logs import load_log
+
+    with clear_errors():
+        check_writable(json_file, out)
+        result = fit_ellipsoid(load_log(recording, 1.0).matrix(_three(columns)))
+        _print(
+            "magnetometer",
+            result.intervals,
+            [
+                f"norm {result.norm_mean:.4f} +/- {result.norm_spread:.4f} over {result.samples} samples, "
+                f"{result.outliers} outliers ({result.kept_spread:.4f} without), condition {result.condition:.1f}",
+                "missing: " + (", ".join(result.missing) or "nothing"),
+            ],
+        )
+        if out is not None:
+            table = {"matrix": result.matrix.tolist(), "bias": result.bias.tolist()}
+            write_text_atomic(
+                out,
+                calibration_toml("magnetometer", f"micron calibrate magnetometer {recording}", {"magnetometer": table}),
+            )
+        write_json({"format": 1, **asdict(result)}, json_file)

@@ -1,0 +1,77 @@
+"""The space that an instrument leaves for accelerometers: boxes, and packages that must each lie in one of them."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from tools.cli.common import InputError
+
+Vector = tuple[float, float, float]
+
+
+class Box(BaseModel):
+    """A box in the body frame, mm; a side of length zero makes it a plate, a line or a point."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    low_mm: Vector
+    high_mm: Vector
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Box:
+        if any(a > b for a, b in zip(self.low_mm, self.high_mm, strict=True)):
+            raise ValueError("low_mm is above high_mm")
+        return self
+
+
+class Space(BaseModel):
+    """``SPACE.toml``. ``packages`` of ``axes_per_package`` axes each; a dual-axis package's axes are orthogonal."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    format: Literal[1]
+    title: str = "accelerometers"
+    box: tuple[Box, ...] = Field(min_length=1)
+    packages: Annotated[int, Field(ge=1, le=12)] = 3
+    axes_per_package: Annotated[int, Field(ge=1, le=3)] = 2
+    noise_m_s2: Annotated[float, Field(gt=0.0)] = 0.010
+    tip_mm: Vector = (0.0, 0.0, 155.0)
+    least: Literal["angular", "tip"] = "angular"
+    largest_force_noise_m_s2: Annotated[float, Field(gt=0.0)] = 0.05
+    """rms of the specific force at the tip: keeps all six degrees of freedom observable."""
+
+    @model_validator(mode="after")
+    def _enough(self) -> Space:
+        if self.packages * self.axes_per_package < 6:
+            raise ValueError(f"{self.packages * self.axes_per_package} axes: six degrees of freedom need six")
+        return self
+
+
+def load_space(path: Path) -> Space:
+    """Read and check; ``InputError`` names the key."""
+    try:
+        return Space.model_validate(tomllib.loads(path.read_text()))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: {error}") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise InputError(f"{path}: {'.'.join(str(v) for v in first['loc'])}: {first['msg']}") from error
+
+
+def space_004(packages: int = 3, axes_per_package: int = 2) -> Space:
+    """The space of 004 Fig. 8: a 26 mm square at the back end, the tool axis up to 130 mm (ERRATA 131)."""
+    return Space(
+        format=1,
+        title="004, Fig. 8",
+        box=(
+            Box(name="back", low_mm=(-13.0, -13.0, 0.0), high_mm=(13.0, 13.0, 0.0)),
+            Box(name="handle", low_mm=(0.0, 0.0, 0.0), high_mm=(0.0, 0.0, 130.0)),
+        ),
+        packages=packages,
+        axes_per_package=axes_per_package,
+    )
