@@ -67,8 +67,8 @@ def zoom(p: Pictures, output: str) -> Span:
     crossings = int(np.sum(np.diff(np.signbit(y - np.median(y))) != 0))
     cycle = 2 * (b - a) / max(crossings, 2)
     length = int(min(b - a, max(6 * cycle, 120, (b - a) // 4)))
-    energy = np.convolve(residual[a:b] ** 2, np.ones(length), "valid")
-    start = a + int(np.argmax(energy))
+    total = np.concatenate([[0.0], np.cumsum(residual[a:b] ** 2)])
+    start = a + int(np.argmax(total[length:] - total[:-length]))
     return start, start + length
 
 

@@ -3,6 +3,7 @@
 The engine sees an ordinary twin with more base parameters, so that effects that are known already are re-fitted
 like a gain is (verdict ``recalibrate``) and are not found a second time. The weights of an effect that is made of
 many elements (hysteresis, creep) are re-fitted by one common factor: a new recording need not excite each of them.
+Additions from outside (hum, warm-up) keep free weights: their phase and level belong to the recording.
 """
 
 from __future__ import annotations
@@ -142,7 +143,12 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
     banks = [model.slices(k)[1] for k in range(len(model.placed))]
     # a step that suits the size that the weights have; their unit says nothing about it
     step = {j: 0.02 * float(np.max(np.abs(theta[w]))) for w in banks for j in range(w.start, w.stop)}
-    common = {j: w.start for w in banks if w.stop - w.start > MOST_FREE for j in range(w.start, w.stop)}
+    common = {
+        j: w.start
+        for w, placed in zip(banks, model.placed, strict=True)
+        if placed.effect.driven and w.stop - w.start > MOST_FREE
+        for j in range(w.start, w.stop)
+    }
     for j, f in enumerate(model.parameters):
         first = common.get(j)
         factor.append(first is not None)
