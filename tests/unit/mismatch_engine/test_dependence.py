@@ -1,4 +1,4 @@
-"""Dependence tests: right false-alarm rate on correlated noise, power on nonlinear relations, memory told from function."""
+"""Dependence: right false-alarm rate on correlated noise, power on nonlinear relations, memory or function."""
 
 import numpy as np
 import pytest

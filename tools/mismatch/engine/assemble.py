@@ -251,14 +251,15 @@ def assemble(
             ) not in seen:
                 seen.add((d.signal, d.feature))
                 depends.append(DependsOn(d.signal, d.feature, d.strength, d.p_value, d.memory))
-    if verdict != "unexplained":
+    if verdict == "missing_physics":
         depends.sort(key=lambda d: -d.strength)
+        depends = led_by_physics(problem, base, fitted, depends)
     span = windows(problem, looked, guilty) if guilty else []
-    stage = (
-        physics[0].stage
-        if physics and verdict == "missing_physics"
-        else (guilty and guess_stage(twin.chain, depends)) or ""
-    )
+    stage = ""
+    if physics and verdict == "missing_physics":
+        stage = physics[0].stage
+    elif guilty:
+        stage = guess_stage(twin.chain, depends)
     noise_filters = {o: fit_whitener(fitted.residual[o], stretches=problem.held_spans) for o in twin.outputs}
     screened = {
         (t.name, t.placed.effect.kind, t.placed.site, t.placed.target): (t.placed, t.candidate.starts)
@@ -330,6 +331,26 @@ def assemble(
             {s: x[problem.index] for s, x in rec.signals.items()},
         ),
     )
+
+
+def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[DependsOn]) -> list[DependsOn]:
+    """What the first named effect follows by its nature comes first: the context signal that it needs, or time for what
+    comes from outside. Its strength is the share of the residual that the effects took.
+    """
+    first = fitted.model.placed[0]
+    effect = first.effect
+    context = [s for s in effect.needs if s in problem.recording.context]
+    if not context and effect.driven:
+        return list(depends)
+    o = first.outputs[0]
+    share = 1 - compare_ratio(problem, fitted, o) / max(compare_ratio(problem, base, o), 1e-12)
+    if context:
+        found = [d for d in depends if d.signal == context[0]]
+        lead = found[0] if found else DependsOn(context[0], "value", max(share, 0.0))
+    else:
+        found = [d for d in depends if d.signal == "time"]
+        lead = found[0] if found else DependsOn("time", "time itself", max(share, 0.0))
+    return [lead, *(d for d in depends if d is not lead)]
 
 
 def guess_stage(chain: Sequence[str], depends: Sequence[DependsOn]) -> str:

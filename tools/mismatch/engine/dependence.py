@@ -1,7 +1,7 @@
 """Does a residual follow a signal? Curves regressed with coloured errors, each test honest about autocorrelation.
 
-Residual and curve pass the same whitening filter (generalised least squares; Cochrane and Orcutt, JASA 44, 1949), so the
-F statistic counts independent innovations and not the samples of a slow wander. The filter is estimated on the
+Residual and curve pass the same whitening filter (generalised least squares; Cochrane and Orcutt, JASA 44, 1949):
+the F statistic counts independent innovations and not the samples of a slow wander. The filter is estimated on the
 residual as it is, which books part of a true dependence as colour: conservative, never the other way.
 """
 

@@ -273,7 +273,7 @@ def fit(
         best = [t[2] for t in tried[:2]]
         if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
-        kept = max(1.0, projected.usual_count)
+        kept = max(1.0, _Projected(problem, model, best[0], 3 * coarse).usual_count)
         give_up = tried[0][0] / kept > hopeless
     else:
         best = starts[:1]

@@ -1,4 +1,4 @@
-"""What this recording cannot tell: effects that look alike in it, effects it cannot show, the smallest it would name."""
+"""What a recording cannot tell: effects that look alike, effects it cannot show, the smallest it would name."""
 
 from __future__ import annotations
 
@@ -137,7 +137,8 @@ def detection(
     q: dict[str, Array] = {}
     for o in problem.twin.outputs:
         columns = base_design.columns[o]
-        q[o] = np.linalg.pinv(columns[rows], rcond=1e-9) if columns.shape[1] else np.zeros((0, rows.size))
+        inverse = np.linalg.pinv(columns[rows], rcond=1e-9) if columns.shape[1] else np.zeros((0, rows.size))
+        q[o] = np.asarray(inverse, np.float64)
     for effect in effects:
         best: dict[str, float] = {}
         tried = False

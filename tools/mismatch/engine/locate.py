@@ -35,6 +35,11 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
     Both its mean and its size are looked at: bursts have no mean that follows, but a size that does.
     """
     e, signals, dt = thinned(problem, fitted, output)
+    if not problem.twin.static:
+        # a plant's own motion is what friction, springs and play follow
+        motion = problem.measured[output] - fitted.residual[output]
+        k = max(1, int(np.ceil(motion.size / e.size)))
+        signals[output] = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
     features = features_of(signals, dt, drive=problem.twin.drive(output))
     found = dependences(e, features)
     present = [f for f in features if not f.memory and f.kind in ("value", "rate")]

@@ -73,10 +73,14 @@ def swap_pass(
     if count < 2:
         return fitted, changed
     for k in range(count):
+        if fitted.model.placed[k].effect.claims is not None:
+            continue
         held = [p for j, p in enumerate(fitted.model.placed) if j != k]
         tried: set[str] = set()
         for rival in rivals[k][:4] if k < len(rivals) else ():
             name = rival.placed.effect.name
+            if rival.placed.effect.claims is not None:
+                continue
             same = any(p.effect.name == name and p.target == rival.placed.target for p in held)
             if same or name in tried or name == fitted.model.placed[k].effect.name:
                 continue
@@ -104,6 +108,8 @@ def simplify_pass(
     start = misfits(problem, base)
     for k in range(len(fitted.model.placed)):
         placed = fitted.model.placed[k]
+        if placed.effect.claims is not None:
+            continue
         held = [p for j, p in enumerate(fitted.model.placed) if j != k]
         mine = size(placed)
         now = misfits(problem, fitted)

@@ -88,7 +88,7 @@ def one_step(problem: Problem, current: Fit, place: Placed, bends: dict[str, Arr
 
 
 def _step_gain(
-    problem: Problem, current: Fit, model: Model, theta: Array, rows: Array, bends: dict[str, Array]
+    problem: Problem, current: Fit, model: Model, theta: Array, rows: NDArray[np.int64], bends: dict[str, Array]
 ) -> tuple[float, float]:
     """(share of the mean square taken, p-value of the F test) by one linear step from ``theta``."""
     design = model.design(problem.view, theta)

@@ -14,7 +14,6 @@ from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
 from tools.mismatch.simulate import Model, Placed
 
-
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
 
 
@@ -25,8 +24,8 @@ class Rule:
     ``z`` whitened held-out correlation in standard deviations, over all candidates and places; ``gain`` least
     share of the mean square; ``excess`` least share of what stands above the noise; ``form`` share of what is
     already explained below which a leftover counts as the accepted effect's own form; ``tie`` excess of a rival
-    relative to the best at which fewer parameters win, ``shape`` share of what is explained that the form of a model may
-    cost on top; ``p_tested`` for effects with a test of their own.
+    relative to the best at which fewer parameters win, ``shape`` share of what is explained that the form of a
+    model may cost on top; ``p_tested`` for effects with a test of their own.
     """
 
     z: float = 5.5
@@ -199,8 +198,8 @@ def rank(name: str) -> int:
 
 
 def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -> bool:
-    """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model may
-    cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
+    """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model
+    may cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
     """
     if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False

@@ -80,7 +80,7 @@ def stranger(problem: Problem, base: Fit, fitted: Fit, output: str) -> Stranger 
     after = float(np.mean((winsorised(fitted.residual[output][problem.held_rows], s) / s) ** 2))
     if after < 1.15:
         return None
-    e, signals, dt = thinned(problem, base, output)
+    e, signals, _dt = thinned(problem, base, output)
     drive = problem.twin.drive(output)
     best: Stranger | None = None
     for name in context:
