@@ -133,18 +133,19 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
     from tools.mismatch.report.terminal import print_report
 
-    if html is not None or out is not None:
-        from tools.mismatch.batch import write_reports
-        from tools.mismatch.report.page import html_page
-
-        page = html_page(report)
-        if out is not None:
-            write_reports(report, out, page)
-        if html is not None:
-            write_text_atomic(html, page)
     # with '--json -' standard output belongs to the JSON
     print_report(report, console() if json_file == "-" else data_console())
     write_json(report.to_json(), json_file)
+    if html is None and out is None:
+        return
+    from tools.mismatch.batch import write_reports
+    from tools.mismatch.report.page import html_page
+
+    page = html_page(report)
+    if out is not None:
+        write_reports(report, out, page)
+    if html is not None:
+        write_text_atomic(html, page)
 
 
 def _diagnose_folder(
