@@ -88,6 +88,7 @@ def test_the_axis_can_be_time_or_nothing():
     p = pictures()
     assert series.axis_of(p, DependsOn("time", "time itself", 0.5))[1] is p.t
     assert series.axis_of(p, DependsOn("voltage_y", "value", 0.5)) is None
+    assert series.axis_of(p, DependsOn("displacement", "value", 0.5))[1] is p.measured["displacement"]
 
 
 def test_guilty_outputs_are_drawn_worst_first():
@@ -108,9 +109,21 @@ def test_binned_means_of_a_line():
     assert np.all(np.diff(at) > 0)
 
 
-def test_an_axis_is_cut_only_for_a_few_large_samples():
+def test_an_axis_is_cut_only_for_what_lies_outside_the_held_out_data():
     e = np.random.default_rng(3).normal(size=5000)
-    assert series.limit([e]) is None
+    held = np.zeros(5000, bool)
+    held[2000:3000] = True
+    assert series.limit([e], held) is None
     e[:10] = 60.0
-    assert series.limit([e, 0.1 * e]) == pytest.approx(1.5 * np.quantile(np.abs(e), 0.99))
-    assert series.limit([np.zeros(100)]) is None
+    assert series.limit([e, 0.1 * e], held) == pytest.approx(1.15 * np.max(np.abs(e[held])))
+    e[2500] = 60.0
+    assert series.limit([e], held) is None
+    assert series.limit([e], np.zeros(5000, bool)) is None
+
+
+def test_a_close_up_shows_a_few_cycles_whatever_the_noise():
+    t = np.arange(6000) * 1e-3
+    noisy = np.sign(np.sin(2 * np.pi * 2.0 * t)) + np.random.default_rng(4).normal(0, 0.3, t.size)
+    p = replace(pictures(), t=t, held_out=np.ones(6000, bool), measured={"y": noisy}, recalibrated={"y": 0 * t})
+    a, b = series.zoom(p, "y")
+    assert b - a == pytest.approx(series.CYCLES * 500, rel=0.02)

@@ -88,10 +88,10 @@ def residual(report: Report, p: Pictures, output: str, name: str) -> str:
             -2 * noise * factor, 2 * noise * factor, color=NOISE, alpha=0.3, lw=0, label="± 2 noise floor", zorder=3
         )
         title = "residual: measured minus simulated"
-        half = series.limit([e for _, _, e in _residuals(report, p, output)])
+        half = series.limit([e for _, _, e in _residuals(report, p, output)], p.held_out)
         if half is not None:
             ax.set_ylim(-max(half, 2 * noise) * factor, max(half, 2 * noise) * factor)
-            title += " (a few samples are off the scale)"
+            title += " (the scale is that of held-out data)"
         ax.set_title(title)
         ax.set_ylabel(f"residual ({unit})")
         ax.set_xlabel("time (s)")

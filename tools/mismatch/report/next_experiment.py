@@ -35,7 +35,8 @@ _FOLLOWS = {
 def next_experiments(report: Report) -> list[Experiment]:
     """Likeliest to be worth it first; never empty."""
     found = [
-        Experiment(e.tell_apart_by, f"tells apart {', '.join(words(n) for n in e.names)}") for e in report.equivalent
+        Experiment(words(e.tell_apart_by), f"tells apart {', '.join(words(n) for n in e.names)}")
+        for e in report.equivalent
     ]
     if report.verdict == "unexplained":
         found += _unexplained(report)

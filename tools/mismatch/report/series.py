@@ -15,6 +15,9 @@ Array = NDArray[np.float64]
 Span = tuple[int, int]
 
 
+CYCLES = 8  # of the strongest frequency, in a close-up
+
+
 def step_s(p: Pictures) -> float:
     """Seconds between samples."""
     return float(np.min(np.diff(p.t)))
@@ -64,9 +67,9 @@ def zoom(p: Pictures, output: str) -> Span:
     spans = runs(p.held_out, p.t) or [(0, p.t.size)]
     a, b = max(spans, key=lambda s: float(np.mean(residual[s[0] : s[1]] ** 2)))
     y = p.measured[output][a:b]
-    crossings = int(np.sum(np.diff(np.signbit(y - np.median(y))) != 0))
-    cycle = 2 * (b - a) / max(crossings, 2)
-    length = int(min(b - a, max(6 * cycle, 120, (b - a) // 4)))
+    power = np.abs(np.fft.rfft((y - y.mean()) * np.hanning(y.size))) ** 2
+    cycle = (b - a) / max(int(np.argmax(power)), 1)
+    length = int(min(b - a, max(CYCLES * cycle, 60)))
     total = np.concatenate([[0.0], np.cumsum(residual[a:b] ** 2)])
     start = a + int(np.argmax(total[length:] - total[:-length]))
     return start, start + length
@@ -112,7 +115,7 @@ def axis_of(p: Pictures, d: DependsOn) -> tuple[str, Array] | None:
     seconds = max(20 * dt, p.t.size * dt / 60)
     if d.signal == "time":
         return "time (s)", p.t
-    x = p.signals.get(d.signal)
+    x = p.signals.get(d.signal, p.measured.get(d.signal))
     if x is None:
         return None
     makers: dict[str, tuple[str, Callable[[Array], Array]]] = {
@@ -135,8 +138,10 @@ def binned(x: Array, y: Array, bins: int = 24) -> tuple[Array, Array]:
     return np.array([float(x[i].mean()) for i in parts]), np.array([float(y[i].mean()) for i in parts])
 
 
-def limit(residuals: list[Array]) -> float | None:
-    """Half height of a residual's axis when a few samples (a start-up, a knock) would flatten all others; else None."""
-    usual = max(float(np.quantile(np.abs(e), 0.99)) for e in residuals)
-    largest = max(float(np.max(np.abs(e))) for e in residuals)
-    return 1.5 * usual if largest > 3 * usual > 0 else None
+def limit(residuals: list[Array], held_out: NDArray[np.bool_]) -> float | None:
+    """Half height of a residual's axis when something outside the held-out data (a start-up, a knock) would flatten
+    them; else None."""
+    if not held_out.any():
+        return None
+    shown = 1.15 * max(float(np.max(np.abs(e[held_out]))) for e in residuals)
+    return shown if max(float(np.max(np.abs(e))) for e in residuals) > 2 * shown > 0 else None

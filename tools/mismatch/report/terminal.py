@@ -166,7 +166,7 @@ def render(report: Report) -> RenderableType:
     if report.alternatives:
         parts.append(_section("Runners-up", _runners_up(report)))
     if report.equivalent:
-        lines = [f"{' = '.join(words(n) for n in e.names)}: {e.tell_apart_by}" for e in report.equivalent]
+        lines = [f"{' = '.join(words(n) for n in e.names)}: {words(e.tell_apart_by)}" for e in report.equivalent]
         parts.append(_section("This recording cannot tell apart (what would)", Text("\n".join(lines))))
     parts.append(_section("Smallest effect that would have been named", _limits(report)))
     if report.cannot_show:
