@@ -23,11 +23,7 @@ from rich.markup import escape
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
-
-
-class InputError(ValueError):
-    """Bad input from a person or a file: the message says what, where and what to do (exit 2)."""
-
+from tools.errors import InputError
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON; '-' is standard output.")

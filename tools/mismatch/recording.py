@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.errors import InputError
+
 Array = NDArray[np.float64]
 
 
-class RecordingError(ValueError):
+class RecordingError(InputError):
     """Bad input. The message names file, key, line or sample, and what to do."""
 
 
