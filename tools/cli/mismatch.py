@@ -216,7 +216,11 @@ def prove(
             keep.mkdir(exist_ok=True)
         err = console()
         result = run_proof(
-            cases, seed, jobs or os.cpu_count() or 1, keep, progress=lambda text: err.print(text, markup=False)
+            cases,
+            seed,
+            jobs or os.cpu_count() or 1,
+            keep,
+            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
         )
         show(result, err if json_file == "-" else data_console())
         write_json(result.to_json(), json_file)

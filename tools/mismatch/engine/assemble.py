@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,7 @@ from scipy.stats import norm
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
-from tools.mismatch.engine.fit import Fit, covariance
+from tools.mismatch.engine.fit import Fit, covariance, residuals
 from tools.mismatch.engine.identifiability import detection, experiment
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.problem import Problem
@@ -217,8 +218,11 @@ def assemble(
     effects: Sequence[Effect],
     rule: Rule,
     said: Sequence[str] = (),
+    official: Problem | None = None,
 ) -> Report:
-    """Everything the contract asks for. ``said``: messages of the checks."""
+    """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
+    free run, when the decisions were made on shorter stretches.
+    """
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
     verdict, p = decide(problem, raw, base, selection, left, rule)
@@ -289,9 +293,7 @@ def assemble(
         fit=FitSummary(
             {o: twin.units[o] for o in twin.outputs},
             True,
-            held_rms(problem, raw),
-            held_rms(problem, base),
-            held_rms(problem, fitted),
+            *(held_rms(official or problem, anew(official, f)) for f in (raw, base, fitted)),
             {o: problem.floors[o].rms for o in twin.outputs},
             {o: problem.floors[o].method for o in twin.outputs},
             problem.split.fit,
@@ -351,6 +353,13 @@ def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[D
         found = [d for d in depends if d.signal == "time"]
         lead = found[0] if found else DependsOn("time", "time itself", max(share, 0.0))
     return [lead, *(d for d in depends if d is not lead)]
+
+
+def anew(problem: Problem | None, fitted: Fit) -> Fit:
+    """The same parameters simulated for another problem."""
+    if problem is None:
+        return fitted
+    return replace(fitted, residual=residuals(problem, fitted.model, fitted.theta))
 
 
 def guess_stage(chain: Sequence[str], depends: Sequence[DependsOn]) -> str:

@@ -14,11 +14,13 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import assemble
 from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.fit import Fit, fit_base, residuals
+from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.select import Rule, search
-from tools.mismatch.engine.split import Split, given_split, own_split
+from tools.mismatch.engine.split import Split, given_split, own_split, shot
 from tools.mismatch.engine.unexplained import leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import View
@@ -29,14 +31,15 @@ from tools.mismatch.twins.make import make
 Progress = Callable[[str, int, int], None]
 
 
-def make_split(recording: Recording, held_out: float, seed: int) -> Split:
-    """The recording's own split when it brings one, else ours."""
+def make_split(recording: Recording, held_out: float, seed: int, restart: bool) -> Split:
+    """The recording's own split when it brings one, else ours: few segments for a twin that starts each afresh."""
     given = recording.split
     if isinstance(given.test, tuple):
         fit_span = given.fit if isinstance(given.fit, tuple) else (0, given.test[0])
         return given_split(recording.n, fit_span, given.test, initialization=given.initialization or 0)
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
-    return own_split(signals, held_out=held_out, seed=seed, guard=max(4, recording.n // 2000))
+    guard = max(4, recording.n // 2000)
+    return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6)
 
 
 def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
@@ -52,7 +55,8 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
     if "x0" in recording.twin.parameters and not twin.restart:
         return twin, 0
     period = 4.0 / max(twin.fastest_per_s * recording.dt, 1e-9)
-    return twin, int(np.clip(period, 40, max(recording.n // 25, 20)))
+    most = recording.n // (150 if twin.restart else 25)
+    return twin, int(np.clip(period, 40, max(most, 40)))
 
 
 def gross(recording: Recording, twin: Twin, raw: Fit) -> list[str]:
@@ -116,21 +120,12 @@ def _diagnose(
     effects: Iterable[Effect] | None,
     rule: Rule,
 ) -> Report:
+    recording, was_joined = joined(recording)
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
-    twin = make(recording)
-    split = make_split(recording, held_out, seed)
-    init = recording.split.initialization or 0
-    if split.own:
-        twin, init = free_run(recording, twin)
-    problem = Problem(recording, twin, split, init, seed)
-    raw = as_given(problem)
-    rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
-    problem = problem.with_floors(
-        {o: noise_floor(problem.measured[o], raw.residual[o], 1 / recording.dt, declared=rough[o]) for o in rough}
-    )
-    base = fit_base(problem)
-    problem = set_floors(problem, base)
-    base = fit_base(problem)
+    if recording.n > LONG:
+        catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
+    problem, raw, base = prepared(recording, held_out, seed, was_joined)
+    twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
     strange = next((f for o in twin.outputs if (f := stranger(problem, base, selection.fitted, o))), None)
@@ -141,7 +136,57 @@ def _diagnose(
     if strange is not None:
         left[strange.output] = left[strange.output].led_by(strange)
     said = gross(recording, twin, raw)
-    return assemble(problem, raw, base, selection, left, catalogue, rule, said)
+    official = None
+    if not problem.split.own and twin.restart:
+        whole = make_split(recording, held_out, seed, True)
+        official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, said, official)
+
+
+def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool) -> tuple[Problem, Fit, Fit]:
+    """The problem with its noise floors, the twin as given and recalibrated."""
+    twin = make(recording)
+    init = recording.split.initialization or 0
+    own = not isinstance(recording.split.test, tuple)
+    if own:
+        twin, init = free_run(recording, twin)
+    split = make_split(recording, held_out, seed, twin.restart)
+    if not own and was_joined and isinstance(twin, DynamicTwin):
+        # the second recording has a start of its own
+        twin = replace(twin, restart=True)
+    if not own and twin.restart:
+        init = max(init, 20)
+        split = shot(split, init)
+    problem = Problem(recording, twin, split, init, seed)
+    raw = as_given(problem)
+    rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
+    problem = problem.with_floors(
+        {o: noise_floor(problem.measured[o], raw.residual[o], 1 / recording.dt, declared=rough[o]) for o in rough}
+    )
+    base = fit_base(problem)
+    problem = set_floors(problem, base)
+    return problem, raw, fit_base(problem)
+
+
+def nominated(
+    recording: Recording,
+    held_out: float,
+    seed: int,
+    jobs: int,
+    progress: Progress | None,
+    catalogue: tuple[Effect, ...],
+    rule: Rule,
+) -> tuple[Effect, ...]:
+    """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals."""
+    names: set[str] = set()
+    slow = tuple(e for e in catalogue if e.name in SLOW)
+    for part, allowed in ((excerpt(recording), catalogue), (thinned_copy(recording), slow)):
+        problem, _, base = prepared(part, held_out, seed, False)
+        stride = max(1, problem.fit_rows.size // 12000)
+        found = search(problem, base, allowed, rule=rule, stride=stride, jobs=jobs, progress=progress)
+        names |= {t.name for t in found.steps}
+        names |= {t.name for rivals in found.rivals for t in rivals[:2]}
+    return tuple(e for e in catalogue if e.name in names)
 
 
 __all__ = ["diagnose"]

@@ -58,7 +58,7 @@ def follow_size(problem: Problem, fitted: Fit, output: str) -> list[Dependence]:
 def regime(problem: Problem, fitted: Fit, output: str) -> str:
     """In words, where the residual is worst: the regime variable whose upper and lower parts differ most."""
     e, signals, dt = thinned(problem, fitted, output)
-    blocks = min(120, max(12, e.size // 50))
+    blocks = max(2, min(120, max(12, e.size // 50), e.size // 4))
     edges = np.linspace(0, e.size, blocks + 1).astype(int)
 
     def per_block(x: Array) -> Array:

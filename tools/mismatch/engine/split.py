@@ -114,3 +114,22 @@ def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Sp
     start = test[0] + max(initialization, 0)
     held = ((start, test[1]),)
     return Split(n, (fit,), held, cut(held, 30), cut((fit,), 48), own=False)
+
+
+def shot(split: Split, init: int, pieces: int = 8) -> Split:
+    """The same parts in about ``pieces`` stretches each, for a twin that starts every stretch afresh (multiple shooting:
+    Bock, Springer Series in Chemical Physics 18, 1981). The free run of an integrator over a whole record says more
+    about its start than about its physics.
+    """
+
+    def stretches(spans: tuple[Span, ...], skip: int) -> tuple[Span, ...]:
+        total = sum(b - a for a, b in spans)
+        out: list[Span] = []
+        for a, b in spans:
+            parts = max(1, round(pieces * (b - a) / max(total, 1)))
+            edges = np.linspace(a, b, parts + 1).astype(int)
+            out += [(int(p) + (skip if p != a else 0), int(q)) for p, q in itertools.pairwise(edges)]
+        return tuple(s for s in out if s[1] - s[0] > 2 * init + 16)
+
+    fit, held = stretches(split.fit, 0), stretches(split.held_out, init)
+    return Split(split.n, fit, held, cut(held, 30), cut(fit, 48), split.own)
