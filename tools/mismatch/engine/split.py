@@ -118,8 +118,8 @@ def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Sp
 
 def shot(split: Split, init: int, pieces: int = 8) -> Split:
     """The same parts in about ``pieces`` stretches each, for a twin that starts every stretch afresh (multiple
-    shooting: Bock, Springer Series in Chemical Physics 18, 1981). The free run of an integrator over a whole record says more
-    about its start than about its physics.
+    shooting: Bock, Springer Series in Chemical Physics 18, 1981). The free run of an integrator over a whole record
+    says more about its start than about its physics.
     """
 
     def stretches(spans: tuple[Span, ...], skip: int) -> tuple[Span, ...]:
