@@ -289,7 +289,7 @@ class InstrumentLoop:
                 return
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1
-            self.counts.clipped += clipped != 0 or self._frame[CLIP] != 0
+            self.counts.clipped += bool(clipped != 0 or self._frame[CLIP] != 0)
         else:
             self.supervisor.step()
 
