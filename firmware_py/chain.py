@@ -7,13 +7,13 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation, actuate_kernel
-from firmware_py.compiled import kernel
 from firmware_py.frame import LAYOUT
 from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing, sense_kernel
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.stage import Tremor, estimate_kernel
+from hal.compiled import kernel
 
 
 @kernel

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.config import StackConfig
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
+from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 UM = 1e-6

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
+from hal.compiled import kernel
 
 
 @kernel

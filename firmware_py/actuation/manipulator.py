@@ -13,7 +13,7 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
+from hal.compiled import kernel
 
 PASSES = 6
 HALF_SQRT3 = 0.5 * sqrt(3.0)

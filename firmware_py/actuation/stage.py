@@ -19,7 +19,6 @@ from firmware_py.actuation.hysteresis import (
 )
 from firmware_py.actuation.limits import limit_slew, limit_voltage, reach_scale
 from firmware_py.actuation.manipulator import strokes_from_tip
-from firmware_py.compiled import kernel
 from firmware_py.frame import (
     ALIGNING,
     CLIP,
@@ -35,6 +34,7 @@ from firmware_py.frame import (
     TREMOR_AHEAD,
 )
 from firmware_py.records import Record, attributes, copy_record, new_record
+from hal.compiled import kernel
 
 # strokes are not quite linear in the displacement: each pass leaves about a hundredth of the excess
 REACH_PASSES = 4

@@ -19,7 +19,6 @@ from math import asin, atan2, exp, pi, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.attitude_params import (
     ERROR_STATE_METHOD,
@@ -43,6 +42,7 @@ from firmware_py.sensing.quaternion_kalman import (
     start_quaternion_kalman,
 )
 from firmware_py.sensing.triad import triad
+from hal.compiled import kernel
 
 # closer to the corner the low-pass would eat the observer's phase margin
 LOWPASS_PER_CORNER = 6.0

@@ -12,7 +12,6 @@ from math import exp
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.frame import (
     ACCELEROMETER,
     COUNTS,
@@ -25,6 +24,7 @@ from firmware_py.frame import (
 )
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
+from hal.compiled import kernel
 
 TEMPERATURE_SMOOTHING_S = 1.0
 

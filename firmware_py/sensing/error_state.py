@@ -24,9 +24,9 @@ from math import atan2, exp, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
+from hal.compiled import kernel
 
 ERRORS = 13
 TURN, RATE, BIAS, VELOCITY, DISTURBANCE = 0, 3, 6, 9, 12

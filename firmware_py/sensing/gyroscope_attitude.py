@@ -7,12 +7,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, begin_filter, restart, step_attitude
 from firmware_py.sensing.attitude_params import METHODS, gyroscope_error_state, gyroscope_quaternion_kalman
 from firmware_py.sensing.quaternion import from_matrix
 from firmware_py.sensing.triad import triad
+from hal.compiled import kernel
 
 ALIGN_S = 0.1
 

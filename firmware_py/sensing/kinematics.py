@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
+from hal.compiled import kernel
 
 MAX_ITERATIONS = 3
 RATE_TOLERANCE_RAD_S = 1e-9

@@ -7,7 +7,7 @@ from math import cos, sin, sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
+from hal.compiled import kernel
 
 
 @kernel

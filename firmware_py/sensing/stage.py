@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.frame import (
     ACCELEROMETER,
     ALIGNING,
@@ -45,6 +44,7 @@ from firmware_py.sensing.translation import (
     tip_acceleration,
     translation_params,
 )
+from hal.compiled import kernel
 
 MAX_RATE_RAD_S = 20.0
 

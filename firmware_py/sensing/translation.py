@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import bilinear_zpk
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
+from hal.compiled import kernel
 
 CORNER_HZ = 2.0
 DAMPING = 0.7

@@ -12,12 +12,12 @@ from math import atan2, cos, sin, sqrt
 
 import numpy as np
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_sections, prefilter_step
 from firmware_py.tremor.wflc import WFLC, WFLC_STATE, wflc_params, wflc_step
+from hal.compiled import kernel
 
 COMBINER = np.dtype(
     [

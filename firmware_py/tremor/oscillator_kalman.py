@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are, solve_discrete_lyapunov
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.tremor.config import TremorConfig
+from hal.compiled import kernel
 
 Matrix = NDArray[np.float64]
 ORDER = 4  # states of a mode: x, v, u, du/dt

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import ellip
 
-from firmware_py.compiled import kernel
 from firmware_py.tremor.config import WflcConfig
+from hal.compiled import kernel
 
 PROTOTYPE_ORDER = 3  # a band-pass doubles it
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.compiled import kernel
 from firmware_py.frame import (
     ALIGNING,
     CONFIDENCE,
@@ -43,6 +42,7 @@ from firmware_py.tremor.oscillator_kalman import (
     kalman_predict,
 )
 from firmware_py.tremor.wflc import wflc_restart
+from hal.compiled import kernel
 
 HISTORY = 64  # ticks of predictions kept for the confidence: the longest loop delay and some
 

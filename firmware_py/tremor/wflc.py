@@ -10,9 +10,9 @@ from math import cos, exp, pi, sin, sqrt
 
 import numpy as np
 
-from firmware_py.compiled import kernel
 from firmware_py.records import Record, new_record
 from firmware_py.tremor.config import WflcConfig
+from hal.compiled import kernel
 
 WFLC = np.dtype(
     [

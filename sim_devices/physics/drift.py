@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 from scipy.stats import kstwobign, norm
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
 from sim_devices.physics.statistics import least_squares, long_run_rms, runs, thin
 
@@ -86,7 +86,7 @@ THERMAL_DRIFT = Effect(
 MOST_STEPS = 6
 
 
-@njit(cache=True)
+@kernel
 def best_split(total, count):
     """Where two levels fit best: (index, gain in sum of squares) for block sums and counts."""
     n = total.size

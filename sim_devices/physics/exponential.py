@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from hal.compiled import kernel
 
 
-@njit(cache=True)
+@kernel
 def exponential(m):
     """e^m of a square matrix (s, s) by scaling, an 18-term Taylor sum (norm below 1/2: error under 1e-16), squaring.
 

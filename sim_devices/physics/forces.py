@@ -7,14 +7,15 @@ One packed row of numbers per family, so that one compiled loop serves every com
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from hal.compiled import kernel
 
 FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, unused
 SPRING = 2  # cubic, quadratic
 COGGING = 5  # period, sin1, cos1, sin2, cos2
 
 
-@njit(cache=True)
+@kernel
 def friction_limit(v, sign, row):
     """Largest friction at speed v in the direction of motion ``sign``: Coulomb, its asymmetry, Stribeck's extra.
 
@@ -27,7 +28,7 @@ def friction_limit(v, sign, row):
     return f
 
 
-@njit(cache=True)
+@kernel
 def smooth_force(p, v, spring, cogging, friction):
     """Forces that are continuous in position p and velocity v: spring curvature, cogging, unequal viscosity."""
     f = -spring[0] * p * p * p - spring[1] * p * p - friction[4] * abs(v)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import least_squares, thin
 
@@ -23,7 +23,7 @@ relays       smooth relays on a triangular grid (Krasnosel'skii-Pokrovskii): any
 """
 
 
-@njit(cache=True)
+@kernel
 def stops(x, thresholds, rest, starts):
     """Stop operators E_r[x] = x - P_r[x] of the play operator P_r, (n, k); |E_r| <= r.
 
@@ -50,7 +50,7 @@ def thresholds(half: float, count: int) -> tuple[float, ...]:
     return tuple(float(half * (i / (count + 0.5)) ** 1.5) for i in range(1, count + 1))
 
 
-@njit(cache=True)
+@kernel
 def dahl(x, radii, skew, rest, starts):
     """Smooth elements dz = dx - (|dx| z + g dx |z|) / r, (n, k), exact for any step; z = 0 at ``rest`` at each start.
 
@@ -91,7 +91,7 @@ def dahl(x, radii, skew, rest, starts):
     return out.T
 
 
-@njit(cache=True)
+@kernel
 def relays(x, lo, hi, count, starts):
     """Relays with ridges of one grid step, rising at g[q], falling at g[p], p <= q, (n, count (count + 1) / 2).
 

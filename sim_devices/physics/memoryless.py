@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
 from sim_devices.physics.statistics import least_squares, rank_starts, thin
 
@@ -190,7 +190,7 @@ STATIC_NONLINEARITY = Effect(
 # -- slew limit -------------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@kernel
 def slew(x, down, up, share, starts):
     """Move towards x by ``share`` of the distance per sample, at most ``up`` and ``down``; on x at each start."""
     y = np.empty_like(x)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.exponential import exponential
 from sim_devices.physics.statistics import least_squares, thin
@@ -28,7 +28,7 @@ def discrete_mode(frequency_hz: float, damping: float, dt: float) -> tuple[Array
     return np.ascontiguousarray(e[:2, :2]), e[:2, 2] - e[:2, 3], np.ascontiguousarray(e[:2, 3])
 
 
-@njit(cache=True)
+@kernel
 def mode(x, ad, g0, g1, starts):
     """Response z and z'/w, (2, n), settled on x at each start."""
     y = np.empty((2, x.size))

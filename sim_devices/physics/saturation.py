@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import rank_starts, thin
 
 
-@njit(cache=True)
+@kernel
 def limit(x, lo, hi, soft):
     """Clip with rounded corners: identity far from the limits, ``soft`` is the width of the corner.
 

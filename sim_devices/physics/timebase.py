@@ -6,13 +6,13 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
 from sim_devices.physics.statistics import robust_rms
 
 
-@njit(cache=True)
+@kernel
 def resample(x, first, step):
     """x at positions ``first + step * k`` (in samples), k = 0..n-1, by cubic convolution; edges are held.
 
@@ -215,7 +215,7 @@ CLOCK_SKEW = Effect(
 # -- dropped samples --------------------------------------------------------------------------------
 
 
-@njit(cache=True)
+@kernel
 def shift_by(x, at, total):
     """y[k] = x[k + s(k)] where s jumps to ``total[i]`` at sample ``at[i]``; edges are held."""
     n = x.size
@@ -230,7 +230,7 @@ def shift_by(x, at, total):
     return y
 
 
-@njit(cache=True)
+@kernel
 def best_shifts(costs, price):
     """Cheapest path of shifts over windows: ``costs`` (windows, shifts), ``price`` for each change (Viterbi)."""
     w, m = costs.shape

@@ -7,8 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -49,7 +50,7 @@ def rotation(angles_deg: tuple[float, float, float]) -> Array:
     )
 
 
-@njit(cache=True)
+@kernel
 def _felt(f, w, alpha, position, origin, turn, felt, turned):
     rx, ry, rz = position[0] - origin[0], position[1] - origin[1], position[2] - origin[2]
     along = w[0] * rx + w[1] * ry + w[2] * rz

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from hal.compiled import kernel
 
 SOURCES = 6
 """Complex tremor envelopes; processes 0..11 are their real and imaginary parts."""
@@ -42,7 +43,7 @@ HAND_STATE = np.dtype(
 )
 
 
-@njit(cache=True)
+@kernel
 def reach_motion(t, reaches, k, out, intended):
     """Adds reach ``k`` at ``t``: row = start, duration, 6 x from, 6 x to. Minimum jerk (Flash and Hogan 1985)."""
     duration = reaches[k, 1]
@@ -65,7 +66,7 @@ def reach_motion(t, reaches, k, out, intended):
             intended[c] = p
 
 
-@njit(cache=True)
+@kernel
 def jerk_motion(t, jerks, k, out):
     """Adds jerk ``k``: row = start, time constant, 3 x peak. Shape (s/3)^3 exp(3 - s), s = t/tau: peak 1 at s = 3."""
     tau = jerks[k, 1]
@@ -82,7 +83,7 @@ def jerk_motion(t, jerks, k, out):
         out[12 + c] += ddb * jerks[k, 2 + c]
 
 
-@njit(cache=True)
+@kernel
 def hand_pose(p, s, reaches, jerks, pose, parts):
     """Pose at the present instant: 6 coordinates, 6 first, 6 second derivatives. ``parts``: intended, tremor (m)."""
     t = s["step"] * p["step_s"]
@@ -135,7 +136,7 @@ def hand_pose(p, s, reaches, jerks, pose, parts):
                 parts[3 + c] += m * y
 
 
-@njit(cache=True)
+@kernel
 def hand_nodes(p, s, noise, reaches, jerks, pose, parts):
     """The next n nodes: ``pose`` (n, 18), ``parts`` (n, 6).
 
@@ -159,7 +160,7 @@ def hand_nodes(p, s, noise, reaches, jerks, pose, parts):
         hand_pose(par, state, reaches, jerks, pose[j], parts[j])
 
 
-@njit(cache=True)
+@kernel
 def between(node0, node1, span, coefficients):
     """``coefficients`` (6, 6) of the quintics that join two nodes ``span`` seconds apart: one row per coordinate."""
     for c in range(6):
@@ -176,7 +177,7 @@ def between(node0, node1, span, coefficients):
         coefficients[c, 5] = 6.0 * dp - 3.0 * dv + 0.5 * da
 
 
-@njit(cache=True)
+@kernel
 def pose_between(coefficients, s, span, pose):
     """``pose`` (18,) at the fraction ``s`` (0..1) of the way."""
     for c in range(6):

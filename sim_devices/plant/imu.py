@@ -15,9 +15,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from hal.compiled import kernel
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
 from sim_devices.plant.sensors import rc_weights
 from sim_devices.plant.streams import stream
@@ -117,7 +117,7 @@ def triad_unit(spec: TriadSpec, rng: np.random.Generator, errors: float = 1.0, n
     )
 
 
-@njit(cache=True)
+@kernel
 def _triad_step(gain, bias, bias_per_K, scale_per_K, per_m_s2, feels, force, warm_K, state, draw, weights, out):
     """One sample (3,) into ``out``; ``state`` (4, 3) goes on. ``draw`` (6,) standard normal."""
     keep, start, end, sigma, drift_keep, drift = weights

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.plant.hand_kernel import between, pose_between
 from sim_devices.plant.manipulator import tip_displacement
 from sim_devices.plant.rigid_body import attitude, body_rates, quaternion, specific_force
@@ -97,14 +97,14 @@ STATE = np.dtype(
 )
 
 
-@njit(cache=True)
+@kernel
 def copy(a, b):
     """b <- a. A slice assignment would compile half of numba's string library, for its error message."""
     for i in range(b.shape[0]):
         b[i] = a[i]
 
 
-@njit(cache=True)
+@kernel
 def room(p, s, noise):
     """Temperature of the sensor board and the supply, once per millisecond."""
     keep = p["ambient_keep"]
@@ -118,7 +118,7 @@ def room(p, s, noise):
     s["supply_V"] = p["supply_V"] + s["supply_wander_V"]
 
 
-@njit(cache=True)
+@kernel
 def sense(p, s, noise):
     """Attitude at ``s["pose"]`` and accelerometers, one step of their RC filters included."""
     pose, c = s["pose"], s["attitude"]
@@ -138,7 +138,7 @@ def sense(p, s, noise):
         s["sensor_V"][i] = v
 
 
-@njit(cache=True)
+@kernel
 def outputs(p, s, later_s):
     """Writes the voltages at the connectors, ``later_s`` (less than a step) after the present instant.
 
@@ -169,7 +169,7 @@ def outputs(p, s, later_s):
         magnetometer_V[i] = 2.5 + v + p["magnetometer_noise_V"] * noise[14 + i]
 
 
-@njit(cache=True)
+@kernel
 def truth_row(p, s, part, row):
     """``row`` (TRUTH_COLUMNS,) of the present instant; ``part`` (6,): intended and tremor part of the tip path."""
     z, d = np.empty(3), np.empty(3)
@@ -192,7 +192,7 @@ def truth_row(p, s, part, row):
     row[22] = s["temperature_C"]
 
 
-@njit(cache=True)
+@kernel
 def begin(plant, state, node, part, truth):
     """The world's first instant: everything at rest, filters settled; writes the first truth row."""
     p, s = plant[0], state[0]
@@ -204,7 +204,7 @@ def begin(plant, state, node, part, truth):
     truth_row(p, s, part, truth)
 
 
-@njit(cache=True)
+@kernel
 def advance(plant, state, nodes, parts, noise, slow, first, stop, truth, row):
     """Steps ``first`` to ``stop`` (excluded) of a block of n milliseconds; the next free row of ``truth``.
 

@@ -16,10 +16,10 @@ import tomllib
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
@@ -38,7 +38,7 @@ class LabError(BenchError):
     """A measurement was asked for that cannot be made."""
 
 
-@njit(cache=True)
+@kernel
 def drive_stack(params, state, volts, temperature_C, steps_per_sample, extension, terminal_V):
     """One stack under held demands ``volts`` (n,): ``extension`` (n,) m and ``terminal_V`` (n,) at each sample's time.
 

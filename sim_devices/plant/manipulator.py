@@ -10,9 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from hal.compiled import kernel
 from sim_devices.config import ManipulatorConfig
 from sim_devices.plant.streams import stream
 
@@ -37,7 +37,7 @@ def manipulator_unit(config: ManipulatorConfig, seed: int) -> ManipulatorUnit:
     )
 
 
-@njit(cache=True)
+@kernel
 def tip_displacement(z, circle_m, shaft_m, out):
     """``out`` (3,) tip displacement from rest in the manipulator frame, m, for ball heights ``z`` (3,) above rest, m.
 

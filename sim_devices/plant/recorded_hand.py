@@ -18,9 +18,9 @@ import math
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from hal.compiled import kernel
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from sim_devices.plant.hand_file import HandFileError, HandRecording, load_hand
@@ -145,7 +145,7 @@ def _nodes(frequency_hz: Array, body: NDArray[np.complex128], recording: HandRec
     return table, recording.seconds / nodes
 
 
-@njit(cache=True)
+@kernel
 def add_recorded(table, span_s, first, pose, parts):
     """Adds the periodic motion of ``table`` to nodes ``first``, ``first`` + 1, ... (milliseconds) of a hand."""
     quintic = np.empty((6, 6))

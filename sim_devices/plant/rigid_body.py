@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
+from hal.compiled import kernel
 
 
-@njit(cache=True)
+@kernel
 def attitude(frame, angles, c):
     """``c`` (3, 3) = frame Rz(angles[2]) Ry(angles[1]) Rx(angles[0])."""
     sx, cx = math.sin(angles[0]), math.cos(angles[0])
@@ -27,7 +27,7 @@ def attitude(frame, angles, c):
         c[i, 2] = f0 * m02 + f1 * m12 + f2 * m22
 
 
-@njit(cache=True)
+@kernel
 def body_rates(angles, rates, accelerations, omega, alpha):
     """Body rate ``omega``, rad/s, and its derivative ``alpha``, from ``attitude``'s angles and their derivatives."""
     sx, cx = math.sin(angles[0]), math.cos(angles[0])
@@ -42,7 +42,7 @@ def body_rates(angles, rates, accelerations, omega, alpha):
     alpha[2] = -y2 * sx - y1 * x1 * cx + z2 * cy * cx - z1 * y1 * sy * cx - z1 * x1 * cy * sx
 
 
-@njit(cache=True)
+@kernel
 def specific_force(c, acceleration, gravity, arm, omega, alpha, f):
     """``f`` (3,) body, m/s^2, at ``arm`` (body, m) from a point with the world ``acceleration``.
 
@@ -58,7 +58,7 @@ def specific_force(c, acceleration, gravity, arm, omega, alpha, f):
     f[2] = c[0, 2] * ax + c[1, 2] * ay + c[2, 2] * az + alpha[0] * ry - alpha[1] * rx + wz * along - w2 * rz
 
 
-@njit(cache=True)
+@kernel
 def quaternion(c, q):
     """``q`` (4,) scalar first, q0 >= 0, of ``c``: the largest component first, so it is exact for every attitude."""
     trace = c[0, 0] + c[1, 1] + c[2, 2]

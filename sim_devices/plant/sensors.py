@@ -11,9 +11,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from hal.compiled import kernel
 from sim_devices.config import EnvironmentConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.streams import stream
 
@@ -131,7 +131,7 @@ def field_gauss(config: EnvironmentConfig) -> Array:
     return config.field_uT * 1e-2 * np.array([math.cos(dip), 0.0, -math.sin(dip)])
 
 
-@njit(cache=True)
+@kernel
 def accelerometer_V(a, f, supply_V, temperature_C):
     """Output before the RC, V, for the specific force ``f`` (3,) in m/s^2 at the sensor, body axes."""
     g = 9.80665

@@ -16,10 +16,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from hal.compiled import kernel
 from sim_devices.config import AmplifierConfig, StackConfig
 from sim_devices.plant.streams import stream
 
@@ -113,7 +113,7 @@ def stack_unit(config: StackConfig, seed: int, axis: int) -> StackUnit:
     )
 
 
-@njit(cache=True)
+@kernel
 def effective_drive(p, s, change_V, stack_V):
     """y, V: moves the slip elements by ``change_V`` to the voltage ``stack_V`` within one step."""
     y = stack_V
@@ -134,7 +134,7 @@ def effective_drive(p, s, change_V, stack_V):
     return y
 
 
-@njit(cache=True)
+@kernel
 def drive_step(p, s, demand_V, temperature_C):
     """One step of amplifier and stack at a demand held over the step; the extension is ``s["mode"][0]``, m."""
     target = min(max(demand_V, p["low_V"]), p["high_V"])
@@ -159,7 +159,7 @@ def drive_step(p, s, demand_V, temperature_C):
     s["drive_m"] = x
 
 
-@njit(cache=True)
+@kernel
 def sweep(p, s, volts):
     """Quasi-static drive along ``volts`` (n,); last effective drive, V. For conditioning, not for time."""
     y = 0.0

@@ -6,8 +6,11 @@ limit is wide here for the same reason; its exact value is tested in virtual tim
 
 from __future__ import annotations
 
+import json
 import os
 import signal
+import subprocess
+import sys
 import threading
 from pathlib import Path
 from typing import cast
@@ -71,3 +74,14 @@ def test_losing_the_link_in_real_time_ends_safe_and_names_it(patient_bench: Path
         assert safe["reached"]
         assert truth is not None
         np.testing.assert_allclose(truth["amplifier_V"][-1], 50.0, atol=0.5)
+
+
+def test_the_process_form_leaves_an_outcome_that_another_program_can_read(patient_bench: Path, tmp_path: Path):
+    (tmp_path / "request.json").write_text(RunRequest(patient_bench, 1.0).to_json(tmp_path))
+    command = [sys.executable, "-m", "firmware_py.app", str(tmp_path / "request.json")]
+    done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=200)
+    assert done.returncode == 0, done.stderr
+    outcome = json.loads((tmp_path / "outcome.json").read_text())
+    assert outcome["samples"]["received"] >= 900
+    assert outcome["safe_state"]["reason"] == "run finished"
+    assert (tmp_path / "truth.npz").is_file()

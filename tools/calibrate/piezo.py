@@ -19,7 +19,7 @@ from scipy.optimize import lsq_linear, minimize_scalar
 
 from firmware_py.actuation.config import StackConfig
 from firmware_py.actuation.hysteresis import inverse_thresholds, inverse_weights
-from firmware_py.compiled import kernel
+from hal.compiled import kernel
 from tools.calibrate.calibration_file import calibration_toml
 from tools.cli.common import InputError
 from tools.mismatch.recording import Recording

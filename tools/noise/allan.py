@@ -10,10 +10,11 @@ from dataclasses import dataclass
 from math import log, pi
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 from scipy.optimize import nnls
 from scipy.stats import chi2
+
+from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 TERMS = ("white", "flicker", "walk", "ramp")
@@ -23,7 +24,7 @@ SIMULATED = 8192
 """Samples of a simulated recording, at most twice that."""
 
 
-@njit(cache=True)
+@kernel
 def overlapping_variance(phase, factors, dt_s, out):
     """``out[j]`` = overlapping Allan variance at ``factors[j]`` samples, from ``phase`` (n + 1,), the summed signal."""
     n = phase.shape[0]

@@ -293,7 +293,9 @@ def assemble(
         fit=FitSummary(
             {o: twin.units[o] for o in twin.outputs},
             True,
-            *(held_rms(official or problem, anew(official, f)) for f in (raw, base, fitted)),
+            held_rms(official or problem, anew(official, raw)),
+            held_rms(official or problem, anew(official, base)),
+            held_rms(official or problem, anew(official, fitted)),
             {o: problem.floors[o].rms for o in twin.outputs},
             {o: problem.floors[o].method for o in twin.outputs},
             problem.split.fit,

@@ -7,10 +7,11 @@ All arrays are one-dimensional and on the prover's fine time grid.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from hal.compiled import kernel
 
 
-@njit(cache=True)
+@kernel
 def bouc_wen(x, a, beta, gamma_up, gamma_down, power):
     """Rate-independent Bouc-Wen memory z of the drive x (Bouc 1967, Wen 1976).
 
@@ -28,7 +29,7 @@ def bouc_wen(x, a, beta, gamma_up, gamma_down, power):
     return z
 
 
-@njit(cache=True)
+@kernel
 def bouc_wen_rate(x, dt, a, beta, gamma, exponent, rate0, leak):
     """Bouc-Wen memory whose dissipation grows with speed and whose state leaks (1/s)."""
     z = np.zeros(x.size)
@@ -45,7 +46,7 @@ def bouc_wen_rate(x, dt, a, beta, gamma, exponent, rate0, leak):
     return z
 
 
-@njit(cache=True)
+@kernel
 def relays(x, up, down, weight):
     """Preisach sum of delayed relays; ``up`` >= ``down`` are the switching values."""
     state = np.empty(up.size)
@@ -69,7 +70,7 @@ def relays(x, up, down, weight):
     return out
 
 
-@njit(cache=True)
+@kernel
 def slip_elements(x, stiffness, reach):
     """Generalised Maxwell-slip: springs that slide when stretched beyond their reach."""
     stretch = np.zeros(stiffness.size)
@@ -85,7 +86,7 @@ def slip_elements(x, stiffness, reach):
     return out
 
 
-@njit(cache=True)
+@kernel
 def jiles(x, shape, pinning, reversible, coupling):
     """Magnetisation-like memory after Jiles and Atherton (1986), normalised to one."""
     out = np.zeros(x.size)
@@ -106,7 +107,7 @@ def jiles(x, shape, pinning, reversible, coupling):
     return out
 
 
-@njit(cache=True)
+@kernel
 def hodgdon(x, speed, slope_line, slope_inner):
     """Coleman-Hodgdon differential memory: dz = a |dx| (b x - z) + c dx."""
     z = np.zeros(x.size)
@@ -121,7 +122,7 @@ def hodgdon(x, speed, slope_line, slope_inner):
     return z
 
 
-@njit(cache=True)
+@kernel
 def free_play(x, half_gap, compliance):
     """Free play; inside the gap the output still follows with a small share ``compliance``."""
     y = np.empty(x.size)
@@ -137,7 +138,7 @@ def free_play(x, half_gap, compliance):
     return y
 
 
-@njit(cache=True)
+@kernel
 def limited_rate(x, step_max, soft):
     """Follower whose step is limited; ``soft`` > 0 rounds the limit off (in units of x)."""
     y = np.empty(x.size)
@@ -151,7 +152,7 @@ def limited_rate(x, step_max, soft):
     return y
 
 
-@njit(cache=True)
+@kernel
 def linear_system(a, b, c, d, x0, u):
     """Discrete linear system, u of shape (n, inputs): y of shape (n, outputs)."""
     n, m = u.shape
@@ -180,7 +181,7 @@ def linear_system(a, b, c, d, x0, u):
     return y
 
 
-@njit(cache=True)
+@kernel
 def _rates(x, v, z, w, force, p):
     """Right-hand side of the axis: (acceleration, friction state rate, loop state rate)."""
     m, c, k, k3, k5 = p[0], p[1], p[2], p[3], p[4]
@@ -211,7 +212,7 @@ def _rates(x, v, z, w, force, p):
     return f / m, dz, dw
 
 
-@njit(cache=True)
+@kernel
 def axis(force, dt, p, x0, v0):
     """Mass on a spring with optional friction, cubic spring, cogging and a hysteretic spring.
 

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, friction_limit, smooth_force
 from tools.mismatch.twins.base import Force
@@ -59,7 +59,7 @@ def pack(forces: Sequence[Force]) -> Rows:
     )
 
 
-@njit(cache=True)
+@kernel
 def run_feedback(
     ad, g0, g1, cp, cv, u, held, sub, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
 ):

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numba import njit
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.exponential import exponential
 
@@ -45,7 +45,7 @@ def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
     return Discrete(ad, np.ascontiguousarray(held - ramp), np.ascontiguousarray(ramp))
 
 
-@njit(cache=True, fastmath=False)
+@kernel
 def run_states(ad, g0, g1, u, x0, starts):
     """States (n, s) for one input (n,); the state is ``x0[i]`` (starts, s) at the i-th start."""
     n, s = u.size, ad.shape[0]
@@ -71,7 +71,7 @@ def run_states(ad, g0, g1, u, x0, starts):
     return out
 
 
-@njit(cache=True)
+@kernel
 def run_output(ad, g0, g1, c, u, starts):
     """``c @ x`` (n,) for one input (n,) and one output row c (s,), from zero state at each start."""
     n, s = u.size, ad.shape[0]
