@@ -1,0 +1,1 @@
+"""What real hands do, and what the estimators make of it."""

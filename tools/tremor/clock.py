@@ -1,0 +1,88 @@
+"""What a recording's sampling clock really does: from known frequencies, or from time stamps that jitter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+SMOOTH_S = 2.0  # a crystal does not change its rate within this; a transport jitters far faster
+
+
+@dataclass(frozen=True)
+class ClockEstimate:
+    """Rate with the 95 % interval of the median. ``stated_hz`` is wrong if it lies outside the interval."""
+
+    rate_hz: float
+    low_hz: float
+    high_hz: float
+    stated_hz: float
+    recordings: int
+
+    @property
+    def stated_is_wrong(self) -> bool:
+        return not self.low_hz <= self.stated_hz <= self.high_hz
+
+    @property
+    def off_percent(self) -> float:
+        """How far the true rate is above the stated one."""
+        return 100.0 * (self.rate_hz / self.stated_hz - 1.0)
+
+    def sentence(self) -> str:
+        """For people."""
+        found = (
+            f"sampling rate from {self.recordings} known frequencies: {self.rate_hz:.2f} Hz "
+            f"({self.low_hz:.2f} to {self.high_hz:.2f})"
+        )
+        if self.stated_is_wrong:
+            return f"{found}; the stated {self.stated_hz:g} Hz is not the real rate ({self.off_percent:+.2f} %)"
+        return f"{found}; agrees with the stated {self.stated_hz:g} Hz"
+
+
+def rate_from_known(known_hz: Sequence[float], seen_cycles: Sequence[float], stated_hz: float) -> ClockEstimate:
+    """The clock's rate from lines of known frequency, each seen at ``seen_cycles`` per sample.
+
+    The median of their ratios, because a drive may be off by itself; interval by the binomial order statistics of the
+    median (distribution-free). Raises ValueError for fewer than six recordings: the interval would be all of them.
+    """
+    ratio = np.sort(np.asarray(known_hz, dtype=np.float64) / np.asarray(seen_cycles, dtype=np.float64))
+    n = len(ratio)
+    if n < 6:
+        raise ValueError(f"{n} known frequencies: at least 6 are needed for an interval of the clock's rate")
+    # ranks of the 95 % interval of a median, normal approximation of the binomial (n >= 6)
+    reach = int(np.ceil(0.98 * np.sqrt(n)))
+    low = max(0, (n - 1) // 2 - reach)
+    high = min(n - 1, n // 2 + reach)
+    return ClockEstimate(float(np.median(ratio)), float(ratio[low]), float(ratio[high]), stated_hz, n)
+
+
+def stamp_share(stamps_s: Array, values: Array) -> float:
+    """How much of the time stamps' scatter is real: 1 if samples were taken then, 0 if evenly and stamped late.
+
+    Between two samples a signal changes by slope x elapsed time. The slope is taken over three steps, so the change
+    over the middle step regressed on slope x (deviation of that step from the mean) is 1 for true stamps, 0 for an
+    even clock behind a jittering transport. ``values`` (n, k).
+    """
+    step = np.diff(stamps_s)
+    deviation = (step[1:-1] / step.mean() - 1.0)[:, None]
+    slope = (values[3:] - values[:-3]) / 3.0
+    change = values[2:-1] - values[1:-2]
+    expected = slope * deviation
+    power = float(np.sum(expected**2))
+    return float(np.sum((change - slope) * expected)) / power if power > 0.0 else 1.0
+
+
+def steady_stamps(stamps_s: Array) -> Array:
+    """Time of each sample of an even clock from jittering host stamps: a straight line in every ``SMOOTH_S``."""
+    from scipy.signal import savgol_filter
+
+    rate_hz = (len(stamps_s) - 1) / (stamps_s[-1] - stamps_s[0])
+    length = min(2 * int(0.5 * SMOOTH_S * rate_hz) + 1, len(stamps_s) - (len(stamps_s) + 1) % 2)
+    smooth = np.asarray(savgol_filter(stamps_s, length, 1))
+    # late stamps that are caught up with can bend the line backwards by less than a sample
+    least = 0.05 / rate_hz
+    return np.maximum.accumulate(smooth - least * np.arange(len(smooth))) + least * np.arange(len(smooth))
