@@ -48,11 +48,14 @@ class VirtualClock:
 
     def advance_to(self, t_ns: int) -> None:
         """Move to ``t_ns``, running what is due on the way. A time in the past moves nothing."""
-        while self._due and self._due[0][0] <= t_ns:
-            due_ns, _, callback = heapq.heappop(self._due)
-            self._now_ns = max(self._now_ns, due_ns)
+        due = self._due
+        while due and due[0][0] <= t_ns:
+            due_ns, _, callback = heapq.heappop(due)
+            if due_ns > self._now_ns:
+                self._now_ns = due_ns
             callback(due_ns)
-        self._now_ns = max(self._now_ns, t_ns)
+        if t_ns > self._now_ns:
+            self._now_ns = t_ns
 
     def burn_ns(self, dt_ns: int) -> None:
         """Let ``dt_ns`` pass, as if something had taken that long."""

@@ -19,7 +19,7 @@ from sim_devices.plant.kernel import (
     TRUTH_COLUMNS,
     advance,
     begin,
-    outputs,
+    outputs_later,
     truth_row,
 )
 from sim_devices.plant.streams import stream
@@ -121,7 +121,7 @@ class Instrument:
         if pulse not in ("set", "reset"):
             raise ValueError(f"strap pulse {pulse!r}: it is 'set' or 'reset'")
         self._state[0]["strap"] = 1.0 if pulse == "set" else -1.0
-        outputs(self._plant[0], self._state[0], 0.0)
+        outputs_later(self._plant, self._state, 0.0)
 
     def motion(self) -> BodyMotion:
         """Of the body at the last step; the specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""
@@ -156,7 +156,7 @@ class Instrument:
         """Bring the voltages from the last step to the present instant."""
         later_ns = self._t_ns - self._steps * STEP_NS
         if later_ns:
-            outputs(self._plant[0], self._state[0], later_ns * 1e-9)
+            outputs_later(self._plant, self._state, later_ns * 1e-9)
 
     def _next_block(self) -> None:
         if self._row + BLOCK_MS > _CHUNK_ROWS:
