@@ -1,7 +1,10 @@
 """InvenSense MPU-6050: three-axis gyroscope and accelerometer, temperature, 1024-byte FIFO.
 
 Source: MPU-6000/6050 Product Specification rev. 3.4 ("PS") and Register Map and Descriptions rev. 4.2 ("RM", section
-numbers in comments); offset registers: InvenSense application note "MPU Hardware Offset Registers" rev. 1.0.
+numbers in comments); offset registers: InvenSense application note "MPU Hardware Offset Registers" rev. 1.0 but for
+the accelerometer's scale. The note prints +-8 g (4096 LSB/g); InvenSense's own Motion Driver 6.12 writes 2048 LSB/g for
+this part and calls that "bug fix from +-8G", and the register map of the sister part (RM-MPU-9250A 1.6, registers 119 to
+126: +-16 g at every full scale, bit 0 reserved, 15-bit steps of 0.98 mg) gives 2048 LSB/g for the 16-bit word too.
 Wire face: I2C register transactions. Truth face: an ``Imu`` (sensing elements on a moving body); observables
 ``samples`` and ``interrupt``.
 
@@ -47,7 +50,7 @@ ACCEL_BANDWIDTH_HZ = (260.0, 184.0, 94.0, 44.0, 21.0, 10.0, 5.0, 260.0)  # RM 4.
 GYRO_BANDWIDTH_HZ = (256.0, 188.0, 98.0, 42.0, 20.0, 10.0, 5.0, 256.0)
 ACCEL_LSB_PER_G = (16384.0, 8192.0, 4096.0, 2048.0)  # RM 4.17
 GYRO_LSB_PER_DPS = (131.0, 65.5, 32.8, 16.4)  # RM 4.19
-ACCEL_OFFSET_LSB_PER_G = 4096.0  # application note: +-8 g format
+ACCEL_OFFSET_LSB_PER_G = 2048.0  # +-16 g format: see the module's docstring
 GYRO_OFFSET_LSB_PER_DPS = 32.8  # application note: +-1000 dps format
 TEMPERATURE_LSB_PER_K, TEMPERATURE_ZERO_C = 340.0, 36.53  # RM 4.18
 
@@ -83,8 +86,7 @@ class Mpu6050(RegisterFace):
     """One MPU-6050. The AD0 strap is the address that the bus puts it at.
 
     ``rate_error`` = 0.01 makes its clock 1 % fast. ``factory_offsets`` is what the accelerometer offset registers hold
-    at power-up: the factory's own correction, which moves with them when they are written. The application note says
-    4096 LSB/g for those registers, users of real chips have measured 2048: ``accel_offset_lsb_per_g`` makes either.
+    at power-up: the factory's own correction, which moves with them when they are written.
     """
 
     def __init__(
@@ -93,7 +95,6 @@ class Mpu6050(RegisterFace):
         *,
         rate_error: float = 0.0,
         factory_offsets: tuple[int, int, int] = (-1320, 846, 1788),
-        accel_offset_lsb_per_g: float = ACCEL_OFFSET_LSB_PER_G,
     ) -> None:
         if not -0.01 <= rate_error <= 0.01:
             raise ValueError(f"rate_error {rate_error} is outside +-1 % (PS 6.6)")
@@ -102,7 +103,6 @@ class Mpu6050(RegisterFace):
         for axis, offset in enumerate(factory_offsets):
             reset[XA_OFFS_H + 2 * axis], reset[XA_OFFS_H + 2 * axis + 1] = (offset & 0xFFFE).to_bytes(2, "big")
         self._imu, self._rate_error = imu, rate_error
-        self._offset_lsb_per_g = accel_offset_lsb_per_g
         self._factory_lsb = np.array([offset & ~1 for offset in factory_offsets], dtype=np.float64)
         self._self_test = np.array(response) * imu.self_test_gain
         self.samples, self.overflows = 0, 0
@@ -248,7 +248,7 @@ class Mpu6050(RegisterFace):
         dps = np.degrees(self._gyro) + WAKE_TRANSIENT_DPS * math.exp(-(t_ns - self._awake_ns) / WAKE_TAU_NS)
         g = self._accel / STANDARD_GRAVITY
         for axis in range(3):
-            g[axis] += ((self._word(XA_OFFS_H + 2 * axis) & ~1) - self._factory_lsb[axis]) / self._offset_lsb_per_g
+            g[axis] += ((self._word(XA_OFFS_H + 2 * axis) & ~1) - self._factory_lsb[axis]) / ACCEL_OFFSET_LSB_PER_G
             dps[axis] += self._word(XG_OFFS_H + 2 * axis) / GYRO_OFFSET_LSB_PER_DPS
             if r[ACCEL_CONFIG] & 0x80 >> axis:
                 g[axis] += self._self_test[axis]

@@ -207,14 +207,14 @@ def test_self_test_response_is_the_factory_trim() -> None:
 
 
 def test_offset_registers_act_in_their_own_scale() -> None:
-    """Application note: gyroscope at +-1000 dps (32.8 LSB/dps), accelerometer at +-8 g (4096 LSB/g) from the trim."""
+    """Gyroscope at +-1000 dps (32.8 LSB/dps), accelerometer at +-16 g (2048 LSB/g, 0.98 mg for bit 1) from the trim."""
     device, _ = awake()
     trim = words(get(device, 0x06, 0, 6))
     assert trim == [-1320, 846, 1788]
     put(device, 0x06, *((trim[0] + 410) & 0xFFFF).to_bytes(2, "big"), t_ns=0)
     put(device, 0x13, *(-328 & 0xFFFF).to_bytes(2, "big"), t_ns=0)
     values = words(get(device, 0x3B, 400 * MS, 14))
-    assert values[0] == pytest.approx(410 / 4096 * 16384, abs=1)
+    assert values[0] == pytest.approx(410 / 2048 * 16384, abs=1)
     assert values[4] == -1310
     put(device, 0x6B, 0x80, t_ns=400 * MS)
     assert words(get(device, 0x06, 410 * MS, 6)) == trim  # a reset brings the factory's back
@@ -267,11 +267,3 @@ def test_clock_error() -> None:
     assert device.samples == 1010
     with pytest.raises(ValueError, match="1 %"):
         make(rate_error=0.02)
-
-
-def test_accelerometer_offsets_at_the_scale_that_users_have_measured() -> None:
-    device, _ = make(factory_offsets=(0, 0, 0), accel_offset_lsb_per_g=2048.0)
-    put(device, 0x19, 9, 3, t_ns=0)
-    put(device, 0x6B, 0, t_ns=0)
-    put(device, 0x06, 0x02, 0x00, t_ns=0)
-    assert words(get(device, 0x3B, 400 * MS, 2)) == [4096]
