@@ -2,9 +2,9 @@
 
 Source: InvenSense RM-MPU-6000A-00 rev 4.2 (section and page with each register); offset registers from the
 application note "MPU Hardware Offset Registers" rev 1.0. That note gives the accelerometer offsets in 8 g format
-(4096 counts per g); InvenSense's Motion Driver 6.12 writes them in 16 g format (2048 counts per g, its comment: "bug fix
-from +-8G") and RM-MPU-9250A rev 1.6, registers 119 to 126, has "+-16 g, 15 bit, 0.98 mg steps" for the same block. 2048 it
-is; bit 0 belongs to the factory's temperature compensation and is kept.
+(4096 counts per g); InvenSense's Motion Driver 6.12 writes them in 16 g format (2048 counts per g, its comment: "bug
+fix from +-8G") and RM-MPU-9250A rev 1.6, registers 119 to 126, has "+-16 g, 15 bit, 0.98 mg steps" for the same block.
+2048 it is; bit 0 belongs to the factory's temperature compensation and is kept.
 """
 
 from __future__ import annotations

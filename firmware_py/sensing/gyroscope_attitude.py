@@ -1,4 +1,7 @@
-"""The attitude filters driven by a gyroscope: a whole recording in one compiled call."""
+"""All attitude filters driven by a gyroscope: a whole recording in one compiled call.
+
+The Kalman filters here; those of document 002, live too, in ``fusion``.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from numpy.typing import NDArray
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, begin_filter, restart, step_attitude
 from firmware_py.sensing.attitude_params import METHODS, gyroscope_error_state, gyroscope_quaternion_kalman
+from firmware_py.sensing.fusion import Fusion, FusionConfig, Method
 from firmware_py.sensing.quaternion import from_matrix
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
@@ -59,12 +63,14 @@ def gyroscope_attitude(
     force: NDArray[np.float64],
     field: NDArray[np.float64],
     rate_hz: float,
-    method: Literal["error-state", "quaternion-kalman"] = "error-state",
+    method: Literal["error-state", "quaternion-kalman"] | Method = "error-state",
     gravity_m_s2: float = 9.81,
 ) -> NDArray[np.float64]:
     """(n, 4) quaternions, body to world (x magnetic north, z up), starting from TRIAD over the first 0.1 s."""
     if not len(rate) == len(force) == len(field) or len(rate) < 2:
         raise ValueError(f"rate, force and field have {len(rate)}, {len(force)} and {len(field)} rows")
+    if method not in ("error-state", "quaternion-kalman"):
+        return Fusion(FusionConfig(method=method), rate_hz).run(rate, force, field)
     params = new_record(
         ATTITUDE,
         dt_s=1.0 / rate_hz,

@@ -3,8 +3,8 @@
 Source: MPU-6000/6050 Product Specification rev. 3.4 ("PS") and Register Map and Descriptions rev. 4.2 ("RM", section
 numbers in comments); offset registers: InvenSense application note "MPU Hardware Offset Registers" rev. 1.0 but for
 the accelerometer's scale. The note prints +-8 g (4096 LSB/g); InvenSense's own Motion Driver 6.12 writes 2048 LSB/g for
-this part and calls that "bug fix from +-8G", and the register map of the sister part (RM-MPU-9250A 1.6, registers 119 to
-126: +-16 g at every full scale, bit 0 reserved, 15-bit steps of 0.98 mg) gives 2048 LSB/g for the 16-bit word too.
+this part and calls that "bug fix from +-8G", and the register map of the sister part (RM-MPU-9250A 1.6, registers 119
+to 126: +-16 g at every full scale, bit 0 reserved, 15-bit steps of 0.98 mg) gives 2048 LSB/g for the 16-bit word too.
 Wire face: I2C register transactions. Truth face: an ``Imu`` (sensing elements on a moving body); observables
 ``samples`` and ``interrupt``.
 

@@ -1,0 +1,164 @@
+"""Attitude of an inertial sensor with a gyroscope: choose a filter, feed samples or a recording (002, chapter 3)."""
+
+from __future__ import annotations
+
+from math import asin, atan2, degrees
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.records import new_record
+from firmware_py.sensing.fusion_filters import (
+    COMPLEMENTARY,
+    FUSION,
+    FUSION_STATE,
+    GYROSCOPE,
+    MADGWICK,
+    MAHONY,
+    TILT,
+    begin_fusion,
+    run_fusion,
+)
+from hal.compiled import kernel
+from hal.errors import BenchError
+
+Array = NDArray[np.float64]
+Method = Literal["tilt", "gyroscope", "complementary", "madgwick", "mahony", "vqf"]
+NATIVE = {
+    "tilt": TILT,
+    "gyroscope": GYROSCOPE,
+    "complementary": COMPLEMENTARY,
+    "madgwick": MADGWICK,
+    "mahony": MAHONY,
+}
+
+
+class FusionConfig(BaseModel):
+    """Which filter and its numbers; defaults are those that document 002 prints as its choice (sections 3.3, 3.4)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    method: Method = "mahony"
+    tau_s: float = Field(default=0.1, gt=0.0)
+    """Complementary filter."""
+    beta: float = Field(default=0.03, ge=0.0)
+    """Madgwick, rad/s."""
+    field_scale: float = Field(default=1.0, gt=0.0, le=1.0)
+    """Madgwick with a magnetometer: 1 is the paper, 0.5 what the widely used C code of 2011 computes by an oversight
+    (its predicted field is half as long as the measured one, so the magnetometer counts half)."""
+    kp: float = Field(default=1.4, ge=0.0)
+    ki: float = Field(default=0.002, ge=0.0)
+    """Mahony, 1/s and 1/s^2."""
+    align_s: float = Field(default=0.1, ge=0.0, le=10.0)
+    """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
+
+
+@kernel
+def _begin(state: NDArray[np.void], params: NDArray[np.void]) -> None:
+    begin_fusion(state[0], params[0])
+
+
+class Fusion:
+    """One sensor, live or batch: ``step`` and ``run`` are the same arithmetic and may be mixed.
+
+    ``quaternion`` (4,) is body to world, z up, scalar first. Without a magnetometer the heading of the body's x axis
+    is zero at the start. ``aligned`` is false while the start attitude is being averaged.
+    """
+
+    def __init__(self, config: FusionConfig, rate_hz: float) -> None:
+        if not rate_hz > 0.0:
+            raise ValueError(f"rate_hz = {rate_hz} must be positive")
+        self.config = config
+        self.rate_hz = rate_hz
+        self._vqf: Any = _open_vqf(rate_hz) if config.method == "vqf" else None
+        self._params = new_record(
+            FUSION,
+            method=NATIVE.get(config.method, MAHONY),
+            tau_s=config.tau_s,
+            beta=config.beta,
+            field_scale=config.field_scale,
+            kp=config.kp,
+            ki=config.ki,
+            align_samples=round(config.align_s * rate_hz),
+        )
+        self._state = np.zeros(1, FUSION_STATE)
+        self._one = (np.zeros((1, 3)), np.zeros((1, 3)), np.full((1, 3), np.nan), np.zeros(1), np.zeros((1, 4)))
+        self.quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        self.restart()
+
+    @property
+    def aligned(self) -> bool:
+        return bool(self._state["aligned"][0])
+
+    def restart(self, start: Array | None = None) -> None:
+        """Forget everything; the next samples align anew, or ``start`` (4,) is the attitude (not with "vqf")."""
+        _begin(self._state, self._params)
+        self.quaternion[:] = (1.0, 0.0, 0.0, 0.0)
+        if self._vqf is not None:
+            self._vqf.resetState()
+        elif start is not None:
+            self.quaternion[:] = np.asarray(start) / np.linalg.norm(start)
+            self._state["quaternion"][0] = self.quaternion
+            self._state["aligned"] = 1
+
+    def step(self, rate: Array, force: Array, field: Array | None = None, dt_s: float | None = None) -> Array:
+        """One sample: rate rad/s, specific force and field of any unit, (3,) body frame; the attitude after it."""
+        w, f, b, dt, q = self._one
+        w[0], f[0] = rate, force
+        b[0] = np.nan if field is None else field
+        dt[0] = 1.0 / self.rate_hz if dt_s is None else dt_s
+        self._go(w, f, b, dt, q)
+        return self.quaternion
+
+    def run(self, rate: Array, force: Array, field: Array | None = None, dt_s: Array | None = None) -> Array:
+        """A recording: (n, 3) arrays to (n, 4) quaternions. ``dt_s`` (n,): time before each sample."""
+        n = len(rate)
+        b = np.full((n, 3), np.nan) if field is None else field
+        dt = np.full(n, 1.0 / self.rate_hz) if dt_s is None else dt_s
+        if not len(force) == len(b) == len(dt) == n:
+            raise ValueError(f"rate, force, field, dt have {n}, {len(force)}, {len(b)}, {len(dt)} rows")
+        out = np.empty((n, 4))
+        if n:
+            arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, b, dt)]
+            self._go(arrays[0], arrays[1], arrays[2], arrays[3], out)
+        return out
+
+    def _go(self, rate: Array, force: Array, field: Array, dt_s: Array, out: Array) -> None:
+        if self._vqf is None:
+            run_fusion(self._state, self._params, rate, force, field, dt_s, out)
+        else:
+            self._state["aligned"] = 1
+            for k in range(len(rate)):
+                if np.isfinite(field[k, 0]):
+                    self._vqf.update(rate[k], force[k], field[k])
+                    out[k] = _north(self._vqf.getQuat9D())
+                else:
+                    self._vqf.update(rate[k], force[k])
+                    out[k] = self._vqf.getQuat6D()
+        self.quaternion[:] = out[-1]
+
+
+def _north(east_north_up: Array) -> Array:
+    """From a world with x to east to one with x to north: minus 90 degrees about up."""
+    w, x, y, z = east_north_up
+    h = np.sqrt(0.5)
+    return np.array([h * (w + z), h * (x + y), h * (y - x), h * (z - w)])
+
+
+def _open_vqf(rate_hz: float) -> Any:
+    try:
+        from vqf import VQF  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise BenchError("fusion method 'vqf' needs the package vqf: pip install vqf, or choose another") from error
+    return VQF(1.0 / rate_hz)  # pyright: ignore[reportUnknownVariableType]
+
+
+def angles_deg(quaternion: Array) -> tuple[float, float, float]:
+    """Roll psi, pitch theta, yaw phi in degrees of one quaternion (3.47)-(3.49), ERRATA 103."""
+    w, x, y, z = (float(v) for v in quaternion)
+    roll = atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
+    pitch = asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))
+    yaw = atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    return degrees(roll), degrees(pitch), degrees(yaw)

@@ -1,0 +1,245 @@
+"""The attitude filters of document 002 (Erat 2018), chapter 3: one compiled step each, gyroscope and gravity.
+
+Attitude is body to world, z up. ``field`` is optional: with a magnetometer, Madgwick's and Mahony's filters also hold
+the heading (Madgwick, Harrison, Vaidyanathan 2011; Mahony, Hamel, Pflimlin 2008); without one nothing turns it back.
+"""
+
+from __future__ import annotations
+
+from math import acos, atan2, sqrt
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.records import Record
+from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
+from firmware_py.sensing.triad import triad
+from hal.compiled import kernel
+
+TILT, GYROSCOPE, COMPLEMENTARY, MADGWICK, MAHONY = 0, 1, 2, 3, 4
+
+FUSION = np.dtype(
+    [
+        ("method", "i8"),
+        ("tau_s", "f8"),  # complementary filter (3.30)
+        ("beta", "f8"),  # Madgwick (3.73), rad/s
+        ("field_scale", "f8"),  # Madgwick: predicted field over measured one
+        ("kp", "f8"),  # Mahony (3.78), 1/s
+        ("ki", "f8"),  # 1/s^2
+        ("align_samples", "f8"),
+    ]
+)
+FUSION_STATE = np.dtype(
+    [
+        ("quaternion", "f8", (4,)),
+        ("matrix", "f8", (3, 3)),
+        ("integral", "f8", (3,)),  # K_I times the integral of Mahony's error, rad/s
+        ("sums", "f8", (2, 3)),  # force and field while aligning
+        ("samples", "f8"),
+        ("aligned", "i8"),
+    ]
+)
+
+
+@kernel
+def begin_fusion(state: Record, params: Record) -> None:
+    """Forget everything. With ``align_samples`` 0 the attitude starts at (1, 0, 0, 0), as the document's filters do."""
+    state.quaternion[:] = 0.0
+    state.quaternion[0] = 1.0
+    state.integral[:] = 0.0
+    state.sums[:, :] = 0.0
+    state.samples = 0.0
+    state.aligned = 1 if params.align_samples < 1.0 else 0
+    to_matrix(state.quaternion, state.matrix)
+
+
+@kernel
+def step_fusion(
+    state: Record,
+    params: Record,
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    dt_s: float,
+) -> None:
+    """One sample, ``dt_s`` after the last: rate rad/s, force and field (any unit; nan: none), all (3,), body frame."""
+    if state.aligned == 0:
+        _align(state, params, force, field)
+        return
+    q = state.quaternion
+    method = params.method
+    if method == MADGWICK:
+        _madgwick(q, rate, force, field, params.beta, params.field_scale, dt_s)
+        return
+    if method == MAHONY:
+        _mahony(state, rate, force, field, params.kp, params.ki, dt_s)
+        return
+    if method != TILT:
+        rotate_by(q, rate[0] * dt_s, rate[1] * dt_s, rate[2] * dt_s)
+    if method != GYROSCOPE:
+        # (3.28)-(3.30), about the axis between predicted and measured up instead of angle by angle (ERRATA 101)
+        share = dt_s / (params.tau_s + dt_s) if method == COMPLEMENTARY else 1.0
+        _lean(state, force, share)
+
+
+@kernel
+def _align(state: Record, params: Record, force: NDArray[np.float64], field: NDArray[np.float64]) -> None:
+    """Mean force and field, then TRIAD; without a field the heading of the body's x axis is zero."""
+    for i in range(3):
+        state.sums[0, i] += force[i]
+        if np.isfinite(field[0]):
+            state.sums[1, i] += field[i]
+    state.samples += 1.0
+    if state.sums[0, 0] == 0.0 and state.sums[0, 1] == 0.0 and state.sums[0, 2] == 0.0:
+        return
+    triad(state.sums[0], state.sums[1], state.matrix)
+    from_matrix(state.matrix, state.quaternion)
+    if state.samples >= params.align_samples:
+        state.aligned = 1
+
+
+@kernel
+def _lean(state: Record, force: NDArray[np.float64], share: float) -> None:
+    """Turn by ``share`` of the angle that takes the predicted up to the measured one; heading stays."""
+    q, c = state.quaternion, state.matrix
+    norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if norm == 0.0:
+        return
+    to_matrix(q, c)
+    ax, ay, az = force[0] / norm, force[1] / norm, force[2] / norm
+    ex, ey, ez = ay * c[2, 2] - az * c[2, 1], az * c[2, 0] - ax * c[2, 2], ax * c[2, 1] - ay * c[2, 0]
+    sine = sqrt(ex * ex + ey * ey + ez * ez)
+    cosine = max(-1.0, min(1.0, ax * c[2, 0] + ay * c[2, 1] + az * c[2, 2]))
+    if sine < 1e-12:
+        if cosine > 0.0:
+            return
+        # upside down: any horizontal axis is as good
+        ex, ey, ez, sine = c[0, 0], c[0, 1], c[0, 2], 1.0
+    scale = share * (atan2(sine, cosine) if cosine > -1.0 else acos(-1.0)) / sine
+    rotate_by(q, ex * scale, ey * scale, ez * scale)
+
+
+@kernel
+def _horizontal_field(q: NDArray[np.float64], mx: float, my: float, mz: float) -> tuple[float, float]:
+    """(b_x, b_z): length of the field's horizontal part and its vertical part, in the world of ``q``."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    hx = mx * (1.0 - 2.0 * (y * y + z * z)) + my * 2.0 * (x * y - w * z) + mz * 2.0 * (x * z + w * y)
+    hy = mx * 2.0 * (x * y + w * z) + my * (1.0 - 2.0 * (x * x + z * z)) + mz * 2.0 * (y * z - w * x)
+    hz = mx * 2.0 * (x * z - w * y) + my * 2.0 * (y * z + w * x) + mz * (1.0 - 2.0 * (x * x + y * y))
+    return sqrt(hx * hx + hy * hy), hz
+
+
+@kernel
+def _madgwick(
+    q: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    beta: float,
+    field_scale: float,
+    dt_s: float,
+) -> None:
+    """(3.65)-(3.74) with ERRATA 105, 107; the field's rows as in Madgwick 2011."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
+    norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if norm > 0.0:
+        # f = predicted minus measured (3.68), s = J^T f (3.70), (3.72)
+        f1 = 2.0 * (x * z - w * y) - force[0] / norm
+        f2 = 2.0 * (w * x + y * z) - force[1] / norm
+        f3 = 1.0 - 2.0 * (x * x + y * y) - force[2] / norm
+        s0 = -2.0 * y * f1 + 2.0 * x * f2
+        s1 = 2.0 * z * f1 + 2.0 * w * f2 - 4.0 * x * f3
+        s2 = -2.0 * w * f1 + 2.0 * z * f2 - 4.0 * y * f3
+        s3 = 2.0 * x * f1 + 2.0 * y * f2
+        size = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
+        if np.isfinite(size) and size > 0.0:
+            mx, my, mz = field[0] / size, field[1] / size, field[2] / size
+            bx, bz = _horizontal_field(q, mx, my, mz)
+            bx, bz = 2.0 * field_scale * bx, 2.0 * field_scale * bz
+            g1 = bx * (0.5 - y * y - z * z) + bz * (x * z - w * y) - mx
+            g2 = bx * (x * y - w * z) + bz * (w * x + y * z) - my
+            g3 = bx * (w * y + x * z) + bz * (0.5 - x * x - y * y) - mz
+            s0 += -bz * y * g1 + (-bx * z + bz * x) * g2 + bx * y * g3
+            s1 += bz * z * g1 + (bx * y + bz * w) * g2 + (bx * z - 2.0 * bz * x) * g3
+            s2 += (-2.0 * bx * y - bz * w) * g1 + (bx * x + bz * z) * g2 + (bx * w - 2.0 * bz * y) * g3
+            s3 += (-2.0 * bx * z + bz * x) * g1 + (-bx * w + bz * y) * g2 + bx * x * g3
+    steep = sqrt(s0 * s0 + s1 * s1 + s2 * s2 + s3 * s3)
+    push = beta / steep if steep > 0.0 else 0.0
+    _integrate(q, rate[0], rate[1], rate[2], (push * s0, push * s1, push * s2, push * s3), dt_s)
+
+
+@kernel
+def _mahony(
+    state: Record,
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    kp: float,
+    ki: float,
+    dt_s: float,
+) -> None:
+    """(3.75)-(3.80) with ERRATA 108."""
+    q = state.quaternion
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    ex, ey, ez = 0.0, 0.0, 0.0
+    norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
+    if norm > 0.0:
+        ax, ay, az = force[0] / norm, force[1] / norm, force[2] / norm
+        vx, vy, vz = 2.0 * (x * z - w * y), 2.0 * (w * x + y * z), w * w - x * x - y * y + z * z
+        ex, ey, ez = ay * vz - az * vy, az * vx - ax * vz, ax * vy - ay * vx
+        size = sqrt(field[0] ** 2 + field[1] ** 2 + field[2] ** 2)
+        if np.isfinite(size) and size > 0.0:
+            mx, my, mz = field[0] / size, field[1] / size, field[2] / size
+            bx, bz = _horizontal_field(q, mx, my, mz)
+            ux = bx * (1.0 - 2.0 * (y * y + z * z)) + bz * vx
+            uy = bx * 2.0 * (x * y - w * z) + bz * vy
+            uz = bx * 2.0 * (w * y + x * z) + bz * vz
+            ex += my * uz - mz * uy
+            ey += mz * ux - mx * uz
+            ez += mx * uy - my * ux
+    integral = state.integral
+    integral[0] += ki * ex * dt_s
+    integral[1] += ki * ey * dt_s
+    integral[2] += ki * ez * dt_s
+    _integrate(
+        q,
+        rate[0] + kp * ex + integral[0],
+        rate[1] + kp * ey + integral[1],
+        rate[2] + kp * ez + integral[2],
+        (0.0, 0.0, 0.0, 0.0),
+        dt_s,
+    )
+
+
+@kernel
+def _integrate(
+    q: NDArray[np.float64], gx: float, gy: float, gz: float, push: tuple[float, float, float, float], dt_s: float
+) -> None:
+    """q + (q x (0, w) / 2 - push) dt and normalised: first order, as (3.59), (3.60), (3.73) have it."""
+    w, x, y, z = q[0], q[1], q[2], q[3]
+    q[0] += (0.5 * (-x * gx - y * gy - z * gz) - push[0]) * dt_s
+    q[1] += (0.5 * (w * gx + y * gz - z * gy) - push[1]) * dt_s
+    q[2] += (0.5 * (w * gy - x * gz + z * gx) - push[2]) * dt_s
+    q[3] += (0.5 * (w * gz + x * gy - y * gx) - push[3]) * dt_s
+    norm = sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
+    for i in range(4):
+        q[i] /= norm
+
+
+@kernel
+def run_fusion(
+    state: NDArray[np.void],
+    params: NDArray[np.void],
+    rate: NDArray[np.float64],
+    force: NDArray[np.float64],
+    field: NDArray[np.float64],
+    dt_s: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """A recording: ``out`` (n, 4) from (n, 3) arrays; ``dt_s`` (n,) before each sample."""
+    s, p = state[0], params[0]
+    for k in range(len(rate)):
+        step_fusion(s, p, rate[k], force[k], field[k], dt_s[k])
+        for i in range(4):
+            out[k, i] = s.quaternion[i]
