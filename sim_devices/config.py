@@ -115,6 +115,12 @@ class SensorConfig(_Table):
     cross_linear_V_per_g: NotNegative = 0.004
     scale_variation_per_g: NotNegative = 0.002
     """Sensitivity that follows the out-of-plane axis (000 (3.12))."""
+    cross_fold_V: NotNegative = 0.001
+    """Bias that follows the in-plane axis a as sqrt(1 + (a / 0.4 g)^2) - 1: no polynomial (ours)."""
+    cross_product_V_per_g2: NotNegative = 0.001
+    """Sensitivity that follows the in-plane axis, which 000 (3.12) does not know (ours)."""
+    spring_per_g2: NotNegative = 0.0005
+    """Relative change of sensitivity with the square of the own axis (data sheet: nonlinearity 0.5 % of full scale)."""
     bias_temperature_mg_per_K: NotNegative = 0.1
     scale_temperature_per_K: NotNegative = 5e-5
 

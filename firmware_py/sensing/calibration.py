@@ -3,6 +3,9 @@
 The ADXL-203 is ratiometric (data sheet, "Ratiometricity"): bias and scale follow the supply. Its outputs sit
 behind the RC filter and the supply reading does not, so the supply passes the same filter here before it
 divides; a supply ripple then cancels instead of being traded for a phase error.
+
+Each axis is read twice: with its line (3.3), then with the bias and the scale factor that the lines of its neighbours
+say, A = (L - g(L_y) - h(L_z)) / (1 + r(L_z)), which is 000 (3.11)-(3.14) with V_y and V_z counted from their zero.
 """
 
 from __future__ import annotations
@@ -37,6 +40,11 @@ CALIBRATION = np.dtype(
         ("scale_V", "f8", (6,)),  # per m/s^2
         ("bias_V_per_C", "f8", (6,)),
         ("scale_per_C", "f8", (6,)),
+        ("in_plane", "i8", (6,)),
+        ("out_of_plane", "i8", (6,)),
+        ("bias_in_plane", "f8", (6, 2)),  # 1, s^2/m
+        ("bias_out_of_plane", "f8", (6, 2)),
+        ("scale_out_of_plane", "f8", (6, 2)),  # s^2/m, s^4/m^2
         ("range", "f8"),  # m/s^2
         ("supply_channel", "i8"),
         ("supply_divider", "f8"),
@@ -66,6 +74,11 @@ def calibration_params(config: SensingConfig) -> Record:
         scale_V=np.array(config.scale_V_per_g) / g,
         bias_V_per_C=config.bias_V_per_C,
         scale_per_C=config.scale_per_C,
+        in_plane=config.in_plane,
+        out_of_plane=config.out_of_plane,
+        bias_in_plane=np.array(config.bias_in_plane) / (1.0, g),
+        bias_out_of_plane=np.array(config.bias_out_of_plane) / (1.0, g),
+        scale_out_of_plane=np.array(config.scale_out_of_plane) / (g, g * g),
         range=config.range_g * g,
         supply_channel=config.supply_channel,
         supply_divider=config.supply_divider,
@@ -108,13 +121,24 @@ def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params:
     ratio = params.nominal_supply_V / smoothed[0]
     rise = smoothed[1] - params.reference_C
     bits = 0
+    line = np.empty(6)
     for i in range(6):
         volts = frame[VOLTS + params.channel[i]] * ratio - params.bias_V[i] - params.bias_V_per_C[i] * rise
-        reading = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))
-        frame[ACCELEROMETER + i] = reading
-        if abs(reading) > params.range:
+        line[i] = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))
+        if abs(line[i]) > params.range:
             bits = SATURATED
+    composite(line, params, frame[ACCELEROMETER : ACCELEROMETER + 6])
     return bits
+
+
+@kernel
+def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64]) -> None:
+    """``out`` (6,) m/s^2 from the axes' lines (6,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (000 (3.4))."""
+    for i in range(len(line)):
+        y, z = line[params.in_plane[i]], line[params.out_of_plane[i]]
+        g, h, r = params.bias_in_plane[i], params.bias_out_of_plane[i], params.scale_out_of_plane[i]
+        bias = y * (g[0] + g[1] * y) + z * (h[0] + h[1] * z)
+        out[i] = (line[i] - bias) / (1.0 + z * (r[0] + r[1] * z))
 
 
 @kernel

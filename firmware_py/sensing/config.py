@@ -14,6 +14,11 @@ from hal.bench import validate_table
 
 Vector = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
+Pair = tuple[float, float]
+SixPairs = tuple[Pair, Pair, Pair, Pair, Pair, Pair]
+Places = tuple[Vector, Vector, Vector] | tuple[Vector, Vector, Vector, Vector, Vector, Vector]
+Axis = Annotated[int, Field(ge=0, le=5)]
+SixAxes = tuple[Axis, Axis, Axis, Axis, Axis, Axis]
 Positive = Annotated[float, Field(gt=0.0)]
 UNIT_AXES: tuple[Vector, ...] = (
     (1.0, 0.0, 0.0),
@@ -37,7 +42,12 @@ class SensingConfig(BaseModel):
     temperature_channel: int = Field(default=7, ge=0, le=7)
 
     # 000 (2.54), second: d1 = 20.2, d2 = 14.3, d3 = 116.0 mm; front sensor on the tool axis
-    positions_m: tuple[Vector, Vector, Vector] = ((0.0059, -0.0143, 0.0), (-0.0143, 0.0059, 0.0), (0.0, 0.0, 0.116))
+    # three packages of two axes, or a place for each of the six axes
+    positions_m: Places = (
+        (0.0059, -0.0143, 0.0),
+        (-0.0143, 0.0059, 0.0),
+        (0.0, 0.0, 0.116),
+    )
     axes: tuple[Vector, Vector, Vector, Vector, Vector, Vector] = UNIT_AXES  # pyright: ignore[reportAssignmentType]
     tip_m: Vector = (0.0, 0.0, 0.155)
     gravity_m_s2: Positive = 9.80131
@@ -55,6 +65,14 @@ class SensingConfig(BaseModel):
     bias_V_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
     scale_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
     range_g: Positive = 1.7
+    # composite model, 000 (3.4)-(3.14): which axes stand for V_y and V_z, and their polynomials without constant
+    # (ERRATA 29) in the first reading of those axes: linear part 1 and quadratic part 1/g of the bias in g; for the
+    # scale factor 1/g and 1/g^2
+    in_plane: SixAxes = (1, 0, 3, 2, 5, 4)
+    out_of_plane: SixAxes = (2, 2, 0, 0, 1, 1)
+    bias_in_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
+    bias_out_of_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
+    scale_out_of_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
 
     magnetometer_bias_V: Vector = (2.5, 2.5, 2.5)
     magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
@@ -81,6 +99,8 @@ class SensingConfig(BaseModel):
             raise ValueError("a scale factor is zero")
         if any(not 0.9 < float(np.linalg.norm(axis)) < 1.1 for axis in self.axes):
             raise ValueError("axes must be unit vectors")
+        if any(i in (j, k) for i, (j, k) in enumerate(zip(self.in_plane, self.out_of_plane, strict=True))):
+            raise ValueError("in_plane and out_of_plane name other axes, not the axis itself")
         condition = float(np.linalg.cond(self.observation()))
         if not condition < 1e5:
             raise ValueError(f"this sensor placement is singular (condition number {condition:.3g}); move a sensor")
@@ -102,7 +122,8 @@ class SensingConfig(BaseModel):
 
     def axis_positions(self) -> NDArray[np.float64]:
         """Position of each of the six axes, shape (6, 3), m."""
-        return np.array(self.positions_m)[[0, 0, 1, 1, 2, 2]]
+        places = np.array(self.positions_m)
+        return places if len(places) == 6 else places[[0, 0, 1, 1, 2, 2]]
 
     def observation(self) -> NDArray[np.float64]:
         """The 6 x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""

@@ -23,7 +23,7 @@ from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
-from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin
+from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin, outputs
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays, start_temperature_C
@@ -137,8 +137,12 @@ unit = "degC"
 
 
 def tumble_attitudes(positions: int) -> tuple[Array, Array]:
-    """Stage angles (n, 2) rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity."""
-    n = np.arange(positions, dtype=np.float64)
+    """Stage angles (n, 2) rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity.
+
+    The order jumps about, so that a drift during the recording does not look like one of the axes.
+    """
+    stride = next(k for k in range(round(0.618 * positions), 2 * positions) if math.gcd(k, positions) == 1)
+    n = (np.arange(positions) * stride % positions).astype(np.float64)
     polar: Array = np.arccos(1.0 - 2.0 * (n + 0.5) / positions)
     turn = math.pi * (3.0 - math.sqrt(5.0)) * n % (2.0 * math.pi)
     angles: Array = np.stack([turn, polar], axis=1).astype(np.float64)
@@ -158,30 +162,37 @@ def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> t
     if not 0.01 <= seconds <= 60.0:
         raise LabError(f"{seconds:g} s per position: give 0.01 to 60 s")
     angles, frames = tumble_attitudes(positions)
-    analog, magnet = np.empty((positions, 8)), np.empty((positions, 3))
+    analog, magnet, turned = np.empty((positions, 8)), np.empty((positions, 3)), np.empty((positions, 3))
     samples = round(seconds / NODE_S)
     plant, state = plant_arrays(config, build_unit(config, config.unit), frames[0])
     spread_V = _mean_noise_V(config, samples)
-    rng = stream(config.seed, "lab.tumble")
+    rng, strap_rng = stream(config.seed, "lab.tumble"), stream(config.seed, "lab.tumble.strap")
     still, truth = np.zeros(18), np.zeros(TRUTH_COLUMNS)
     for i in range(positions):
         plant[0]["frame"] = frames[i]
         begin(plant, state, still, still[:6], truth)
         noise = spread_V * rng.standard_normal(11)
         analog[i], magnet[i] = state[0]["daq_V"] + noise[:8], state[0]["magnetometer_V"] + noise[8:]
+        # the strap's reset pulse turns the sign of the sensitivity, not of the bridge's offset
+        state[0]["strap"] = -1.0
+        outputs(plant[0], state[0], 0.0)
+        turned[i] = state[0]["magnetometer_V"] + spread_V[8:] * strap_rng.standard_normal(3)
+        state[0]["strap"] = 1.0
     columns = {
         "stage_z_rad": angles[:, 0],
         "stage_y_rad": angles[:, 1],
         "attitude": frames,
         "analog_V": analog,
         "magnetometer_V": magnet,
+        "magnetometer_reset_V": turned,
     }
     descriptor = f"""format = 1
 title = "tumble of unit {config.unit}: {positions} positions, mean of {samples} samples each"
 data = "data.npz"
 gravity_m_s2 = {config.environment.gravity_m_s2}
 # attitude (n, 3, 3): body to world = Ry(stage_y) Rz(stage_z)
-# analog_V (n, 8): a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36; magnetometer_V (n, 3)
+# analog_V (n, 8): a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36; magnetometer_V (n, 3), after a set pulse
+# magnetometer_reset_V (n, 3): after a reset pulse
 """
     return columns, descriptor
 

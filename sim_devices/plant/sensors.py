@@ -2,7 +2,9 @@
 
 ADXL-203 (data sheet: ratiometric, 1 V/g and 2.5 V at 5 V, 110 ug/rtHz, internal 32 kOhm against 0.33 uF), TMP36
 (0.5 V + 10 mV/degC), supply through a 2:1 divider, HMC-2003 (1 V/gauss, 2.5 V at zero field), DAQ inputs. Cross-axis
-terms have the form of 000 (3.8), (3.10), (3.12). Not simulated: the accelerometer's resonance (5.5 kHz), 1/f noise.
+terms have the form of 000 (3.8), (3.10), (3.12), and on top of them three that no polynomial in the other axes'
+outputs describes: a fold, a product with the in-plane axis and a hardening spring. Not simulated: the accelerometer's
+resonance (5.5 kHz), 1/f noise.
 """
 
 from __future__ import annotations
@@ -42,6 +44,9 @@ ACCELEROMETER = np.dtype(
         ("out_of_plane_1", "f8"),
         ("out_of_plane_2", "f8"),
         ("scale_per_g", "f8"),
+        ("fold_V", "f8"),
+        ("product", "f8"),
+        ("spring", "f8"),
         ("range_V", "f8"),
         ("rc_s", "f8"),
         ("rc_keep", "f8"),
@@ -80,10 +85,10 @@ def rc_weights(tau_s: float, step_s: float) -> tuple[float, float, float]:
 
 
 def sensor_unit(config: SensorConfig, instrument: InstrumentConfig, seed: int, step_s: float) -> SensorUnit:
-    rng = stream(seed, "accelerometers")
+    rng, curves = stream(seed, "accelerometers"), stream(seed, "accelerometers.curves")
     rows = np.zeros(6, ACCELEROMETER)
     for i in range(6):
-        row, draw = rows[i], rng.standard_normal(12)
+        row, draw, curve = rows[i], rng.standard_normal(12), curves.standard_normal(3)
         row["location"], row["in_plane"], row["out_of_plane"] = LOCATION[i], IN_PLANE[i], OUT_OF_PLANE[i]
         axis = np.eye(3)[DIRECTION[i]]
         axis[IN_PLANE[i]] += math.radians(config.misalignment_deg) * draw[0]
@@ -96,6 +101,9 @@ def sensor_unit(config: SensorConfig, instrument: InstrumentConfig, seed: int, s
         row["in_plane_1"], row["out_of_plane_1"] = config.cross_linear_V_per_g * draw[6:8]
         row["in_plane_2"], row["out_of_plane_2"] = config.cross_quadratic_V_per_g2 * draw[8:10]
         row["scale_per_g"] = config.scale_variation_per_g * draw[10]
+        row["fold_V"] = config.cross_fold_V * curve[0]
+        row["product"] = config.cross_product_V_per_g2 * curve[1]
+        row["spring"] = config.spring_per_g2 * curve[2]
         row["range_V"] = config.range_g
         row["rc_s"] = config.rc_ohm * config.rc_farad * (1.0 + config.rc_spread * draw[11])
         row["rc_keep"], row["rc_from"], row["rc_to"] = rc_weights(row["rc_s"], step_s)
@@ -141,7 +149,12 @@ def accelerometer_V(a, f, supply_V, temperature_C):
     v = (
         a["bias_V"]
         + a["bias_V_per_K"] * warm
-        + a["scale_V_per_g"] * (1.0 + a["scale_per_K"] * warm) * (1.0 + a["scale_per_g"] * across) * along
+        + a["scale_V_per_g"]
+        * (1.0 + a["scale_per_K"] * warm)
+        * (1.0 + a["scale_per_g"] * across + a["spring"] * along * along)
+        * along
+        + a["product"] * other * along
+        + a["fold_V"] * (math.sqrt(1.0 + 6.25 * other * other) - 1.0)
         + other * (a["in_plane_1"] + a["in_plane_2"] * other)
         + across * (a["out_of_plane_1"] + a["out_of_plane_2"] * across)
     )

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from tools.calibrate.multi_position import Estimate, missing_poses
-from tools.cli.common import InputError
+from tools.errors import InputError
 
 Array = NDArray[np.float64]
 TUKEY = 4.685

@@ -1,28 +1,43 @@
-"""Sensor logs: a folder or .npz of one array per column, as recorded by the lab, exported, or re-packed."""
+"""Sensor logs: whatever a recording of the contract may be, with or without its descriptor, and our own recordings.
+
+A folder (recording.toml, meta.toml or data.npz in it), a descriptor, a .csv, .npz or .mcap file. Arrays of two
+dimensions in an .npz become columns ``name_0``, ``name_1``, ...
+"""
 
 from __future__ import annotations
 
 import tomllib
-from dataclasses import dataclass
+import zipfile
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.cli.common import InputError
+from tools.errors import InputError
+from tools.mismatch.recording_columns import column_names, read_columns
 
 Array = NDArray[np.float64]
+TIMES = ("t_s", "t", "time_s")
+LOST = 1.5
+"""A step of time longer than this many samples is a gap."""
 
 
 @dataclass(frozen=True)
 class SensorLog:
-    """Columns of equal length (n,), the rate if it is known, and what the folder's TOML says."""
+    """Columns of equal length (n,), the rate if it is known, what the folder's TOML says, units where it gives them.
+
+    ``gaps``: how often time jumps ahead.
+    """
 
     path: Path
     columns: dict[str, Array]
     rate_hz: float | None
     meta: dict[str, Any]
+    units: dict[str, str] = field(default_factory=dict[str, str])
+    gaps: int = 0
+    time_column: str | None = None
 
     def matrix(self, names: tuple[str, ...]) -> Array:
         """(n, len(names)); ``InputError`` names a column that is missing or not finite."""
@@ -42,22 +57,75 @@ class SensorLog:
 
 
 def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
-    """Read ``path`` (folder with data.npz, or .npz); ``rate_hz`` overrides what the file says."""
-    file = path / "data.npz" if path.is_dir() else path
+    """Read ``path``; ``rate_hz`` overrides what the file says. ``InputError`` for everything that is wrong with it."""
+    file, descriptor = _find(path)
+    meta = _toml(descriptor) if descriptor is not None else {}
+    channels = [c for c in meta.get("channels", []) if isinstance(c, dict) and isinstance(c.get("column"), str)]
+    units = {str(c["column"]): str(c["unit"]) for c in channels if "unit" in c}
+    if file.suffix.lower() == ".npz":
+        columns = _npz(file)
+    elif file.suffix.lower() == ".mcap" and (own := _own_recording(file)) is not None:
+        columns, units = own
+    else:
+        columns = read_columns(file, column_names(file))
+    if not columns:
+        raise InputError(f"{file}: holds no columns")
+    named = meta.get("time_column")
+    time = named if isinstance(named, str) else next((name for name in TIMES if name in columns), None)
+    if time is None:
+        time = next((name for name in columns if name.endswith(".log_time_s")), None)
+    gaps = 0
+    if time is not None:
+        if time not in columns:
+            raise InputError(f"{descriptor}: time_column '{time}' is no column of {file}")
+        step = np.diff(columns[time])
+        if len(step) == 0 or not np.all(np.isfinite(step)) or np.min(step) <= 0.0:
+            where = int(np.argmin(np.where(np.isfinite(step), step, -np.inf))) if len(step) else 0
+            raise InputError(f"{file}: time column '{time}' does not run forward at sample {where + 1}")
+        usual = float(np.median(step))
+        gaps = int(np.sum(step > LOST * usual))
+        rate_hz = rate_hz or 1.0 / usual
+    if rate_hz is None and isinstance(meta.get("rate_hz"), int | float) and float(meta["rate_hz"]) > 0.0:
+        rate_hz = float(meta["rate_hz"])
+    return SensorLog(file, columns, rate_hz, meta, units, gaps, time)
+
+
+def _find(path: Path) -> tuple[Path, Path | None]:
+    """The data file and its descriptor."""
+    if path.is_dir():
+        for name in ("recording.toml", "meta.toml"):
+            if (path / name).is_file():
+                return _data(path / name), path / name
+        return path / "data.npz", None
+    if path.suffix.lower() == ".toml":
+        return _data(path), path
+    beside = next((p for p in (path.parent / n for n in ("recording.toml", "meta.toml")) if p.is_file()), None)
+    return path, beside
+
+
+def _data(descriptor: Path) -> Path:
+    name = _toml(descriptor).get("data", "data.npz")
+    if not isinstance(name, str):
+        raise InputError(f"{descriptor}: 'data' must name the data file (.csv, .npz, .mcap), got {name!r}")
+    return descriptor.parent / name
+
+
+def _toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+
+
+def _npz(file: Path) -> dict[str, Array]:
     try:
         with np.load(file, allow_pickle=False) as archive:
             arrays = {name: np.asarray(archive[name]) for name in archive.files}
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
         raise InputError(f"{file}: cannot be read as .npz ({error})") from error
-    meta: dict[str, Any] = {}
-    for name in ("meta.toml", "recording.toml"):
-        beside = file.parent / name
-        if beside.is_file():
-            try:
-                meta = tomllib.loads(beside.read_text())
-            except tomllib.TOMLDecodeError as error:
-                raise InputError(f"{beside}: {error}") from error
-            break
+    arrays = {name: a for name, a in arrays.items() if a.dtype.kind in "fiub"}
     lengths = {len(array) for array in arrays.values() if array.ndim == 1}
     if not lengths:
         raise InputError(f"{file}: holds no columns (one-dimensional arrays)")
@@ -68,8 +136,17 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
     for name, array in arrays.items():
         if array.ndim == 2 and len(array) == length and array.shape[1] <= 16:
             columns.update({f"{name}_{i}": array[:, i].astype(np.float64) for i in range(array.shape[1])})
-    if rate_hz is None and "t_s" in columns:
-        rate_hz = float(1.0 / np.median(np.diff(columns["t_s"])))
-    if rate_hz is None and isinstance(meta.get("rate_hz"), int | float):
-        rate_hz = float(meta["rate_hz"])
-    return SensorLog(file, columns, rate_hz, meta)
+    return columns
+
+
+def _own_recording(file: Path) -> tuple[dict[str, Array], dict[str, str]] | None:
+    """Columns and units of a recording that ``micron run`` made; None when the file is another MCAP."""
+    from firmware_py.recording.errors import RecordingError
+    from firmware_py.recording.reader import Recording
+
+    try:
+        recording = Recording(file)
+    except (RecordingError, OSError):
+        return None
+    columns = {name: np.asarray(values) for name, values in recording.arrays().items()}
+    return columns, {name: recording.unit(name) for name in columns}

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from tools.calibrate.still import FACTORS, find_poses, quiet_level
-from tools.cli.common import InputError
+from tools.errors import InputError
 
 Array = NDArray[np.float64]
 NAMES = ("misalignment_0", "misalignment_1", "misalignment_2", "scale_x", "scale_y", "scale_z")

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.calibrate.multi_position import Estimate
-from tools.cli.common import InputError
+from tools.errors import InputError
 
 Array = NDArray[np.float64]
 

@@ -1,9 +1,8 @@
-"""Bias, scale and direction of every sensor axis from a resting instrument in many known attitudes.
+"""The sensors of a resting instrument from a tumble on two rotary stages (000 sec. 3.2.1.7, 3.2.2.4).
 
-At rest V / (supply / nominal) = bias + s . f, with f = C_WB^T (0, 0, g) (ERRATA 2): linear in bias and the
-sensitivity vector s, whose length is the scale factor and whose direction is the axis with its misalignment
-(000, sec. 3.2.1). The magnetometer measures a field of unknown size and direction: V = bias + M C_WB^T B, solved
-by alternating least squares; only the product of M and B shows, so the mean scale is taken as nominal.
+At rest every axis reads f = C_WB^T (0, 0, g) (ERRATA 2). Accelerometers: ``composite``, magnetometer: ``field_frame``.
+C_WB = R_y(alpha) R_z(beta) with the stage angles of 000 Fig. 3.3: alpha = 0 lays the x-y plane level, at alpha = 90
+degrees beta = 0 points x along gravity.
 """
 
 from __future__ import annotations
@@ -15,101 +14,117 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.cli.common import InputError
+from firmware_py.sensing.config import SensingConfig
+from tools.calibrate.composite import CompositeFit, fit_composite
+from tools.calibrate.field_frame import FieldFrame, fit_field
+from tools.calibrate.stage_log import load_stage_log
+from tools.errors import InputError
 
 Array = NDArray[np.float64]
 NOMINAL_SUPPLY_V = 5.0
-NOMINAL_MAGNETOMETER_V_PER_UT = 0.01
 SENSORS = ("1x", "1z", "2y", "2z", "3x", "3y")
+DRIFT_TOLERANCE_G = 2e-3
 
 
 @dataclass(frozen=True)
 class TumbleResult:
-    """What was identified: ``table`` for [sensing] of a calibration, residual rms per axis in V."""
+    """What was identified: ``table`` for [sensing] of a calibration, fits with intervals and residuals."""
 
     table: dict[str, Any]
-    residual_V: dict[str, float]
-    condition: float
-    positions: int
+    accelerometers: CompositeFit
+    magnetometer: FieldFrame
+    drift_fitted: bool
+
+    @property
+    def positions(self) -> int:
+        return self.accelerometers.poses
+
+    @property
+    def condition(self) -> float:
+        """The worst of the axes."""
+        return max(axis.condition for axis in self.accelerometers.axes)
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
-        return asdict(self)
+        return {
+            "table": self.table,
+            "positions": self.positions,
+            "condition": self.condition,
+            "missing": self.accelerometers.missing,
+            "drift_fitted": self.drift_fitted,
+            "axes": {
+                name: {**asdict(axis), "scale_V_per_g": axis.scale_V_per_g, "direction": axis.direction}
+                for name, axis in zip(SENSORS, self.accelerometers.axes, strict=True)
+            },
+            "magnetometer": asdict(self.magnetometer),
+        }
 
 
 def load_tumble(folder: Path) -> dict[str, Array]:
-    """Arrays of a tumble recording: ``attitude`` (n,3,3) body to world, ``analog_V`` (n,8), ``magnetometer_V``."""
-    path = folder / "data.npz" if folder.is_dir() else folder
-    try:
-        with np.load(path, allow_pickle=False) as archive:
-            data = {name: np.asarray(archive[name], dtype=np.float64) for name in archive.files}
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as .npz ({error}); record one with the lab's 'tumble'") from error
-    for name, shape in (("attitude", (3, 3)), ("analog_V", (8,)), ("magnetometer_V", (3,))):
-        if name not in data or data[name].shape[1:] != shape:
-            raise InputError(
-                f"{path}: array '{name}' (n, {', '.join(map(str, shape))}) is missing or has another shape"
-            )
-        if not np.all(np.isfinite(data[name])):
-            row = int(np.argwhere(~np.isfinite(data[name]))[0][0])
-            raise InputError(f"{path}: '{name}' is not finite at position {row}")
+    """``attitude`` (n,3,3) body to world, ``analog_V`` (n,8), ``magnetometer_V`` (n,3), and ``magnetometer_reset_V``
+    if it was recorded; one row a pose (rows at one pair of stage angles are averaged)."""
+    log = load_stage_log(folder)
+    data = {"attitude": log.attitude}
+    for name, width in (("analog_V", 8), ("magnetometer_V", 3), ("magnetometer_reset_V", 3)):
+        if name == "magnetometer_reset_V" and f"{name}_0" not in log.columns:
+            continue
+        data[name] = log.matrix(tuple(f"{name}_{i}" for i in range(width)))
     return data
 
 
-def identify(data: dict[str, Array], *, supply_divider: float = 2.0) -> TumbleResult:
-    """Fit all axes. Raises ``InputError`` when the attitudes do not span enough."""
-    attitude, analog, field_V = data["attitude"], data["analog_V"], data["magnetometer_V"]
+def identify(
+    data: dict[str, Array], *, supply_divider: float = 2.0, quadratic: bool = True, fit_drift: bool = False
+) -> TumbleResult:
+    """Fit all axes. InputError when the attitudes do not span enough, or while the sensors still warm up.
+
+    ``quadratic`` off leaves bias, scale and direction alone (000 (3.1)-(3.3), (3.15)-(3.19)).
+    """
+    attitude, analog = data["attitude"], data["analog_V"]
     up_body = attitude.transpose(0, 2, 1) @ np.array([0.0, 0.0, 1.0])  # specific force in g
-    design = np.column_stack([np.ones(len(up_body)), up_body])
-    condition = float(np.linalg.cond(design))
-    if len(design) < 6 or condition > 20:
-        raise InputError(
-            f"{len(design)} positions with condition number {condition:.0f} do not show all axes; "
-            "point each axis up and down at least once"
-        )
     ratio = analog[:, 6] * supply_divider / NOMINAL_SUPPLY_V
-    bias, scale, axes, residual = [], [], [], {}
-    for i, sensor in enumerate(SENSORS):
-        volts = analog[:, i] / ratio
-        solution, *_ = np.linalg.lstsq(design, volts, rcond=None)
-        bias.append(float(solution[0]))
-        scale.append(float(np.linalg.norm(solution[1:])))
-        axes.append([float(v) for v in solution[1:] / scale[-1]])
-        residual[sensor] = float(np.std(volts - design @ solution))
-    magnetometer_bias, matrix, magnetometer_residual = _magnetometer(attitude, field_V)
-    magnetometer_scale = np.linalg.norm(matrix, axis=1)
-    residual["magnetometer"] = magnetometer_residual
-    table = {
-        "bias_V": bias,
-        "scale_V_per_g": scale,
-        "axes": axes,
-        "reference_temperature_C": float(np.mean((analog[:, 7] - 0.5) / 0.010)),
-        "magnetometer_bias_V": magnetometer_bias.tolist(),
-        "magnetometer_scale_V_per_uT": magnetometer_scale.tolist(),
-        "magnetometer_axes": (matrix / magnetometer_scale[:, None]).tolist(),
+    nominal = SensingConfig()
+    fit = fit_composite(
+        analog[:, :6] / ratio[:, None],
+        up_body,
+        nominal.in_plane,
+        nominal.out_of_plane,
+        quadratic=quadratic,
+        fit_drift=fit_drift,
+    )
+    if not fit_drift:
+        refuse_drift(fit)
+    field = fit_field(attitude, data["magnetometer_V"], data.get("magnetometer_reset_V"))
+    scale = np.linalg.norm(field.matrix, axis=1)
+    table: dict[str, Any] = {
+        "bias_V": [axis.value("bias_V") for axis in fit.axes],
+        "scale_V_per_g": [axis.scale_V_per_g for axis in fit.axes],
+        "axes": [list(axis.direction) for axis in fit.axes],
     }
-    return TumbleResult(table, residual, condition, len(design))
+    if quadratic:
+        table |= {
+            "in_plane": list(nominal.in_plane),
+            "out_of_plane": list(nominal.out_of_plane),
+            "bias_in_plane": [[0.0, axis.value("in_plane_2")] for axis in fit.axes],
+            "bias_out_of_plane": [[0.0, axis.value("out_of_plane_2")] for axis in fit.axes],
+            "scale_out_of_plane": [[axis.value("scale_1"), axis.value("scale_2")] for axis in fit.axes],
+        }
+    table |= {
+        "reference_temperature_C": float(np.mean((analog[:, 7] - 0.5) / 0.010)),
+        "magnetometer_bias_V": [e.value for e in field.bias],
+        "magnetometer_scale_V_per_uT": scale.tolist(),
+        "magnetometer_axes": (field.matrix / scale[:, None]).tolist(),
+    }
+    return TumbleResult(table, fit, field, fit_drift)
 
 
-def _magnetometer(attitude: Array, volts: Array) -> tuple[Array, Array, float]:
-    """Bias (3,), sensitivity (3,3) V/uT and residual rms V, by alternating between M and the world field B."""
-    n = len(attitude)
-    matrix = NOMINAL_MAGNETOMETER_V_PER_UT * np.eye(3)
-    bias = volts.mean(axis=0)
-    field = np.zeros(3)
-    for _ in range(200):
-        # B, given M and bias: stack M C^T over all positions
-        stack = (matrix @ attitude.transpose(0, 2, 1)).reshape(3 * n, 3)
-        field, *_ = np.linalg.lstsq(stack, (volts - bias).ravel(), rcond=None)
-        body = attitude.transpose(0, 2, 1) @ field
-        design = np.column_stack([np.ones(n), body])
-        solution, *_ = np.linalg.lstsq(design, volts, rcond=None)
-        previous, bias, matrix = matrix, solution[0], solution[1:].T
-        # the product M B is what shows: fix the gauge by the mean scale
-        matrix = matrix * (NOMINAL_MAGNETOMETER_V_PER_UT / np.cbrt(abs(np.linalg.det(matrix))))
-        if np.max(np.abs(matrix - previous)) < 1e-12:
-            break
-    stack = (matrix @ attitude.transpose(0, 2, 1)).reshape(3 * n, 3)
-    field, *_ = np.linalg.lstsq(stack, (volts - bias).ravel(), rcond=None)
-    residual = float(np.std(volts - bias - (attitude.transpose(0, 2, 1) @ field) @ matrix.T))
-    return bias, matrix, residual
+def refuse_drift(fit: CompositeFit) -> None:
+    """InputError when an axis' bias moved during the recording by more than 2 mg, beyond doubt."""
+    for i, axis in enumerate(fit.axes):
+        moved = axis.drift.value / axis.scale_V_per_g
+        sure = min(abs(axis.drift.low), abs(axis.drift.high)) if axis.drift.low * axis.drift.high > 0.0 else 0.0
+        if abs(moved) > DRIFT_TOLERANCE_G and np.isfinite(sure) and sure > 0.0:
+            raise InputError(
+                f"the bias of axis {SENSORS[i] if len(fit.axes) == 6 else i} moved by {1e3 * moved:.1f} mg during the "
+                f"recording ({1e3 * DRIFT_TOLERANCE_G:g} mg is allowed): the sensors still warm up; wait and record "
+                "again, or give --drift fit"
+            )

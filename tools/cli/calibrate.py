@@ -9,6 +9,7 @@ import typer
 from rich.table import Table
 
 from tools.cli import calibrate_axes
+from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json, write_text_atomic
 
 calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks from calibration recordings.")
@@ -21,36 +22,64 @@ Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration fi
 
 @calibrate.command("sensors")
 def sensors(
-    recording: Annotated[Path, typer.Argument(metavar="TUMBLE", help="Folder or .npz of a tumble in known attitudes.")],
+    recording: Annotated[
+        Path, typer.Argument(metavar="TUMBLE", help="Recording of the resting instrument on two rotary stages.")
+    ],
     out: Out,
-    gravity: Annotated[float, typer.Option(help="Local gravity, m/s^2.")] = 9.80131,
+    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = 9.80131,
+    model: Annotated[Model, typer.Option(help="Cross-axis bias and scale factor as well, or the line alone.")] = (
+        Model.COMPOSITE
+    ),
+    drift: Annotated[OnDrift, typer.Option(help="When the sensors still warm up.")] = OnDrift.REFUSE,
     json_file: JsonOption = None,
 ) -> None:
-    """Bias, scale and direction of every sensor axis from a resting instrument in many known attitudes.
+    """Bias, scale, direction and cross-axis terms of every sensor axis from a resting instrument in many attitudes.
 
     Example: micron calibrate sensors out/tumble --out out/sensors.toml
     """
     from tools.calibrate.calibration_file import calibration_toml
-    from tools.calibrate.tumble import identify, load_tumble
+    from tools.calibrate.tumble import SENSORS, identify, load_tumble
 
     with clear_errors():
         check_writable(json_file, out)
-        result = identify(load_tumble(recording))
+        result = identify(load_tumble(recording), quadratic=model is Model.COMPOSITE, fit_drift=drift is OnDrift.FIT)
         made_by = f"micron calibrate sensors {recording}"
         write_text_atomic(
             out, calibration_toml("sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
         )
-        table = Table(title=f"{result.positions} positions, condition {result.condition:.1f}", title_justify="left")
-        for column in ("axis", "bias (V)", "scale (V/g)", "residual rms (mV)"):
+        table = Table(
+            title=f"{result.positions} positions, condition {result.condition:.1f}, intervals of 95 %",
+            title_justify="left",
+        )
+        for column in (
+            "axis",
+            "bias (V)",
+            "scale (V/g)",
+            "bias with in-plane, out-of-plane (mg/g^2)",
+            "rms: line, model, left out (mV)",
+        ):
             table.add_column(column, justify="right")
-        for i, axis in enumerate(("1x", "1z", "2y", "2z", "3x", "3y")):
+        for name, axis in zip(SENSORS, result.accelerometers.axes, strict=True):
+            cross = [axis.parameters[key] for key in ("in_plane_2", "out_of_plane_2")]
+            bias = axis.parameters["bias_V"]
             table.add_row(
-                axis,
-                f"{result.table['bias_V'][i]:.4f}",
-                f"{result.table['scale_V_per_g'][i]:.4f}",
-                f"{1e3 * result.residual_V[axis]:.3f}",
+                name,
+                f"{bias.value:.5f} +- {bias.high - bias.value:.5f}",
+                f"{axis.scale_V_per_g:.5f}",
+                ", ".join(f"{1e3 * e.value:.2f} +- {1e3 * (e.high - e.value):.2f}" for e in cross),
+                f"{1e3 * axis.linear_rms_V:.3f}, {1e3 * axis.residual_rms_V:.3f}, {1e3 * axis.held_out_rms_V:.3f}",
             )
         console().print(table)
+        offset = result.magnetometer.offset_V
+        console().print(
+            f"magnetometer: residual {1e6 * result.magnetometer.residual_rms_V:.2f} uV rms; "
+            + (
+                "bridge offset from set and reset " + ", ".join(f"{1e3 * (e.value - 2.5):+.3f}" for e in offset) + " mV"
+                if offset
+                else "no reset pulses recorded: bridge offset and hard iron are one number"
+            )
+        )
+        console().print("missing poses: " + (", ".join(result.accelerometers.missing) or "none"))
         console().print(f"written: {out}")
         write_json({"format": 1, "out": str(out), **result.as_dict()}, json_file)
 

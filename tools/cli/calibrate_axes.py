@@ -27,6 +27,7 @@ class Method(StrEnum):
     """How the log was taken."""
 
     POSES = "poses"
+    STAGE = "stage"
     TURN = "turn"
     FALL = "fall"
     FLAT = "flat"
@@ -37,6 +38,13 @@ class OnDrift(StrEnum):
 
     REFUSE = "refuse"
     FIT = "fit"
+
+
+class Model(StrEnum):
+    """How much of 000 sec. 3.2.1 is identified."""
+
+    COMPOSITE = "composite"
+    LINEAR = "linear"
 
 
 Columns = Annotated[str, typer.Option(help="The three columns, with commas.")]
@@ -61,10 +69,14 @@ def _print(title: str, parameters: dict, notes: list[str]) -> None:
 
 
 def accelerometer(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .npz with three columns.")],
-    method: Annotated[Method, typer.Option(help="Still poses at unknown angles, or a quick method of 002.")] = (
-        Method.POSES
-    ),
+    recording: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING", help="Recording (folder, .toml, .csv, .npz, .mcap) with three columns."),
+    ],
+    method: Annotated[
+        Method, typer.Option(help="Still poses at unknown angles, a rotary stage, or a quick method of 002.")
+    ] = Method.POSES,
+    model: Annotated[Model, typer.Option(help="Stage: with cross-axis terms, or the line alone.")] = Model.COMPOSITE,
     columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
     gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = STANDARD_GRAVITY,
     rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
@@ -86,6 +98,9 @@ def accelerometer(
 
     with clear_errors():
         check_writable(json_file, out)
+        if method is Method.STAGE:
+            _stage(recording, _three(columns), model, drift, rate_hz, out, json_file)
+            return
         log = load_log(recording, rate_hz)
         raw, rate = log.matrix(_three(columns)), log.need_rate()
         raw, warm = remove_drift(raw, rate, allowed=drift is OnDrift.FIT)
@@ -115,10 +130,50 @@ def accelerometer(
         write_json({"format": 1, "method": method.value, **asdict(result), "warm_up": asdict(warm)}, json_file)
 
 
+def _stage(
+    recording: Path,
+    columns: tuple[str, str, str],
+    model: Model,
+    drift: OnDrift,
+    rate_hz: float | None,
+    out: Path | None,
+    json_file: str | None,
+) -> None:
+    """Three axes whose attitude two stages gave: x and y of one package, z of another (000 sec. 3.2.1.7)."""
+    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.composite import fit_composite
+    from tools.calibrate.stage_log import load_stage_log
+    from tools.calibrate.tumble import refuse_drift
+
+    log = load_stage_log(recording, rate_hz)
+    force = log.attitude[:, 2, :]
+    fit = fit_composite(
+        log.matrix(columns),
+        force,
+        (1, 0, 0),
+        (2, 2, 1),
+        quadratic=model is Model.COMPOSITE,
+        fit_drift=drift is OnDrift.FIT,
+    )
+    if drift is OnDrift.REFUSE:
+        refuse_drift(fit)
+    notes = [
+        f"{name}: residual rms {axis.residual_rms_V:.4g} V (line alone {axis.linear_rms_V:.4g}, poses left out "
+        f"{axis.held_out_rms_V:.4g}), condition {axis.condition:.1f}"
+        for name, axis in zip("xyz", fit.axes, strict=True)
+    ]
+    notes.append("missing: " + (", ".join(fit.missing) or "nothing"))
+    named = {f"{n}.{k}": e for n, axis in zip("xyz", fit.axes, strict=True) for k, e in axis.parameters.items()}
+    _print(f"accelerometer, stage, {fit.poses} poses", named, notes)
+    if out is not None:
+        tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
+        made_by = f"micron calibrate accelerometer {recording} --method stage"
+        write_text_atomic(out, calibration_toml("accelerometer", made_by, tables))
+    write_json({"format": 1, "method": "stage", **asdict(fit)}, json_file)
+
+
 def magnetometer(
-    recording: Annotated[
-        Path, typer.Argument(metavar="RECORDING", help="Folder or .npz, turned through all directions.")
-    ],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording, turned through all directions.")],
     columns: Columns = "mag_x_raw,mag_y_raw,mag_z_raw",
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,

@@ -38,6 +38,42 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
     return columns
 
 
+def column_names(path: Path) -> list[str]:
+    """The columns that ``read_columns`` could read from a data file. Raises RecordingError."""
+    if not path.is_file():
+        raise RecordingError(f"{path}: data file does not exist")
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        try:
+            with path.open(newline="", encoding="utf-8-sig") as f:
+                head = f.readline()
+        except UnicodeDecodeError as error:
+            raise RecordingError(f"{path}: not a UTF-8 text file ({error.reason}); save it as UTF-8 csv") from None
+        delimiter = next((d for d in ",;\t" if d in head), ",")
+        return [h.strip() for h in next(csv.reader([head], delimiter=delimiter), [])]
+    if suffix == ".mcap":
+        return _mcap_names(path)
+    raise RecordingError(f"{path}: data must be .csv, .npz or .mcap, not '{path.suffix}'")
+
+
+def _mcap_names(path: Path) -> list[str]:
+    from mcap.exceptions import McapError
+    from mcap.reader import make_reader
+
+    names: dict[str, None] = {}
+    try:
+        with path.open("rb") as f:
+            for _, (_schema, channel, message) in zip(range(1000), make_reader(f).iter_messages(), strict=False):
+                if channel.message_encoding == "json":
+                    names.update(dict.fromkeys(_flatten(json.loads(message.data), channel.topic)))
+                    names[f"{channel.topic}.log_time_s"] = None
+    except McapError as error:
+        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise RecordingError(f"{path}: not JSON ({error})") from None
+    return list(names)
+
+
 def _missing(path: Path, name: str, have: list[str]) -> RecordingError:
     shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
     return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")

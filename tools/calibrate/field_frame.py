@@ -1,0 +1,75 @@
+"""Bias, scale and direction of a three-axis magnetometer from poses whose attitude is known (000 sec. 3.2.2).
+
+V = b + M C_WB^T B with the world field B unknown: only the product M B shows, so the mean scale is taken as nominal
+and B comes out in those units. Hard iron turns with the body and is part of b, soft iron and misalignment part of M. A
+reset pulse on the strap turns the sign of M and of the hard iron but not of the bridge's offset: (set - reset) / 2 is
+free of that offset, (set + reset) / 2 is nothing else.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import t as student
+
+from tools.calibrate.multi_position import Estimate
+
+Array = NDArray[np.float64]
+NOMINAL_V_PER_UT = 0.01
+
+
+@dataclass(frozen=True)
+class FieldFrame:
+    """``bias`` V and ``matrix`` V/uT (3, 3) with 95 % intervals; ``offset_V`` of the bridge if pulses were recorded."""
+
+    bias: tuple[Estimate, ...]
+    matrix: Array
+    matrix_reach: Array
+    field: Array
+    residual_rms_V: float
+    offset_V: tuple[Estimate, ...] | None
+
+
+def _mean(values: Array) -> Estimate:
+    reach = float(student.ppf(0.975, len(values) - 1)) * float(values.std(ddof=1)) / len(values) ** 0.5
+    centre = float(values.mean())
+    return Estimate(centre, centre - reach, centre + reach)
+
+
+def fit_field(attitude: Array, set_V: Array, reset_V: Array | None = None) -> FieldFrame:
+    """``attitude`` (n, 3, 3) body to world; outputs (n, 3) after a set and, if recorded, after a reset pulse."""
+    offset = None
+    volts = set_V
+    if reset_V is not None:
+        sums = 0.5 * (set_V + reset_V)
+        offset = tuple(_mean(sums[:, i]) for i in range(3))
+        volts = 0.5 * (set_V - reset_V) + np.array([e.value for e in offset])
+    n = len(attitude)
+    matrix, bias, field = NOMINAL_V_PER_UT * np.eye(3), volts.mean(axis=0), np.zeros(3)
+    turned = attitude.transpose(0, 2, 1)
+    design = np.empty((n, 4))
+    for _ in range(200):
+        # B, given M and bias: stack M C^T over all poses
+        field, *_ = np.linalg.lstsq((matrix @ turned).reshape(3 * n, 3), (volts - bias).ravel(), rcond=None)
+        design = np.column_stack([np.ones(n), turned @ field])
+        solution, *_ = np.linalg.lstsq(design, volts, rcond=None)
+        previous, bias, matrix = matrix, solution[0], solution[1:].T
+        matrix = matrix * (NOMINAL_V_PER_UT / np.cbrt(abs(np.linalg.det(matrix))))
+        if np.max(np.abs(matrix - previous)) < 1e-12:
+            break
+    field, *_ = np.linalg.lstsq((matrix @ turned).reshape(3 * n, 3), (volts - bias).ravel(), rcond=None)
+    residual = volts - bias - (turned @ field) @ matrix.T
+    # intervals given B: M and b are linear then
+    freedom = max(1, n - 4)
+    factor = float(student.ppf(0.975, freedom)) * np.sqrt(np.sum(residual**2, axis=0) / freedom)
+    reach = factor[:, None] * np.sqrt(np.diag(np.linalg.pinv(design.T @ design)))
+    return FieldFrame(
+        tuple(Estimate(float(b), float(b - r), float(b + r)) for b, r in zip(bias, reach[:, 0], strict=True)),
+        matrix,
+        reach[:, 1:],
+        field,
+        float(np.sqrt(np.mean(residual**2))),
+        offset,
+    )
