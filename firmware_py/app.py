@@ -26,6 +26,7 @@ from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
 from firmware_py.exit_codes import exit_code_of
 from firmware_py.frame import LAYOUT
+from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
@@ -47,6 +48,12 @@ class RunRequest:
     hand_scale: float | None = None
     record: Path | None = None
     seed: int | None = None
+    live_fds: tuple[int, int] | None = None
+    """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
+    stale_ms: float | None = None
+    """Another limit for missing scans than the bench file's."""
+    truth_s: float | None = None
+    """How much truth an emulated world keeps; None: all of it."""
 
     def to_json(self, runtime_dir: Path) -> str:
         """For the firmware's own process."""
@@ -79,14 +86,23 @@ def run_in_process(
                 hand_file=Path(request.hand_file) if request.hand_file else None,
                 hand_scale=request.hand_scale,
                 seed=request.seed,
+                truth_s=request.truth_s,
             )
         )
         devices = open_devices(opened)
         if on_open is not None:
             on_open(opened)
         config, configs = load_firmware_config(bench, devices.sensing_table)
+        if request.stale_ms is not None:
+            safety = config.safety.model_copy(update={"stale_ms": request.stale_ms})
+            config = config.model_copy(update={"safety": safety})
         stages = Stages(configs)
         recorder = _recorder(request, bench, configs, opened)
+        live = None
+        if request.live_fds is not None:
+            live = LiveLink(*request.live_fds)
+            stack.callback(live.close)
+            (folder / "metadata.json").write_text(json.dumps(recording_metadata(bench, configs, opened)))
         loop = InstrumentLoop(
             devices,
             stages,
@@ -95,7 +111,10 @@ def run_in_process(
             tick_hz=bench.description.clock.tick_hz,
             recorder=recorder,
             on_status=on_status,
+            live=live,
         )
+        if on_status is not None and live is not None:
+            on_status({"event": "devices", "identities": devices.identities, "histograms": list(loop.histograms())})
         report = RealtimeReport()
         summary: RecordingSummary | None = None
         try:
@@ -127,7 +146,13 @@ def _recorder(
 ) -> RecorderProcess | None:
     if request.record is None:
         return None
-    metadata = {
+    columns = list(zip(LAYOUT.scalar_names(), LAYOUT.scalar_units(), strict=True))
+    return RecorderProcess.start(request.record, columns, recording_metadata(bench, configs, opened))
+
+
+def recording_metadata(bench: BenchFile, configs: StageConfigs, opened: OpenBench) -> dict[str, str]:
+    """What a recording says of the run that it is of."""
+    return {
         "bench": bench.text,
         "bench_name": bench.description.name,
         "stages": json.dumps(configs.as_dict()),
@@ -135,8 +160,6 @@ def _recorder(
         "clock": "virtual" if opened.virtual else "real",
         "tick_hz": str(bench.description.clock.tick_hz),
     }
-    columns = list(zip(LAYOUT.scalar_names(), LAYOUT.scalar_units(), strict=True))
-    return RecorderProcess.start(request.record, columns, metadata)
 
 
 def make_outcome(
@@ -181,6 +204,8 @@ def make_outcome(
             "reason": reason,
             "normal": trip is not None and trip.normal and supervisor.safe_reached,
             "tick": trip.tick if trip is not None else -1,
+            "asked_ns": loop.asked_safe_ns,
+            "reached_ns": loop.safe_reached_ns,
         },
         "estimator": loop.stages.configs.tremor.method,
         "realtime": describe_scheduling(report, request.virtual),
@@ -226,8 +251,10 @@ def main(arguments: list[str]) -> int:
     table = json.loads(Path(arguments[0]).read_text())
     runtime_dir = Path(table.pop("runtime_dir"))
     record = table.pop("record")
+    live_fds = table.pop("live_fds")
     request = RunRequest(
-        **{**table, "bench": Path(table["bench"]), "record": Path(record) if record is not None else None}
+        **{**table, "bench": Path(table["bench"]), "record": Path(record) if record is not None else None},
+        live_fds=tuple(live_fds) if live_fds is not None else None,
     )
     try:
         outcome, truth = run_in_process(request, _status_pipe(), runtime_dir)

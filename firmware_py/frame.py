@@ -83,6 +83,7 @@ class FrameStatus(IntFlag):
     SETTLING = 32  # estimator not settled, nothing is commanded yet
     RESTARTED = 64  # a gap was too long to coast over: alignment starts again
     COMMANDED = 128  # the newest scan of its tick, and the outputs were free to move: a command was computed
+    MANUAL = 256  # the command was chosen by hand (bench page), not computed
 
 
 class Clip(IntFlag):

@@ -266,10 +266,11 @@ def open_bench(
     hand_file: Path | None = None,
     hand_scale: float | None = None,
     seed: int | None = None,
+    truth_s: float | None = None,
 ) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
-    ``hand_file`` and ``hand_scale`` go to the emulated world. Raises ``OpenFailed`` with every cause.
+    ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps. Raises ``OpenFailed`` with every cause.
     """
     description = bench.description
     emulated = description.emulated_buses()
@@ -285,6 +286,8 @@ def open_bench(
             table = description.model_dump()
             if seed is not None:
                 table["emulation"]["seed"] = seed
+            if truth_s is not None:
+                table["emulation"]["truth_s"] = truth_s
             world = _provider(bench)(
                 table,
                 clock=clock if virtual else None,

@@ -268,6 +268,8 @@ class EmulationConfig(_Table):
     """Which physical instrument: its sensors' and stacks' own errors. Calibration files belong to one unit."""
     seed: Annotated[int, Field(ge=0)] = 1
     """The hand, and everything that is noise."""
+    truth_s: Positive | None = None
+    """How much of the physical truth is kept, at least; None: all of it."""
     hand: HandConfig = HandConfig()
     instrument: InstrumentConfig = InstrumentConfig()
     sensors: SensorConfig = SensorConfig()

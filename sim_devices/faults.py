@@ -17,6 +17,7 @@ FAULTS = (
     "stuck / free: SDA of an I2C bus is held low / released",
     "silence / speak: a CAN node or CAN bus goes silent / comes back",
     "overflow: the DAQ's FIFO overflows now",
+    "spike: a pulse of 0.5 V for 2 ms on a DAQ input; the target is its number, 0 to 7",
     "press / release: the stop button, or the button of the motion card named",
 )
 
@@ -42,6 +43,11 @@ def inject(
                 device.press() if fault == "press" else device.release()
                 return
         raise UnknownFault("there is no button on this bench; add a can_telemetry device or a motion card")
+    if fault == "spike":
+        if target not in tuple("01234567"):
+            raise UnknownFault(f"'{target}' is not a DAQ input; inputs are 0 to 7")
+        world.spike(int(target))
+        return
     where = _target(world, target)
     flags = {
         "freeze": ("frozen", True),

@@ -36,6 +36,7 @@ from sim_devices.transports.i2c_line import I2cLine
 
 SIM_SCHEME = "sim://"
 AMPLIFIER_GAIN = 20.0  # the emulated amplifier's own; what the firmware believes is in its device table
+SPIKE_V, SPIKE_NS = 0.5, 2_000_000
 STRAP_SET, STRAP_RESET = 1, 2  # digital outputs 0 and 1 of the DAQ
 Truth = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 
@@ -75,6 +76,8 @@ class World:
         self._timed: list[TimedFace] = []
         self._adc_wiring = np.zeros(4, dtype=np.intp)
         self._adc_volts = np.zeros(4)
+        self._spike_channel: int | None = None
+        self._spike_until_ns: int | None = None
         self._build(description)
 
     # ------------------------------------------------------------------ time
@@ -124,7 +127,22 @@ class World:
 
     def _analog_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
-        return self.plant.analog_V
+        return self.plant.analog_V if self._spike_channel is None else self._spiked(self.plant.analog_V, t_ns)
+
+    def spike(self, channel: int) -> None:
+        """The wire of DAQ input ``channel`` picks up a pulse of ``SPIKE_V`` for ``SPIKE_NS``, from the next look on."""
+        self._spike_channel, self._spike_until_ns = channel, None
+
+    def _spiked(self, volts: Volts, t_ns: int) -> Volts:
+        assert self._spike_channel is not None
+        if self._spike_until_ns is None:
+            self._spike_until_ns = t_ns + SPIKE_NS
+        if t_ns >= self._spike_until_ns:
+            self._spike_channel = None
+            return volts
+        disturbed = np.array(volts, dtype=np.float64)
+        disturbed[self._spike_channel] += SPIKE_V
+        return disturbed
 
     def _motion(self, t_ns: int) -> BodyMotion:
         self.plant.advance_to(t_ns - self.epoch_ns)

@@ -7,7 +7,7 @@ everything that can wait. Nothing here knows whether the bench is real.
 from __future__ import annotations
 
 import signal
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.manual import ManualDrive
 from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.wiring import Devices
@@ -33,6 +34,7 @@ from firmware_py.frame import (
     TREMOR_FREQUENCY,
     FrameStatus,
 )
+from firmware_py.live.link import LiveLink
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.scheduler import Scheduler
 from firmware_py.scheduler.task import BackgroundSpec, TaskSpec, TickInfo
@@ -87,7 +89,9 @@ class InstrumentLoop:
         tick_hz: int,
         recorder: Recorder | None = None,
         on_status: Callable[[dict[str, object]], None] | None = None,
+        live: LiveLink | None = None,
     ) -> None:
+        self._live = live
         self._devices = devices
         self.stages = stages
         self._frame = stages.frame
@@ -108,12 +112,14 @@ class InstrumentLoop:
         self.counts = LoopCounts()
         self.error: HalError | None = None
         self.armed_ns: int | None = None
-        self.scheduler = Scheduler(
-            self._task_table(tick_hz),
-            clock,
-            period_ns=self._period_ns,
-            background=[BackgroundSpec("status", self._report_status, 150.0)] if on_status else [],
-        )
+        self.asked_safe_ns: int | None = None
+        self.safe_reached_ns: int | None = None
+        actuation = stages.configs.actuation
+        self.manual = ManualDrive(actuation.low_V, actuation.high_V, actuation.neutral_V)
+        background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
+        if live is not None:
+            background.append(BackgroundSpec("histograms", lambda: live.show(self.histograms), 30.0))
+        self.scheduler = Scheduler(self._task_table(tick_hz), clock, period_ns=self._period_ns, background=background)
 
     # -- tables -------------------------------------------------------------------------------------------
 
@@ -169,6 +175,7 @@ class InstrumentLoop:
             raise
         finally:
             self._ramp_without_scans()
+            self._tell_end()
             self._stop()
             for number, handler in previous.items():
                 signal.signal(number, handler)
@@ -230,9 +237,26 @@ class InstrumentLoop:
         """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
         while self.supervisor.state is State.SAFE_RAMP:
             due_ns = self._clock.now_ns() + self._period_ns
-            self.supervisor.step()
+            if self.supervisor.step():
+                self._note_safe()
             self._clock.sleep_until_ns(due_ns)
         self._clock.sleep_until_ns(self._clock.now_ns() + SETTLE_TICKS * self._period_ns)
+
+    def _tell_end(self) -> None:
+        """The bench page need not wait for the outcome to know that the outputs are safe."""
+        trip = self.supervisor.trip_cause
+        if self._live is not None and self._on_status is not None and trip is not None:
+            self._on_status(
+                {
+                    "event": "safe state",
+                    "reason": trip.reason,
+                    "normal": trip.normal,
+                    "reached": self.supervisor.safe_reached,
+                    "asked_ns": self.asked_safe_ns,
+                    "tripped_ns": trip.t_ns,
+                    "reached_ns": self.safe_reached_ns,
+                }
+            )
 
     def _stop(self) -> None:
         for close in (self._devices.daq.stop, self._devices.amplifier.close):
@@ -280,7 +304,11 @@ class InstrumentLoop:
 
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:
-            self.stages.actuate()
+            if self.manual.active:
+                self.stages.command_V[:] = self.manual.step(self._clock.now_ns())
+                self.stages.follow()
+            else:
+                self.stages.actuate()
             try:
                 clipped = self._devices.amplifier.write(self.stages.command_V)
             except HalError as error:
@@ -290,10 +318,16 @@ class InstrumentLoop:
             self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
             self.counts.commands += 1
             self.counts.clipped += bool(clipped != 0 or self._frame[CLIP] != 0)
-        else:
-            self.supervisor.step()
+        elif self.supervisor.step():
+            self._note_safe()
+
+    def _note_safe(self) -> None:
+        if self.safe_reached_ns is None:
+            self.safe_reached_ns = self._clock.now_ns()
 
     def _publish(self, info: TickInfo) -> None:
+        if self._live is not None:
+            self._live.publish(self._frame)
         if self._recorder is not None:
             self._recorder.push(self._frame)
 
@@ -312,6 +346,9 @@ class InstrumentLoop:
 
     def _supervise(self, info: TickInfo) -> None:
         """100 Hz: everything that may end the run and is not seen by the task that needs it."""
+        if self._live is not None:
+            for order in self._live.orders():
+                self._obey(order)
         frame, limits = self._frame, self._config.safety
         status = int(frame[STATUS])
         t_ns = info.due_ns
@@ -336,6 +373,30 @@ class InstrumentLoop:
                 self._trip("stop button pressed")
             elif telemetry.button_silent() and self.supervisor.may_move:
                 self._trip(f"{telemetry.name}: the stop button is not heard any more; check the CAN bus and the button")
+
+    def _obey(self, order: Mapping[str, Any]) -> None:
+        """An order of the bench page; one that makes no sense is dropped."""
+        now_ns = self._clock.now_ns()
+        match order:
+            case {"order": "safe"}:
+                asked_ns = order.get("t_ns")
+                self.asked_safe_ns = asked_ns if isinstance(asked_ns, int) else now_ns
+                self._trip("stopped by the operator (safe button of the bench page)", normal=True)
+            case {"order": "arm"} if self.supervisor.may_move:
+                self.manual.arm(now_ns, self.stages.command_V)
+            case {"order": "disarm"}:
+                self.manual.disarm()
+            case {"order": "jog", "channel": int(channel), "rate_V_per_s": float(rate) | int(rate)}:
+                self.manual.jog(now_ns, channel, float(rate))
+            case {"order": "gain", "value": float(gain) | int(gain)} if 0.0 <= gain <= 1.5:
+                self.stages.actuation.params["gain"] = float(gain)
+                self._note({"event": "compensation gain", "value": float(gain)})
+            case _:
+                return
+
+    def _note(self, event: dict[str, object]) -> None:
+        if self._recorder is not None:
+            self._recorder.event({"t_ns": self._clock.now_ns(), "tick": int(self._frame[TICK]), **event})
 
     def _bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
         """Trip when ``bad`` has held for ``limit_ms``."""
@@ -389,11 +450,31 @@ class InstrumentLoop:
                 self._on_status(self.status())
             yield False
 
+    def histograms(self) -> dict[str, DurationHistogram]:
+        """Every live histogram, sample to command first."""
+        return {"sample to command": self.counts.latency, **self.scheduler.histograms()}
+
     def status(self) -> dict[str, object]:
         """A few numbers for the eye."""
         frame = self._frame
         latency = self.counts.latency.distribution()
+        bench: dict[str, object] = {}
+        if self._live is not None:
+            now_ns = self._clock.now_ns()
+            trip = self.supervisor.trip_cause
+            bench = {
+                "now_ns": now_ns,
+                "reason": trip.reason if trip is not None else "",
+                "manual": "armed" if self.manual.armed(now_ns) else "returning" if self.manual.active else "off",
+                "gain": float(self.stages.actuation.params["gain"][0]),
+                "samples": self.counts.received,
+                "commands": self.counts.commands,
+                "clipped": self.counts.clipped,
+                "magnetometer_errors": self.counts.magnetometer_errors,
+                "tasks": self.scheduler.task_counts(),
+            }
         return {
+            **bench,
             "t_s": float(frame[TIME]),
             "state": self.supervisor.state.name.lower().replace("_", " "),
             "amplitude_um": [1e6 * float(v) for v in frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]],

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
+from firmware_py.control.manual import follow
 from firmware_py.frame import COMMAND, LAYOUT, STATUS, FrameStatus
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing
@@ -68,11 +69,17 @@ class Stages:
         self.frame[STATUS] = int(self.frame[STATUS]) | FrameStatus.COMMANDED
         self.actuation.step(self.frame)
 
+    def follow(self) -> None:
+        """The command in the frame was chosen by hand: mark it, and let the stage's memory follow."""
+        self.frame[STATUS] = int(self.frame[STATUS]) | FrameStatus.MANUAL
+        follow(self.actuation, self.frame)
+
     def warm_up(self) -> None:
         """Compile or load every kernel, then forget what that did. A cold start takes seconds, a tick may not."""
         self.sense()
         self.estimate()
         self.actuate()
+        self.follow()
         self.reset()
 
     def reset(self) -> None:

@@ -34,7 +34,8 @@ _TAIL, _WRITTEN, _STATE = 16, 17, 18  # written by the consumer
 _ROWS_MAGIC, _BYTES_MAGIC = 0x4D52_4F57, 0x4D42_5954
 
 
-def _shared_file(size: int) -> int:
+def shared_file(size: int) -> int:
+    """An anonymous file of ``size`` bytes that other processes can map. ``RecordingError`` on a weakly ordered machine."""
     machine = platform.machine()
     if machine not in ("x86_64", "AMD64"):
         raise RecordingError(f"the recording ring relies on the memory ordering of x86-64; this machine is {machine}")
@@ -59,7 +60,7 @@ class _Shared:
 
     @staticmethod
     def create(data_bytes: int, magic: int, size: int, width: int) -> int:
-        fd = _shared_file(_HEADER_BYTES + data_bytes)
+        fd = shared_file(_HEADER_BYTES + data_bytes)
         os.pwrite(fd, struct.pack("<qqq", magic, size, width), 0)
         return fd
 

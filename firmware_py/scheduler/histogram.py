@@ -60,6 +60,7 @@ class DurationHistogram:
     """Counts durations in ns. A negative one (a due time in the future) counts as zero."""
 
     __slots__ = ("_counts", "_max_ns", "_min_ns", "_total_ns", "max_tick")
+    STATE_WORDS = _N_BUCKETS + 4
 
     def __init__(self) -> None:
         self._counts = array("q", bytes(8 * _N_BUCKETS))
@@ -105,6 +106,20 @@ class DurationHistogram:
     def counts(self) -> np.ndarray:
         """A copy of the bucket counts, int64."""
         return np.frombuffer(self._counts, dtype=np.int64).copy()
+
+    def copy_state_to(self, words: np.ndarray) -> None:
+        """All of it into int64 ``words[STATE_WORDS]``, for another process to read."""
+        words[:4] = self._min_ns % (1 << 63), self._max_ns, self._total_ns, self.max_tick
+        words[4:] = self._counts
+
+    @classmethod
+    def from_state(cls, words: np.ndarray) -> DurationHistogram:
+        """The histogram that ``copy_state_to`` wrote."""
+        histogram = cls()
+        histogram._counts = array("q", words[4:].tobytes())
+        lowest, histogram._max_ns, histogram._total_ns, histogram.max_tick = (int(w) for w in words[:4])
+        histogram._min_ns = lowest if histogram._max_ns >= 0 else 1 << 63
+        return histogram
 
     def quantile_ns(self, q: float) -> float:
         """The value below which a share ``q`` of the counted values lies; 0 when nothing was counted."""

@@ -234,6 +234,25 @@ class Scheduler:
         self._ignored.setdefault(reason, _Ignored())
         self._ignoring = [reason] * ticks + self._ignoring
 
+    def histograms(self) -> dict[str, DurationHistogram]:
+        """The live histograms by name: ``tick``, ``lateness``, and the duration of each task."""
+        durations = {task.spec.name: task.duration for task in self._tasks}
+        return {"tick": self._tick_duration, "lateness": self._tick_lateness, **durations}
+
+    def task_counts(self) -> dict[str, list[float]]:
+        """For each task: rate in Hz, budget in us, runs, overruns, slips, skipped."""
+        return {
+            task.spec.name: [
+                1e9 / self.period_ns / task.spec.divider,
+                task.spec.budget_us,
+                task.runs,
+                task.overruns,
+                task.slips,
+                task.skipped,
+            ]
+            for task in self._tasks
+        }
+
     def snapshot(self) -> SchedulerSnapshot:
         """All counters and percentiles since the last ``reset``; changes nothing."""
         tick_hz = 1e9 / self.period_ns

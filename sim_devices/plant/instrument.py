@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from typing import Literal
 
 import numpy as np
@@ -52,7 +54,9 @@ class Instrument:
         self._nodes, self._parts = np.zeros((BLOCK_MS + 1, 18)), np.zeros((BLOCK_MS, 6))
         self._noise, self._slow = np.zeros((_BLOCK_STEPS, NOISES)), np.zeros((BLOCK_MS, SLOW_NOISES))
         self._part = np.zeros(6)
-        self._chunks: list[Array] = []
+        keep = None if config.truth_s is None else 1 + math.ceil(config.truth_s * 1000 / _CHUNK_ROWS)
+        self._chunks: deque[Array] = deque(maxlen=keep)
+        self._forgotten = 0  # rows
         self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 1
         hand.start(self._nodes[-1], self._part)
         begin(self._plant, self._state, self._nodes[-1], self._part, self._chunk[0])
@@ -147,7 +151,8 @@ class Instrument:
     def truth(self) -> dict[str, NDArray]:
         """Columns, one row per millisecond: ``t_ns`` (n,) int64, ``tip_m`` (n, 3) and so on (kernel.TRUTH)."""
         rows = np.concatenate([*self._chunks, self._chunk[: self._row]])
-        columns: dict[str, NDArray] = {"t_ns": np.arange(len(rows), dtype=np.int64) * 1_000_000}
+        numbers = self._forgotten + np.arange(len(rows), dtype=np.int64)
+        columns: dict[str, NDArray] = {"t_ns": numbers * 1_000_000}
         for name, at, n in TRUTH:
             columns[name] = rows[:, at] if n == 1 else rows[:, at : at + n]
         return columns
@@ -160,6 +165,8 @@ class Instrument:
 
     def _next_block(self) -> None:
         if self._row + BLOCK_MS > _CHUNK_ROWS:
+            if len(self._chunks) == self._chunks.maxlen:
+                self._forgotten += len(self._chunks[0])
             self._chunks.append(self._chunk[: self._row])
             self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 0
         self._nodes[0] = self._nodes[-1]

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import calibrate, doctor, hands, mismatch, noise, placement, recordings, replay, reproduce, run
+from tools.cli import bench, calibrate, doctor, hands, mismatch, noise, placement, recordings, replay, reproduce, run
 
 app = typer.Typer(
     name="micron",
@@ -35,6 +35,7 @@ def options(
 
 
 app.command("run")(run.run)
+app.command("bench")(bench.bench)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("hands")(hands.hands)

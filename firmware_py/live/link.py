@@ -1,0 +1,59 @@
+"""The firmware's end of its link to the bench page: shows frames and histograms, hears short orders, never waits."""
+
+from __future__ import annotations
+
+import json
+import socket
+from collections.abc import Callable, Generator, Iterator
+from contextlib import suppress
+from typing import Any
+
+from firmware_py.live.memory import HISTOGRAMS, LiveMemory
+from firmware_py.scheduler.histogram import DurationHistogram
+
+MAX_ORDERS = 4
+"""Taken at most per call: what an eager sender costs a tick is bounded."""
+_MAX_BYTES = 1024
+
+
+class LiveLink:
+    """``memory_fd`` is mapped, ``control_fd`` is one end of a SOCK_SEQPACKET pair; both belong to this object."""
+
+    def __init__(self, memory_fd: int, control_fd: int) -> None:
+        self._memory = LiveMemory(memory_fd)
+        self._control = socket.socket(fileno=control_fd)
+        self._control.setblocking(False)
+        self._hung_up = False
+        self.publish = self._memory.push
+
+    def orders(self) -> Iterator[dict[str, Any]]:
+        """What has arrived: JSON objects with a text under ``order``; anything else is dropped."""
+        for _ in range(MAX_ORDERS):
+            if self._hung_up:
+                return
+            try:
+                data = self._control.recv(_MAX_BYTES)
+            except BlockingIOError:
+                return
+            except OSError:
+                data = b""
+            if not data:
+                self._hung_up = True
+                return
+            with suppress(ValueError):
+                order = json.loads(data)
+                if isinstance(order, dict) and isinstance(order.get("order"), str):
+                    yield order
+
+    def show(self, histograms: Callable[[], dict[str, DurationHistogram]]) -> Generator[bool, None, None]:
+        """A background task: one histogram a step, round and round, in the order of ``histograms()``."""
+        shown = list(histograms().values())[:HISTOGRAMS]
+        while True:
+            for index, histogram in enumerate(shown):
+                self._memory.put_histogram(index, histogram)
+                yield False
+
+    def close(self) -> None:
+        del self.publish
+        self._memory.close()
+        self._control.close()

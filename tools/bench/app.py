@@ -1,0 +1,138 @@
+"""The routes: a static page, one websocket, a few requests that change something."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.websockets import WebSocket
+
+from firmware_py.frame import LAYOUT
+from firmware_py.recording.errors import RecordingError
+from hal.errors import HalError
+from tools.bench.guard import Access, Guard
+from tools.bench.session import Session
+from tools.bench.viewer import Viewer
+from tools.errors import InputError
+
+STATIC = Path(__file__).with_name("static")
+MAX_VIEWERS = 16
+Handler = Callable[[Request], Awaitable[Response]]
+
+
+def clear(handler: Callable[[Request], Awaitable[Any]]) -> Handler:
+    """A handler whose bad input is one line for the page."""
+
+    async def wrapped(request: Request) -> Response:
+        try:
+            result = await handler(request)
+        except (InputError, RecordingError, HalError) as error:
+            return JSONResponse({"error": str(error)}, 400)
+        return result if isinstance(result, Response) else JSONResponse({"ok": True} if result is None else result)
+
+    return wrapped
+
+
+async def body(request: Request) -> dict[str, Any]:
+    """The JSON object of a request; ``InputError`` when it is none."""
+    try:
+        value = json.loads(await request.body() or b"{}")
+    except (ValueError, RecursionError):
+        raise InputError("the request is not JSON") from None
+    if not isinstance(value, dict):
+        raise InputError("the request is not a JSON object")
+    return value
+
+
+def text(table: dict[str, Any], key: str, default: str = "", longest: int = 2000) -> str:
+    """A text of the request."""
+    value = table.get(key, default)
+    if not isinstance(value, str) or len(value) > longest:
+        raise InputError(f"{key} must be a text of at most {longest} characters")
+    return value
+
+
+def catalogue() -> list[dict[str, Any]]:
+    """Every scalar that can be looked at."""
+    return [
+        {"name": name, "unit": column.unit, "group": column.name, "what": column.what, "index": column.start + i}
+        for column in LAYOUT
+        for i, name in enumerate(column.scalar_names())
+    ]
+
+
+def core_routes(session: Session, access: Access) -> list[BaseRoute]:
+    """Page, websocket, firmware and recordings."""
+    viewers: set[Viewer] = set()
+
+    async def page(_: Request) -> Response:
+        return FileResponse(STATIC / "index.html")
+
+    async def channels(_: Request) -> Any:
+        return {"channels": catalogue()}
+
+    async def benches(_: Request) -> Any:
+        folder = session.choice.bench.parent
+        return {"benches": sorted(str(p) for p in folder.glob("*.toml")), "now": str(session.choice.bench)}
+
+    async def safe(_: Request) -> Any:
+        return {"ok": session.order("safe")}
+
+    async def start(request: Request) -> Any:
+        table = await body(request)
+        bench = text(table, "bench")
+        if bench and Path(bench) not in session.choice.bench.parent.glob("*.toml"):
+            raise InputError(f"{bench} is not one of the benches beside {session.choice.bench}")
+        await session.start(replace(session.choice, bench=Path(bench)) if bench else None)
+
+    async def stop(_: Request) -> Any:
+        await session.stop()
+
+    async def look(socket: WebSocket) -> None:
+        if len(viewers) >= MAX_VIEWERS:
+            await socket.close(1013, "too many viewers")
+            return
+        viewer = Viewer(socket, session, access)
+        viewers.add(viewer)
+        try:
+            await viewer.serve()
+        finally:
+            viewers.discard(viewer)
+
+    return [
+        Route("/", page),
+        Route("/api/channels", clear(channels)),
+        Route("/api/benches", clear(benches)),
+        Route("/api/safe", clear(safe), methods=["POST"]),
+        Route("/api/firmware/start", clear(start), methods=["POST"]),
+        Route("/api/firmware/stop", clear(stop), methods=["POST"]),
+        WebSocketRoute("/live", look),
+    ]
+
+
+def make_app(session: Session, access: Access, more_routes: list[BaseRoute] | None = None) -> Guard:
+    """The application; the firmware starts and ends with it."""
+
+    @contextlib.asynccontextmanager
+    async def lifespan(_: Starlette) -> AsyncIterator[None]:
+        pump = asyncio.create_task(session.run_forever())
+        await session.start()
+        try:
+            yield
+        finally:
+            await session.stop()
+            pump.cancel()
+            await asyncio.gather(pump, return_exceptions=True)
+
+    routes = [*core_routes(session, access), *(more_routes or []), Mount("/static", StaticFiles(directory=STATIC))]
+    return Guard(Starlette(routes=routes, lifespan=lifespan), access)

@@ -1,0 +1,144 @@
+"""A firmware in its own process, with shared memory to look at and a socket to give orders."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import signal
+import socket
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from firmware_py.app import RunRequest
+from firmware_py.frame import LAYOUT
+from firmware_py.live.memory import LiveMemory
+
+FOREVER_S = 30 * 86_400.0
+TRUTH_S = 5.0
+STOP_S = 15.0
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What to run."""
+
+    bench: Path
+    hand_file: str | None = None
+    hand_scale: float | None = None
+    seed: int | None = None
+    stale_ms: float | None = None
+
+
+class Firmware:
+    """Start with ``start``; ``on_line`` gets every status line, ``on_end`` the outcome or the reason of the failure."""
+
+    def __init__(self, choice: Choice, runtime_dir: Path) -> None:
+        """Use ``start``."""
+        self.choice = choice
+        self.runtime_dir = runtime_dir
+        self.memory = LiveMemory.create(LAYOUT.size)
+        self._control, self._their_control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._control.setblocking(False)
+        self._process: asyncio.subprocess.Process | None = None
+        self._reader: asyncio.Task[None] | None = None
+
+    @classmethod
+    async def start(
+        cls,
+        choice: Choice,
+        on_line: Callable[[dict[str, Any]], None],
+        on_end: Callable[[dict[str, Any] | None, str], None],
+    ) -> Firmware:
+        """Start the process; what it says comes through the callbacks."""
+        self = cls(choice, Path(tempfile.mkdtemp(prefix="micron-bench-")))
+        fds = (self.memory.fd, self._their_control.fileno())
+        request = RunRequest(
+            bench=choice.bench,
+            seconds=FOREVER_S,
+            hand_file=choice.hand_file,
+            hand_scale=choice.hand_scale,
+            seed=choice.seed,
+            stale_ms=choice.stale_ms,
+            live_fds=fds,
+            truth_s=TRUTH_S,
+        )
+        request_file = self.runtime_dir / "request.json"
+        request_file.write_text(request.to_json(self.runtime_dir), encoding="utf-8")
+        self._process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "firmware_py.app",
+            str(request_file),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+            pass_fds=fds,
+        )
+        self._their_control.close()
+        self._reader = asyncio.create_task(self._read(on_line, on_end))
+        return self
+
+    @property
+    def pid(self) -> int:
+        assert self._process is not None
+        return self._process.pid
+
+    async def _read(
+        self, on_line: Callable[[dict[str, Any]], None], on_end: Callable[[dict[str, Any] | None, str], None]
+    ) -> None:
+        process = self._process
+        assert process is not None
+        assert process.stdout is not None
+        assert process.stderr is not None
+        errors = asyncio.create_task(process.stderr.read())
+        async for line in process.stdout:
+            with contextlib.suppress(ValueError):
+                on_line(json.loads(line))
+        await process.wait()
+        told = (await errors).decode(errors="replace").strip()
+        outcome_file = self.runtime_dir / "outcome.json"
+        outcome = json.loads(outcome_file.read_text(encoding="utf-8")) if outcome_file.exists() else None
+        last = told.splitlines()[-1].removeprefix("micron: ") if told else f"it ended with code {process.returncode}"
+        on_end(outcome, "" if outcome is not None else last)
+
+    def order(self, order: str, **values: Any) -> bool:
+        """Send an order; False when the firmware is gone or does not take any."""
+        message = {"order": order, "t_ns": time.monotonic_ns(), **values}
+        try:
+            self._control.send(json.dumps(message).encode())
+        except OSError:
+            return False
+        return True
+
+    def metadata(self) -> dict[str, Any]:
+        """For recordings of this run; empty before the devices are open."""
+        path = self.runtime_dir / "metadata.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+    async def stop(self) -> None:
+        """Ramp to neutral and end; idempotent. A firmware that does not end is killed."""
+        process, reader = self._process, self._reader
+        assert process is not None
+        assert reader is not None
+        if process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                process.send_signal(signal.SIGTERM)
+            try:
+                await asyncio.wait_for(asyncio.shield(reader), STOP_S)
+            except TimeoutError:
+                process.kill()
+        await reader
+
+    def close(self) -> None:
+        """After ``stop``: give memory and folder back."""
+        import shutil
+
+        self.memory.close()
+        self._control.close()
+        shutil.rmtree(self.runtime_dir, ignore_errors=True)

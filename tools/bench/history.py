@@ -1,0 +1,147 @@
+"""The last minutes of every column, and smallest and largest value per pixel of any part of them.
+
+Rows are numbered from the start of the run. Bucket ``b`` of ``k`` rows holds rows ``b k`` to ``(b + 1) k - 1``: the
+grid does not move with the window, so what is drawn does not shimmer, and no row is ever left out.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+BLOCK = 16
+"""Rows of one entry of the coarse level."""
+
+
+class Buckets(NamedTuple):
+    """Buckets ``first`` to ``first + n - 1``: time of the first row of each [n] s, extremes [channels, n]."""
+
+    first: int
+    per_bucket: int
+    t_s: Float64Array
+    low: Float32Array
+    high: Float32Array
+
+
+def extremes(low: Float32Array, high: Float32Array, k: int) -> tuple[Float32Array, Float32Array]:
+    """Smallest of ``low`` and largest of ``high`` [channels, n] in groups of ``k``, the last may be shorter.
+
+    NaN counts only where a group has nothing else.
+    """
+    n = low.shape[1]
+    starts = np.arange(0, n, k)
+    if n == 0 or k == 1:
+        return low, high
+    return np.fmin.reduceat(low, starts, axis=1), np.fmax.reduceat(high, starts, axis=1)
+
+
+def rows_per_bucket(rows: float, pixels: int) -> int:
+    """The finest grid that gives a window of ``rows`` no more than two buckets a pixel; coarse ones in whole blocks."""
+    k = max(1, int(rows // max(1, pixels)))
+    return k if k < BLOCK else k // BLOCK * BLOCK
+
+
+class _Ring:
+    """``depth`` columns-by-entries, numbered for ever; the oldest are overwritten."""
+
+    def __init__(self, n_columns: int, depth: int) -> None:
+        self.depth = depth
+        self.head = 0
+        self._data = np.zeros((n_columns, depth), dtype=np.float32)
+
+    def append(self, values: Float32Array) -> None:
+        """``values`` [columns, n], n at most ``depth``."""
+        n = values.shape[1]
+        start = self.head % self.depth
+        fits = min(n, self.depth - start)
+        self._data[:, start : start + fits] = values[:, :fits]
+        self._data[:, : n - fits] = values[:, fits:]
+        self.head += n
+
+    @property
+    def tail(self) -> int:
+        return max(0, self.head - self.depth)
+
+    def take(self, channels: NDArray[np.intp], first: int, stop: int) -> Float32Array:
+        """Entries ``first`` to ``stop - 1`` of ``channels``, contiguous."""
+        a, n = first % self.depth, stop - first
+        fits = min(n, self.depth - a)
+        part = self._data[channels, a : a + fits]
+        return part if fits == n else np.concatenate([part, self._data[channels, : n - fits]], axis=1)
+
+
+class History:
+    """Single rows for ``fine_rows``, extremes of blocks of 16 rows for ``coarse_rows``."""
+
+    def __init__(self, n_columns: int, time_column: int, fine_rows: int = 1 << 17, coarse_rows: int = 600_000) -> None:
+        self._time_column = time_column
+        self._fine = _Ring(n_columns, fine_rows)
+        self._low = _Ring(n_columns, coarse_rows // BLOCK)
+        self._high = _Ring(n_columns, coarse_rows // BLOCK)
+        # times need more digits than a float32 has after some hours
+        self._fine_t = np.zeros(fine_rows)
+        self._coarse_t = np.zeros(coarse_rows // BLOCK)
+        self._n_columns = n_columns
+
+    @property
+    def head(self) -> int:
+        """Rows that were ever added."""
+        return self._fine.head
+
+    @property
+    def oldest(self) -> int:
+        """The oldest row of which anything is known."""
+        return min(self._fine.tail, self._low.tail * BLOCK)
+
+    def latest(self) -> Float32Array:
+        """The newest row; zeros before the first."""
+        if not self.head:
+            return np.zeros(self._n_columns, dtype=np.float32)
+        return self._fine.take(np.arange(self._n_columns), self.head - 1, self.head)[:, 0]
+
+    def append(self, rows: Float64Array) -> None:
+        """Add ``rows`` [n, columns]; more than the fine level holds is added in parts."""
+        step = self._fine.depth // 2
+        for start in range(0, len(rows), step):
+            self._append(rows[start : start + step])
+
+    def _append(self, rows: Float64Array) -> None:
+        numbers = np.arange(self.head, self.head + len(rows))
+        self._fine_t[numbers % self._fine.depth] = rows[:, self._time_column]
+        self._fine.append(rows.T.astype(np.float32))
+        whole = self._fine.head // BLOCK
+        first = self._low.head
+        if whole > first:
+            block = self._fine.take(np.arange(self._n_columns), first * BLOCK, whole * BLOCK)
+            low, high = extremes(block, block, BLOCK)
+            starts = np.arange(first, whole)
+            self._coarse_t[starts % self._low.depth] = self._fine_t[starts * BLOCK % self._fine.depth]
+            self._low.append(low)
+            self._high.append(high)
+
+    def buckets(self, channels: NDArray[np.intp], k: int, first: int, stop: int | None = None) -> Buckets:
+        """Buckets of ``k`` rows from ``first`` up to ``stop`` (excluded) or the newest, which may be incomplete.
+
+        ``k`` comes from ``rows_per_bucket``. What has been overwritten is left out: see ``Buckets.first``.
+        """
+        coarse = k % BLOCK == 0 and k >= BLOCK
+        unit = k // BLOCK if coarse else k
+        ring = self._low if coarse else self._fine
+        end = ring.head if stop is None else min(ring.head, stop * unit)
+        first = max(first, -(-ring.tail // unit))
+        begin = min(first * unit, end)
+        numbers = np.arange(begin, end, unit)
+        if coarse:
+            t_s = self._coarse_t[numbers % ring.depth]
+            low = self._low.take(channels, begin, end)
+            high = self._high.take(channels, begin, end)
+        else:
+            t_s = self._fine_t[numbers % ring.depth]
+            low = high = self._fine.take(channels, begin, end)
+        low, high = extremes(low, high, unit)
+        return Buckets(first, k, t_s, low, high)

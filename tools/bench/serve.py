@@ -1,0 +1,99 @@
+"""The server's own process: addresses, token, uvicorn."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import secrets
+import signal
+import socket
+from collections.abc import Callable
+from pathlib import Path
+
+import uvicorn
+
+from tools.bench.app import make_app
+from tools.bench.firmware import Choice
+from tools.bench.guard import Access
+from tools.bench.routes import more_routes
+from tools.bench.session import Session
+from tools.errors import InputError
+
+LOOPBACK = "127.0.0.1"
+MAX_MESSAGE_BYTES = 65_536
+
+
+def bind(address: str, port: int) -> socket.socket:
+    """A listening socket, ``port`` 0 for any. ``InputError`` when that cannot be."""
+    try:
+        family = socket.AF_INET6 if ipaddress.ip_address(address).version == 6 else socket.AF_INET
+        sock = socket.socket(family)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        sock.bind((address, port))
+    except ValueError:
+        raise InputError(f"--listen {address}: not an IP address") from None
+    except OSError as error:
+        raise InputError(f"cannot listen on {address}, port {port}: {error.strerror}; choose another --port") from error
+    return sock
+
+
+def access_for(address: str, port: int, token: str, names: tuple[str, ...] = ()) -> Access:
+    """On loopback looking is free, elsewhere it is not. ``names``: further host names that may be used."""
+    loopback = ipaddress.ip_address(address).is_loopback
+    hosts = {address if ":" not in address else f"[{address}]", *names}
+    if loopback:
+        hosts |= {"localhost", LOOPBACK}
+    elif ipaddress.ip_address(address).is_unspecified:
+        hosts |= {"localhost", LOOPBACK, socket.gethostname(), *_own_addresses()}
+    return Access(token, frozenset(f"{host.lower()}:{port}" for host in hosts), open_reading=loopback)
+
+
+def _own_addresses() -> set[str]:
+    try:
+        return {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None)}
+    except OSError:
+        return set()
+
+
+def serve(
+    choice: Choice,
+    recordings: Path,
+    sock: socket.socket,
+    announce: Callable[[str], None],
+    *,
+    names: tuple[str, ...] = (),
+    token: str | None = None,
+) -> None:
+    """Run until SIGINT or SIGTERM; the firmware is then in its safe state. ``announce`` gets the page's address."""
+    address, port = sock.getsockname()[:2]
+    token = token or secrets.token_urlsafe(24)
+    access = access_for(address, port, token, names)
+
+    async def run() -> None:
+        session = Session(choice, recordings)
+        app = make_app(session, access, more_routes(session))
+        config = uvicorn.Config(
+            app,
+            ws="websockets-sansio",
+            ws_max_size=MAX_MESSAGE_BYTES,
+            ws_per_message_deflate=False,  # costs more than a loopback saves
+            access_log=False,
+            log_level="warning",
+            server_header=False,
+            limit_concurrency=64,
+            timeout_graceful_shutdown=1,
+        )
+        server = uvicorn.Server(config)
+        loop = asyncio.get_running_loop()
+
+        def leave() -> None:
+            server.should_exit = True
+
+        server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, leave)
+        shown = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
+        announce(f"http://{shown if ':' not in shown else f'[{shown}]'}:{port}/#token={token}")
+        await server.serve(sockets=[sock])
+
+    asyncio.run(run())

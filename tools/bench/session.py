@@ -1,0 +1,265 @@
+"""What the server knows and does: one firmware, its history, one recording, the viewers' orders."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import shutil
+import time
+from collections import deque
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.frame import LAYOUT
+from hal.bench import load_bench
+from tools.bench.firmware import Choice, Firmware
+from tools.bench.history import History
+from tools.bench.recorder import RunRecorder
+
+FRAME_S = 1 / 60
+STATUS_S = 0.1
+DISK_S = 2.0
+STALE_S = 0.25
+DISK_LOW_BYTES = 2 << 30
+DISK_LOW_SHARE = 0.03
+
+
+@dataclass
+class Disk:
+    """Room where recordings go."""
+
+    free_bytes: int = 0
+    total_bytes: int = 1
+
+    @property
+    def low(self) -> bool:
+        return self.free_bytes < max(DISK_LOW_BYTES, DISK_LOW_SHARE * self.total_bytes)
+
+
+@dataclass
+class Run:
+    """One life of a firmware, as far as it has told. ``phase``: starting, running, safe, ended, failed."""
+
+    phase: str = "starting"
+    reason: str = ""
+    reached: bool = False
+    normal: bool = False
+    status: dict[str, Any] = field(default_factory=dict[str, Any])
+    devices: dict[str, str] = field(default_factory=dict[str, str])
+    histograms: list[str] = field(default_factory=list[str])
+    safe_ms: float | None = None
+    outcome: dict[str, Any] | None = None
+
+
+class Session:
+    """The bench as all viewers see it. ``run_forever`` is its one task; everything else is called from the loop."""
+
+    def __init__(self, choice: Choice, recordings: Path) -> None:
+        self.choice = choice
+        self.bench = load_bench(choice.bench)
+        self.firmware: Firmware | None = None
+        self.run = Run()
+        self.run_number = 0
+        self.history = self._new_history()
+        self.recorder = RunRecorder(recordings)
+        self.disk = Disk()
+        self.log: deque[dict[str, Any]] = deque(maxlen=500)
+        self.log_number = 0
+        self.missed_rows = 0
+        self.frame_ready = asyncio.Event()
+        self._row = 0
+        self._fresh_s = time.monotonic()
+        self._lock = asyncio.Lock()
+
+    @staticmethod
+    def _new_history() -> History:
+        return History(LAYOUT.size, LAYOUT.start("t"))
+
+    # -- firmware -------------------------------------------------------------------------------------------
+
+    async def start(self, choice: Choice | None = None) -> None:
+        """End what runs and start again, with another bench if ``choice`` says so. ``HalError`` for a wrong bench."""
+        async with self._lock:
+            bench = load_bench((choice or self.choice).bench)
+            await self._end()
+            self.choice, self.bench = choice or self.choice, bench
+            self.run, self.history, self._row = Run(), self._new_history(), 0
+            self.run_number += 1
+            run = self.run
+            self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
+            self.firmware = await Firmware.start(
+                self.choice,
+                lambda line: self._on_line(run, line),
+                lambda outcome, failure: self._on_end(run, outcome, failure),
+            )
+            self._fresh_s = time.monotonic()
+
+    async def stop(self) -> None:
+        """End firmware and recording, in that order: the ramp belongs into the recording."""
+        async with self._lock:
+            await self._end()
+
+    async def _end(self) -> None:
+        if self.firmware is None:
+            return
+        await self.firmware.stop()
+        self._take_rows()
+        if self.recorder.active:
+            await self.stop_recording()
+        self.firmware.close()
+        self.firmware = None
+
+    def order(self, order: str, **values: Any) -> bool:
+        """Pass an order on to the firmware."""
+        return self.firmware is not None and self.firmware.order(order, **values)
+
+    def _on_line(self, run: Run, line: dict[str, Any]) -> None:
+        event = line.get("event")
+        if event == "devices":
+            run.devices, run.histograms = line["identities"], line["histograms"]
+            self.note("info", "devices open: " + ", ".join(run.devices.values()))
+        elif event == "safe state":
+            run.phase, run.reason, run.reached = "safe", line["reason"], line["reached"]
+            run.normal = bool(line["normal"])
+            if line["asked_ns"] and line["reached_ns"]:
+                run.safe_ms = (line["reached_ns"] - line["asked_ns"]) * 1e-6
+            took = f", {run.safe_ms:.0f} ms after it was asked for" if run.safe_ms is not None else ""
+            how = "outputs at neutral" if run.reached else "NEUTRAL NOT CONFIRMED: switch the amplifier off"
+            self.note("info" if run.reached and run.normal else "error", f"safe state: {run.reason}; {how}{took}")
+        else:
+            run.status = line
+            if run.phase == "starting":
+                run.phase = "running"
+
+    def _on_end(self, run: Run, outcome: dict[str, Any] | None, failure: str) -> None:
+        run.outcome = outcome
+        if outcome is not None:
+            run.reason = outcome["safe_state"]["reason"]
+            run.phase = "safe" if outcome["safe_state"]["reached"] else "ended"
+            run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
+        else:
+            run.phase, run.reason = "failed", failure
+            self.note("error", f"the firmware failed: {failure}")
+
+    # -- what people read -----------------------------------------------------------------------------------
+
+    def note(self, level: str, text: str) -> None:
+        """A line of the page's log."""
+        self.log_number += 1
+        self.log.append({"n": self.log_number, "time": time.time(), "level": level, "text": text})
+
+    def stale_s(self) -> float:
+        """How long no row has come."""
+        return time.monotonic() - self._fresh_s
+
+    def alerts(self) -> list[dict[str, str]]:
+        """What must be said at once, in words; the worst first."""
+        run, found = self.run, list[tuple[str, str]]()
+        if run.phase == "failed":
+            found.append(("error", f"The firmware failed: {run.reason}"))
+        elif run.phase == "ended":
+            found.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
+        elif run.phase == "safe":
+            kind = "info" if run.normal else "error"
+            found.append((kind, f"Safe state, outputs at neutral: {run.reason}."))
+        elif run.phase == "running" and self.stale_s() > STALE_S:
+            found.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
+        if self.disk.low:
+            found.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
+        if self.recorder.active and self.recorder.trouble():
+            found.append(("error", f"Recording: {self.recorder.trouble()}"))
+        return [{"kind": kind, "text": text} for kind, text in found]
+
+    def state(self) -> dict[str, Any]:
+        """The status message of the page."""
+        run, memory = self.run, self.firmware.memory if self.firmware is not None else None
+        timing: dict[str, list[float]] = {}
+        if memory is not None:
+            for index, name in enumerate(run.histograms):
+                d = memory.distribution(index)
+                timing[name] = [d.n, d.p50_us, d.p99_us, d.p99_9_us, d.max_us, d.max_tick]
+        return {
+            "type": "state",
+            "run": self.run_number,
+            "bench": self.bench.description.name,
+            "bench_file": str(self.choice.bench),
+            "emulated": bool(self.bench.description.emulated_buses()),
+            "phase": run.phase,
+            "reason": run.reason,
+            "safe_ms": run.safe_ms,
+            "devices": run.devices,
+            "status": run.status,
+            "timing": timing,
+            "rows": self.history.head,
+            "missed_rows": self.missed_rows,
+            "stale_s": self.stale_s() if run.phase == "running" else 0.0,
+            "alerts": self.alerts(),
+            "disk": {"free": self.disk.free_bytes, "total": self.disk.total_bytes},
+            "recording": self.recorder.state(),
+            "log": self.log_number,
+        }
+
+    def counts(self) -> dict[str, dict[str, list[int]]]:
+        """The non-empty buckets of every histogram, for drawing: lower bounds in ns and counts."""
+        from firmware_py.scheduler.histogram import bucket_bounds_ns
+
+        firmware = self.firmware
+        if firmware is None:
+            return {}
+        found: dict[str, dict[str, list[int]]] = {}
+        for index, name in enumerate(self.run.histograms):
+            counts = firmware.memory.histogram(index).counts()
+            used = np.flatnonzero(counts)
+            found[name] = {"ns": [bucket_bounds_ns(int(i))[0] for i in used], "n": [int(c) for c in counts[used]]}
+        return found
+
+    # -- rows -----------------------------------------------------------------------------------------------
+
+    async def run_forever(self) -> None:
+        """Move rows from the firmware into the history sixty times a second; watch the disk."""
+        loop = asyncio.get_running_loop()
+        due_s = loop.time()
+        disk_s = 0.0
+        while True:
+            due_s = max(due_s + FRAME_S, loop.time())
+            self._take_rows()
+            ready, self.frame_ready = self.frame_ready, asyncio.Event()
+            ready.set()
+            if due_s >= disk_s:
+                disk_s = due_s + DISK_S
+                with contextlib.suppress(OSError):
+                    usage = shutil.disk_usage(self.recorder.folder)
+                    self.disk = Disk(usage.free, usage.total)
+            await asyncio.sleep(max(0.0, due_s - loop.time()))
+
+    def _take_rows(self) -> None:
+        if self.firmware is None:
+            return
+        rows = self.firmware.memory.read(self._row)
+        if rows.missed:
+            self.missed_rows += rows.missed
+            self.note("warn", f"the server was too slow for {rows.missed} rows; the firmware did not wait")
+        if len(rows.values):
+            self._row = rows.first + len(rows.values)
+            self._fresh_s = time.monotonic()
+            self.history.append(rows.values)
+            if self.recorder.active:
+                self.recorder.push(rows)
+
+    # -- recording ------------------------------------------------------------------------------------------
+
+    async def start_recording(self, name: str, notes: str) -> None:
+        """Raises ``RecordingError`` or ``InputError`` when that cannot be."""
+        metadata = self.firmware.metadata() if self.firmware is not None else {}
+        await self.recorder.start(name, notes, metadata)
+        self.note("info", f"recording {self.recorder.name}")
+
+    async def stop_recording(self) -> dict[str, Any]:
+        """What became of it."""
+        summary = await self.recorder.stop(self.run.outcome or {})
+        level = "error" if summary["problem"] or summary["dropped"] else "info"
+        self.note(level, f"recorded {summary['name']}: {summary['ticks']} ticks, {summary['dropped']} dropped")
+        return summary

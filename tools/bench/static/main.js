@@ -1,0 +1,168 @@
+// The frame of the page: views, vital signs, alerts, the safe button.
+import { get, post, setToken } from "./api.js";
+import { bytes, duration, h } from "./dom.js";
+import { Link } from "./link.js";
+
+const VIEWS = [
+  ["scope", "Scope", "M3 5v14h18M6 14c2 0 2-6 4-6s2 9 4 9 2-5 4-5"],
+  ["attitude", "Attitude", "M12 3l8 4.5v9L12 21l-8-4.5v-9zM12 12l8-4.5M12 12v9M12 12L4 7.5"],
+  ["tremor", "Tremor", "M2 12h3l2-7 4 14 3-11 2 4h6"],
+  ["latency", "Latency", "M12 8v5l3 2M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18z"],
+  ["actuators", "Actuators", "M6 3v18M12 3v18M18 3v18M4 14h4M10 8h4M16 16h4"],
+  ["targets", "Targets", "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM12 8a4 4 0 1 0 0 8 4 4 0 0 0 0-8zM12 1v4M12 19v4M1 12h4M19 12h4"],
+  ["collect", "Collect", "M12 3v12m-4-4l4 4 4-4M4 17v3h16v-3"],
+  ["mismatch", "Mismatch", "M3 17c3 0 4-10 9-10s5 6 9 6M3 20c4 0 5-7 9-7s6 3 9 3"],
+  ["calibrate", "Calibrate", "M4 20l5-5m0 0l9-9 2 2-9 9zM13 7l4 4"],
+];
+
+const hash = new URLSearchParams(location.hash.slice(1));
+if (hash.has("token")) {
+  localStorage.setItem("micron.token", hash.get("token"));
+  history.replaceState(null, "", "#/scope");
+}
+const token = localStorage.getItem("micron.token") || "";
+setToken(token);
+
+const byId = (id) => document.getElementById(id);
+const link = new Link(token);
+const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; } };
+let unmount = null;
+let shown = "";
+
+async function show(name) {
+  if (!VIEWS.some(([key]) => key === name)) name = "scope";
+  if (name === shown) return;
+  shown = name;
+  unmount?.();
+  unmount = null;
+  const root = byId("view");
+  root.replaceChildren();
+  byId("nav").querySelectorAll("a").forEach((a) => (a.dataset.view === name ? a.setAttribute("aria-current", "page") : a.removeAttribute("aria-current")));
+  const view = await import(`./views/${name}.js`);
+  if (shown !== name) return;
+  document.title = `${VIEWS.find(([key]) => key === name)[1]} · Micron bench`;
+  unmount = view.mount(root, context) || null;
+  root.dataset.view = name;
+}
+
+function buildNav() {
+  VIEWS.forEach(([key, title, path], i) => {
+    const a = h("a", { href: `#/${key}` });
+    a.dataset.view = key;
+    a.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
+    a.append(title, h("kbd", {}, String(i + 1)));
+    byId("nav").append(a);
+  });
+}
+
+function showVitals(state) {
+  const s = state.status;
+  const timing = state.timing["sample to command"];
+  const items = [
+    ["run time", s.t_s === undefined ? "–" : duration(s.t_s)],
+    ["sample to command p50", timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–"],
+    ["lost / skipped", s.lost === undefined ? "–" : `${s.lost} / ${s.skipped}`],
+    ["tremor", s.amplitude_um ? `${Math.hypot(...s.amplitude_um).toFixed(0)} µm` : "–"],
+  ];
+  byId("vitals").replaceChildren(...items.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+}
+
+const PHASES = {
+  starting: ["warn", "starting"], running: ["good", "running"], safe: ["bad", "safe state"],
+  ended: ["bad", "neutral not confirmed"], failed: ["bad", "failed"],
+};
+
+function showPhase() {
+  const pill = byId("phase");
+  const state = link.state;
+  let [kind, text] = state ? PHASES[state.phase] : ["", "connecting"];
+  if (state?.phase === "running") text = state.status.manual !== "off" ? "manual drive" : state.status.state;
+  if (state?.phase === "running" && state.status.state !== "running") kind = "warn";
+  if (!link.connected) [kind, text] = ["bad", "not connected"];
+  pill.className = `pill ${kind}`;
+  pill.textContent = text;
+}
+
+let lastAlerts = "";
+function showAlerts() {
+  const alerts = [...(link.state?.alerts || [])];
+  const age = (performance.now() - link.lastMessage) / 1000;
+  if (!link.connected) alerts.unshift({ kind: "error", text: "Connection to the bench server lost. What you see is old. Trying again …" });
+  else if (age > 1.5) alerts.unshift({ kind: "error", text: `The bench server has said nothing for ${age.toFixed(0)} s. What you see is old.` });
+  if (link.connected && link.state && !link.mayOrder) {
+    alerts.push({ kind: "info", text: "View only: to control the bench open the address that “micron bench” printed." });
+  }
+  const text = JSON.stringify(alerts) + link.mayOrder + link.state?.phase;
+  if (text === lastAlerts) return;
+  lastAlerts = text;
+  const ended = ["safe", "ended", "failed"].includes(link.state?.phase);
+  byId("alerts").replaceChildren(
+    ...alerts.map((alert, i) => h(`p.${alert.kind}`, {}, alert.text,
+      i === 0 && ended && link.connected && link.mayOrder ? h("button", { onclick: () => post("/api/firmware/start").catch(() => {}) }, "Start again") : null)),
+  );
+}
+
+function showRecording(state) {
+  const box = byId("rec");
+  box.hidden = !state.recording;
+  if (state.recording) box.textContent = `REC ${duration(state.recording.seconds)}`;
+}
+
+function showLog(lines) {
+  const last = lines[lines.length - 1];
+  byId("last-log").textContent = last.text;
+  byId("last-log").className = last.level;
+  byId("log").replaceChildren(...link.log.slice().reverse().map((line) =>
+    h("div", { className: line.level }, h("time", {}, new Date(line.time * 1000).toLocaleTimeString()), line.text)));
+}
+
+/** The one button that must always work: over the websocket, and by request in case that is stuck. */
+function goSafe() {
+  link.order("safe");
+  post("/api/safe").catch(() => {});
+}
+
+function setTheme(theme) {
+  document.documentElement.dataset.theme = theme;
+  localStorage.setItem("micron.theme", theme);
+  window.dispatchEvent(new Event("themechange"));
+}
+
+function bindKeys() {
+  document.addEventListener("keydown", (event) => {
+    if (event.key === "Escape") { goSafe(); return; }
+    if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
+    const view = VIEWS[Number(event.key) - 1];
+    if (view) context.navigate(view[0]);
+    else if (event.key === "t" || event.key === "T") byId("theme").click();
+  });
+}
+
+async function boot() {
+  setTheme(localStorage.getItem("micron.theme") || (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"));
+  buildNav();
+  bindKeys();
+  byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+  byId("safe").onclick = goSafe;
+  byId("log-toggle").onclick = () => {
+    byId("log").hidden = !byId("log").hidden;
+    byId("log-toggle").setAttribute("aria-expanded", String(!byId("log").hidden));
+  };
+  link.on("state", (state) => {
+    byId("bench-name").textContent = `${state.bench}${state.emulated ? " · emulated" : ""}`;
+    byId("foot").title = `${bytes(state.disk.free)} free for recordings`;
+    showVitals(state);
+    showRecording(state);
+    showPhase();
+    showAlerts();
+  });
+  link.on("log", showLog);
+  link.on("connection", () => { showPhase(); showAlerts(); });
+  setInterval(() => { showPhase(); showAlerts(); }, 500);
+  context.catalogue = (await get("/api/channels")).channels;
+  window.addEventListener("hashchange", () => show(location.hash.slice(2)));
+  await show(location.hash.slice(2));
+}
+
+window.micron = { link, context };
+boot();

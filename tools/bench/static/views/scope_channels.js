@@ -1,0 +1,58 @@
+// Which channels the scope shows: by group, with presets.
+import { h, unitText } from "../dom.js";
+
+const PRESETS = [
+  ["Sensors, volts", ["volts", "supply", "magnetometer_raw"]],
+  ["Sensors, raw counts", ["counts"]],
+  ["Sensors, calibrated", ["accelerometer", "magnetometer", "temperature"]],
+  ["Motion of the body", ["specific_force", "rate", "angular_acceleration", "quaternion"]],
+  ["Tip and tremor", ["tip_displacement", "tremor", "tremor_ahead", "confidence"]],
+  ["Actuators", ["desired_tip", "stroke", "command", "clip"]],
+  ["20 channels", ["volts", "accelerometer", "magnetometer", "command"]],
+];
+export const MAX_CHANNELS = 32;
+
+export function channelPicker(catalogue, settings, changed) {
+  const boxes = new Map();
+  const groups = [...new Set(catalogue.map((c) => c.group))];
+  const details = groups.map((group) => {
+    const members = catalogue.filter((c) => c.group === group);
+    const all = h("input", { type: "checkbox", title: `All of ${group}`, onchange: () => choose(members.map((m) => m.name), all.checked) });
+    const list = members.map((c) => {
+      const box = h("input", { type: "checkbox", onchange: () => choose([c.name], box.checked) });
+      boxes.set(c.name, box);
+      return h("label", { style: "display:flex;padding:1px 0 1px 18px" }, box, h("span.num", { style: "font-size:12px" }, c.name));
+    });
+    const element = h("details", { title: members[0].what }, h("summary", { style: "cursor:pointer;padding:2px 0" }, all, ` ${group.replaceAll("_", " ")} `, h("span.faint", {}, unitText(members[0].unit))), list);
+    element.check = () => {
+      const on = members.filter((m) => settings.channels.includes(m.name)).length;
+      all.checked = on === members.length;
+      all.indeterminate = on > 0 && on < members.length;
+    };
+    return element;
+  });
+
+  function show() {
+    for (const [name, box] of boxes) box.checked = settings.channels.includes(name);
+    details.forEach((d) => d.check());
+  }
+
+  function choose(names, on) {
+    const left = settings.channels.filter((name) => !names.includes(name));
+    settings.channels = (on ? [...left, ...names] : left).slice(0, MAX_CHANNELS);
+    settings.channels.sort((a, b) => catalogue.findIndex((c) => c.name === a) - catalogue.findIndex((c) => c.name === b));
+    show();
+    changed();
+  }
+
+  const preset = h("select", { "aria-label": "Preset", style: "width:100%", onchange: () => {
+    const wanted = PRESETS[Number(preset.value)]?.[1];
+    if (wanted) {
+      settings.channels = [];
+      choose(catalogue.filter((c) => wanted.includes(c.group)).map((c) => c.name), true);
+    }
+    preset.value = "";
+  } }, h("option", { value: "" }, "Preset …"), PRESETS.map(([title], i) => h("option", { value: i }, title)));
+  show();
+  return h("div.panel", {}, h("h2", {}, "Channels"), preset, h("div", { style: "margin-top:6px" }, details));
+}

@@ -1,0 +1,242 @@
+"""One open page: what it subscribed to, what it may order, and what it is sent.
+
+A viewer that does not read is waited for by its own task alone; when it reads again it gets the present, not the
+past. A viewer that talks nonsense is cut off.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import time
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from firmware_py.frame import LAYOUT
+from tools.bench.guard import Access
+from tools.bench.history import rows_per_bucket
+from tools.bench.session import STATUS_S, Session
+from tools.bench.wire import encode
+
+MAX_SUBSCRIPTIONS = 4
+MAX_CHANNELS = 64
+MAX_PIXELS = 8192
+MAX_NONSENSE = 100
+ORDERS_PER_S = 100
+HELLO_S = 5.0
+SEND_S = 30.0
+COUNTS_S = 0.5
+_INDEX = {name: i for i, name in enumerate(LAYOUT.scalar_names())}
+
+
+class Nonsense(ValueError):
+    """A message that the page would not send."""
+
+
+@dataclass
+class Subscription:
+    """``next_bucket``: the first that the viewer does not have for good; None: it has nothing yet."""
+
+    id: int
+    channels: NDArray[np.intp]
+    rows: int
+    per_bucket: int
+    next_bucket: int | None = None
+
+
+def _number(message: dict[str, Any], key: str, low: float, high: float) -> float:
+    value = message.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not low <= value <= high:
+        raise Nonsense(f"{key} must be a number from {low:g} to {high:g}")
+    return value
+
+
+def _channels(message: dict[str, Any]) -> NDArray[np.intp]:
+    names = message.get("channels")
+    if not isinstance(names, list) or len(names) > MAX_CHANNELS or any(name not in _INDEX for name in names):
+        raise Nonsense("channels must be names of columns")
+    return np.array([_INDEX[name] for name in names], dtype=np.intp)
+
+
+class Viewer:
+    """Serves one websocket until it closes."""
+
+    def __init__(self, socket: WebSocket, session: Session, access: Access) -> None:
+        self._socket = socket
+        self._session = session
+        self._access = access
+        self._may_order = False
+        self._may_look = access.open_reading
+        self._subscriptions: dict[int, Subscription] = {}
+        self._ranges: dict[int, bytes] = {}
+        self._nonsense = 0
+        self._armed = False
+        self._wants_counts = False
+        self._orders = 0
+        self._orders_since_s = 0.0
+        self._run = -1
+        self._log_sent = 0
+
+    async def serve(self) -> None:
+        """Both directions; the first that ends takes the other with it. An armed viewer that goes away is disarmed."""
+        await self._socket.accept()
+        tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send())]
+        try:
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        finally:
+            if self._armed:
+                self._session.order("disarm")
+            for task in tasks:
+                task.cancel()
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    # -- from the page --------------------------------------------------------------------------------------
+
+    async def _receive(self) -> None:
+        opened_s = time.monotonic()
+        while True:
+            patience_s = None if self._may_look else max(0.0, opened_s + HELLO_S - time.monotonic())
+            try:
+                message = await asyncio.wait_for(self._socket.receive(), patience_s)
+            except TimeoutError:
+                await self._socket.close(4403, "no token")
+                return
+            if message["type"] == "websocket.disconnect":
+                return
+            try:
+                self._obey(_parse(message.get("text")))
+            except Nonsense:
+                self._nonsense += 1
+                if self._nonsense > MAX_NONSENSE:
+                    await self._socket.close(1008, "too many messages that make no sense")
+                    return
+
+    def _obey(self, message: dict[str, Any]) -> None:
+        match message.get("type"):
+            case "hello":
+                token = message.get("token")
+                self._may_order = isinstance(token, str) and self._access.knows(token)
+                self._may_look |= self._may_order
+                self._run = -1  # greet (again)
+            case "subscribe" if self._may_look:
+                self._subscribe(message)
+            case "unsubscribe":
+                self._subscriptions.pop(int(_number(message, "id", 0, 1e9)), None)
+            case "range" if self._may_look:
+                self._range(message)
+            case "counts" if self._may_look:
+                self._wants_counts = message.get("on") is True
+            case "order" if self._may_order:
+                self._order(message)
+            case "order":
+                pass  # the page says so itself: it knows that it has no token
+            case _:
+                raise Nonsense("no such message")
+
+    def _subscribe(self, message: dict[str, Any]) -> None:
+        number = int(_number(message, "id", 0, 1e9))
+        if number not in self._subscriptions and len(self._subscriptions) >= MAX_SUBSCRIPTIONS:
+            raise Nonsense("too many subscriptions")
+        rows = int(_number(message, "rows", 1, 1e6))
+        k = rows_per_bucket(rows, int(_number(message, "pixels", 1, MAX_PIXELS)))
+        self._subscriptions[number] = Subscription(number, _channels(message), rows, k)
+
+    def _range(self, message: dict[str, Any]) -> None:
+        """A part of the past, once; a later request replaces an earlier one that was not sent yet."""
+        first, stop = int(_number(message, "first", 0, 1e15)), int(_number(message, "stop", 0, 1e15))
+        k = rows_per_bucket(max(1, stop - first), int(_number(message, "pixels", 1, MAX_PIXELS)))
+        number = int(_number(message, "id", 0, 1e9))
+        if len(self._ranges) >= MAX_SUBSCRIPTIONS and number not in self._ranges:
+            raise Nonsense("too many requests at once")
+        buckets = self._session.history.buckets(_channels(message), k, first // k, -(-stop // k))
+        self._ranges[number] = encode(buckets, number)
+
+    def _order(self, message: dict[str, Any]) -> None:
+        now_s = time.monotonic()
+        if now_s - self._orders_since_s > 1.0:
+            self._orders, self._orders_since_s = 0, now_s
+        self._orders += 1
+        order = message.get("order")
+        if order == "safe":
+            self._session.order("safe")
+        elif self._orders > ORDERS_PER_S:
+            raise Nonsense("too many orders")
+        elif order == "arm":
+            self._armed = self._session.order("arm")
+        elif order == "disarm":
+            self._armed = False
+            self._session.order("disarm")
+        elif order == "jog" and self._armed:
+            channel = int(_number(message, "channel", 0, 2))
+            self._session.order("jog", channel=channel, rate_V_per_s=_number(message, "rate_V_per_s", -1e3, 1e3))
+        elif order == "gain":
+            self._session.order("gain", value=_number(message, "value", 0.0, 1.5))
+
+    # -- to the page ----------------------------------------------------------------------------------------
+
+    async def _send(self) -> None:
+        state_s = counts_s = 0.0
+        while True:
+            try:
+                async with asyncio.timeout(SEND_S):
+                    await self._session.frame_ready.wait()
+                    now_s = time.monotonic()
+                    if self._may_look:
+                        await self._greet_new_run()
+                        for subscription in list(self._subscriptions.values()):
+                            await self._send_new(subscription)
+                        while self._ranges:
+                            await self._socket.send_bytes(self._ranges.pop(next(iter(self._ranges))))
+                        if now_s - state_s >= STATUS_S:
+                            state_s = now_s
+                            await self._send_state()
+                        if self._wants_counts and now_s - counts_s >= COUNTS_S:
+                            counts_s = now_s
+                            await self._socket.send_json({"type": "counts", "counts": self._session.counts()})
+            except (TimeoutError, WebSocketDisconnect, RuntimeError):
+                return  # gone, or has not read for half a minute
+
+    async def _greet_new_run(self) -> None:
+        session = self._session
+        if self._run == session.run_number:
+            return
+        self._run = session.run_number
+        for subscription in self._subscriptions.values():
+            subscription.next_bucket = None
+        await self._socket.send_json({"type": "hello", "run": self._run, "may_order": self._may_order})
+
+    async def _send_new(self, subscription: Subscription) -> None:
+        history, k = self._session.history, subscription.per_bucket
+        newest = history.head // k
+        oldest = max(0, history.head - subscription.rows) // k
+        first = subscription.next_bucket
+        if first is None or first < oldest:
+            first = oldest
+        if first * k >= history.head:
+            return
+        buckets = history.buckets(subscription.channels, k, first)
+        if buckets.t_s.size:
+            subscription.next_bucket = min(newest, buckets.first + buckets.t_s.size)
+            await self._socket.send_bytes(encode(buckets, subscription.id))
+
+    async def _send_state(self) -> None:
+        session = self._session
+        await self._socket.send_json({**session.state(), "may_order": self._may_order})
+        if session.log_number > self._log_sent:
+            lines = [line for line in session.log if line["n"] > self._log_sent]
+            self._log_sent = session.log_number
+            await self._socket.send_json({"type": "log", "lines": lines})
+
+
+def _parse(text: str | None) -> dict[str, Any]:
+    try:
+        message = json.loads(text or "")
+    except (ValueError, RecursionError):
+        raise Nonsense("not JSON") from None
+    if not isinstance(message, dict):
+        raise Nonsense("not an object")
+    return message

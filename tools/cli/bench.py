@@ -1,0 +1,55 @@
+"""``micron bench``: the page, over a running firmware."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import InputError, clear_errors, console
+
+
+def bench(
+    bench: BenchOption = None,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free one.")] = 8750,
+    listen: Annotated[
+        str | None, typer.Option(metavar="ADDRESS", help="Another address than loopback; everything needs the token.")
+    ] = None,
+    host_name: Annotated[
+        list[str] | None, typer.Option(metavar="NAME", help="With --listen: names under which people reach it.")
+    ] = None,
+    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Where recordings go.")] = Path("out/recordings"),
+    hand: Annotated[
+        str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
+    ] = None,
+    stale_ms: Annotated[
+        float | None,
+        typer.Option(min=1.0, max=1000.0, help="Missing scans end the run after this; for machines that do more."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the emulated world.")] = None,
+) -> None:
+    """Run the instrument and serve the bench page for it, until Ctrl-C.
+
+    Example: micron bench --port 8750
+    """
+    from tools.bench.firmware import Choice
+    from tools.bench.serve import LOOPBACK, bind, serve
+
+    with clear_errors():
+        if host_name and listen is None:
+            raise InputError("--host-name belongs to --listen; give both or neither")
+        sock = bind(listen or LOOPBACK, port)
+        try:
+            recordings.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(f"--recordings {recordings}: cannot be made ({error.strerror})") from error
+
+        def announce(address: str) -> None:
+            console().print(
+                f"bench page: [bold]{address}[/]  (the token is shown only here; Ctrl-C ends)", soft_wrap=True
+            )
+
+        choice = Choice(bench_path(bench).absolute(), hand, None, seed, stale_ms)
+        serve(choice, recordings.absolute(), sock, announce, names=tuple(host_name or ()))
