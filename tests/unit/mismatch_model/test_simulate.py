@@ -194,3 +194,30 @@ def test_bad_corrected_twins(entry: dict[str, object], message: str) -> None:
     rec = piezo()
     with pytest.raises(RecordingError, match=message):
         restore(replace(rec, twin=TwinText("piezo_stack", {}, (entry,))))
+
+
+@pytest.mark.parametrize("base_kind", ["axis", "first_order", "friction"])
+def test_what_a_view_remembers_never_outlives_a_change_of_base_parameters(base_kind: str) -> None:
+    if base_kind == "first_order":
+        u = wave()
+        given = {"A": [[-5.0]], "B": [[5.0]], "C": [[1.0]]}
+        rec = recording("state_space", DT, {"u": u}, {"y": 0.3 * u}, {"u": "V", "y": "V"}, given)
+    else:
+        rec = axis()
+    twin = make(rec)
+    output = twin.outputs[0]
+    clip = {o.name: o for o in EFFECTS.values()}["saturation"]
+    placed = [Placed(clip, "output", output, "sensor", (output,))]
+    if base_kind == "friction":
+        placed.append(sites(twin, rec, EFFECTS["coulomb_friction"])[0])
+    model = Model(twin, placed)
+    view = View.whole(rec)
+    theta = model.start(rec)
+    for j in range(model.n_base):
+        changed = theta.copy()
+        changed[j] = 1.5 * theta[j] + model.parameters[j].scale
+        for t in (theta, changed):
+            kept = model.simulate(view, t)[output]
+            np.testing.assert_array_equal(kept, model.simulate(View.whole(rec), t)[output])
+            design = model.design(view, t)
+            np.testing.assert_array_equal(design.constant[output], model.design(View.whole(rec), t).constant[output])

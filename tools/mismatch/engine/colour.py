@@ -7,34 +7,66 @@ a slow wander, where a plain autoregression would need hundreds.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import oaconvolve
+
+from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 
 
+@kernel
+def whiten_stretch(x, lags, scales, weights, warm):
+    """Innovations (n - warm, k) of one stretch x (n, k): each sample less ``lags[i]`` times the one i + 1 before it and
+    ``weights[j]`` times the mean of the ``scales[j]`` before it.
+    """
+    n, k = x.shape
+    out = np.empty((n - warm, k))
+    sums = np.zeros((scales.size, k))
+    for j in range(scales.size):
+        for i in range(warm - scales[j], warm):
+            for c in range(k):
+                sums[j, c] += x[i, c]
+    for i in range(warm, n):
+        for c in range(k):
+            v = x[i, c]
+            for a in range(lags.size):
+                v -= lags[a] * x[i - 1 - a, c]
+            for j in range(scales.size):
+                v -= weights[j] / scales[j] * sums[j, c]
+                sums[j, c] += x[i, c] - x[i - scales[j], c]
+            out[i - warm, c] = v
+    return out
+
+
 @dataclass(frozen=True)
 class Whitener:
-    """``taps`` (k,): convolving a residual with them leaves innovations; ``taps[0] == 1``."""
+    """What leaves innovations of a residual: coefficients on the last samples (``lags``) and on the means of the last
+    ``scales[j]`` samples (``weights``).
+    """
 
-    taps: Array
     innovation_rms: float
+    lags: Array = field(default_factory=lambda: np.zeros(0))
+    scales: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    weights: Array = field(default_factory=lambda: np.zeros(0))
 
     @property
     def warm_up(self) -> int:
-        """Samples at the start of a stretch that the filter spoils."""
-        return self.taps.size - 1
+        """Samples at the start of a stretch that cannot be whitened."""
+        return int(max(self.lags.size, self.scales.max(initial=0)))
 
     def apply(self, x: Array) -> Array:
-        """Whitened copy of one stretch ``x`` (n,) or (n, k) without its spoilt start."""
-        if x.shape[0] <= self.warm_up:
+        """Whitened copy of one stretch ``x`` (n,) or (n, k) without its first ``warm_up`` samples."""
+        warm = self.warm_up
+        if x.shape[0] <= warm:
             return x[:0]
-        taps = self.taps if x.ndim == 1 else self.taps[:, None]
-        full = oaconvolve(x, taps, mode="full", axes=0) if self.taps.size > 1 else x
-        return full[self.warm_up : x.shape[0]]
+        if warm == 0:
+            return x
+        columns = np.ascontiguousarray(x if x.ndim == 2 else x[:, None], np.float64)
+        out = whiten_stretch(columns, self.lags, self.scales, self.weights, warm)
+        return out if x.ndim == 2 else out[:, 0]
 
 
 def _scales(n: int, lags: int) -> list[int]:
@@ -58,7 +90,7 @@ def fit_whitener(e: Array, *, lags: int = 6, stretches: list[tuple[int, int]] | 
     centre = float(np.median(e))
     scale = 1.4826 * float(np.median(np.abs(e - centre))) or float(np.std(e))
     if scale == 0.0 or total < 40:
-        return Whitener(np.ones(1), scale or 1.0)
+        return Whitener(scale or 1.0)
     e = np.clip(e - centre, -6 * scale, 6 * scale)
     lags = min(lags, total // 20, longest // 4)
     scales = [s for s in _scales(total, lags) if s < longest // 2]
@@ -79,17 +111,13 @@ def fit_whitener(e: Array, *, lags: int = 6, stretches: list[tuple[int, int]] | 
         gram += columns.T @ columns
         cross += columns.T @ x[warm:]
     if not np.any(gram):
-        return Whitener(np.ones(1), scale)
+        return Whitener(scale)
     ridge = 1e-9 * np.trace(gram) / gram.shape[0]
     solution = np.linalg.solve(gram + ridge * np.eye(gram.shape[0]), cross)
-    taps = np.zeros(warm + 1)
-    taps[0] = 1.0
-    taps[1 : lags + 1] -= solution[:lags]
-    for j, s in enumerate(scales):
-        taps[1 : s + 1] -= solution[lags + j] / s
-    model = Whitener(taps, scale)
+    found = (solution[:lags].copy(), np.array(scales, np.int64), solution[lags:].copy())
+    model = Whitener(scale, *found)
     white = np.concatenate([model.apply(e[a:b]) for a, b in stretches])
-    return Whitener(taps, float(np.std(white)) if white.size else scale)
+    return Whitener(float(np.std(white)) if white.size else scale, *found)
 
 
 def whiten(model: Whitener, x: Array, stretches: list[tuple[int, int]]) -> Array:

@@ -130,7 +130,7 @@ def direction_z(
         f = filters[o]
         usable = [s for s in spans if s[1] - s[0] > f.warm_up + 4]
         if not usable:
-            f = Whitener(np.ones(1), float(np.std(r)))
+            f = Whitener(float(np.std(r)))
             usable = spans
         white = whiten(f, r, usable)
         moved = whiten(f, d, usable)

@@ -114,6 +114,7 @@ class DynamicTwin:
         tag = (d.ad.tobytes(), run.starts)
         value: dict[str, Array] = {o: np.zeros(n) for o in self.outputs}
         columns: dict[int, dict[str, Array]] = {}
+        folded: list[float] = []
 
         def states(u: Array, token: object) -> Array:
             key = ("states", token, tag)
@@ -137,19 +138,25 @@ class DynamicTwin:
                     g = self.input_gain(source, theta)
                     total = drive.value + sum(theta[j] / g * c for j, c in drive.columns.items())
                     keys = tuple(theta[j] / g for j in drive.columns)
+                    folded += keys
                     parts = [(-1, np.asarray(total), (*drive.token, keys))]
                 else:
                     parts += [(j, c, (*drive.token, j)) for j, c in drive.columns.items()]
             elif drive.columns:
                 total = drive.value + sum(theta[j] * c for j, c in drive.columns.items())
                 keys = tuple(theta[j] for j in drive.columns)
+                folded += keys
                 parts = [(-1, np.asarray(total), (*drive.token, keys))]
             for j, u, token in parts:
                 x = states(u, token) if any(link.row >= 0 for link in links) else np.zeros((0, 0))
                 for link in links:
                     column = u if link.row < 0 else x[:, link.row]
                     add(link.j if j < 0 else j, link.output, column)
-        return self._settle(run, d.ad, value, columns)
+        token = ("plant", d.ad.tobytes(), d.g0.tobytes(), d.g1.tobytes(), run.starts, run.window)
+        token = (*token, *(x.token for x in inputs.values()), tuple(folded))
+        if join:
+            token = (*token, theta[: len(self.parameters)].tobytes())
+        return self._settle(run, d.ad, value, columns, token)
 
     def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
         """See Twin."""
@@ -175,7 +182,12 @@ class DynamicTwin:
         return carry
 
     def _settle(
-        self, run: Run, ad: Array, value: dict[str, Array], columns: dict[int, dict[str, Array]]
+        self,
+        run: Run,
+        ad: Array,
+        value: dict[str, Array],
+        columns: dict[int, dict[str, Array]],
+        token: tuple[object, ...],
     ) -> dict[str, Signal]:
         """Add the free response of the start states: the engineer's, or what the first samples say."""
         n = run.t.size
@@ -196,7 +208,7 @@ class DynamicTwin:
                     x0 = ss.states({o: -entry.get(o, zero) for o in group})
                     for o in group:
                         entry[o] = entry.get(o, zero) + ss.response(x0, o, n)
-        return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}) for o in self.outputs}
+        return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}, (*token, o)) for o in self.outputs}
 
     def _start_state(self, run: Run, ad: Array, group: Mapping[str, int]) -> StartState:
         rows: dict[str, Array] = {}
@@ -248,6 +260,9 @@ class DynamicTwin:
             else:
                 rows[link.output][link.row] = 1.0 if normal else theta[link.j]
         u = _once(u)
+        token: tuple[object, ...] = ("forced", theta[: len(self.parameters)].tobytes(), run.starts, run.window)
+        token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
+        token = (*token, *((f.effect.name, _key(f)) for f in forces))
         cp = rows[self.feedback_on]
         if self.hold == "discrete":
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
@@ -271,7 +286,7 @@ class DynamicTwin:
         if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
             free = self.fixed_free(run.t.size)
             x = go(np.zeros((1, plant.a.shape[0])), ends)
-            return {o: Signal(x @ rows[o] + extra[o] + free[o]) for o in self.outputs}
+            return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
         full = np.linalg.matrix_power(d.ad, sub)
         ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
@@ -281,13 +296,17 @@ class DynamicTwin:
             x = go(x0, stop)
             x0 = x0 + ss.states({o: run.measured[o][:m] - extra[o][:m] - x @ rows[o] for o in self.outputs})
         x = go(x0, ends)
-        return {o: Signal(x @ rows[o] + extra[o]) for o in self.outputs}
+        return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
 
 
 def _states(d: Discrete, u: Array, starts: tuple[int, ...]) -> Array:
     s = d.ad.shape[0]
     at = np.array(starts, np.int64)
     return run_states(d.ad, d.g0, d.g1, _once(u), np.zeros((at.size, s)), at)
+
+
+def _key(force: Force) -> tuple[object, ...]:
+    return force.q.tobytes(), force.weights.tobytes(), tuple(sorted(force.settings.items()))
 
 
 def _once(u: Array) -> Array:
