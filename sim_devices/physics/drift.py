@@ -310,8 +310,35 @@ def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return hats(ctx.t, np.array(settings.get("knots_s", (0.0, 1.0))))
 
 
+def growth(residual: Array, keep: np.ndarray) -> float:
+    """How the mean square difference of neighbouring block means grows from blocks of n/64 to n/16: about 4 for a
+    walk, 1/4 for noise that forgets within a block, near 1 for noise that forgets within n/60.
+    """
+    n = residual.size
+    total = np.concatenate([[0.0], np.cumsum(np.where(keep, residual, 0.0))])
+    count = np.concatenate([[0.0], np.cumsum(keep)])
+
+    def level(m: int) -> float:
+        at = np.arange(0, n - 2 * m + 1, max(1, m // 4))
+        c0, c1 = count[at + m] - count[at], count[at + 2 * m] - count[at + m]
+        seen = (c0 > 0.4 * m) & (c1 > 0.4 * m)
+        if seen.sum() < 4:
+            return np.nan
+        at, c0, c1 = at[seen], c0[seen], c1[seen]
+        d = (total[at + 2 * m] - total[at + m]) / c1 - (total[at + m] - total[at]) / c0
+        return float(np.mean(d * d))
+
+    short, long = level(max(2, n // 64)), level(max(4, n // 16))
+    return long / short if short > 0 and np.isfinite(long) else 4.0
+
+
+LEAST_GROWTH = 1.7
+
+
 def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
     white, walk, z, _ = increments(residual, ctx.keep, ctx.dt)
+    if growth(residual, ctx.keep) < LEAST_GROWTH:
+        return Signature(1.0, 0.0, "stationary: it forgets within a fraction of the record")
     e = residual[ctx.keep]
     power = float(np.var(e))
     share = min(1.0, max(0.0, 1 - white**2 / power)) if power > 0 else 0.0

@@ -58,7 +58,7 @@ def _parts(settings: Settings) -> Parts:
     return Parts(
         (
             Parameter("frequency_Hz", "Hz", 3 / span, 0.8 / dt, log=True, scale=1 / span),
-            Parameter("damping_ratio", "1", 1e-4, 2.0, log=True, scale=0.01),
+            Parameter("damping_ratio", "1", 1e-4, 0.71, log=True, scale=0.01),
             Parameter("share", "1", -20.0, 20.0, scale=0.05),
             Parameter("rate_share", "1", -20.0, 20.0, scale=0.05),
         )

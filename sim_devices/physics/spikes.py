@@ -13,6 +13,7 @@ from sim_devices.physics.statistics import robust_rms, smooth, whiten
 
 MOST_SHARE = 0.05  # of all samples; more is not "short and isolated"
 THRESHOLD = 6.0
+LEAST_OF_TOP = 0.25  # of the third largest burst
 
 
 def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
@@ -44,7 +45,9 @@ def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int
             a = out.pop()[0]
         piece = residual[a:b] - local
         out.append((a, b, float(piece[np.argmax(np.abs(piece))])))
-    return out
+    # a heavy tail's outliers beside real bursts are noise, and stay in the comparison
+    tops = np.sort([abs(b[2]) for b in out])[::-1]
+    return [b for b in out if abs(b[2]) > LEAST_OF_TOP * tops[min(2, tops.size - 1)]]
 
 
 def _where(ctx: Context, residual: Array) -> tuple[Array, NDArray[np.bool_]]:

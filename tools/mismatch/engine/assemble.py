@@ -184,15 +184,24 @@ def base_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> list[Base
     return shifts
 
 
+FLEXIBLE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "step_shift", "dropped_samples"))
+"""Families with so much freedom that a real effect of theirs leaves little: one that leaves more is an imitation."""
+
+
 def decide(
     problem: Problem, raw: Fit, base: Fit, selection: Selection, left: dict[str, Leftover], rule: Rule
 ) -> tuple[Verdict, float]:
     """The verdict and the p-value that nothing is missing."""
+    if selection.strange is not None:
+        return "unexplained", selection.strange.p_value
     if selection.steps:
         p = min(float(np.exp(s.comparison.log_p)) for s in selection.steps if s.comparison)
         worst = max(left.values(), key=lambda v: v.ratio)
         before = max(compare_ratio(problem, base, o) for o in left)
-        if worst.real and worst.ratio - 1 > 0.3 * (before - 1) and worst.ratio > 1.3:
+        left_over = (worst.ratio - 1) / max(before - 1, 1e-9)
+        if worst.real and left_over > 0.3 and worst.ratio > 1.3:
+            return "unexplained", p
+        if worst.real and left_over > 0.15 and worst.ratio > 2.0 and {s.name for s in selection.steps} <= FLEXIBLE:
             return "unexplained", p
         return "missing_physics", p
     if any(v.real and v.ratio > 1.05 for v in left.values()):

@@ -79,8 +79,13 @@ def dependences(
     stretches: list[Span] | None = None,
     blocks: list[Span] | None = None,
     whitener: Whitener | None = None,
+    own_colour: bool = False,
 ) -> list[Dependence]:
-    """Every feature tested against the residual ``e`` (n,); p-values Holm-corrected; strongest first."""
+    """Every feature tested against the residual ``e`` (n,); p-values Holm-corrected; strongest first.
+
+    ``own_colour``: the filter of each test from what its curve leaves (Cochrane and Orcutt), which has more power
+    against a slow signal; two wanders that have nothing to do with each other leave a wander and stay unrelated.
+    """
     stretches = stretches or [(0, e.size)]
     if blocks is None:
         edges = np.linspace(0, e.size, 25).astype(int)
@@ -92,7 +97,10 @@ def dependences(
         white = np.clip(white, -limit, limit)
     found: list[Dependence] = []
     for feature in features:
-        p = whitened_f(white, whiten(model, feature.columns, stretches))
+        if own_colour:
+            p = _after_its_curve(e, feature.columns, stretches)
+        else:
+            p = whitened_f(white, whiten(model, feature.columns, stretches))
         share = cross_fitted_share(e, feature.columns, blocks)
         found.append(Dependence(feature.signal, feature.kind, p, share, feature.memory))
     order = np.argsort([d.p_value for d in found])
@@ -105,6 +113,17 @@ def dependences(
         Dependence(d.signal, d.feature, float(p), d.strength, d.memory) for d, p in zip(found, corrected, strict=True)
     ]
     return sorted(out, key=lambda d: (-d.strength, d.p_value))
+
+
+def _after_its_curve(e: Array, columns: Array, stretches: list[Span]) -> float:
+    """p-value of a curve, whitened by the colour of what it leaves."""
+    design = np.column_stack([np.ones(e.size), columns])
+    size = np.maximum(np.linalg.norm(design, axis=0), 1e-300)
+    left = e - design @ (np.linalg.lstsq(design / size, e, rcond=1e-8)[0] / size)
+    model = fit_whitener(left, stretches=stretches)
+    white = whiten(model, e, stretches)
+    limit = 8.0 * 1.4826 * float(np.median(np.abs(white)))
+    return whitened_f(np.clip(white, -limit, limit) if limit > 0 else white, whiten(model, columns, stretches))
 
 
 def needs_memory(

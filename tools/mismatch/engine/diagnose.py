@@ -128,19 +128,22 @@ def _diagnose(
     twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
-    strange = next((f for o in twin.outputs if (f := stranger(problem, base, selection.fitted, o))), None)
-    if strange is not None:
-        # the effects only imitated it: nothing is named
-        selection = replace(selection, fitted=base, steps=(), rivals=())
+    strange = selection.strange
+    if strange is None:
+        said = {t.name for t in selection.steps}
+        strange = next((f for o in twin.outputs if (f := stranger(problem, base, selection.fitted, o, said))), None)
+        if strange is not None:
+            # the effects only imitated it: nothing is named
+            selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
     left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
     if strange is not None:
         left[strange.output] = left[strange.output].led_by(strange)
-    said = gross(recording, twin, raw)
+    remarks = gross(recording, twin, raw)
     official = None
     if not problem.split.own and twin.restart:
         whole = make_split(recording, held_out, seed, True)
         official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
-    return assemble(problem, raw, base, selection, left, catalogue, rule, said, official)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official)
 
 
 def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool) -> tuple[Problem, Fit, Fit]:

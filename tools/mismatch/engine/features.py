@@ -82,7 +82,8 @@ def local_frequency(x: Array, seconds: float, dt: float) -> Array:
     return envelope(rate, seconds, dt) / (2 * np.pi * np.maximum(envelope(x, seconds, dt), 1e-12 * np.std(x) + 1e-300))
 
 
-def _standard(x: Array) -> Array:
+def standard(x: Array) -> Array:
+    """``x`` (n,) less its mean, over its deviation."""
     return (x - x.mean()) / (np.std(x) or 1.0)
 
 
@@ -90,12 +91,14 @@ def _moves(x: Array) -> bool:
     return bool(np.std(x) > 1e-9 * max(float(np.max(np.abs(x))), 1e-300))
 
 
-def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True, drive: str = "") -> list[Feature]:
+def features_of(
+    signals: Mapping[str, Array], dt: float, *, pairs: bool = True, drive: str = "", motion: str = ""
+) -> list[Feature]:
     """Every feature tested: per signal its value, rate, acceleration, sign of rate, square, last reversal, recent
     history, amplitude and frequency; products of two signals; time itself. ``signals`` (n,) each.
 
-    A gain that depends on a signal is a curve of that signal times ``drive``: its ``kind`` is "cross product" and its
-    signal the one that sets the gain.
+    A gain that depends on a signal is a curve of that signal times ``drive`` or ``motion`` (the plant's own course):
+    its ``kind`` is "cross product" and its signal the one that sets the gain.
     """
     out: list[Feature] = []
     names = [k for k, v in signals.items() if _moves(v)]
@@ -122,16 +125,21 @@ def features_of(signals: Mapping[str, Array], dt: float, *, pairs: bool = True, 
     if pairs:
         for i, a in enumerate(names):
             for b in names[i + 1 :]:
-                gain_by, other = (b, a) if a == drive or b != drive else (a, b)
-                za, zb = _standard(signals[gain_by]), _standard(signals[other])
-                columns = curve(za, 5) * zb[:, None] if other == drive else (za * zb)[:, None]
+                movers = (drive, motion)
+                gain_by, other = (b, a) if a in movers or b not in movers else (a, b)
+                za, zb = standard(signals[gain_by]), standard(signals[other])
+                moved = other in movers and gain_by not in movers
+                columns = curve(za, 5) * zb[:, None] if moved else (za * zb)[:, None]
                 out.append(Feature(gain_by, "cross product", columns))
+                if moved:
+                    slope = standard(rate_of(zb, dt))
+                    out.append(Feature(gain_by, "cross product with rate", curve(za, 5) * slope[:, None]))
     if n:
         phase = np.linspace(0, 1, n)
         waves = np.column_stack([np.cos(np.pi * k * phase) for k in range(1, 7)])
         out.append(Feature("time", "time itself", waves))
         if drive in names and pairs:
-            out.append(Feature("time", "cross product", waves * _standard(signals[drive])[:, None]))
+            out.append(Feature("time", "cross product", waves * standard(signals[drive])[:, None]))
     return [f for f in out if f.columns.shape[1] > 0 and np.all(np.isfinite(f.columns))]
 
 

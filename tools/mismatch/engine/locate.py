@@ -40,7 +40,7 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
         motion = problem.measured[output] - fitted.residual[output]
         k = max(1, int(np.ceil(motion.size / e.size)))
         signals[output] = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
-    features = features_of(signals, dt, drive=problem.twin.drive(output))
+    features = features_of(signals, dt, drive=problem.twin.drive(output), motion=output)
     found = dependences(e, features)
     present = [f for f in features if not f.memory and f.kind in ("value", "rate")]
     past = [f for f in features if f.memory and f.kind in ("running extremum", "recent history", "amplitude")]

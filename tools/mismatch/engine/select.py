@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+
+import numpy as np
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
@@ -12,6 +14,7 @@ from tools.mismatch.engine.revise import pair_search, prune, simplify_pass, size
 from tools.mismatch.engine.score import block_energy, misfits, paired_t
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
+from tools.mismatch.engine.unexplained import Stranger, stranger
 from tools.mismatch.simulate import Model, Placed
 
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
@@ -49,6 +52,8 @@ class Selection:
     steps: tuple[Trial, ...]
     rivals: tuple[tuple[Trial, ...], ...]
     first: tuple[Trial, ...] = field(default=())
+    strange: Stranger | None = None
+    """A context signal whose free curve does better than the next effect would have done: the search ended there."""
 
 
 def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
@@ -86,6 +91,7 @@ def search(
     rivals: list[tuple[Trial, ...]] = []
     first: tuple[Trial, ...] = ()
     known: dict[tuple[str, ...], Trial] = {}
+    strange: Stranger | None = None
     decoupled = bool(getattr(problem.twin, "static", False))
     while len(steps) < rule.most * len(problem.twin.outputs):
         now = misfits(problem, current)
@@ -120,16 +126,20 @@ def search(
         models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
         best = choose(models or good, rule, now, frozenset(t.name for t in steps))
         refined = refine(problem, current, best)
+        assert refined.fitted is not None
+        found = (stranger(problem, current, refined.fitted, o, (best.name,)) for o in best.placed.outputs)
+        strange = next((f for f in found if f is not None), None)
+        if strange is not None:
+            break
         steps.append(refined)
         shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
         rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))
-        assert refined.fitted is not None
         current = refined.fitted
         touched = set(best.placed.outputs)
         known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
     if len(steps) > 1:
         current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, first, rule)
-    return Selection(base, current, tuple(steps), tuple(rivals), first)
+    return Selection(base, current, tuple(steps), tuple(rivals), first, strange)
 
 
 def second_thoughts(
@@ -179,7 +189,10 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
     here = sorted((t for t in good if output in t.placed.outputs), key=lambda t: (t.misfits[output], t.label))
     best = here[0]
     near = [t for t in here if t is best or as_good(t, best, rule, output, now[output])]
-    return min(near, key=lambda t: (t.name not in named, complexity(t), rank(t.name), -t.improvement, t.label))
+    names = {t.name for t in near}
+    return min(
+        near, key=lambda t: (t.name not in named, complexity(t), less_plain(t.name, names), -t.improvement, t.label)
+    )
 
 
 ORDER = (
@@ -191,30 +204,50 @@ ORDER = (
 )
 """Where two effects serve equally well with equal freedom, the first is the plainer statement."""
 
+FREEDOM = {
+    "static_nonlinearity": 4,
+    "creep": 5,
+    "hysteresis": 8,
+    "rate_dependent_hysteresis": 20,
+    "random_walk": 12,
+}
+"""What a family counts as at most: its weights are smoothed, and how many columns its data asked for is no physics."""
 
-def rank(name: str) -> int:
-    """Place among equals: 1 for the less plain of a pair."""
-    return int(any(name == second for _, second in ORDER))
+
+def less_plain(name: str, among: Collection[str]) -> bool:
+    """Is a plainer statement of the same freedom among those that serve equally well."""
+    return any(name == second and first in among for first, second in ORDER)
 
 
 def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -> bool:
     """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model
     may cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
+
+    A tenth of the blocks may be left out: what a start transient costs says nothing about the physics. A best effect
+    without shape allows for no form of its own.
     """
     if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False
     a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
-    if b <= rule.tie * a + 0.02 + rule.shape * max(before - best.misfits[output], 0.0):
+    form = 0.02 + rule.shape * max(before - best.misfits[output], 0.0)
+    shapeless = best.placed.effect.stochastic
+    if b <= (1.0 if shapeless else rule.tie) * a + form:
         return True
-    if b > 2.0 * a + 0.1:
+    if shapeless or b > 2.0 * a + 0.1 + 5.0 * form:
         return False
     column = best.outputs.index(output)
-    return paired_t(rival.energy[:, [column]], best.energy[:, [column]]) < 2.0
+    mine, his = best.energy[:, column], rival.energy[:, column]
+    if paired_t(his[:, None], mine[:, None]) < 2.0 and b <= 2.0 * a + 0.1:
+        return True
+    usual = np.argsort(his - mine)[: his.size - his.size // 10]
+    a, b = max(float(mine[usual].mean()) - 1.0, 0.0), max(float(his[usual].mean()) - 1.0, 0.0)
+    return b <= rule.tie * a + form
 
 
 def complexity(trial: Trial) -> float:
     """How much freedom an effect has, per output that it serves; events read off the data count as parameters."""
-    return size(trial.placed) / max(len(trial.placed.outputs), 1)
+    most = FREEDOM.get(trial.name, np.inf)
+    return min(size(trial.placed), most) / max(len(trial.placed.outputs), 1)
 
 
 def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:

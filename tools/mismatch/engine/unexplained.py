@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tools.mismatch.engine.dependence import Dependence, dependences
-from tools.mismatch.engine.features import Feature, curve
+from tools.mismatch.engine.features import Feature, curve, rate_of, standard
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.locate import follow, follow_size, thinned
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import winsorised
+
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -53,10 +57,14 @@ def leftover(
     return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
 
 
+SHAPELESS = frozenset(("random_walk", "step_shift", "spikes", "dropped_samples"))
+"""Effects made of events or of levels read off the data: they imitate anything that changes in time."""
+
+
 @dataclass(frozen=True)
 class Stranger:
-    """A recorded context signal that a free curve follows better than the named effects do: ``share`` of the base
-    residual's mean square that the curve predicts on blocks it has not seen.
+    """A recorded context signal that a free curve follows better than named effects do: ``share`` of the residual's
+    mean square that the curve predicts on blocks it has not seen.
     """
 
     output: str
@@ -66,33 +74,75 @@ class Stranger:
     p_value: float
 
 
-def stranger(problem: Problem, base: Fit, fitted: Fit, output: str) -> Stranger | None:
-    """Does a free curve of a context signal (an offset or a gain by it) explain what the accepted effects do not?
-
-    Only signals that no accepted effect is about, and only when the curve leaves clearly less than the effects.
+def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> list[Feature]:
+    """What a context signal may do that no effect is about: an offset by a curve of it, and that curve times the
+    drive, the plant's motion, or the rate of either.
     """
-    used = {s for p in fitted.model.placed if output in p.outputs for s in p.effect.needs}
-    context = {s: x for s, x in problem.recording.context.items() if s not in used}
-    if not context or not fitted.model.placed:
+    _, signals, dt = thinned(problem, before, output)
+    movers: dict[str, Array] = {}
+    drive = problem.twin.drive(output)
+    if drive in signals:
+        movers["drive"] = standard(signals[drive])
+    if not problem.twin.static or drive not in signals:
+        movers["motion"] = standard(block_means(problem.measured[output] - before.residual[output], dt, problem))
+    found: list[Feature] = []
+    for name in names:
+        bend = curve(signals[name], 10)
+        if bend.shape[1] == 0:
+            continue
+        gains = [bend * m[:, None] for m in movers.values()]
+        slopes = [bend * standard(rate_of(m, dt))[:, None] for m in movers.values()]
+        found.append(Feature(name, "value", bend))
+        if gains:
+            found.append(Feature(name, "cross product", np.column_stack([bend, *gains])))
+            found.append(Feature(name, "cross product with rate", np.column_stack([bend, *gains, *slopes])))
+        found.append(Feature(name, "rate", np.column_stack([bend, curve(rate_of(signals[name], dt), 4)])))
+    return found
+
+
+def block_means(x: Array, dt: float, problem: Problem) -> Array:
+    """``x`` (m,) on the view, averaged to the step ``dt`` of ``thinned``."""
+    k = max(1, round(dt / problem.recording.dt))
+    m = x.size // k
+    return x[: m * k].reshape(m, k).mean(axis=1)
+
+
+def stranger(
+    problem: Problem, before: Fit, after: Fit, output: str, said: Iterable[str], *, p_limit: float = 1e-8
+) -> Stranger | None:
+    """Does a free curve of a context signal explain what the effects between ``before`` and ``after`` do not?
+
+    Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
+    these (``said``) are shapeless, which imitate whatever changes, it may leave up to twice as much.
+    """
+    used = {s for p in after.model.placed if output in p.outputs for s in p.effect.needs}
+    names = [s for s in problem.recording.context if s not in used]
+    said = set(said)
+    if not names or not said:
         return None
     s = problem.sigma(output)
-    before = float(np.mean((winsorised(base.residual[output][problem.held_rows], s) / s) ** 2))
-    after = float(np.mean((winsorised(fitted.residual[output][problem.held_rows], s) / s) ** 2))
-    if after < 1.15:
+    rows = problem.held_rows
+    start = float(np.mean((winsorised(before.residual[output][rows], s) / s) ** 2))
+    end = float(np.mean((winsorised(after.residual[output][rows], s) / s) ** 2))
+    if end < 1.15:
         return None
-    e, signals, _dt = thinned(problem, base, output)
-    drive = problem.twin.drive(output)
+    e = thinned(problem, before, output)[0]
     best: Stranger | None = None
-    for name in context:
-        columns = [curve(signals[name])]
-        if drive in signals:
-            z = (signals[drive] - signals[drive].mean()) / (np.std(signals[drive]) or 1.0)
-            columns.append(columns[0] * z[:, None])
-        feature = Feature(name, "cross product" if len(columns) > 1 else "value", np.column_stack(columns))
-        if feature.columns.shape[1] == 0:
-            continue
-        found = dependences(e, [feature])[0]
-        left = (1 - found.strength) * before
-        if found.p_value < 1e-8 and left - 1 < 0.6 * (after - 1) and (best is None or found.strength > best.share):
-            best = Stranger(output, name, feature.kind, found.strength, found.p_value)
+    for d in dependences(e, context_features(problem, before, output, names), own_colour=True):
+        left = (1 - d.strength) * start
+        limit = (2.0 if said <= SHAPELESS else 1.0) * (end - 1)
+        # the plainest feature that comes close to the best
+        close = best is None or (
+            best.signal == d.signal and d.strength > 0.95 * best.share and plainer(d.feature, best.feature)
+        )
+        if d.p_value < p_limit and left - 1 < limit and close:
+            best = Stranger(output, d.signal, d.feature, d.strength, d.p_value)
     return best
+
+
+_PLAIN = ("value", "rate", "cross product", "cross product with rate")
+
+
+def plainer(a: str, b: str) -> bool:
+    """Is feature ``a`` the simpler statement."""
+    return _PLAIN.index(a) < _PLAIN.index(b)
