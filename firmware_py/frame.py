@@ -90,9 +90,10 @@ class Clip(IntFlag):
     """Limits that the actuation stage ran into in this tick."""
 
     NONE = 0
-    WORKSPACE = 1  # the wanted displacement is out of reach: scaled back
+    WORKSPACE = 1  # the wanted displacement is out of reach: the nearest reachable one is commanded
     VOLTAGE = 2  # the command was limited to the amplifier's range
     SLEW = 4  # the command moved as far as the amplifier can in one tick
+    SINGULAR = 8  # so fast that a slope of the hysteresis model had to be kept positive
 
 
 class Layout:
@@ -173,3 +174,4 @@ RESTARTED = int(FrameStatus.RESTARTED)
 CLIP_WORKSPACE = int(Clip.WORKSPACE)
 CLIP_VOLTAGE = int(Clip.VOLTAGE)
 CLIP_SLEW = int(Clip.SLEW)
+CLIP_SINGULAR = int(Clip.SINGULAR)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hal.bench import validate_table
 
@@ -29,6 +29,21 @@ class StackConfig(BaseModel):
     dead_zone_thresholds_um: tuple[float, ...] = (0.0,)
     dead_zone_weights: tuple[float, ...] = (1.0,)
     offset_um: float = 0.0
+    centre_V: float = 0.0
+    """The plays see the drive less this: what a rate does to the slopes then leaves this voltage alone."""
+
+    slope_per_rate_s_per_V: tuple[float, ...] = ()
+    """c_i of W_i(v) = W_i + c_i v, 000 (7.17), um/V per um/s; empty: rate-independent."""
+    rate_low_um_per_s: Annotated[float, Field(ge=0.0)] = 0.0
+    """Below, the slopes are those at this rate (000, 7.5: the law is not linear for slow motion)."""
+    rate_high_um_per_s: tuple[Positive, ...] = ()
+    """Beyond, slope i is that at this rate (000, Fig. 7.11; ERRATA 79); empty: never."""
+    least_slope_um_per_V: Positive = 0.01
+    """Slopes are held here when the rate would make them smaller: a slope of zero has no inverse."""
+
+    creep_times_s: tuple[Positive, ...] = ()
+    creep_shares: tuple[Annotated[float, Field(ge=0.0, lt=0.2)], ...] = ()
+    """Each time constant's share of a step that follows by creep (Krejci, Kuhnen 2001); empty: none."""
 
     @model_validator(mode="after")
     def _check(self) -> StackConfig:
@@ -43,6 +58,17 @@ class StackConfig(BaseModel):
             # ERRATA 74: the inverse exists when every partial sum is positive; single weights may be negative
             if np.any(np.cumsum(weights) <= 0.0):
                 raise ValueError(f"{name}: every partial sum of the weights must be positive, or there is no inverse")
+        n = len(self.play_thresholds_V)
+        for name, values in (
+            ("slope_per_rate_s_per_V", self.slope_per_rate_s_per_V),
+            ("rate_high_um_per_s", self.rate_high_um_per_s),
+        ):
+            if values and len(values) != n:
+                raise ValueError(f"{name}: one value per play, or none")
+        if len(self.creep_times_s) != len(self.creep_shares):
+            raise ValueError("creep: as many times as shares are needed")
+        if min(np.cumsum(self.play_weights_um_per_V)) <= self.least_slope_um_per_V:
+            raise ValueError("least_slope_um_per_V must be below every partial sum of the play weights")
         return self
 
 
@@ -58,7 +84,8 @@ class ActuationConfig(BaseModel):
 
     ball_circle_m: Positive = 0.005  # R = r, 000 (6.11)
     shaft_m: Positive = 0.040  # ball plane to tip
-    lever_gain: Positive = 8.0
+    lever_gain: tuple[Positive, Positive, Positive] = (8.0, 8.0, 8.0)
+    rest_heights_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the balls at neutral, against a level star
     mounting: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     low_V: float = 0.0
@@ -66,6 +93,14 @@ class ActuationConfig(BaseModel):
     neutral_V: float = 50.0
     slew_V_per_s: Positive = 20_000.0
     stacks: tuple[StackConfig, StackConfig, StackConfig] = (StackConfig(), StackConfig(), StackConfig())
+    feedforward: Annotated[tuple[float, ...], Field(min_length=1, max_length=16)] = (1.0,)
+    """Taps on the wanted strokes, newest first: inverse of amplifier lag and resonance. What they need to see of the
+    future is part of the predictor's horizon ([firmware.tremor] loop_delay_s)."""
+
+    @field_validator("lever_gain", mode="before")
+    @classmethod
+    def _one_for_all(cls, value: Any) -> Any:
+        return (value,) * 3 if isinstance(value, int | float) else value
 
     @model_validator(mode="after")
     def _check(self) -> ActuationConfig:

@@ -1,8 +1,9 @@
-"""Modified Prandtl-Ishlinskii hysteresis and its exact inverse (000, 7.2; ERRATA 73, 74).
+"""Rate-dependent modified Prandtl-Ishlinskii hysteresis, creep, and the exact inverse (000, 7.2, 7.3; ERRATA 73-79).
 
-Forward: z = w_s . S_d(w_h . H_r[x, y0]), plays H_r with memory, then one-sided dead zones S_d without. The
-inverse has the same form with transformed weights, thresholds and initial states, the dead zones first.
-Units: drive x in V, z in m (weights m/V); dead-zone thresholds in the unit of w_h . H_r, m.
+Forward: z = x + creep(x), x = w_s . S_d(w_h(v) . H_r[u]): plays H_r of the drive with memory, weighted by slopes
+W_i(v) = W_i + c_i v that depend on the rate v = |dz/dt| of the wanted extension, then one-sided dead zones without
+memory, then creep. The inverse keeps the forward play states and transforms them anew in every step (ERRATA 78).
+Units: drive V, extension m (slopes m/V), rate m/s; dead-zone thresholds in m.
 """
 
 from __future__ import annotations
@@ -20,20 +21,26 @@ Array = NDArray[np.float64]
 UM = 1e-6
 
 
-def operator_dtype(n_plays: int, n_zones: int) -> np.dtype[Any]:
-    """Numbers of one stack: the forward operator, and its inverse (names ending in ``_inverse``)."""
+def operator_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
+    """Numbers of one stack."""
     return np.dtype(
         [
+            ("centre_V", "f8"),  # the plays see the drive less this
+            ("level", "f8"),  # and their sum counts from here, m
             ("r", "f8", (n_plays,)),
-            ("w", "f8", (n_plays,)),
-            ("sums", "f8", (n_plays,)),  # W_i, partial sums of w
+            ("slope", "f8", (n_plays,)),  # W_i, partial sums of the weights, m/V
+            ("slope_per_rate", "f8", (n_plays,)),  # c_i, m/V per m/s
+            ("rate_high", "f8", (n_plays,)),  # the law is held beyond, m/s
+            ("rate_low", "f8"),  # and below
+            ("least_slope", "f8"),
             ("d", "f8", (n_zones,)),
             ("s", "f8", (n_zones,)),
-            ("r_inverse", "f8", (n_plays,)),
-            ("w_inverse", "f8", (n_plays,)),
             ("d_inverse", "f8", (n_zones,)),
             ("s_inverse", "f8", (n_zones,)),
             ("offset", "f8"),
+            ("creep_share", "f8", (n_creep,)),
+            ("creep_keep", "f8", (n_creep,)),  # of one tick
+            ("creep_reference", "f8"),  # extension without creep at which it rests, m
         ]
     )
 
@@ -49,46 +56,110 @@ def inverse_thresholds(r: Array, w: Array) -> Array:
     return np.array([np.sum(w[: i + 1] * (r[i] - r[: i + 1])) for i in range(len(r))])
 
 
-def inverse_states(w: Array, y: Array) -> Array:
-    """y'_i = W_i y_i + sum_{j > i} w_j y_j: play states of the inverse from those of the forward operator."""
-    return np.cumsum(w) * y + np.array([np.sum(w[i + 1 :] * y[i + 1 :]) for i in range(len(w))])
+def plays_at(stack: Record, drive_V: float, high_V: float) -> Array:
+    """Play states of a stack that was cycled over its range (0, ``high_V``, 0) and then driven up to ``drive_V``."""
+    down = np.maximum(-stack.r, np.minimum(stack.r, np.maximum(high_V - stack.r, 0.0)))
+    return np.maximum(drive_V - stack.r, down) - stack.centre_V
 
 
-def plays_after_rise(r: Array, drive_V: float) -> Array:
-    """Play states of a de-energised stack whose drive has risen from 0 to ``drive_V``."""
-    return np.maximum(drive_V - r, 0.0)
+def sizes_of(*stacks: StackConfig) -> tuple[int, int, int]:
+    """Plays, dead zones and creep elements that hold each of ``stacks``; in whole blocks, because every new size
+    compiles the kernels anew. What is over does nothing."""
+
+    def blocks(needed: int, block: int) -> int:
+        return -(-max(needed, 1) // block) * block
+
+    return (
+        blocks(max(len(stack.play_thresholds_V) for stack in stacks), 16),
+        blocks(max(len(stack.dead_zone_thresholds_um) for stack in stacks), 4),
+        blocks(max(len(stack.creep_times_s) for stack in stacks), 4),
+    )
 
 
-def operator_params(stack: StackConfig) -> Record:
-    """The kernels' numbers of one stack (dtype ``operator_dtype``)."""
-    r = np.array(stack.play_thresholds_V)
-    w = np.array(stack.play_weights_um_per_V) * UM
-    d = np.array(stack.dead_zone_thresholds_um) * UM
-    s = np.array(stack.dead_zone_weights)
+def _fill(values: tuple[float, ...], n: int, rest: float, step: float = 0.0) -> Array:
+    """``values`` and then ``rest``, ``rest + step``, ... to length ``n``."""
+    return np.concatenate([np.array(values, dtype=np.float64), rest + step * np.arange(n - len(values))])
+
+
+def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[int, int, int] | None = None) -> Record:
+    """The kernels' numbers of one stack (dtype ``operator_dtype``), filled up to ``sizes``."""
+    plays, zones, creep = sizes or sizes_of(stack)
+    r = _fill(stack.play_thresholds_V, plays, stack.play_thresholds_V[-1] + 1.0, 1.0)
+    slope = np.cumsum(_fill(stack.play_weights_um_per_V, plays, 0.0)) * UM
+    law = stack.slope_per_rate_s_per_V or (0.0,)
+    high = stack.rate_high_um_per_s or (np.inf,)
+    d = _fill(stack.dead_zone_thresholds_um, zones, stack.dead_zone_thresholds_um[-1] + 1.0, 1.0) * UM
+    s = _fill(stack.dead_zone_weights, zones, 0.0)
     return new_record(
-        operator_dtype(len(r), len(d)),
+        operator_dtype(plays, zones, creep),
+        centre_V=stack.centre_V,
+        level=slope[-1] * stack.centre_V,
         r=r,
-        w=w,
-        sums=np.cumsum(w),
+        slope=slope,
+        slope_per_rate=_fill(law, plays, law[-1]),
+        rate_high=_fill(high, plays, high[-1]) * UM,
+        rate_low=stack.rate_low_um_per_s * UM,
+        least_slope=stack.least_slope_um_per_V * UM,
         d=d,
         s=s,
-        r_inverse=inverse_thresholds(r, w),
-        w_inverse=inverse_weights(w),
         d_inverse=inverse_thresholds(d, s),
         s_inverse=inverse_weights(s),
         offset=stack.offset_um * UM,
+        creep_share=_fill(stack.creep_shares, creep, 0.0),
+        creep_keep=np.exp(-1.0 / (_fill(stack.creep_times_s, creep, 1.0) * tick_hz)),
     )
 
 
 @kernel
-def play(x: float, states: Array, r: Array, w: Array) -> float:
-    """w . H_r[x]: moves the play ``states`` and sums them, 000 (7.1), (7.4)."""
+def slopes_at(rate: float, stack: Record, out: Array) -> bool:
+    """``out`` (n,) = W_i at ``rate`` m/s, 000 (7.17), held at the ends of the law; True when one had to be limited.
+
+    A slope that is not positive has no inverse (000, 7.5): it is held at the least one.
+    """
+    limited = False
+    for i in range(len(stack.r)):
+        w = stack.slope[i] + stack.slope_per_rate[i] * min(max(rate, stack.rate_low), stack.rate_high[i])
+        # also for nan
+        if not w >= stack.least_slope:
+            w = stack.least_slope
+            limited = True
+        out[i] = w
+    return limited
+
+
+@kernel
+def play(x: float, states: Array, slopes: Array, r: Array) -> float:
+    """w . H_r[x] with w_i = W_i - W_(i-1), 000 (7.1), (7.4), (7.18): moves the ``states`` and sums them."""
     total = 0.0
+    before = 0.0
     for i in range(len(r)):
         y = max(x - r[i], min(x + r[i], states[i]))
         states[i] = y
-        total += w[i] * y
+        total += (slopes[i] - before) * y
+        before = slopes[i]
     return total
+
+
+@kernel
+def play_inverse(h: float, states: Array, slopes: Array, r: Array) -> float:
+    """x with w . H_r[x] = h, 000 (7.20), (7.21); ``states`` are the forward operator's and do not move.
+
+    y'_i = W_i y_i + sum_{j > i} w_j y_j is carried from play to play as y'_(i-1) less the change.
+    """
+    n = len(r)
+    mapped = 0.0
+    for i in range(n):
+        mapped += (slopes[i] - (slopes[i - 1] if i > 0 else 0.0)) * states[i]
+    # y'_0 = W_0 y_0 + sum_{j > 0} w_j y_j is the whole sum; then y'_i = y'_(i-1) + W_(i-1) (y_i - y_(i-1))
+    threshold = 0.0
+    x = 0.0
+    for i in range(n):
+        if i > 0:
+            mapped += slopes[i - 1] * (states[i] - states[i - 1])
+            threshold += slopes[i - 1] * (r[i] - r[i - 1])
+        weight = 1.0 / slopes[i] - (1.0 / slopes[i - 1] if i > 0 else 0.0)
+        x += weight * max(h - threshold, min(h + threshold, mapped))
+    return x
 
 
 @kernel
@@ -101,30 +172,27 @@ def dead_zones(y: float, d: Array, s: Array) -> float:
 
 
 @kernel
-def extension(drive_V: float, states: Array, stack: Record) -> float:
-    """Forward model: extension m of the stack at ``drive_V``; moves the forward play ``states``."""
-    return dead_zones(play(drive_V, states, stack.r, stack.w), stack.d, stack.s) + stack.offset
+def extension(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+    """Forward model, one tick: extension m at ``drive_V``; moves ``plays`` and ``creep`` (m)."""
+    y = play(drive_V - stack.centre_V, plays, slopes, stack.r) + stack.level
+    x = dead_zones(y, stack.d, stack.s) + stack.offset
+    z = x
+    for j in range(len(creep)):
+        keep = stack.creep_keep[j]
+        creep[j] = keep * creep[j] + (1.0 - keep) * stack.creep_share[j] * (x - stack.creep_reference)
+        z += creep[j]
+    return z
 
 
 @kernel
-def drive(extension_m: float, states: Array, stack: Record) -> float:
-    """Inverse model: drive V that gives ``extension_m``; moves the inverse play ``states``."""
-    linear = dead_zones(extension_m - stack.offset, stack.d_inverse, stack.s_inverse)
-    return play(linear, states, stack.r_inverse, stack.w_inverse)
-
-
-@kernel
-def follow_drive(drive_V: float, states: Array, stack: Record) -> None:
-    """Move the inverse's play ``states`` as if it had asked for ``drive_V`` (what a limit left of the wish).
-
-    Undoes y'_i = W_i y_i + sum_{j > i} w_j y_j from the last play to the first, moves the forward plays, and
-    maps them back.
-    """
-    before = 0.0
-    after = 0.0
-    for i in range(len(stack.r) - 1, -1, -1):
-        y = (states[i] - before) / stack.sums[i]
-        moved = max(drive_V - stack.r[i], min(drive_V + stack.r[i], y))
-        states[i] = stack.sums[i] * moved + after
-        before += stack.w[i] * y
-        after += stack.w[i] * moved
+def drive(extension_m: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+    """Inverse model: drive V with which ``extension`` would give ``extension_m`` in this tick; nothing moves."""
+    rest = extension_m
+    gain = 1.0
+    for j in range(len(creep)):
+        share = (1.0 - stack.creep_keep[j]) * stack.creep_share[j]
+        gain += share
+        rest += share * stack.creep_reference - stack.creep_keep[j] * creep[j]
+    # rest = x (1 + shares): the creep of this very tick is part of what is wanted
+    h = dead_zones(rest / gain - stack.offset, stack.d_inverse, stack.s_inverse)
+    return play_inverse(h - stack.level, plays, slopes, stack.r) + stack.centre_V

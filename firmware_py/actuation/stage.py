@@ -11,17 +11,19 @@ from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.hysteresis import (
     drive,
     extension,
-    follow_drive,
-    inverse_states,
     operator_dtype,
     operator_params,
-    plays_after_rise,
+    plays_at,
+    sizes_of,
+    slopes_at,
 )
-from firmware_py.actuation.limits import limit_slew, limit_voltage, reach_scale
-from firmware_py.actuation.manipulator import strokes_from_tip
+from firmware_py.actuation.limits import limit_slew, limit_voltage
+from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip
+from firmware_py.actuation.reach import inside, nearest_reachable
 from firmware_py.frame import (
     ALIGNING,
     CLIP,
+    CLIP_SINGULAR,
     CLIP_SLEW,
     CLIP_VOLTAGE,
     CLIP_WORKSPACE,
@@ -36,27 +38,21 @@ from firmware_py.frame import (
 from firmware_py.records import Record, attributes, copy_record, new_record
 from hal.compiled import kernel
 
-# strokes are not quite linear in the displacement: each pass leaves about a hundredth of the excess
-REACH_PASSES = 4
+Array = NDArray[np.float64]
 
 
-def _sizes(config: ActuationConfig) -> tuple[int, int]:
-    return (
-        max(len(stack.play_thresholds_V) for stack in config.stacks),
-        max(len(stack.dead_zone_thresholds_um) for stack in config.stacks),
-    )
+TAPS = 16  # the most that a configuration may have; one size, one compilation
 
 
-def actuate_dtype(n_plays: int, n_zones: int) -> np.dtype[Any]:
+def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
     return np.dtype(
         [
             ("gain", "f8"),
             ("ramp_step", "f8"),
             ("min_confidence", "f8"),
+            ("tick_hz", "f8"),
             ("mounting", "f8", (3, 3)),
-            ("ball_circle_m", "f8"),
-            ("shaft_m", "f8"),
-            ("lever_gain", "f8"),
+            ("geometry", GEOMETRY),
             ("low_V", "f8"),
             ("high_V", "f8"),
             ("neutral_V", "f8"),
@@ -64,84 +60,107 @@ def actuate_dtype(n_plays: int, n_zones: int) -> np.dtype[Any]:
             ("stroke_low", "f8", (3,)),  # m from neutral
             ("stroke_high", "f8", (3,)),
             ("neutral_extension", "f8", (3,)),  # m
-            ("stacks", operator_dtype(n_plays, n_zones), (3,)),
+            ("taps", "f8", (TAPS,)),
+            ("stacks", operator_dtype(n_plays, n_zones, n_creep), (3,)),
         ]
     )
 
 
-def actuate_state_dtype(n_plays: int) -> np.dtype[Any]:
+def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
     return np.dtype(
         [
             ("on", "f8", (3,)),  # 0 .. 1, how far compensation of each axis is switched on
+            ("tilt", "f8", (2,)),  # of the shaft, where the next inverse kinematics starts
+            ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
+            ("target", "f8", (3,)),  # extension from neutral that was asked of the stack, m
             ("command_V", "f8", (3,)),
-            ("plays", "f8", (3, n_plays)),  # of the inverse operators
-            ("trial", "f8", (n_plays,)),
+            ("plays", "f8", (3, n_plays)),
+            ("creep", "f8", (3, n_creep)),
+            ("slopes", "f8", (n_plays,)),
         ]
     )
 
 
-def _padded(config: ActuationConfig) -> list[Record]:
-    """All stacks with the same numbers of operators: extra ones have weight zero beyond every other threshold."""
-    plays, zones = _sizes(config)
-    records: list[Record] = []
-    for stack in config.stacks:
-        r, w = list(stack.play_thresholds_V), list(stack.play_weights_um_per_V)
-        d, s = list(stack.dead_zone_thresholds_um), list(stack.dead_zone_weights)
-        while len(r) < plays:
-            r, w = [*r, r[-1] + 1.0], [*w, 0.0]
-        while len(d) < zones:
-            d, s = [*d, d[-1] + 1.0], [*s, 0.0]
-        records.append(
-            operator_params(
-                stack.model_copy(
-                    update={
-                        "play_thresholds_V": tuple(r),
-                        "play_weights_um_per_V": tuple(w),
-                        "dead_zone_thresholds_um": tuple(d),
-                        "dead_zone_weights": tuple(s),
-                    }
-                )
-            )
-        )
-    return records
+def geometry_of(config: ActuationConfig) -> Record:
+    """The kinematics' numbers (dtype ``GEOMETRY``)."""
+    geometry = new_record(
+        GEOMETRY,
+        circle_m=config.ball_circle_m,
+        shaft_m=config.shaft_m,
+        lever=config.lever_gain,
+        rest_m=config.rest_heights_m,
+    )
+    star_tip(geometry["rest_m"][0], config.ball_circle_m, config.shaft_m, geometry["rest_tip"][0])
+    return geometry
 
 
 def actuate_params(config: ActuationConfig) -> Record:
     """All numbers of the stage."""
-    plays, zones = _sizes(config)
+    sizes = sizes_of(*config.stacks)
     params = new_record(
-        actuate_dtype(plays, zones),
+        actuate_dtype(*sizes),
         gain=config.gain,
         ramp_step=1.0 / (config.ramp_s * config.tick_hz),
         min_confidence=config.min_confidence,
+        tick_hz=config.tick_hz,
         mounting=config.mounting,
-        ball_circle_m=config.ball_circle_m,
-        shaft_m=config.shaft_m,
-        lever_gain=config.lever_gain,
+        geometry=geometry_of(config),
         low_V=config.low_V,
         high_V=config.high_V,
         neutral_V=config.neutral_V,
         slew_step_V=config.slew_V_per_s / config.tick_hz,
+        taps=np.array(config.feedforward + (0.0,) * (TAPS - len(config.feedforward))),
     )
     param = attributes(params)[0]
-    for i, stack in enumerate(_padded(config)):
-        param.stacks[i] = stack[0]
-        at = attributes(stack)[0]
-        risen = plays_after_rise(at.r, config.neutral_V)
-        param.neutral_extension[i] = extension(config.neutral_V, risen, at)
+    slopes = np.empty(sizes[0])
+    for i, stack in enumerate(config.stacks):
+        record = operator_params(stack, config.tick_hz, sizes)
+        # without creep: the range must be there at once
+        quick = stack.model_copy(update={"creep_times_s": (), "creep_shares": ()})
+        at = attributes(operator_params(quick, config.tick_hz, sizes))[0]
+        slopes_at(0.0, at, slopes)
+        plays, creep = plays_at(at, config.neutral_V, config.high_V), np.zeros(sizes[2])
+        volts = (config.neutral_V, config.high_V, config.low_V)
+        rest, high, low = (extension(v, slopes, plays, creep, at) for v in volts)
         # what is reached whatever came before: the top erases all memory, the bottom is worst right after the top
-        param.stroke_high[i] = extension(config.high_V, risen, at) - param.neutral_extension[i]
-        param.stroke_low[i] = extension(config.low_V, risen, at) - param.neutral_extension[i]
+        param.neutral_extension[i] = rest
+        param.stroke_high[i] = high - rest
+        param.stroke_low[i] = low - rest
+        record["creep_reference"] = rest
+        param.stacks[i] = record[0]
     return params
 
 
 def actuate_state(config: ActuationConfig, params: Record) -> Record:
     """At neutral, as after the amplifier's first rise from 0 V."""
-    state = new_record(actuate_state_dtype(_sizes(config)[0]), command_V=config.neutral_V)
+    plays, _, creep = sizes_of(*config.stacks)
+    state = new_record(actuate_state_dtype(plays, creep), command_V=config.neutral_V)
     for i in range(3):
-        stack = attributes(params)[0].stacks[i]
-        state["plays"][0, i] = inverse_states(stack.w, plays_after_rise(stack.r, config.neutral_V))
+        state["plays"][0, i] = plays_at(attributes(params)[0].stacks[i], config.neutral_V, config.high_V)
     return state
+
+
+@kernel
+def command_stack(
+    target: float, plays: Array, creep: Array, slopes: Array, last_target: float, last_V: float, i: int, param: Record
+) -> tuple[float, int]:
+    """Drive V of stack ``i`` for the extension ``target`` (m from neutral), limited, and the Clip bits that took.
+
+    Moves ``plays`` and ``creep`` by what is commanded, so that after a limit the model still knows the stack.
+    """
+    stack = param.stacks[i]
+    clip = 0
+    if slopes_at(abs(target - last_target) * param.tick_hz, stack, slopes):
+        clip |= CLIP_SINGULAR
+    wanted = drive(param.neutral_extension[i] + target, slopes, plays, creep, stack)
+    inside_V = limit_voltage(wanted, param.low_V, param.high_V)
+    if inside_V != wanted:
+        clip |= CLIP_VOLTAGE
+    command = limit_slew(inside_V, last_V, param.slew_step_V)
+    if command != inside_V:
+        clip |= CLIP_SLEW
+    extension(command, slopes, plays, creep, stack)
+    return command, clip
 
 
 @kernel
@@ -167,30 +186,23 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     for i in range(3):
         tip[i] = param.mounting[i, 0] * wish[0] + param.mounting[i, 1] * wish[1] + param.mounting[i, 2] * wish[2]
     clip = 0
-    strokes_from_tip(tip, param.ball_circle_m, param.shaft_m, param.lever_gain, stroke)
-    for _ in range(REACH_PASSES):
-        scale = reach_scale(stroke, param.stroke_low, param.stroke_high)
-        if scale == 1.0:
-            break
+    strokes_from_tip(tip, param.geometry, state.tilt, stroke)
+    if not inside(stroke, param.stroke_low, param.stroke_high):
         clip = CLIP_WORKSPACE
-        for i in range(3):
-            tip[i] *= scale
-        strokes_from_tip(tip, param.ball_circle_m, param.shaft_m, param.lever_gain, stroke)
+        nearest_reachable(tip, param.geometry, param.stroke_low, param.stroke_high, stroke)
     for i in range(3):
-        stack = param.stacks[i]
-        plays = state.plays[i]
-        state.trial[:] = plays
-        wanted = drive(param.neutral_extension[i] + stroke[i], state.trial, stack)
-        inside = limit_voltage(wanted, param.low_V, param.high_V)
-        if inside != wanted:
-            clip |= CLIP_VOLTAGE
-        command = limit_slew(inside, state.command_V[i], param.slew_step_V)
-        if command != inside:
-            clip |= CLIP_SLEW
-        if command == wanted:
-            plays[:] = state.trial
-        else:
-            follow_drive(command, plays, stack)
+        past = state.strokes[i]
+        for k in range(len(past) - 1, 0, -1):
+            past[k] = past[k - 1]
+        past[0] = stroke[i]
+        target = 0.0
+        for k in range(len(past)):
+            target += param.taps[k] * past[k]
+        command, limited = command_stack(
+            target, state.plays[i], state.creep[i], state.slopes, state.target[i], state.command_V[i], i, param
+        )
+        clip |= limited
+        state.target[i] = target
         state.command_V[i] = command
         frame[COMMAND + i] = command
     frame[CLIP] = clip

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation import stage
-from firmware_py.actuation.config import ActuationConfig
-from firmware_py.actuation.hysteresis import extension, plays_after_rise
+from firmware_py.actuation.config import ActuationConfig, StackConfig
+from firmware_py.actuation.hysteresis import extension, plays_at
 from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import (
     CLIP,
+    CLIP_SINGULAR,
     CLIP_SLEW,
     CLIP_VOLTAGE,
     CLIP_WORKSPACE,
@@ -46,17 +47,19 @@ def run(config: ActuationConfig, frames: np.ndarray) -> Actuation:
 def tip_of(actuation: Actuation, frames: np.ndarray) -> np.ndarray:
     """Where stacks that are exactly the model and the real mechanism put the tip, manipulator frame."""
     config, param = actuation.config, attributes(actuation.params)[0]
-    plays = [plays_after_rise(param.stacks[i].r, config.neutral_V) for i in range(3)]
+    plays = [plays_at(param.stacks[i], config.neutral_V, config.high_V) for i in range(3)]
+    slopes = [param.stacks[i].slope for i in range(3)]
     tips = []
     for k, frame in enumerate(frames):
         z = np.array(
             [
-                extension(frame[COMMAND + i], plays[i], actuation.params[0]["stacks"][i]) - param.neutral_extension[i]
+                extension(frame[COMMAND + i], slopes[i], plays[i], np.zeros(4), actuation.params[0]["stacks"][i])
+                - param.neutral_extension[i]
                 for i in range(3)
             ]
         )
         if k % 25 == 0:
-            tips.append(tip_from_strokes(z, config.ball_circle_m, config.shaft_m, config.lever_gain))
+            tips.append(tip_from_strokes(z, config))
     return np.array(tips)
 
 
@@ -91,22 +94,76 @@ def test_compensation_fades_in_and_out_with_trust() -> None:
     assert wish[-1, 0] == 1.0
 
 
-def test_out_of_reach_is_scaled_back_and_flagged() -> None:
+def test_out_of_reach_is_the_nearest_point_flagged_and_without_a_jump() -> None:
     frames = trembling(1500, size=400e-6)
     actuation = run(ActuationConfig(), frames)
     clipped = frames[600:, CLIP].astype(int) & CLIP_WORKSPACE != 0
     assert 0.2 < np.mean(clipped) < 1.0
     wish, tremor = frames[600:, LAYOUT["desired_tip"]], frames[600:, LAYOUT["tremor_ahead"]]
-    for w, x in zip(wish[clipped], tremor[clipped], strict=True):
-        np.testing.assert_allclose(np.cross(w, x), 0.0, atol=1e-12)  # the direction is kept
-        assert w @ x < 0.0
-    assert np.all(frames[:, COMMAND : COMMAND + 3] >= 0.0)
-    assert np.all(frames[:, COMMAND : COMMAND + 3] <= 100.0)
-    # where the amplifier could follow (a wish that swings through zero in one tick is too fast for it)
+    assert np.all(np.any(wish != -tremor, axis=1) == clipped)
+    # the nearest point of a convex set moves no more than what it is nearest to
+    moved, wanted = (np.linalg.norm(np.diff(v, axis=0), axis=1) for v in (wish, tremor))
+    assert np.all(moved <= 1.02 * wanted)
+    command = frames[:, LAYOUT["command"]]
+    assert np.all((command >= 0.0) & (command <= 100.0))
+    # where the amplifier could follow
     followed = frames[::25, CLIP].astype(int) & CLIP_SLEW == 0
     assert np.mean(followed) > 0.8
-    wanted = frames[::25, LAYOUT["desired_tip"]]
-    np.testing.assert_allclose(tip_of(actuation, frames)[followed], wanted[followed], atol=1e-9)
+    at = frames[::25, LAYOUT["desired_tip"]]
+    np.testing.assert_allclose(tip_of(actuation, frames)[followed], at[followed], atol=1e-9)
+
+
+def test_too_fast_for_the_model_is_limited_and_flagged() -> None:
+    """000, 7.5: above 36 Hz (1414 um/s) a slope turns negative and the inverse would run backwards."""
+    falling = tuple(-w / 1414.0 for w in np.cumsum(StackConfig().play_weights_um_per_V)[:2])
+    law = (*falling, *[0.0] * 8)
+    stack = StackConfig(slope_per_rate_s_per_V=law, least_slope_um_per_V=0.005)
+    config = ActuationConfig(stacks=(stack,) * 3)
+    t = np.arange(1200) / 1000.0
+    for frequency_hz, beyond in ((20.0, False), (35.0, False), (45.0, True)):
+        frames = trembling(1200)
+        # all three stacks: 12.5 um p-p of stroke along the shaft
+        frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 2] = 0.0
+        frames[:, TREMOR_AHEAD + 2] = 8.0 * 5.5e-6 * np.sin(2 * np.pi * frequency_hz * t)
+        run(config, frames)
+        # peak rate of this sine: 2 pi f 5.5 um/s, so 36 Hz for 12.5 um p-p is 40.9 Hz here
+        assert np.any(frames[:, CLIP].astype(int) & CLIP_SINGULAR) == beyond
+        command = frames[700:, COMMAND]
+        assert np.all((command >= 0.0) & (command <= 100.0))
+        # monotonic: where the wish rises for good, so does the drive
+        rising = np.diff(frames[700:, LAYOUT["stroke"]][:, 0]) > 0.3e-6
+        assert np.all(np.diff(command)[rising] > 0.0)
+
+
+def test_feedforward_taps_act_on_the_strokes() -> None:
+    frames, plain = trembling(900), trembling(900)
+    run(ActuationConfig(feedforward=(0.0, 1.0)), frames)
+    run(ActuationConfig(), plain)
+    np.testing.assert_allclose(frames[1:, LAYOUT["command"]], plain[:-1, LAYOUT["command"]], atol=1e-9)
+
+
+def test_creep_is_taken_back() -> None:
+    """A constant wish: the drive falls as the stack creeps, by the share of what was asked."""
+    stack = StackConfig(creep_times_s=(0.1,), creep_shares=(0.05,))
+    actuation = Actuation(ActuationConfig(stacks=(stack,) * 3, ramp_s=0.001))
+    frames = trembling(1500, size=0.0)
+    frames[:, TREMOR_AHEAD + 2] = -24e-6  # 3 um of stroke
+    for frame in frames:
+        actuation.step(frame)
+    param = attributes(actuation.params)[0]
+    np.testing.assert_allclose(attributes(actuation.state)[0].creep[:, 0], 3e-6 * 0.05 / 1.05, rtol=1e-4)
+    assert np.all(np.diff(frames[10:, COMMAND]) <= 1e-12)
+    z = (
+        extension(
+            frames[-1, COMMAND],
+            param.stacks[0].slope,
+            plays_at(param.stacks[0], 50.0, 100.0),
+            np.zeros(4),
+            actuation.params[0]["stacks"][0],
+        )
+        - param.neutral_extension[0]
+    )
+    assert z < 3e-6
 
 
 def test_slew_and_voltage_limits_hold_and_are_flagged() -> None:

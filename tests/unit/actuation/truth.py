@@ -7,13 +7,15 @@ from numpy.typing import NDArray
 from scipy.optimize import fsolve
 from scipy.spatial.transform import Rotation
 
+from firmware_py.actuation.config import ActuationConfig
+
 Array = NDArray[np.float64]
 PINS = np.array([[1.0, 0.0], [-0.5, np.sqrt(3) / 2], [-0.5, -np.sqrt(3) / 2]])  # 000 (6.1), (6.2) for R = r = 1
 
 
-def tip_from_strokes(strokes: Array, ball_circle_m: float, shaft_m: float, lever_gain: float) -> Array:
-    """Tip displacement (3,) m by solving the constraints for the star's pose: each ball stays in the vertical
-    plane of its leg (6.13) and at the height its actuator gives it. Unknowns: rotation vector and centre."""
+def tip_at_heights(heights: Array, ball_circle_m: float, shaft_m: float) -> Array:
+    """Tip (3,) m by solving the constraints for the star's pose: each ball stays in the vertical plane of its leg
+    (6.13) and at its height. Unknowns: rotation vector and centre. Counted from a level star at height 0."""
     r = ball_circle_m
     balls = np.column_stack([r * PINS, np.zeros(3)])
 
@@ -21,12 +23,19 @@ def tip_from_strokes(strokes: Array, ball_circle_m: float, shaft_m: float, lever
         rotation = Rotation.from_rotvec(pose[:3])
         at = rotation.apply(balls) + r * pose[3:]
         out_of_plane = at[:, 0] * PINS[:, 1] - at[:, 1] * PINS[:, 0]
-        return np.concatenate([out_of_plane, at[:, 2] - lever_gain * strokes]) / r
+        return np.concatenate([out_of_plane, at[:, 2] - heights]) / r
 
     pose, _, found, message = fsolve(constraint, np.zeros(6), full_output=True, xtol=1e-14)
     assert found == 1 or np.max(np.abs(constraint(pose))) < 1e-12, message
     shaft = np.array([0.0, 0.0, shaft_m])
     return Rotation.from_rotvec(pose[:3]).apply(shaft) + r * pose[3:] - shaft
+
+
+def tip_from_strokes(strokes: Array, config: ActuationConfig) -> Array:
+    """Tip displacement (3,) m from neutral, manipulator frame."""
+    rest = np.array(config.rest_heights_m)
+    there = tip_at_heights(rest + np.array(config.lever_gain) * strokes, config.ball_circle_m, config.shaft_m)
+    return there - tip_at_heights(rest, config.ball_circle_m, config.shaft_m)
 
 
 class Plays:
