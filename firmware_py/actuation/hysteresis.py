@@ -78,7 +78,10 @@ def sizes_of(*stacks: StackConfig) -> tuple[int, int, int]:
 
 def _fill(values: tuple[float, ...], n: int, rest: float, step: float = 0.0) -> Array:
     """``values`` and then ``rest``, ``rest + step``, ... to length ``n``."""
-    return np.concatenate([np.array(values, dtype=np.float64), rest + step * np.arange(n - len(values))])
+    filled = np.empty(n)
+    filled[: len(values)] = values
+    filled[len(values) :] = rest + step * np.arange(n - len(values))
+    return filled
 
 
 def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[int, int, int] | None = None) -> Record:
