@@ -38,7 +38,7 @@ class StackConfig(BaseModel):
     """Below, the slopes are those at this rate (000, 7.5: the law is not linear for slow motion)."""
     rate_high_um_per_s: tuple[Positive, ...] = ()
     """Beyond, slope i is that at this rate (000, Fig. 7.11; ERRATA 79); empty: never."""
-    least_slope_um_per_V: Positive = 0.01
+    least_slope_um_per_V: Positive = 0.005
     """Slopes are held here when the rate would make them smaller: a slope of zero has no inverse."""
 
     creep_times_s: tuple[Positive, ...] = ()
