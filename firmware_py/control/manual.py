@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.actuation.hysteresis import dead_zones, follow_drive
+from firmware_py.actuation.hysteresis import extension, slopes_at
 from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CLIP, COMMAND, DESIRED_TIP, STROKE
 from firmware_py.records import Record
@@ -73,7 +73,7 @@ class ManualDrive:
 
 @kernel
 def follow_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
-    """The stage follows ``command`` that something else chose: memory of the inverse moves along, compensation is
+    """The stage follows ``command`` that something else chose: memory of the model moves along, compensation is
     off, ``stroke`` is what the hysteresis model says of the command."""
     state = states[0]
     param = params[0]
@@ -81,14 +81,11 @@ def follow_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
         stack = param.stacks[i]
         plays = state.plays[i]
         command = frame[COMMAND + i]
-        follow_drive(command, plays, stack)
-        before = 0.0
-        total = 0.0
-        for j in range(len(stack.r) - 1, -1, -1):
-            y = (plays[j] - before) / stack.sums[j]  # forward play state, see follow_drive
-            before += stack.w[j] * y
-            total += stack.w[j] * y
-        frame[STROKE + i] = dead_zones(total, stack.d, stack.s) + stack.offset - param.neutral_extension[i]
+        slopes_at(0.0, stack, state.slopes)
+        stroke = extension(command, state.slopes, plays, state.creep[i], stack) - param.neutral_extension[i]
+        frame[STROKE + i] = stroke
+        state.strokes[i, :] = stroke
+        state.target[i] = stroke
         frame[DESIRED_TIP + i] = 0.0
         state.command_V[i] = command
         state.on[i] = 0.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from firmware_py.actuation.hysteresis import extension
+from firmware_py.actuation.hysteresis import extension, plays_at
 from firmware_py.actuation.stage import Actuation
 from firmware_py.control.manual import ARM_S, HOLD_S, RETURN_V_PER_S, ManualDrive, follow, follow_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STROKE
@@ -75,12 +75,16 @@ def test_stroke_is_the_forward_model_of_the_command():
     stage = Actuation(ActuationConfig())
     frame = LAYOUT.new_frame()
     param = attributes(stage.params)[0]
-    plays = [np.maximum(50.0 - param.stacks[i].r, 0.0) for i in range(3)]
+    plays = [plays_at(param.stacks[i], 50.0, 100.0) for i in range(3)]
     rng = np.random.default_rng(3)
     for volts in 50.0 + 40.0 * rng.uniform(-1, 1, (60, 3)):
         frame[COMMAND : COMMAND + 3] = volts
         follow(stage, frame)
-        expected = [extension(volts[i], plays[i], param.stacks[i]) - param.neutral_extension[i] for i in range(3)]
+        expected = [
+            extension(volts[i], param.stacks[i].slope, plays[i], np.zeros(4), param.stacks[i])
+            - param.neutral_extension[i]
+            for i in range(3)
+        ]
         np.testing.assert_allclose(frame[STROKE : STROKE + 3], expected, rtol=1e-9, atol=1e-13)
 
 
