@@ -7,7 +7,20 @@ from typing import Annotated
 
 import typer
 
-from tools.cli import bench, calibrate, doctor, hands, mismatch, noise, placement, recordings, replay, reproduce, run
+from tools.cli import (
+    bench,
+    calibrate,
+    doctor,
+    hands,
+    mismatch,
+    noise,
+    placement,
+    recordings,
+    replay,
+    reproduce,
+    run,
+    tremor,
+)
 
 app = typer.Typer(
     name="micron",
@@ -46,6 +59,7 @@ app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")
 app.add_typer(mismatch.app, name="mismatch")
+app.add_typer(tremor.app, name="tremor")
 
 
 def main() -> None:

@@ -65,3 +65,33 @@ def highest_line(spectrum: Spectrum, band_hz: tuple[float, float]) -> float:
     bend = left - 2.0 * top + right
     shift = 0.5 * (left - right) / bend if bend < 0.0 else 0.0
     return float((at + shift) * spectrum.step_hz)
+
+
+def segments(values: Array, rate_hz: float, segment_s: float) -> list[Array]:
+    """Pieces of ``values`` (n, k) of ``segment_s``, overlapping by half; all of it if it is shorter."""
+    length = min(len(values), round(segment_s * rate_hz))
+    return [values[a : a + length] for a in range(0, len(values) - length + 1, max(1, length // 2))]
+
+
+def mean_spectrum(spectra: list[Spectrum]) -> Spectrum:
+    """Mean density of spectra on one grid."""
+    density = np.asarray(np.mean([s.density for s in spectra], axis=0), dtype=np.float64)
+    return Spectrum(spectra[0].frequency_hz, density, spectra[0].segment_s)
+
+
+def line_spread_hz(spectrum: Spectrum, at_hz: float, half_width_hz: float, axes: int, rate_hz: float) -> float:
+    """Standard deviation of the frequency of a line at ``at_hz`` of a Hann periodogram, Hz.
+
+    A tone of power P per sum of axes in noise of density N per axis: var(w) = (N rate / (2 P)) sum(h^2 t^2) /
+    sum(h t^2)^2 with the window h (first order, Rife and Boorstyn 1974; without window it is their bound). N is the
+    mean density from 1 to 3 half widths off the line, so that a tremor's own unsteadiness counts as noise.
+    """
+    off = np.abs(spectrum.frequency_hz - at_hz)
+    beside = (off > half_width_hz) & (off <= 3.0 * half_width_hz) & (spectrum.frequency_hz > 0.0)
+    noise = float(np.mean(spectrum.density[beside])) / axes
+    power = spectrum.power((at_hz - half_width_hz, at_hz + half_width_hz))
+    n = round(spectrum.segment_s * rate_hz)
+    t = (np.arange(n) - 0.5 * (n - 1)) / rate_hz
+    h = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n)
+    shape = float(np.sum(h**2 * t**2) / np.sum(h * t**2) ** 2)
+    return float(np.sqrt(0.5 * noise * rate_hz / max(power, 1e-300) * shape) / (2.0 * np.pi))

@@ -1,0 +1,10 @@
+"""``micron tremor``: what recorded hands do, and what the estimators make of it."""
+
+from __future__ import annotations
+
+import typer
+
+from tools.cli import tremor_inspect
+
+app = typer.Typer(help="Recorded hands: inspect them, train on them, evaluate estimators.", no_args_is_help=True)
+app.command("inspect")(tremor_inspect.inspect)
