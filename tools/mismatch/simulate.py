@@ -7,12 +7,13 @@ weights are in output units and linear: input or output placement is the same th
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_devices.physics.effect import (
     STAGES,
@@ -25,8 +26,8 @@ from sim_devices.physics.effect import (
     Settings,
     Stage,
 )
-from sim_devices.physics.statistics import least_squares, thin
 from tools.mismatch.recording import Recording
+from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
 
 
@@ -55,47 +56,6 @@ class Placed:
     def label(self) -> str:
         """Name for parameter lists and logs, e.g. ``creep[displacement]``."""
         return f"{self.effect.name}[{self.target}]"
-
-
-@dataclass(frozen=True)
-class View:
-    """Sample ranges of a recording to compare on.
-
-    ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
-    and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
-    ``memo`` remembers columns that do not change between calls; do not share it between processes.
-    """
-
-    recording: Recording
-    ranges: tuple[tuple[int, int], ...]
-    init: int = 0
-    lead: int = 0
-    memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
-
-    @property
-    def index(self) -> np.ndarray:
-        """Samples of the view, concatenated ranges, int64 (m,)."""
-        return np.concatenate([np.arange(a, b) for a, b in self.ranges])
-
-    def scored(self, twin: Twin) -> np.ndarray:
-        """(m,) bool: samples that count (not used to set a state)."""
-        if self.init == 0:
-            return np.ones(sum(b - a for a, b in self.ranges), np.bool_)
-        first = 0 if twin.restart else self.init
-        out: list[np.ndarray] = []
-        for a, b in self.ranges:
-            i = np.arange(a, b)
-            out.append(i >= a + self.init if twin.restart else i >= first)
-        return np.concatenate(out)
-
-    def measured(self, output: str) -> Array:
-        """(m,) the recorded output on the view."""
-        return self.recording.outputs[output][self.index]
-
-    @staticmethod
-    def whole(recording: Recording, init: int = 0) -> View:
-        """Everything."""
-        return View(recording, ((0, recording.n),), init)
 
 
 @dataclass(frozen=True)
@@ -168,6 +128,28 @@ class Model:
         """Where the nonlinear parameters and the weights of placed effect ``k`` sit in theta."""
         return self._slices[k]
 
+    def together(self, outputs: Sequence[str]) -> tuple[str, ...]:
+        """``outputs`` and all others that share a parameter with one of them, in the twin's order."""
+        if not self.twin.apart or any(p.site == "input" for p in self.placed):
+            return self.twin.outputs
+        found = set(outputs)
+        while True:
+            more = {o for p in self.placed if found & set(p.outputs) for o in p.outputs} - found
+            if not more:
+                return tuple(o for o in self.twin.outputs if o in found)
+            found |= more
+
+    def parameters_of(self, outputs: Sequence[str]) -> set[int]:
+        """Indices of the parameters that move one of ``outputs``."""
+        if set(outputs) == set(self.twin.outputs):
+            return set(range(len(self.parameters)))
+        m = len(self.twin.outputs)
+        found = {i for i in range(self.n_base) if self.twin.outputs[i % m] in outputs}
+        for k, pl in enumerate(self.placed):
+            if set(pl.outputs) & set(outputs):
+                found |= {i for part in self._slices[k] for i in range(part.start, part.stop)}
+        return found
+
     def start(self, recording: Recording) -> Array:
         """Theta with the base as given, effects absent as far as that is expressible (weights zero, nonlinear
         parameters in the middle of their bounds)."""
@@ -191,51 +173,6 @@ class Model:
                     mine[a] = theta[b]
         return mine
 
-    def starts(self, k: int, view: View, theta: Array) -> list[Array]:
-        """Theta with placed effect ``k`` at each of its guesses (others kept), from the residual at ``theta``
-        without effect ``k``."""
-        pl = self.placed[k]
-        rest = Model(self.twin, [p for j, p in enumerate(self.placed) if j != k])
-        without = rest.carry(self, theta, view.recording)
-        output = pl.outputs[0]
-        residual = full_residual(rest, view, without)[output]
-        x, ctx = probe_signals(rest, view, without, pl, output)
-        out: list[Array] = []
-        a, b = self._slices[k]
-        searched = b.stop > b.start and b.start not in self.linear
-        for q in pl.effect.guess(x, residual, ctx, pl.settings):
-            th = theta.copy()
-            th[a] = q
-            if searched:
-                th[b] = first_weights(pl, x, residual, ctx, th[a])
-                out.append(th.copy())
-                th[b] *= 0.3
-            out.append(th)
-        if not self.twin.static:
-            # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
-            given = self.twin.start(view.recording)
-            if not np.allclose(given, theta[: self.n_base], rtol=1e-3, atol=0.0):
-                out += self._from_believed(k, view, out[:2], given)
-        return out
-
-    def _from_believed(self, k: int, view: View, starts: Sequence[Array], given: Array) -> list[Array]:
-        """The same starts on the engineer's base, searched weights met anew there."""
-        pl = self.placed[k]
-        a, b = self._slices[k]
-        rest = Model(self.twin, [p for j, p in enumerate(self.placed) if j != k])
-        out: list[Array] = []
-        for th in starts:
-            other = th.copy()
-            other[: self.n_base] = given
-            if b.stop > b.start and b.start not in self.linear:
-                without = rest.carry(self, other, view.recording)
-                output = pl.outputs[0]
-                residual = full_residual(rest, view, without)[output]
-                x, ctx = probe_signals(rest, view, without, pl, output)
-                other[b] = first_weights(pl, x, residual, ctx, other[a])
-            out.append(other)
-        return out
-
     def human(self, theta: Array) -> dict[str, list[Human]]:
         """Parameters for the report: key "base" and each effect's label."""
         out: dict[str, list[Human]] = {"base": list(self.twin.human(theta[: self.n_base]))}
@@ -254,14 +191,27 @@ class Model:
 
     # -- simulation ---------------------------------------------------------------------------------
 
-    def simulate(self, view: View, theta: Array) -> dict[str, Array]:
-        """Every output of the twin on the view, (m,) each: free-run, no measured output but for start states."""
-        index = view.index
-        return {o: s.value[index] for o, s in self._flow(view_run(self.twin, view), theta, True).items()}
+    def simulate(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
+        """Outputs of the twin on the view, (m,) each: free-run, no measured output but for start states.
 
-    def residual(self, view: View, theta: Array) -> dict[str, Array]:
+        ``only`` these outputs (all if None).
+        """
+        flow = self._flow(view_run(self.twin, view), theta, True, only=only)
+        return {o: view.take(s.value) for o, s in flow.items()}
+
+    def whole(self, view: View, theta: Array) -> dict[str, Array]:
+        """Outputs over the whole recording (n,) from the start states that the view allows; remembered."""
+        key = ("whole", self.key, theta.tobytes())
+
+        def make() -> Array:
+            flow = self._flow(view_run(self.twin, view), theta, True)
+            return np.stack([flow[o].value for o in self.twin.outputs])
+
+        return dict(zip(self.twin.outputs, remember(view.memo, key, make), strict=True))
+
+    def residual(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
         """Measured minus simulated on the view."""
-        return {o: view.measured(o) - y for o, y in self.simulate(view, theta).items()}
+        return {o: view.measured(o) - y for o, y in self.simulate(view, theta, only).items()}
 
     def excused(self, view: View, output: str) -> np.ndarray:
         """(m,) bool: samples that a placed effect takes as its own events (bursts); not to be fitted or scored."""
@@ -271,30 +221,43 @@ class Model:
                 out |= pl.effect.claims(pl.settings, view.recording.n)
         return out[view.index]
 
-    def design(self, view: View, theta: Array) -> Design:
-        """The affine structure at the nonlinear parameters of ``theta``; linear entries are ignored."""
-        index = view.index
-        flow = self._flow(view_run(self.twin, view), theta, False)
+    def design(
+        self, view: View, theta: Array, only: Collection[str] | None = None, samples: NDArray[np.int64] | None = None
+    ) -> Design:
+        """The affine structure at the nonlinear parameters of ``theta``; linear entries are ignored.
+
+        ``only`` these outputs; at ``samples`` of the recording instead of the whole view.
+        """
+        flow = self._flow(view_run(self.twin, view), theta, False, only=only)
         keep = set(self.linear)
         constant: dict[str, Array] = {}
         columns: dict[str, Array] = {}
         linear: dict[str, tuple[int, ...]] = {}
+        take = view.take if samples is None else lambda x: x[samples]
         for o, s in flow.items():
-            value = s.value[index]
+            value = take(s.value)
             js = sorted(j for j in s.columns if j in keep)
             for j in s.columns:
                 if j not in keep:
-                    value = value + theta[j] * s.columns[j][index]
+                    value = value + theta[j] * take(s.columns[j])
             constant[o] = value
             linear[o] = tuple(js)
-            matrix = np.empty((index.size, len(js)), order="F")
+            matrix = np.empty((value.size, len(js)), order="F")
             for i, j in enumerate(js):
-                matrix[:, i] = s.columns[j][index]
+                matrix[:, i] = take(s.columns[j])
             columns[o] = matrix
-        return Design(constant, columns, linear, self._penalty)
+        return Design(constant, columns, linear, self.penalty)
 
     @cached_property
-    def _penalty(self) -> Array:
+    def key(self) -> tuple[object, ...]:
+        """What tells this model from another of the same twin."""
+        return tuple(
+            (p.effect.name, p.effect.kind, p.site, p.target, p.outputs, _frozen(p.settings)) for p in self.placed
+        )
+
+    @cached_property
+    def penalty(self) -> Array:
+        """Smoothness rows over ``self.linear``."""
         rows = self.smoothness()
         others = np.ones(len(self.parameters), np.bool_)
         others[list(self.linear)] = False
@@ -329,6 +292,7 @@ class Model:
         folded: set[int] | None = None,
         given: Mapping[str, Signal] | None = None,
         beside: Sequence[Force] = (),
+        only: Collection[str] | None = None,
     ) -> dict[str, Signal]:
         theta = np.asarray(theta, np.float64)
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
@@ -341,6 +305,8 @@ class Model:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
         outputs = self.twin.respond(run, inputs, theta, [*forces, *beside], join)
+        if only is not None:
+            outputs = {o: s for o, s in outputs.items() if o in only}
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
         for k in self.order:
@@ -431,32 +397,6 @@ class Model:
         return found - folded
 
 
-def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array) -> Array:
-    """Weights that meet the residual best to first order, on the recorded course of ``x``."""
-    basis = pl.effect.basis
-    assert basis is not None
-    columns = basis(x, ctx, q, pl.settings)
-    if pl.site != "output":
-        columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
-    k = thin(ctx.keep, 20_000)
-    line = np.ones((k.size, 1)) if pl.site == "output" else np.stack([np.ones(k.size), x[k]], axis=1)
-    w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
-    return w[: columns.shape[1]]
-
-
-def view_run(twin: Twin, view: View) -> Run:
-    """The stretch that a view needs: the whole past, since inputs before a block are known and set its memory.
-
-    A twin that restarts does so at every range; others start at sample 0 and run through.
-    """
-    rec = view.recording
-    starts, window = (0,), view.init
-    if twin.restart:
-        starts = tuple(dict.fromkeys((0, *(max(0, a - view.lead) for a, _ in view.ranges))))
-        window += view.lead
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo)
-
-
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
     """What an effect sees on this run."""
     return Context(
@@ -471,79 +411,6 @@ def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
         None,
         twin.facts(output),
     )
-
-
-def full_residual(model: Model, view: View, theta: Array) -> dict[str, Array]:
-    """Measured minus simulated over the whole recording (n,), zero outside the view."""
-    out: dict[str, Array] = {}
-    index = view.index
-    for o, r in model.residual(view, theta).items():
-        full = np.zeros(view.recording.n)
-        full[index] = r
-        out[o] = full
-    return out
-
-
-def view_mask(view: View) -> np.ndarray:
-    """(n,) bool: samples of the recording that are in the view."""
-    mask = np.zeros(view.recording.n, np.bool_)
-    mask[view.index] = True
-    return mask
-
-
-def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
-    """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
-    the view as mask, the declared noise, and the way to the output."""
-    twin = model.twin
-    run = view_run(twin, view)
-    ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)
-    measured = run.measured[output]
-    mask = view_mask(view)
-    everything = View(view.recording, ((0, view.recording.n),), view.init, view.lead, view.memo)
-    whole = model.residual(everything if not twin.restart else view, theta)[output]
-    everywhere = whole if whole.size == mask.size else None
-    signals = ctx.signals
-    if pl.site == "feedback" and "velocity" in run.measured:
-        signals = {**signals, "velocity": run.measured["velocity"]}
-    ctx = replace(
-        ctx,
-        mask=mask,
-        noise=view.recording.noise.get(output),
-        measured=measured,
-        everywhere=everywhere,
-        signals=signals,
-    )
-    base = theta[: model.n_base]
-    if pl.site == "output" and not (twin.static and pl.effect.kind == "add"):
-        given = theta.copy()
-        given[: model.n_base] = twin.start(view.recording)
-        ctx = replace(ctx, believed=model._flow(run, given, True)[output].value)
-    if pl.site == "input" or pl.site == "feedback":
-        through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
-        ctx = replace(ctx, through=through)
-        return (run.signals[pl.target] if pl.site == "input" else measured), ctx
-    drive = twin.drive(output)
-    if twin.static and drive and pl.effect.kind == "add":
-        return run.signals[drive], replace(ctx, through=twin.through(run, drive, base, output))
-    return model._flow(run, theta, True)[output].value, ctx
-
-
-def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
-    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view.
-
-    An effect of several outputs that has a test of its own reads them off the output that shows it best.
-    """
-    best: tuple[float, Settings] | None = None
-    outputs = pl.outputs if pl.effect.test is not None and not pl.effect.shared else pl.outputs[:1]
-    for output in outputs:
-        x, ctx = probe_signals(model, view, theta, pl, output)
-        residual = full_residual(model, view, theta)[output]
-        settings = pl.effect.prepare(x, residual, ctx)
-        share = pl.effect.test(x, residual, ctx).share if pl.effect.test is not None and len(outputs) > 1 else 0.0
-        if best is None or share > best[0]:
-            best = (share, settings)
-    assert best is not None
-    return replace(pl, settings=best[1])
 
 
 def _frozen(settings: Settings) -> tuple[object, ...]:

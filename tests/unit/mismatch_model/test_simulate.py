@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.mismatch.recording import Recording, RecordingError, TwinText
-from tools.mismatch.simulate import Model, Placed, View, prepare
+from tools.mismatch.simulate import Model, Placed
 from tools.mismatch.simulate_sites import sites, why_not
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_text import describe, restore
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins import make
 
 Array = NDArray[np.float64]

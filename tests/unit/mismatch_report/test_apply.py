@@ -15,7 +15,8 @@ from tools.cli.common import InputError
 from tools.mismatch.apply import corrected_twin, twin_toml
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.recording import RecordingError, TwinText, load
-from tools.mismatch.simulate import Model, View
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 
 FEW = [EFFECTS[n] for n in ("dead_zone", "hysteresis", "vibration")]

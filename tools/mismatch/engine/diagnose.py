@@ -23,7 +23,7 @@ from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
 from tools.mismatch.engine.unexplained import leftover, stranger
 from tools.mismatch.recording import Recording
-from tools.mismatch.simulate import View
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make

@@ -7,17 +7,19 @@ always free. Intervals come from the block-clustered sandwich, so coloured resid
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.problem import Problem, spread
 from tools.mismatch.simulate import Free, Model
 
 Array = NDArray[np.float64]
 
 HUBER = 4.0
+LEAST_ROWS = 2000  # that a coarse search looks at
 
 
 @dataclass(frozen=True)
@@ -56,20 +58,24 @@ def robust_scale(r: Array, floor: float) -> float:
 class _Projected:
     """Residuals as a function of the nonlinear parameters alone."""
 
-    def __init__(self, problem: Problem, model: Model, theta: Array, stride: int, fixed_base: bool = False) -> None:
+    def __init__(self, problem: Problem, model: Model, outputs: Sequence[str], most_rows: int) -> None:
         self.problem = problem
         self.model = model
         self.view = problem.view
-        step = max(1, stride)
-        self.pick = slice(None, None, step)
-        fitted = np.zeros(problem.index.size)
-        fitted[problem.fit_rows] = 1.0
-        self.theta = theta.copy()
-        self.free = [i for i in model.nonlinear if not (fixed_base and i < model.n_base)]
-        self.linear = np.array(model.linear, int)
-        self.position = {j: i for i, j in enumerate(model.linear)}
-        self.outputs = problem.twin.outputs
-        self.usual = {o: fitted[self.pick] * ~model.excused(self.view, o)[self.pick] for o in self.outputs}
+        self.outputs = tuple(outputs)
+        rows = spread(problem.fit_rows, most_rows, problem.seed)
+        self.rows = rows
+        self.samples = problem.index[rows]
+        design_free = model.parameters_of(outputs)
+        self.free = [i for i in model.nonlinear if i in design_free]
+        self.linear = np.array([j for j in model.linear if j in design_free], int)
+        self.position = {j: i for i, j in enumerate(self.linear.tolist())}
+        kept = [i for i, j in enumerate(model.linear) if j in design_free]
+        self.penalty = model.penalty[:, kept]
+        self.lo = np.array([model.parameters[j].lo for j in self.linear])
+        self.hi = np.array([model.parameters[j].hi for j in self.linear])
+        self.measured = {o: problem.measured[o][rows] for o in self.outputs}
+        self.usual = {o: 1.0 - model.excused(self.view, o)[rows] for o in self.outputs}
         self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
         self.evaluations = 0
 
@@ -80,7 +86,7 @@ class _Projected:
 
     def reweight(self, residual: dict[str, Array]) -> None:
         for o in self.outputs:
-            r = residual[o][self.pick]
+            r = residual[o][self.rows]
             s = robust_scale(r, self.problem.sigma(o))
             robust = np.sqrt(huber_weights((r - np.median(r)) / s))
             self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
@@ -89,41 +95,37 @@ class _Projected:
         """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
         self.evaluations += 1
         theta = theta.copy()
-        design = self.model.design(self.view, theta)
+        design = self.model.design(self.view, theta, self.outputs, self.samples)
         if self.linear.size == 0:
-            parts = [
-                (self.problem.measured[o][self.pick] - design.constant[o][self.pick]) * self.weight[o]
-                for o in self.outputs
-            ]
+            parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
             return np.concatenate(parts), theta
         k = self.linear.size
         gram = np.zeros((k, k))
         cross = np.zeros(k)
-        kept: list[tuple[str, Array, Array, NDArray[np.int64]]] = []
+        kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
         for o in self.outputs:
             w = self.weight[o]
             at = np.array([self.position[j] for j in design.linear[o]], int)
-            a = np.asfortranarray(design.columns[o][self.pick]) * w[:, None]
-            b = (self.problem.measured[o][self.pick] - design.constant[o][self.pick]) * w
+            a = design.columns[o]
+            a *= w[:, None]
+            b = (self.measured[o] - design.constant[o]) * w
             gram[np.ix_(at, at)] += a.T @ a
             cross[at] += a.T @ b
-            kept.append((o, a, b, at))
+            kept.append((a, b, at))
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled = gram / np.outer(size, size)
-        if design.penalty.size:
+        if self.penalty.size:
             # rows are in units of weight; weak against what the data see
-            rows = design.penalty * (0.02 * np.median(size[np.any(design.penalty != 0, axis=0)]))
+            rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
             scaled = scaled + (rows.T @ rows) / np.outer(size, size)
         scaled[np.diag_indices(k)] += 1e-11
         try:
             solution = np.linalg.solve(scaled, cross / size) / size
         except np.linalg.LinAlgError:
             solution = np.linalg.lstsq(scaled, cross / size, rcond=1e-10)[0] / size
-        lo = np.array([self.model.parameters[j].lo for j in self.linear])
-        hi = np.array([self.model.parameters[j].hi for j in self.linear])
-        solution = np.clip(solution, lo, hi)
+        solution = np.clip(solution, self.lo, self.hi)
         theta[self.linear] = solution
-        return np.concatenate([b - a @ solution[at] for _, a, b, at in kept]), theta
+        return np.concatenate([b - a @ solution[at] for a, b, at in kept]), theta
 
 
 def _inside(p: Free, v: float) -> float:
@@ -146,8 +148,29 @@ def _step_size(p: Free, v: float) -> float:
     return min(typical, 0.01 * wide) if np.isfinite(wide) else typical
 
 
+def _slopes(projected: _Projected, theta: Array, residual: Array) -> Array:
+    """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences."""
+    model = projected.model
+    out = np.zeros((residual.size, len(projected.free)))
+    for c, i in enumerate(projected.free):
+        p = model.parameters[i]
+        z, h = _forward(p, theta[i]), _step_size(p, theta[i])
+        shifted = theta.copy()
+        shifted[i] = _backward(p, z + h)
+        if shifted[i] == theta[i]:
+            shifted[i] = _backward(p, z - h)
+        moved = _forward(p, shifted[i]) - z
+        if moved != 0.0:
+            out[:, c] = (projected.evaluate(shifted)[0] - residual) / moved
+    return out
+
+
 def _search(projected: _Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
-    """Damped Gauss-Newton with bounds; returns theta and the cost."""
+    """Damped Gauss-Newton with bounds; returns theta and the cost.
+
+    Between steps the sensitivities are updated from what the step itself showed (Broyden, Mathematics of Computation
+    19, 1965) and measured anew only when that no longer leads downhill.
+    """
     model = projected.model
     free = projected.free
     residual, theta = projected.evaluate(theta)
@@ -156,29 +179,17 @@ def _search(projected: _Projected, theta: Array, iterations: int, tolerance: flo
         return theta, cost
     parameters = [model.parameters[i] for i in free]
     damping = 1e-2
+    jacobian = _slopes(projected, theta, residual)
+    fresh = True
     for _ in range(iterations):
-        z = np.array([_forward(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
-        jacobian = np.empty((residual.size, len(free)))
-        for c, (p, i) in enumerate(zip(parameters, free, strict=True)):
-            h = _step_size(p, theta[i])
-            shifted = theta.copy()
-            shifted[i] = _backward(p, z[c] + h)
-            if shifted[i] == theta[i]:
-                h = -h
-                shifted[i] = _backward(p, z[c] + h)
-            moved = _forward(p, shifted[i]) - z[c]
-            if moved == 0.0:
-                jacobian[:, c] = 0.0
-                continue
-            other, _t = projected.evaluate(shifted)
-            jacobian[:, c] = (other - residual) / moved
         if not np.all(np.isfinite(jacobian)):
             break
+        z = np.array([_forward(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
         gradient = jacobian.T @ residual
         hessian = jacobian.T @ jacobian
         scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
-        improved = False
-        for _try in range(6):
+        gain = -1.0
+        for _try in range(6 if fresh else 2):
             system = hessian / np.outer(scale, scale) + damping * np.eye(len(free))
             step = -np.linalg.lstsq(system, gradient / scale, rcond=1e-12)[0] / scale
             for c, p in enumerate(parameters):
@@ -193,25 +204,34 @@ def _search(projected: _Projected, theta: Array, iterations: int, tolerance: flo
             new = float(trial @ trial)
             if np.isfinite(new) and new < cost:
                 gain = (cost - new) / max(cost, 1e-300)
+                taken = np.array([_forward(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
+                length = float(taken @ taken)
+                if length > 0.0:
+                    jacobian += np.outer((trial - residual - jacobian @ taken) / length, taken)
                 theta, residual, cost = solved, trial, new
                 damping = max(damping / 6, 1e-8)
-                improved = gain > tolerance
                 break
             damping *= 8
-        if not improved:
+        if gain > tolerance:
+            fresh = False
+        elif fresh:
             break
+        else:
+            jacobian = _slopes(projected, theta, residual)
+            fresh = True
+            damping = min(damping, 1e-2)
     return theta, cost
 
 
-def residuals(problem: Problem, model: Model, theta: Array) -> dict[str, Array]:
-    """Measured minus simulated on the problem's view; not finite becomes very large.
+def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[str] | None = None) -> dict[str, Array]:
+    """Measured minus simulated on the problem's view (of ``outputs``, all if None); not finite becomes very large.
 
     In samples that an effect takes as its own events the nearest earlier usual sample stands in, so that every
     mean square is over usual samples.
     """
-    found = model.residual(problem.view, theta)
+    found = model.residual(problem.view, theta, outputs)
     out: dict[str, Array] = {}
-    for o in problem.twin.outputs:
+    for o in outputs or problem.twin.outputs:
         r = np.nan_to_num(found[o], nan=1e12, posinf=1e12, neginf=-1e12)
         excused = model.excused(problem.view, o)
         if excused.any() and not excused.all():
@@ -237,64 +257,65 @@ def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
 def fit(
     problem: Problem,
     model: Model,
-    starts: list[Array],
+    starts: Sequence[Array],
     *,
-    stride: int | None = None,
+    stride: int = 1,
     iterations: int = 25,
     rounds: int = 2,
     tolerance: float = 1e-5,
     tries: int = 3,
     hopeless: float = np.inf,
+    keep: Fit | None = None,
+    touched: Sequence[str] = (),
 ) -> Fit:
-    """Best fit over ``starts``. Each start is tried coarsely on thinned rows; the best two are refined.
+    """Best fit over ``starts``. Each start is tried coarsely on few rows; the best two are refined.
 
     ``stride`` thins the fit rows (the simulation itself keeps every sample). When the coarse search ends above
-    ``hopeless`` (weighted mean square), it is not refined.
+    ``hopeless`` (weighted mean square), it is not refined. ``keep``: a fit whose residual stands for every output that
+    shares no parameter with the outputs ``touched``; only these are fitted then.
     """
-    coarse = max(problem.stride, stride or 1)
+    outputs = model.together(touched) if keep is not None and touched else problem.twin.outputs
+    rows = max(1, problem.fit_rows.size // max(1, stride))
+    few = min(rows, max(LEAST_ROWS, rows // 3))
     evaluations = 0
-    ranked: list[tuple[float, int, Array]] = []
     give_up = False
+    best = list(starts[:1])
     if model.nonlinear and (len(starts) > 1 or np.isfinite(hopeless)):
+        projected = _Projected(problem, model, outputs, few)
+        ranked: list[tuple[float, int, Array]] = []
         for i, theta in enumerate(starts[: 3 * tries]):
-            projected = _Projected(problem, model, theta, 3 * coarse)
             residual, solved = projected.evaluate(theta)
             cost = float(residual @ residual)
             ranked.append((cost if np.isfinite(cost) else np.inf, i, solved))
-            evaluations += projected.evaluations
         ranked.sort(key=lambda r: (r[0], r[1]))
         tried: list[tuple[float, int, Array]] = []
-        for cost, i, theta in ranked[:tries]:
-            projected = _Projected(problem, model, theta, 3 * coarse)
+        for _, i, theta in ranked[:tries]:
             theta, cost = _search(projected, theta, 4, 1e-3)
             tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
-            evaluations += projected.evaluations
         tried.sort(key=lambda r: (r[0], r[1]))
         best = [t[2] for t in tried[:2]]
         if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
-        kept = max(1.0, _Projected(problem, model, best[0], 3 * coarse).usual_count)
-        give_up = tried[0][0] / kept > hopeless
-    else:
-        best = starts[:1]
-    found: tuple[float, Array, dict[str, Array]] | None = None
-    for theta in best:
-        projected = _Projected(problem, model, theta, coarse)
+        give_up = tried[0][0] / max(1.0, projected.usual_count) > hopeless
+        evaluations += projected.evaluations
+    found: tuple[float, Array] | None = None
+    for theta in best[:1] if give_up else best:
+        projected = _Projected(problem, model, outputs, rows)
         cost = np.inf
-        if give_up:
-            found = (np.inf if found is None else found[0], theta, residuals(problem, model, theta))
-            continue
-        for round_ in range(rounds):
+        for round_ in range(0 if give_up else rounds):
             theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)
             if not np.isfinite(cost):
                 break
             if round_ + 1 < rounds:
-                projected.reweight(residuals(problem, model, theta))
+                projected.reweight(residuals(problem, model, theta, outputs))
         evaluations += projected.evaluations
         if found is None or (np.isfinite(cost) and cost < found[0]):
-            found = (cost, theta, residuals(problem, model, theta))
+            found = (cost, theta)
     assert found is not None
-    cost, theta, residual = found
+    cost, theta = found
+    residual = residuals(problem, model, theta, outputs)
+    if keep is not None:
+        residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
     ok = (give_up or bool(np.isfinite(cost))) and all(np.all(np.abs(r) < 1e11) for r in residual.values())
     return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
 

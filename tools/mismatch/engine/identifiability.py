@@ -13,7 +13,9 @@ from tools.mismatch.engine.colour import Whitener, whiten
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.screen import places
-from tools.mismatch.simulate import Model, Placed, prepare
+from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.simulate_start import prepare
+from tools.mismatch.simulate_start import starts as starts_of
 
 Array = NDArray[np.float64]
 
@@ -89,27 +91,25 @@ def directions(
     out: list[dict[str, Array]] = []
     weights = model.slices(len(model.placed) - 1)[1]
     if not starts or starts[0].size != theta.size:
-        starts = model.starts(len(model.placed) - 1, problem.fit_view, theta)
+        starts = starts_of(model, len(model.placed) - 1, problem.fit_view, theta)
     for start in starts[:most]:
         if weights.stop > weights.start:
-            design = model.design(problem.view, start)
+            design = model.design(problem.view, start, placed.outputs)
             for j in range(weights.start, weights.stop):
                 move = {
-                    o: design.columns[o][:, design.linear[o].index(j)]
-                    for o in problem.twin.outputs
-                    if j in design.linear[o]
+                    o: design.columns[o][:, design.linear[o].index(j)] for o in placed.outputs if j in design.linear[o]
                 }
                 if move:
                     out.append(move)
             if not out:
-                here = model.simulate(problem.view, start)
+                here = model.simulate(problem.view, start, placed.outputs)
                 for j in range(weights.start, weights.stop):
                     pushed = start.copy()
                     pushed[j] += model.parameters[j].scale * 1e-3
-                    there = model.simulate(problem.view, pushed)
+                    there = model.simulate(problem.view, pushed, placed.outputs)
                     out.append({o: there[o] - here[o] for o in there})
         else:
-            there = model.simulate(problem.view, start)
+            there = model.simulate(problem.view, start, placed.outputs)
             out.append({o: there[o] - (problem.measured[o] - current.residual[o]) for o in there})
     return out
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from tools.mismatch.engine.noise import NoiseFloor
 from tools.mismatch.engine.split import Span, Split
 from tools.mismatch.recording import Recording
-from tools.mismatch.simulate import Model, View
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
 
 Array = NDArray[np.float64]
@@ -30,7 +31,6 @@ class Problem:
     init: int
     seed: int
     floors: Mapping[str, NoiseFloor] = field(default_factory=dict[str, NoiseFloor])
-    stride: int = 1
 
     def __getstate__(self) -> dict[str, object]:
         """Fields alone: what is derived (and what views remember) is rebuilt in a worker process."""
@@ -38,10 +38,6 @@ class Problem:
 
     def __setstate__(self, state: dict[str, object]) -> None:
         self.__dict__.update(state)
-
-    def fresh(self) -> Problem:
-        """The same problem with empty memories."""
-        return replace(self)
 
     @cached_property
     def view(self) -> View:
@@ -114,6 +110,17 @@ class Problem:
 
     def base(self) -> Model:
         return Model(self.twin)
+
+
+def spread(rows: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:
+    """At most ``most`` of ``rows``, evenly spread but at irregular distances: a regular stride would fold lines of the
+    spectrum onto others.
+    """
+    if rows.size <= most:
+        return rows
+    edges = np.linspace(0, rows.size, most + 1).astype(np.int64)
+    inside = np.random.default_rng([seed, rows.size, most]).random(most) * np.diff(edges)
+    return rows[edges[:-1] + inside.astype(np.int64)]
 
 
 def _with_init(held: tuple[Span, ...], init: int, twin: Twin, split: Split) -> tuple[Span, ...]:

@@ -12,7 +12,8 @@ from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.simulate import Model, Placed, prepare
+from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.simulate_start import prepare, starts
 
 Array = np.ndarray
 
@@ -22,7 +23,10 @@ def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
     placed = [p for j, p in enumerate(fitted.model.placed) if j != drop]
     model = Model(problem.twin, placed)
     theta = model.carry(fitted.model, fitted.theta, problem.recording)
-    return fit(problem, model, [theta], stride=2, iterations=12)
+    return fit(
+        problem, model, [theta], stride=2, iterations=12, keep=fitted,
+        touched=fitted.model.together(fitted.model.placed[drop].outputs),
+    )  # fmt: skip
 
 
 def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
@@ -36,8 +40,8 @@ def added(problem: Problem, current: Fit, place: Placed) -> Fit:
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
-    starts = model.starts(len(model.placed) - 1, problem.fit_view, theta)
-    return fit(problem, model, list(starts), stride=2, iterations=12)
+    begin = starts(model, len(model.placed) - 1, problem.fit_view, theta)
+    return fit(problem, model, begin, stride=2, iterations=12, keep=current, touched=placed.outputs)
 
 
 def total(problem: Problem, fitted: Fit) -> float:

@@ -11,9 +11,10 @@ from scipy.stats import f as f_distribution
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.problem import Problem
-from tools.mismatch.simulate import Model, Placed, prepare, probe_signals
+from tools.mismatch.engine.problem import Problem, spread
+from tools.mismatch.simulate import Model, Placed
 from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare, probe_signals, starts
 
 Array = NDArray[np.float64]
 
@@ -44,30 +45,57 @@ def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, .
     return out
 
 
-def bend(problem: Problem, current: Fit) -> dict[str, Array]:
-    """How the outputs move with each searched parameter of the current model: output -> (m, k) on the view."""
+@dataclass(frozen=True)
+class Ground:
+    """What every candidate is screened against: ``samples`` of the recording and their ``rows`` in the view, the
+    outputs' movement with each searched parameter of the current model there (``bends[o]`` (rows, k)), and the energy
+    that is left to each output when everything free is regressed out.
+    """
+
+    rows: NDArray[np.int64]
+    samples: NDArray[np.int64]
+    bends: dict[str, Array]
+    energy: dict[str, float]
+
+
+ROWS = 12_000  # of the fit, that a screen looks at
+
+
+def bend(problem: Problem, current: Fit) -> Ground:
+    """The ground that the candidates share, with the sensitivities by forward differences."""
     model, theta = current.model, current.theta
-    out = {o: np.zeros((problem.index.size, len(model.nonlinear))) for o in problem.twin.outputs}
+    rows = spread(problem.fit_rows, ROWS, problem.seed)
+    samples = problem.index[rows]
+    outputs = problem.twin.outputs
+    bends = {o: np.zeros((rows.size, len(model.nonlinear))) for o in outputs}
     for c, i in enumerate(model.nonlinear):
         p = model.parameters[i]
         h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
         shifted = theta.copy()
         shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
         there = model.simulate(problem.view, shifted)
-        for o in out:
-            out[o][:, c] = (there[o] - (problem.measured[o] - current.residual[o])) / (shifted[i] - theta[i])
-    return out
+        for o in outputs:
+            now = problem.measured[o][rows] - current.residual[o][rows]
+            bends[o][:, c] = (there[o][rows] - now) / (shifted[i] - theta[i])
+    energy: dict[str, float] = {}
+    if problem.twin.apart:
+        design = model.design(problem.view, theta, samples=samples)
+        for o in outputs:
+            s = problem.sigma(o)
+            left, _ = _without(current.residual[o][rows] / s, np.column_stack([design.columns[o], bends[o]]) / s)
+            energy[o] = float(left @ left)
+    return Ground(rows, samples, bends, energy)
 
 
-def one_step(problem: Problem, current: Fit, place: Placed, bends: dict[str, Array]) -> Candidate:
+def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
     """Score test of one candidate: the simulator's output moved by the effect at each of its starting points,
-    regressed on the residual together with everything that is free already (``bends`` from ``bend``).
+    regressed on the residual together with everything that is free already (``ground`` from ``bend``).
     """
     placed = prepare(current.model, problem.fit_view, current.theta, place)
     model = Model(problem.twin, (*current.model.placed, placed))
     theta = model.carry(current.model, current.theta, problem.recording)
     k = len(model.placed) - 1
-    starts = model.starts(k, problem.fit_view, theta)
+    begin = starts(model, k, problem.fit_view, theta)
     share, p_value, tested = 0.0, 1.0, False
     if placed.effect.test is not None:
         o = placed.outputs[0]
@@ -77,35 +105,34 @@ def one_step(problem: Problem, current: Fit, place: Placed, bends: dict[str, Arr
         full[index] = current.residual[o][problem.row_of_sample[index]]
         signature = placed.effect.test(x, full, ctx)
         share, p_value, tested = signature.share, signature.p_value, True
-    thin = max(1, problem.fit_rows.size // 12000)
-    rows = problem.fit_rows[::thin]
-    for start in starts[:6]:
-        gained, p = _step_gain(problem, current, model, start, rows, bends)
+    for start in begin[:6]:
+        gained, p = _step_gain(problem, current, model, start, ground)
         share = max(share, gained)
         if not tested:
-            p_value = min(p_value, min(1.0, p * len(starts)))
-    return Candidate(placed, share, p_value, tested, tuple(starts))
+            p_value = min(p_value, min(1.0, p * len(begin)))
+    return Candidate(placed, share, p_value, tested, tuple(begin))
 
 
-def _step_gain(
-    problem: Problem, current: Fit, model: Model, theta: Array, rows: NDArray[np.int64], bends: dict[str, Array]
-) -> tuple[float, float]:
+def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, ground: Ground) -> tuple[float, float]:
     """(share of the mean square taken, p-value of the F test) by one linear step from ``theta``."""
-    design = model.design(problem.view, theta)
+    outputs = model.together(model.placed[-1].outputs)
+    rows = ground.rows
+    design = model.design(problem.view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
-    moved = model.simulate(problem.view, theta) if model.nonlinear else None
+    moved = model.simulate(problem.view, theta, outputs) if model.nonlinear else None
     pushed: list[dict[str, Array]] = []
     for j in new_weights:
         other = theta.copy()
         other[j] += 0.05 * model.parameters[j].scale
-        pushed.append(model.simulate(problem.view, other))
-    old_linear = [j for j in model.linear if model.parameters[j].name in n_old]
-    new_linear = [j for j in model.linear if model.parameters[j].name not in n_old]
+        pushed.append(model.simulate(problem.view, other, outputs))
+    seen = {j for o in outputs for j in design.linear[o]}
+    old_linear = [j for j in model.linear if j in seen and model.parameters[j].name in n_old]
+    new_linear = [j for j in model.linear if j in seen and model.parameters[j].name not in n_old]
     target: list[Array] = []
     old: list[Array] = []
     new: list[Array] = []
-    for o in problem.twin.outputs:
+    for o in outputs:
         s = problem.sigma(o)
         target.append(current.residual[o][rows] / s)
         at = {j: i for i, j in enumerate(design.linear[o])}
@@ -114,10 +141,10 @@ def _step_gain(
             block = np.zeros((rows.size, len(js)))
             for c, j in enumerate(js):
                 if j in at:
-                    block[:, c] = design.columns[o][rows, at[j]] / s
+                    block[:, c] = design.columns[o][:, at[j]] / s
             return block
 
-        old.append(np.column_stack([columns(old_linear), bends[o][rows] / s]))
+        old.append(np.column_stack([columns(old_linear), ground.bends[o] / s]))
         extra = [columns(new_linear)]
         if moved is not None:
             before = problem.measured[o][rows] - current.residual[o][rows]
@@ -131,12 +158,14 @@ def _step_gain(
     more = more - base_q @ (base_q.T @ more)
     size = np.linalg.norm(more, axis=0)
     more = more[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
-    before_ = float(e0 @ e0)
+    # outputs that share nothing with the candidate keep what they have
+    idle = sum(ground.energy[o] for o in problem.twin.outputs if o not in outputs)
+    before_ = float(e0 @ e0) + idle
     if before_ <= 0 or more.shape[1] == 0:
         return 0.0, 1.0
     left, _ = _without(e0, more)
-    after = float(left @ left)
-    dof = max(e.size - more.shape[1] - base.shape[1], 1)
+    after = float(left @ left) + idle
+    dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - base.shape[1], 1)
     f = (before_ - after) / more.shape[1] / max(after / dof, 1e-300)
     return max(0.0, 1 - after / before_), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
 

@@ -260,6 +260,6 @@ def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:
         model.slices(k), trial.fitted.model.slices(len(trial.fitted.model.placed) - 1), strict=True
     ):
         theta[mine] = trial.fitted.theta[theirs]
-    fitted = fit(problem, model, [theta], stride=1, iterations=15)
+    fitted = fit(problem, model, [theta], iterations=15, keep=current, touched=trial.placed.outputs)
     energy = block_energy(problem, fitted, problem.held_blocks)
     return replace(trial, fitted=fitted, misfits=misfits(problem, fitted), energy=energy)

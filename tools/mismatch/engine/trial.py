@@ -13,7 +13,7 @@ from threadpoolctl import threadpool_limits
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
-from tools.mismatch.engine.screen import Candidate, bend, one_step
+from tools.mismatch.engine.screen import Candidate, Ground, bend, one_step
 from tools.mismatch.simulate import Model, Placed
 
 Array = np.ndarray
@@ -24,6 +24,7 @@ LEAST_FITS = 3  # per output, whatever their share
 MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
+TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is accepted is fitted on every row
 
 
 @dataclass(frozen=True)
@@ -62,10 +63,10 @@ def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Arr
     return model, model.carry(current.model, current.theta, problem.recording)
 
 
-def screen_one(problem: Problem, current: Fit, place: Placed, bends: dict[str, Array]) -> Candidate:
+def screen_one(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
     """One step of one candidate."""
     with np.errstate(all="ignore"), threadpool_limits(1):
-        return one_step(problem.fresh(), current, place, bends)
+        return one_step(problem, current, place, ground)
 
 
 def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, tops: dict[str, float]) -> Trial:
@@ -73,14 +74,18 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
 
     ``tops``: the best one-step share per output; who stays far below it is not refined.
     """
-    problem = problem.fresh()
     with np.errstate(all="ignore"), threadpool_limits(1):
         model, _ = extended(problem, current, candidate.placed)
         rows = problem.fit_rows
-        now = {o: float(np.mean((r[rows] / problem.sigma(o)) ** 2)) for o, r in current.residual.items()}
-        gone = max(0.5 * tops[o] * now[o] for o in candidate.placed.outputs)
+        touched = candidate.placed.outputs
+        now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
+        gone = max(0.5 * tops[o] * now[o] for o in touched)
         limit = (sum(now.values()) - gone) / len(now)
-        fitted = fit(problem, model, list(candidate.starts), stride=stride, iterations=20, hopeless=limit)
+        thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
+        fitted = fit(
+            problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-4, hopeless=limit,
+            keep=current, touched=touched,
+        )  # fmt: skip
         comparison = compare(problem, current, fitted)
         value = misfits(problem, fitted)
         energy = block_energy(problem, fitted, problem.held_blocks)
@@ -144,8 +149,8 @@ def try_all(
         return found
 
     with np.errstate(all="ignore"):
-        bends = bend(problem, current)
-    screened: list[Candidate] = run(screen_one, candidates, (bends,), f"{what}: screen")
+        ground = bend(problem, current)
+    screened: list[Candidate] = run(screen_one, candidates, (ground,), f"{what}: screen")
     keep = hopeful(screened)
     chosen = [c for c, k in zip(screened, keep, strict=True) if k]
     tops = dict.fromkeys(problem.twin.outputs, 0.0)

@@ -105,6 +105,12 @@ class Twin(Protocol):
         ...
 
     @property
+    def apart(self) -> bool:
+        """Every output has base parameters of its own, so that one can be fitted without the others: parameter ``i``
+        belongs to output ``i`` modulo their number."""
+        ...
+
+    @property
     def restart(self) -> bool:
         """Free-run drifts (an integrator, a slow pole): each range of a view starts from a state set by data."""
         ...

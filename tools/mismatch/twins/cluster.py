@@ -28,6 +28,7 @@ class ClusterTwin:
     parameters: tuple[Parameter, ...]
     positions: Mapping[str, tuple[float, float, float]]
     static: bool = True
+    apart: bool = True
     restart: bool = False
     feedback_on: str = ""
 

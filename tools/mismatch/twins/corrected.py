@@ -43,6 +43,7 @@ class CorrectedTwin:
     feedback_on: str
     penalty: Array
     """Smoothness rows of weights that are free, (rows, len(parameters))."""
+    apart: bool = False
 
     @property
     def core(self) -> Twin:

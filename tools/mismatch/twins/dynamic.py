@@ -65,6 +65,7 @@ class DynamicTwin:
     feedback_on: str
     fastest_per_s: float
     static: bool = False
+    apart: bool = False
 
     def start(self, recording: object) -> Array:
         """See Twin."""

@@ -47,6 +47,7 @@ class OpaqueTwin:
     parameters: tuple[Parameter, ...]
     chain: tuple[Stage, ...] = STAGES
     static: bool = False
+    apart: bool = False
     restart: bool = False
     feedback_on: str = ""
     source: str = field(default="", compare=False)

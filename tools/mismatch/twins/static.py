@@ -30,6 +30,7 @@ class StaticTwin:
     names: tuple[str, str]
     given: tuple[tuple[float, float], ...]
     static: bool = True
+    apart: bool = True
     restart: bool = False
     feedback_on: str = ""
 

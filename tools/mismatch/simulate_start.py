@@ -1,0 +1,133 @@
+"""Where a placed effect starts: its settings and first parameters, read off the residual of the model without it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Settings
+from sim_devices.physics.statistics import least_squares, thin
+from tools.mismatch.simulate import Model, Placed, make_context
+from tools.mismatch.simulate_view import View, view_run
+
+
+def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
+    """``pl`` with its settings read from the residual of ``model`` at ``theta`` on the view.
+
+    An effect of several outputs that has a test of its own reads them off the output that shows it best.
+    """
+    best: tuple[float, Settings] | None = None
+    outputs = pl.outputs if pl.effect.test is not None and not pl.effect.shared else pl.outputs[:1]
+    for output in outputs:
+        x, ctx = probe_signals(model, view, theta, pl, output)
+        residual = full_residual(model, view, theta, output)
+        settings = pl.effect.prepare(x, residual, ctx)
+        share = pl.effect.test(x, residual, ctx).share if pl.effect.test is not None and len(outputs) > 1 else 0.0
+        if best is None or share > best[0]:
+            best = (share, settings)
+    assert best is not None
+    return replace(pl, settings=best[1])
+
+
+def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
+    """Theta with placed effect ``k`` at each of its guesses (others kept), from the residual at ``theta``
+    without effect ``k``.
+    """
+    pl, twin = model.placed[k], model.twin
+    rest = Model(twin, [p for j, p in enumerate(model.placed) if j != k])
+    without = rest.carry(model, theta, view.recording)
+    output = pl.outputs[0]
+    residual = full_residual(rest, view, without, output)
+    x, ctx = probe_signals(rest, view, without, pl, output)
+    out: list[Array] = []
+    a, b = model.slices(k)
+    searched = b.stop > b.start and b.start not in model.linear
+    for q in pl.effect.guess(x, residual, ctx, pl.settings):
+        th = theta.copy()
+        th[a] = q
+        if searched:
+            th[b] = first_weights(pl, x, residual, ctx, th[a])
+            out.append(th.copy())
+            th[b] *= 0.3
+        out.append(th)
+    if not twin.static:
+        # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
+        given = twin.start(view.recording)
+        if not np.allclose(given, theta[: model.n_base], rtol=1e-3, atol=0.0):
+            out += _from_believed(model, rest, k, view, out[:2], given)
+    return out
+
+
+def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequence[Array], given: Array) -> list[Array]:
+    """The same starts on the engineer's base, searched weights met anew there; ``rest``: without effect ``k``."""
+    pl = model.placed[k]
+    a, b = model.slices(k)
+    out: list[Array] = []
+    for th in found:
+        other = th.copy()
+        other[: model.n_base] = given
+        if b.stop > b.start and b.start not in model.linear:
+            without = rest.carry(model, other, view.recording)
+            output = pl.outputs[0]
+            residual = full_residual(rest, view, without, output)
+            x, ctx = probe_signals(rest, view, without, pl, output)
+            other[b] = first_weights(pl, x, residual, ctx, other[a])
+        out.append(other)
+    return out
+
+
+def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array) -> Array:
+    """Weights that meet the residual best to first order, on the recorded course of ``x``."""
+    basis = pl.effect.basis
+    assert basis is not None
+    columns = basis(x, ctx, q, pl.settings)
+    if pl.site != "output":
+        columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
+    k = thin(ctx.keep, 20_000)
+    line = np.ones((k.size, 1)) if pl.site == "output" else np.stack([np.ones(k.size), x[k]], axis=1)
+    w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
+    return w[: columns.shape[1]]
+
+
+def full_residual(model: Model, view: View, theta: Array, output: str) -> Array:
+    """Measured minus simulated over the whole recording (n,), zero outside the view."""
+    full = view.recording.outputs[output] - model.whole(view, theta)[output]
+    return np.where(view.mask, full, 0.0)
+
+
+def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
+    """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
+    the view as mask, the declared noise, and the way to the output."""
+    twin = model.twin
+    run = view_run(twin, view)
+    ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)
+    measured = run.measured[output]
+    everywhere = None
+    if not twin.restart or view.mask.all():
+        everywhere = measured - model.whole(view, theta)[output]
+    signals = ctx.signals
+    if pl.site == "feedback" and "velocity" in run.measured:
+        signals = {**signals, "velocity": run.measured["velocity"]}
+    ctx = replace(
+        ctx,
+        mask=view.mask,
+        noise=view.recording.noise.get(output),
+        measured=measured,
+        everywhere=everywhere,
+        signals=signals,
+    )
+    base = theta[: model.n_base]
+    if pl.site == "output" and not (twin.static and pl.effect.kind == "add"):
+        given = theta.copy()
+        given[: model.n_base] = twin.start(view.recording)
+        ctx = replace(ctx, believed=model.whole(view, given)[output])
+    if pl.site == "input" or pl.site == "feedback":
+        through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
+        ctx = replace(ctx, through=through)
+        return (run.signals[pl.target] if pl.site == "input" else measured), ctx
+    drive = twin.drive(output)
+    if twin.static and drive and pl.effect.kind == "add":
+        return run.signals[drive], replace(ctx, through=twin.through(run, drive, base, output))
+    return model.whole(view, theta)[output], ctx

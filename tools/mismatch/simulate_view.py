@@ -1,0 +1,85 @@
+"""Which samples of a recording are compared, and the stretch that has to be simulated for them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.physics.effect import Array
+from tools.mismatch.recording import Recording
+from tools.mismatch.twins.base import Run, Twin
+
+
+@dataclass(frozen=True)
+class View:
+    """Sample ranges of a recording to compare on.
+
+    ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
+    and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
+    ``memo`` remembers columns that do not change between calls; do not share it between processes.
+    """
+
+    recording: Recording
+    ranges: tuple[tuple[int, int], ...]
+    init: int = 0
+    lead: int = 0
+    memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
+
+    def __getstate__(self) -> dict[str, object]:
+        """Fields without what is remembered: that is rebuilt in another process."""
+        return {f.name: getattr(self, f.name) for f in fields(self) if f.name != "memo"}
+
+    def __setstate__(self, state: dict[str, object]) -> None:
+        self.__dict__.update(state, memo={})
+
+    @cached_property
+    def index(self) -> NDArray[np.int64]:
+        """Samples of the view, concatenated ranges, (m,)."""
+        return np.concatenate([np.arange(a, b) for a, b in self.ranges])
+
+    @cached_property
+    def mask(self) -> NDArray[np.bool_]:
+        """(n,) samples of the recording that are in the view."""
+        mask = np.zeros(self.recording.n, np.bool_)
+        mask[self.index] = True
+        return mask
+
+    def take(self, x: Array) -> Array:
+        """``x`` (n,) on the view, (m,): contiguous ranges are copied faster than indices."""
+        return np.concatenate([x[a:b] for a, b in self.ranges])
+
+    def scored(self, twin: Twin) -> np.ndarray:
+        """(m,) bool: samples that count (not used to set a state)."""
+        if self.init == 0:
+            return np.ones(sum(b - a for a, b in self.ranges), np.bool_)
+        first = 0 if twin.restart else self.init
+        out: list[np.ndarray] = []
+        for a, b in self.ranges:
+            i = np.arange(a, b)
+            out.append(i >= a + self.init if twin.restart else i >= first)
+        return np.concatenate(out)
+
+    def measured(self, output: str) -> Array:
+        """(m,) the recorded output on the view."""
+        return self.take(self.recording.outputs[output])
+
+    @staticmethod
+    def whole(recording: Recording, init: int = 0) -> View:
+        """Everything."""
+        return View(recording, ((0, recording.n),), init)
+
+
+def view_run(twin: Twin, view: View) -> Run:
+    """The stretch that a view needs: the whole past, since inputs before a block are known and set its memory.
+
+    A twin that restarts does so at every range; others start at sample 0 and run through.
+    """
+    rec = view.recording
+    starts, window = (0,), view.init
+    if twin.restart:
+        starts = tuple(dict.fromkeys((0, *(max(0, a - view.lead) for a, _ in view.ranges))))
+        window += view.lead
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo)
