@@ -258,6 +258,25 @@ def best_shifts(costs, price):
     return path, total.min()
 
 
+@kernel
+def shift_costs(x, y, window, shifts):
+    """Sum of squares (windows, shifts) of y less the shifted x about its mean in each window of ``window`` samples."""
+    n = x.size
+    count = n // window
+    out = np.empty((count, shifts.size))
+    for i in range(count):
+        first = i * window
+        for j in range(shifts.size):
+            total = 0.0
+            square = 0.0
+            for k in range(first, first + window):
+                d = y[k] - x[min(max(k + shifts[j], 0), n - 1)]
+                total += d
+                square += d * d
+            out[i, j] = max(square - total * total / window, 0.0)
+    return out
+
+
 MOST_SHIFT = 60
 MOST_DROPS = 40
 
@@ -279,12 +298,8 @@ def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], flo
         return [], [], 0.0, np.inf
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
     shifts = shifts[np.abs(shifts) < n // 8]
-    costs = np.empty((count, shifts.size))
-    for j, s in enumerate(shifts):
-        moved = x[np.clip(np.arange(n) + s, 0, n - 1)]
-        e = (y - moved)[: count * window].reshape(count, window)
-        # the local mean is left to slower effects
-        costs[:, j] = np.sum((e - e.mean(axis=1, keepdims=True)) ** 2, axis=1)
+    # the local mean is left to slower effects
+    costs = shift_costs(x, y, window, shifts)
     zero = int(np.flatnonzero(shifts == 0)[0])
     floor = robust_rms(np.sqrt(costs.min(axis=1) / window)) + float(np.median(np.sqrt(costs.min(axis=1) / window)))
     price = 30.0 * floor * floor + 0.3 * float(np.median(costs.min(axis=1)))

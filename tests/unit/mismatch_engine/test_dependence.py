@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from tools.mismatch.engine.dependence import dependences, needs_memory
+from tools.mismatch.engine.dependence import dependences, needs_memory, projected_energy
 from tools.mismatch.engine.features import Feature, curve, features_of, last_reversal
 
 N = 3000
@@ -78,3 +78,14 @@ def test_function_is_told_from_memory(seed: int) -> None:
 def test_last_reversal_holds_the_turning_value() -> None:
     x = np.array([0.0, 1.0, 2.0, 1.0, 0.0, 1.0, 3.0, 2.0])
     assert last_reversal(x, 0.5).tolist() == [0.0, 0.0, 0.0, 2.0, 2.0, 0.0, 0.0, 3.0]
+
+
+def test_projection_by_gram_equals_qr_even_with_dependent_columns() -> None:
+    rng = np.random.default_rng(3)
+    x = rng.standard_normal((600, 5)) * np.array([1.0, 1e-3, 1e4, 1.0, 1.0])
+    x = np.column_stack([x, x[:, 0] + 1e-4 * x[:, 2], np.zeros(600)])
+    e = rng.standard_normal(600) + 0.3 * x[:, 3]
+    q, _ = np.linalg.qr(x[:, :5])
+    energy, rank = projected_energy(e, x)
+    assert rank == 5
+    assert energy == pytest.approx(float(np.sum((q.T @ e) ** 2)), rel=1e-9)

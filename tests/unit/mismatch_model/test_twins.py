@@ -19,7 +19,7 @@ from tools.mismatch.simulate_view import View
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.twins import make
 from tools.mismatch.twins.feedback import run_feedback
-from tools.mismatch.twins.linear import discretise, run_output, run_states
+from tools.mismatch.twins.linear import discretise, free_response, run_output, run_states, start_state
 
 Array = NDArray[np.float64]
 AXIS = {"force": "N", "position": "m", "velocity": "m/s"}
@@ -243,3 +243,13 @@ def test_linear_kernels_equal_python() -> None:
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     args = (d.ad, d.g0, d.g1, cp, cv, u, False, 2, x0, starts, np.array([40, 80]), *rows, *more, True)
     np.testing.assert_allclose(run_feedback(*args), run_feedback.py_func(*args), atol=1e-13)
+
+
+def test_free_responses_are_kept_while_they_are_felt() -> None:
+    d = discretise(np.array([[0.0, 1.0], [-400.0, -16.0]]), np.array([0.0, 1.0]), 0.01, "linear")
+    row, measured = np.array([1.0, 0.0]), {"y": np.zeros(5000)}
+    state = start_state(d.ad, {"y": row}, measured, (0,), 5000, 20, {})
+    assert state.free["y"].shape[0] < 600
+    x0 = np.array([[0.3, -2.0]])
+    whole = free_response(d.ad, row, 5000) @ x0[0]
+    np.testing.assert_allclose(state.response(x0, "y", 5000), whole, atol=1e-12)

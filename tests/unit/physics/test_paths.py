@@ -17,7 +17,14 @@ from sim_devices.physics.lag import low_pass
 from sim_devices.physics.memoryless import curve_basis, find_step, mean_of_steps, slew
 from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.saturation import limit
-from sim_devices.physics.timebase import best_shifts, delay_by_correlation, find_drops, resample, shift_by
+from sim_devices.physics.timebase import (
+    best_shifts,
+    delay_by_correlation,
+    find_drops,
+    resample,
+    shift_by,
+    shift_costs,
+)
 
 Array = NDArray[np.float64]
 ONE = np.zeros(1, np.int64)
@@ -162,3 +169,13 @@ def test_cheapest_path_compiled_equals_python() -> None:
     a, b = best_shifts(costs, 0.4), best_shifts.py_func(costs, 0.4)
     np.testing.assert_array_equal(a[0], b[0])
     assert a[1] == pytest.approx(b[1])
+
+
+def test_shift_costs_equal_python() -> None:
+    rng = np.random.default_rng(5)
+    x, y = rng.standard_normal(90), rng.standard_normal(90)
+    shifts = np.array([-7, 0, 3])
+    costs = shift_costs(x, y, 20, shifts)
+    np.testing.assert_allclose(costs, shift_costs.py_func(x, y, 20, shifts), atol=1e-12)
+    d = y[20:40] - x[23:43]
+    assert costs[1, 2] == pytest.approx(float(np.sum((d - d.mean()) ** 2)))

@@ -50,6 +50,25 @@ def run_states(ad, g0, g1, u, x0, starts):
     """States (n, s) for one input (n,); the state is ``x0[i]`` (starts, s) at the i-th start."""
     n, s = u.size, ad.shape[0]
     out = np.empty((n, s))
+    if s == 2:
+        # the usual case without inner loops: five times faster
+        a00, a01, a10, a11 = ad[0, 0], ad[0, 1], ad[1, 0], ad[1, 1]
+        b0, b1, c0, c1 = g0[0], g0[1], g1[0], g1[1]
+        p = 0.0
+        q = 0.0
+        at = 0
+        for k in range(n):
+            if at < starts.size and k == starts[at]:
+                p = x0[at, 0]
+                q = x0[at, 1]
+                at += 1
+            else:
+                v = a00 * p + a01 * q + b0 * u[k - 1] + c0 * u[k]
+                q = a10 * p + a11 * q + b1 * u[k - 1] + c1 * u[k]
+                p = v
+            out[k, 0] = p
+            out[k, 1] = q
+        return out
     x = np.zeros(s)
     y = np.zeros(s)
     at = 0
@@ -112,11 +131,18 @@ def free_response(ad: Array, c: Array, length: int) -> Array:
     return out
 
 
+def _while_felt(free: Array, window: int) -> Array:
+    """Free responses up to where they have decayed below 1e-12 of their largest, at least over ``window``."""
+    size = np.abs(free).max(axis=1, initial=0.0)
+    felt = np.flatnonzero(size > 1e-12 * size.max(initial=0.0))
+    return free[: max(window, int(felt[-1]) + 1 if felt.size else 0)]
+
+
 @dataclass(frozen=True)
 class StartState:
     """Sets the state at each start by least squares over the first measured samples, for every column alike.
 
-    ``free[o]`` (longest, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
+    ``free[o]`` (while it is felt, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
     free responses over the window.
     """
 
@@ -138,8 +164,10 @@ class StartState:
     def response(self, states: Array, output: str, n: int) -> Array:
         """Free response (n,) of one output for states (starts, s)."""
         y = np.zeros(n)
+        free = self.free[output]
         for (a, b), x0 in zip(self.spans, states, strict=True):
-            y[a:b] = self.free[output][: b - a] @ x0
+            m = min(b - a, free.shape[0])
+            y[a : a + m] = free[:m] @ x0
         return y
 
 
@@ -163,7 +191,7 @@ def start_state(
         return found
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
     longest = max(b - a for a, b in spans) if whole else window
-    free = {o: free_response(ad, c, longest) for o, c in rows.items()}
+    free = {o: _while_felt(free_response(ad, c, longest), window) for o, c in rows.items()}
     windows = tuple(min(window, b - a) for a, b in spans)
     weight = dict.fromkeys(rows, 1.0)
     if len(rows) > 1:
