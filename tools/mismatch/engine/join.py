@@ -21,6 +21,9 @@ def joined(recording: Recording) -> tuple[Recording, bool]:
         fit = split.fit if isinstance(split.fit, tuple) else (0, recording.n)
         test = other.split.test if isinstance(other.split.test, tuple) else (0, other.n)
         first, second = recording, other
+    elif isinstance(split.fit, Path) and not split.fit.is_file():
+        # fitted on several recordings: no single one stands for them, so this one is split by itself
+        return replace(recording, split=Split()), False
     elif isinstance(split.fit, Path) and isinstance(split.test, tuple):
         other = load(split.fit)
         fit = other.split.fit if isinstance(other.split.fit, tuple) else (0, other.n)

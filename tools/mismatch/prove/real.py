@@ -205,19 +205,31 @@ def run(
     jobs: int = 1,
     diagnose: Diagnose = tool,
     say: Callable[[str], None] | None = None,
+    rows_file: Path | None = None,
 ) -> list[RealRow]:
-    """Diagnose every set on its official split. FileNotFoundError when the data are not beside the project."""
+    """Diagnose every set on its official split. FileNotFoundError when the data are not beside the project.
+
+    ``rows_file`` (JSON) keeps each set as soon as it is done; what it already holds counts and is returned, so that
+    the sets may be run one by one. It must come from the same state of the tool: remove it when the tool changes.
+    """
     tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
     if not data.is_dir():
         raise FileNotFoundError(f"{data}: the measured recordings are not here; they are not part of the repository")
     chosen = {s.name: s for s in SETS if not only or any(o in s.name for o in only)}
+    kept: dict[str, Any] = json.loads(rows_file.read_text()) if rows_file is not None and rows_file.exists() else {}
+    wanted = {s.name: s for s in SETS if s.name in chosen or s.name in kept}
     with tempfile.TemporaryDirectory(prefix="micron-real-") as tmp:
-        paths = {name: joined(s, data, Path(tmp) / name.replace(" ", "_")) for name, s in chosen.items()}
-        rows: dict[str, RealRow] = {}
+        paths = {
+            name: joined(s, data, Path(tmp) / name.replace(" ", "_")) for name, s in chosen.items() if name not in kept
+        }
+        rows = {name: RealRow(wanted[name], k["report"], k["seconds"]) for name, k in kept.items() if name in wanted}
         for name, report, seconds in diagnose_all(paths, jobs, diagnose):
             rows[name] = RealRow(chosen[name], report, seconds)
             tell(f"{name}: {rows[name].said()} ({seconds:.0f} s)")
-    return [rows[name] for name in chosen]
+            if rows_file is not None:
+                kept[name] = {"report": report, "seconds": seconds}
+                rows_file.write_text(json.dumps(kept))
+    return [rows[name] for name in wanted]
 
 
 def rows_json(rows: Sequence[RealRow], seconds: float) -> dict[str, Any]:
@@ -299,10 +311,17 @@ def document(rows: Sequence[RealRow]) -> str:
     return "\n".join(lines)
 
 
-def reproduce(data: Path = DATA, *, only: Sequence[str] = (), jobs: int = 1, doc: Path | None = DOC) -> dict[str, Any]:
+def reproduce(
+    data: Path = DATA,
+    *,
+    only: Sequence[str] = (),
+    jobs: int = 1,
+    doc: Path | None = DOC,
+    rows_file: Path | None = None,
+) -> dict[str, Any]:
     """Run all sets, write the page, return the JSON of `micron reproduce mismatch-real`."""
     start = time.perf_counter()
-    rows = run(data, only=only, jobs=jobs)
+    rows = run(data, only=only, jobs=jobs, rows_file=rows_file)
     if doc is not None:
         doc.parent.mkdir(parents=True, exist_ok=True)
         doc.write_text(document(rows))
@@ -320,9 +339,10 @@ def main() -> None:
     p.add_argument("--only", nargs="*", default=[], help="parts of set names")
     p.add_argument("--jobs", type=int, default=1)
     p.add_argument("--doc", type=Path, default=DOC)
+    p.add_argument("--rows", type=Path, default=None, help="JSON kept after every set, and continued from")
     p.add_argument("--json", type=Path, default=None)
     a = p.parse_args()
-    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc)
+    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows)
     text = json.dumps(result, indent=1)
     if a.json:
         a.json.write_text(text)
