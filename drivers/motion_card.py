@@ -141,6 +141,11 @@ class MotionCard:
         """Samples that the spike filter held back."""
         return self._queue.spikes.held if self._queue.spikes else 0
 
+    @property
+    def bad_frames(self) -> int:
+        """Lines that were none, since the first good one."""
+        return self.parser.bad_frames
+
     def probe(self, limit_s: float = 1.0) -> str:
         """Wait for a good line. ``HalTimeout`` when nothing comes, ``WrongDevice`` when it is something else."""
         limit_ns = self._clock.now_ns() + round(limit_s * 1e9)

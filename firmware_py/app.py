@@ -24,6 +24,7 @@ from firmware_py.control.config import FirmwareConfig, load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
+from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.exit_codes import exit_code_of
 from firmware_py.frame import LAYOUT
 from firmware_py.live.link import LiveLink
@@ -73,22 +74,14 @@ def run_in_process(
     ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the opened bench (fault tests).
     """
     bench = load_bench(request.bench)
+    if is_endoscope(bench.description):
+        from firmware_py.endoscope.app import run_request
+
+        return run_request(request, bench, on_status, runtime_dir, on_open)
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
     _, configs = load_firmware_config(bench, {})
     Stages(configs).warm_up()
-    with contextlib.ExitStack() as stack:
-        folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
-        opened = stack.enter_context(
-            open_bench(
-                bench,
-                virtual=request.virtual,
-                runtime_dir=folder,
-                hand_file=Path(request.hand_file) if request.hand_file else None,
-                hand_scale=request.hand_scale,
-                seed=request.seed,
-                truth_s=request.truth_s,
-            )
-        )
+    with open_requested(request, bench, runtime_dir) as opened:
         devices = open_devices(opened)
         if on_open is not None:
             on_open(opened)
@@ -118,22 +111,45 @@ def run_in_process(
         report = RealtimeReport()
         summary: RecordingSummary | None = None
         try:
-            with _scheduling(request.virtual) as report:
+            with scheduling(request.virtual) as report:
                 loop.run(request.seconds)
         finally:
             if recorder is not None:
                 summary = recorder.stop(loop.scheduler.snapshot().as_dict())
         outcome = make_outcome(request, bench, devices, loop, config, report, summary)
-        truth = None
-        if opened.world is not None:
-            opened.world.stop()
-            with contextlib.suppress(Disconnected):
-                truth = opened.world.truth()
-        return outcome, truth
+        return outcome, truth_of(opened)
 
 
 @contextlib.contextmanager
-def _scheduling(virtual: bool) -> Iterator[RealtimeReport]:
+def open_requested(request: RunRequest, bench: BenchFile, runtime_dir: Path | None) -> Iterator[OpenBench]:
+    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own."""
+    with contextlib.ExitStack() as stack:
+        folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
+        yield stack.enter_context(
+            open_bench(
+                bench,
+                virtual=request.virtual,
+                runtime_dir=folder,
+                hand_file=Path(request.hand_file) if request.hand_file else None,
+                hand_scale=request.hand_scale,
+                seed=request.seed,
+                truth_s=request.truth_s,
+            )
+        )
+
+
+def truth_of(opened: OpenBench) -> dict[str, Any] | None:
+    """Stops the emulated world; its truth, or None where nothing is emulated or the world died."""
+    if opened.world is None:
+        return None
+    opened.world.stop()
+    with contextlib.suppress(Disconnected):
+        return opened.world.truth()
+    return None
+
+
+@contextlib.contextmanager
+def scheduling(virtual: bool) -> Iterator[RealtimeReport]:
     if virtual:
         yield RealtimeReport()
         return

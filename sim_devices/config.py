@@ -234,7 +234,8 @@ class ImuConfig(_Table):
 class EndoscopeConfig(_Table):
     """``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
 
-    scenario: Literal["rest", "turntable", "fall", "poses", "hand"] = "hand"
+    scenario: Literal["rest", "turntable", "fall", "poses", "hand", "led"] = "hand"
+    """"led": somebody outside moves it (``Scanner.lead``)."""
     attitude_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw at the start."""
 
@@ -253,6 +254,9 @@ class EndoscopeConfig(_Table):
     sweep_deg: NotNegative = 15.0
     tremor_deg: NotNegative = 0.2
     tremor_um: NotNegative = 100.0
+
+    presses: tuple[tuple[NotNegative, Positive], ...] = ()
+    """The motion card's button, by itself: (start s, how long s) of each press, in order."""
 
     start_C: float = 25.0
     end_C: float = 25.0

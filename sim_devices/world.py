@@ -189,6 +189,7 @@ class World:
         }
         emulation = description.get("emulation", {})
         self._seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
+        self._presses = (emulation.get("endoscope") or {}).get("presses", ())
         self._baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
         for name, bus in description["bus"].items():
             if not str(bus["uri"]).startswith(SIM_SCHEME):
@@ -299,6 +300,7 @@ class World:
             rate_hz=float(device.get("rate_hz", 100.0)),
             scaled=device.get("fields") == "scaled",
             start_ns=self.epoch_ns,
+            presses=self._presses,
             **self._specimen(name),
         )
         self._add_serial(name, device["bus"], card)

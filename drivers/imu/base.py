@@ -132,6 +132,7 @@ class Imu(Protocol):
     """
 
     name: str
+    setup: ImuSetup
 
     @property
     def lost(self) -> int: ...

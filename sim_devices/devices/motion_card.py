@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -61,6 +62,7 @@ class MotionCard:
         errors: float = 1.0,
         noise: float = 1.0,
         start_ns: int = 0,
+        presses: Sequence[tuple[float, float]] = (),
     ) -> None:
         if not 1.0 <= rate_hz <= 1000.0:
             raise ValueError(f"rate_hz {rate_hz:g} is outside 1 to 1000 Hz, what an MPU-6050 gives with its filter on")
@@ -80,6 +82,7 @@ class MotionCard:
         self._start_ns, self._now_ns = start_ns, start_ns
         self._charge = 100.0
         self._edges: deque[int] = deque()
+        self._presses = deque((start_ns + round(s * 1e9), start_ns + round((s + long) * 1e9)) for s, long in presses)
         self._pressed_ns = 0
         self._clock = SampleClock()
         self._steps = max(1, math.ceil(STEP_HZ / rate_hz - 1e-9))
@@ -108,6 +111,14 @@ class MotionCard:
             self._edges.append(self._now_ns)
             long = self._now_ns - self._pressed_ns >= LONG_PRESS_NS
             self.status = 2 if long else 0 if self.status else 1
+
+    def _press_by_plan(self) -> None:
+        """``presses`` (start s, how long s), at the sampling steps of the card."""
+        if self._presses and self._now_ns >= self._presses[0][1]:
+            self.release()
+            self._presses.popleft()
+        if self._presses and self._now_ns >= self._presses[0][0]:
+            self.press()
 
     @property
     def battery_percent(self) -> float:
@@ -151,6 +162,7 @@ class MotionCard:
             due_ns = self._clock.due_ns
             self._clock.tick()
             self._now_ns = max(self._now_ns, due_ns)
+            self._press_by_plan()
             self._transmit(due_ns)
             self._sample(due_ns)
         self._now_ns = max(self._now_ns, t_ns)

@@ -1,12 +1,14 @@
 """What the endoscope bench moves: a small body that rests, turns on a table, falls, is led through poses or is held.
 
-The scenarios are functions of time, so nothing depends on how often anybody looks. World frame: z up, x to magnetic
+The scenarios are functions of time, so nothing depends on how often anybody looks; but for "led", where somebody
+outside says now and then how the body turns. World frame: z up, x to magnetic
 north. The body's origin is where the specific force is felt; sensors elsewhere follow through their ``Mount``.
 """
 
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Callable, Mapping
 from typing import Literal
 
@@ -24,6 +26,7 @@ Pose = tuple[Array, Array, Array, Array]
 
 TRUTH_STEP_NS = 10_000_000
 IMPACT_S = 4e-3
+LED_S = 0.05
 _LEVEL = np.eye(3)
 
 
@@ -43,7 +46,10 @@ class Scanner:
             "fall": self._rest,
             "poses": self._poses,
             "hand": self._hand,
+            "led": self._led,
         }
+        self._led_ns: list[int] = [0]
+        self._led_states: list[tuple[Array, Array, Array]] = [(self._level, np.zeros(3), np.zeros(3))]
         self._waves = _waves(self._config, config.seed)
         self.now_ns = 0
         self.analog_V, self.magnetometer_V = np.zeros(8), np.full(3, 2.5)
@@ -147,6 +153,26 @@ class Scanner:
                 rise = 60.0 * x * (1.0 - 3.0 * x + 2.0 * x * x) / lasts_s**2
                 return angles + go * step, speed * step, rise * step, np.zeros(3)
         return angles, np.zeros(3), np.zeros(3), np.zeros(3)
+
+    def lead(self, t_ns: int, angles: Array, rates: Array, accelerations: Array) -> None:
+        """From plant time ``t_ns`` on: roll, pitch, yaw in rad and their derivatives, carried on as a parabola.
+
+        After 50 ms without another word the body stands still. Times must not run backwards.
+        """
+        if t_ns < self._led_ns[-1]:
+            raise ValueError(f"led at {t_ns} ns after {self._led_ns[-1]} ns: time runs forwards")
+        self._led_ns.append(t_ns)
+        self._led_states.append((np.array(angles), np.array(rates), np.array(accelerations)))
+
+    def _led(self, t_s: float) -> Pose:
+        i = max(0, bisect_right(self._led_ns, round(t_s * 1e9)) - 1)
+        angles, rates, accelerations = self._led_states[i]
+        since_s = t_s - self._led_ns[i] * 1e-9
+        if since_s > LED_S:
+            end = angles + rates * LED_S + 0.5 * accelerations * LED_S**2
+            return end, np.zeros(3), np.zeros(3), np.zeros(3)
+        turned = angles + rates * since_s + 0.5 * accelerations * since_s**2
+        return turned, rates + accelerations * since_s, accelerations, np.zeros(3)
 
     def _hand(self, t_s: float) -> Pose:
         """Slow voluntary sweeps and tremor: sums of sines, the same for the same seed."""

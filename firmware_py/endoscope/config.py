@@ -1,0 +1,30 @@
+"""``[firmware]`` of an endoscope bench: filter, control, experiment, limits."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.endoscope.targets import GameConfig
+from firmware_py.sensing.fusion import FusionConfig
+from hal.bench import BenchFile, validate_table
+
+
+class EndoscopeConfig(BaseModel):
+    """``steered_by`` names the device whose turning moves the view; empty: the motion card, else the first sensor.
+
+    ``initial_s``: the start attitude of every activation is the mean of so long (002, section 6.2: less than 0.1 s).
+    ``silent_ms``: after so long without a sample the view is held and the run ends.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    fusion: FusionConfig = FusionConfig()
+    game: GameConfig = GameConfig()
+    steered_by: str = ""
+    silent_ms: float = Field(default=500.0, ge=20.0, le=60_000.0)
+    budget_us: dict[str, float] = Field(default_factory=dict[str, float])
+
+
+def load_endoscope_config(bench: BenchFile) -> EndoscopeConfig:
+    """Raises ``BenchError`` naming file and key."""
+    return validate_table(EndoscopeConfig, bench.description.firmware, f"{bench.path}: firmware")

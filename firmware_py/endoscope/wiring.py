@@ -1,0 +1,159 @@
+"""From a bench description to opened inertial sensors: chips on I2C and the motion card, one face for all."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from drivers.ble_motion_card import BleMotionCard
+from drivers.imu.base import Imu, ImuSample
+from drivers.imu.bench import IMU_OPTIONS, ImuOptions, open_imu
+from drivers.motion_card import MotionCard
+from drivers.specs import BleMotionCardOptions, MotionCardOptions, check_devices
+from hal.bench import BenchDescription, DeviceSpec, OpenBench
+from hal.errors import BenchError, HalError, OpenFailed
+from hal.types import Status
+
+CARDS = ("motion_card", "ble_motion_card")
+
+
+def is_endoscope(description: BenchDescription) -> bool:
+    """Whether a bench declares inertial sensors or a motion card and nothing that moves an instrument."""
+    return bool(description.devices_with(*IMU_OPTIONS, *CARDS)) and not description.devices_with(
+        "di4108", "nidaqmx", "dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"
+    )
+
+
+class Card(Protocol):
+    """A motion card over wire or air."""
+
+    name: str
+
+    @property
+    def card_status(self) -> int: ...
+    @property
+    def clicks(self) -> int: ...
+    @property
+    def lost(self) -> int: ...
+    @property
+    def stale(self) -> int: ...
+    @property
+    def bad_frames(self) -> int: ...
+    @property
+    def masked(self) -> int: ...
+    def read(self, out: ImuSample) -> Status: ...
+
+
+@dataclass
+class Sensor:
+    """One source of inertial samples. ``imu`` is the chip's driver, ``card`` the card's; one of them is there."""
+
+    name: str
+    rate_hz: float
+    imu: Imu | None = None
+    card: Card | None = None
+    sample: ImuSample = field(default_factory=ImuSample)
+
+    def read(self) -> Status:
+        source = self.card if self.card is not None else self.imu
+        assert source is not None
+        return source.read(self.sample)
+
+    @property
+    def lost(self) -> int:
+        source = self.card if self.card is not None else self.imu
+        return source.lost if source is not None else 0
+
+    @property
+    def stale(self) -> int:
+        source = self.card if self.card is not None else self.imu
+        return source.stale if source is not None else 0
+
+    @property
+    def bad_frames(self) -> int:
+        return self.card.bad_frames if self.card is not None else 0
+
+    @property
+    def masked(self) -> int:
+        return self.card.masked if self.card is not None else 0
+
+
+@dataclass
+class Sensors:
+    """All of a bench, probed and configured, not yet started. ``identities`` is what each probe found."""
+
+    by_name: dict[str, Sensor]
+    identities: dict[str, str]
+    closers: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
+
+    def start(self) -> None:
+        """Begin to measure."""
+        for sensor in self.by_name.values():
+            if sensor.imu is not None:
+                sensor.imu.start()
+
+    def close(self) -> None:
+        while self.closers:
+            self.closers.pop()()
+
+
+def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
+    """Make, probe, reset and configure every inertial sensor of the bench, or the one called ``only``.
+
+    Raises ``BenchError`` for a bench without one, ``OpenFailed`` with every device that did not answer.
+    """
+    where, description = str(bench.file.path), bench.file.description
+    options = check_devices(description, where)
+    found = description.devices_with(*IMU_OPTIONS, *CARDS)
+    if only is not None and only not in found:
+        raise BenchError(
+            f"{where}: [device] there is no inertial sensor '{only}'; there are {', '.join(found) or 'none'}"
+        )
+    sensors = Sensors({}, {})
+    failures: list[HalError] = []
+    for name, spec in found.items():
+        if only in (None, name):
+            try:
+                sensors.by_name[name] = _open(bench, name, spec, options[name], sensors)
+            except HalError as error:
+                failures.append(error)
+    if failures:
+        sensors.close()
+        raise failures[0] if len(failures) == 1 else OpenFailed(failures)
+    if not sensors.by_name:
+        raise BenchError(f"{where}: [device] declares no inertial sensor and no motion card")
+    return sensors
+
+
+def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors: Sensors) -> Sensor:
+    match option:
+        case ImuOptions():
+            if option.mode != "data ready":
+                raise BenchError(
+                    f"{bench.file.path}: [device.{name}.mode] the loop reads sample by sample: 'data ready'"
+                )
+            imu = open_imu(spec, option, bench.i2c(spec.bus or ""), bench.clock, name)
+            sensors.identities[name] = imu.probe()
+            return Sensor(name, imu.setup.rate_hz, imu=imu)
+        case MotionCardOptions():
+            card = MotionCard(
+                bench.serial(spec.bus or ""),
+                bench.clock,
+                rate_hz=option.rate_hz,
+                fields=option.fields,
+                spike_filter=option.spike_filter,
+                name=name,
+            )
+            sensors.identities[name] = card.probe()
+            return Sensor(name, option.rate_hz, card=card)
+        case BleMotionCardOptions():
+            from hal.backends.bleak_gatt import BleakGatt  # bleak is optional
+
+            link = BleakGatt(option.peripheral, bench.clock)
+            card = BleMotionCard(link, bench.clock, rate_hz=option.rate_hz, spike_filter=option.spike_filter, name=name)
+            sensors.closers.append(card.close)
+            sensors.identities[name] = card.probe()
+            return Sensor(name, option.rate_hz, card=card)
+        case _:
+            raise BenchError(f"{bench.file.path}: [device.{name}] is no inertial sensor")
