@@ -81,7 +81,8 @@ def run_in_process(
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
     _, configs = load_firmware_config(bench, {})
     Stages(configs).warm_up()
-    with open_requested(request, bench, runtime_dir) as opened:
+    with contextlib.ExitStack() as stack:
+        opened = stack.enter_context(open_requested(request, bench, runtime_dir))
         devices = open_devices(opened)
         if on_open is not None:
             on_open(opened)
@@ -95,7 +96,7 @@ def run_in_process(
         if request.live_fds is not None:
             live = LiveLink(*request.live_fds)
             stack.callback(live.close)
-            (folder / "metadata.json").write_text(json.dumps(recording_metadata(bench, configs, opened)))
+            (opened.runtime_dir / "metadata.json").write_text(json.dumps(recording_metadata(bench, configs, opened)))
         loop = InstrumentLoop(
             devices,
             stages,

@@ -111,7 +111,6 @@ def make_outcome(
             "received": track.received,
             "used": track.used,
             "lost": track.sensor.lost,
-            "stale": track.sensor.stale,
             "masked": track.sensor.masked,
             "bad_frames": track.sensor.bad_frames,
         }
@@ -137,6 +136,7 @@ def make_outcome(
         "sensors": sensors,
         "samples": {key: sum(s[key] for s in sensors.values()) for key in ("expected", "received", "lost")},
         "fusion": loop.config.fusion.model_dump(),
+        "attitudes": {name: [list(row) for row in track.history] for name, track in loop.tracks.items()},
         "view": {"status": state.status, "x": state.view.x, "y": state.view.y, "size": state.view.size},
         "experiment": experiment(loop.game),
         "safe_state": {"reached": True, "reason": loop.reason, "normal": loop.normal},

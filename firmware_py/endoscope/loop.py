@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import signal
+from collections import deque
 from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -29,6 +30,7 @@ from hal.types import Status
 
 BUDGETS_US = {"imu": 900.0, "card": 400.0, "publish": 50.0, "watch": 50.0}
 MOST_AT_ONCE = 32
+HISTORY, HISTORY_NS = 18_000, 100_000_000
 FRAME = [("tick", "1"), ("t", "s"), *((f"accel_{a}", "m/s^2") for a in "xyz"), *((f"gyro_{a}", "rad/s") for a in "xyz")]
 FRAME += [("temperature", "degC"), ("status", "1"), ("used", "1"), *((f"quaternion_{a}", "1") for a in "wxyz")]
 FRAME += [("psi", "deg"), ("theta", "deg"), ("view_x", "px"), ("view_y", "px"), ("view_size", "px"), ("reached", "1")]
@@ -52,9 +54,10 @@ class Track:
     used: int = 0
     t_ns: int = 0
     last_used_ns: int = -1
-    history: list[tuple[int, float, float, float, float]] = field(
-        default_factory=list[tuple[int, float, float, float, float]]
+    history: deque[tuple[int, float, float, float, float]] = field(
+        default_factory=lambda: deque[tuple[int, float, float, float, float]](maxlen=HISTORY)
     )
+    """Time and quaternion ten times a second, the newest half hour."""
 
     def forget(self) -> None:
         """A card has sent since it was opened: what has arrived is not of this run."""
@@ -79,7 +82,7 @@ class Track:
         self.last_used_ns = sample.t_ns
         self.fusion.step(sample.gyro_rad_s, sample.accel_mps2, dt_s=dt_s)
         self.used += 1
-        if self.fusion.aligned:
+        if self.fusion.aligned and (not self.history or sample.t_ns - self.history[-1][0] >= HISTORY_NS):
             q = self.fusion.quaternion
             self.history.append((sample.t_ns, float(q[0]), float(q[1]), float(q[2]), float(q[3])))
         return True

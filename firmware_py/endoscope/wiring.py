@@ -37,8 +37,6 @@ class Card(Protocol):
     @property
     def lost(self) -> int: ...
     @property
-    def stale(self) -> int: ...
-    @property
     def bad_frames(self) -> int: ...
     @property
     def masked(self) -> int: ...
@@ -64,11 +62,6 @@ class Sensor:
     def lost(self) -> int:
         source = self.card if self.card is not None else self.imu
         return source.lost if source is not None else 0
-
-    @property
-    def stale(self) -> int:
-        source = self.card if self.card is not None else self.imu
-        return source.stale if source is not None else 0
 
     @property
     def bad_frames(self) -> int:

@@ -11,6 +11,7 @@ from tools.cli import (
     bench,
     calibrate,
     doctor,
+    endoscope,
     hands,
     mismatch,
     noise,
@@ -58,6 +59,7 @@ app.command("placement")(placement.placement)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")
+app.add_typer(endoscope.endoscope, name="endoscope")
 app.add_typer(mismatch.app, name="mismatch")
 app.add_typer(tremor.app, name="tremor")
 

@@ -68,6 +68,9 @@ def run(
         )
         load_bench(request.bench)
         outcome, truth = _run_virtual(request) if virtual else _run_real(request)
+        if outcome.get("instrument") == "endoscope":
+            finish_endoscope_run(outcome, truth, json_file)
+            return
         result = complete_result(outcome, truth)
         if truth is not None and result["tremor"]["reduction_percent"] is not None:
             png = picture(truth, result)
@@ -154,7 +157,24 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
             live.update(_status_table(json.loads(line), seconds))
 
 
+def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None, json_file: str | None) -> None:
+    """Report, JSON and exit code of an endoscope bench."""
+    from tools.endoscope.run_report import complete_run, print_run
+
+    result = complete_run(outcome, truth)
+    print_run(result, console())
+    write_json(result, json_file)
+    if not result["safe_state"]["normal"]:
+        raise typer.Exit(Exit.FAILED)
+    if result["samples"]["lost"] or result["recorder"]["dropped"]:
+        raise typer.Exit(Exit.DATA_LOST)
+
+
 def _status_table(status: dict[str, Any], seconds: float) -> Table:
+    if "view" in status:
+        from tools.endoscope.run_report import status_table
+
+        return status_table(status, seconds)
     table = Table(title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}]", title_justify="left")
     for column in ("", "x", "y", "z"):
         table.add_column(column, justify="left" if not column else "right")

@@ -1,0 +1,162 @@
+"""``micron endoscope``: the targeting experiment, played by a synthetic user, and its tables."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.progress import track
+from rich.table import Table
+
+from tools.cli.common import (
+    Exit,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+    write_text_atomic,
+)
+from tools.errors import InputError
+
+endoscope = typer.Typer(
+    no_args_is_help=True, help="Steer a field of view with a motion card (document 002, chapter 6)."
+)
+
+MappingOption = Annotated[str, typer.Option("--mapping", help="position or speed.")]
+GainOption = Annotated[float, typer.Option(min=0.01, max=1000.0, help="Pixels per degree, or pixels/s per degree.")]
+ResponseOption = Annotated[float, typer.Option("--response", min=0.0, max=60.0, help="Response time constant, s.")]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of targets and user.")]
+
+
+def _mapping(name: str) -> Any:
+    if name not in ("position", "speed"):
+        raise InputError(f"--mapping {name}: it is position or speed")
+    return name
+
+
+def default_bench() -> Path:
+    """The emulated endoscope bench that ships with the package."""
+    import benches
+
+    return Path(benches.__file__).with_name("endoscope.toml")
+
+
+@endoscope.command("play")
+def play_command(
+    user: Annotated[str, typer.Option(help="Name of the user in the report.")] = "synthetic",
+    mapping: MappingOption = "position",
+    gain: GainOption = 8.0,
+    response: ResponseOption = 0.25,
+    targets: Annotated[int, typer.Option(min=1, max=100)] = 5,
+    tolerance: Annotated[float, typer.Option(min=0.1, max=100.0, help="Pixels.")] = 9.0,
+    seed: SeedOption = 1,
+    bench: Annotated[
+        Path | None, typer.Option("--bench", metavar="FILE", help="Emulated bench; default the endoscope bench.")
+    ] = None,
+    direct: Annotated[bool, typer.Option("--direct", help="Without bench: angles straight into the game.")] = False,
+    limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Give up after so many seconds.")] = 300.0,
+    record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
+    report: Annotated[Path | None, typer.Option(metavar="FILE", help="Report file of this user (CSV).")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """A synthetic user turns the emulated card and presses its button until all targets are reached (virtual time).
+
+    Example: micron endoscope play --mapping speed --response 1 --report out/user.csv
+    """
+    from firmware_py.endoscope.control import ControlConfig
+    from firmware_py.endoscope.report import report_csv
+    from firmware_py.endoscope.targets import GameConfig
+    from tools.endoscope.play import play, play_on_bench
+    from tools.endoscope.user import UserConfig
+
+    with clear_errors():
+        check_writable(json_file, record, report)
+        if direct and (record or bench):
+            raise InputError("--direct runs without a bench; leave out --bench and --record")
+        control = ControlConfig(mapping=_mapping(mapping), gain=gain, response_s=response)
+        game = GameConfig(control=control, targets=targets, tolerance_px=tolerance, seed=seed)
+        person = UserConfig(name=user, seed=seed)
+        if direct:
+            result: dict[str, Any] = {"format": 1, "experiment": play(person, game, limit)}
+            healthy = True
+        else:
+            with console().status("the user plays on the emulated bench"):
+                outcome = play_on_bench(bench or default_bench(), person, game, seed=seed, record=record, limit_s=limit)
+            outcome.pop("attitudes")
+            result = outcome
+            healthy = outcome["samples"]["lost"] == 0 and outcome["recorder"]["dropped"] == 0
+        result["user"] = user
+        done = result["experiment"]
+        _show(user, done)
+        if report is not None:
+            write_text_atomic(report, report_csv(user, done))
+            console().print(f"report: {report}")
+        write_json(result, json_file)
+        if not done["done"]:
+            raise typer.Exit(Exit.FAILED)
+        if not healthy:
+            raise typer.Exit(Exit.DATA_LOST)
+
+
+def _show(user: str, result: dict[str, Any]) -> None:
+    title = f"{user}: {result['reached']} of {result['targets']} targets in {result['elapsed_s']:.1f} s, "
+    table = Table(title=title + f"{result['clicks']} clicks, {result['mapping']} mapping", title_justify="left")
+    for column in ("target", "time (s)", "clicks", "psi (deg)", "theta (deg)"):
+        table.add_column(column, justify="right")
+    for row in result["rows"]:
+        psi, theta = (f"{row[f'{a}_min_deg']:.1f} .. {row[f'{a}_max_deg']:.1f}" for a in ("psi", "theta"))
+        table.add_row(str(row["target"]), f"{row['elapsed_s']:.1f}", str(row["clicks"]), psi, theta)
+    console().print(table)
+
+
+@endoscope.command("tables")
+def tables(
+    gain: GainOption = 8.0,
+    experiments: Annotated[int, typer.Option(min=1, max=100, help="Per cell.")] = 5,
+    seed: SeedOption = 1,
+    json_file: JsonOption = None,
+) -> None:
+    """Elapsed time for both mappings and four response times, as Tables 6.1 and 6.2, with a synthetic user.
+
+    Example: micron endoscope tables --json out/mapping.json
+    """
+    from tools.endoscope.experiment import RESPONSES_S, run_cell
+    from tools.endoscope.user import UserConfig
+
+    with clear_errors():
+        check_writable(json_file)
+        person = UserConfig(seed=seed)
+        jobs = [(mapping, tau) for mapping in ("position", "speed") for tau in RESPONSES_S]
+        cells = [
+            run_cell(_mapping(mapping), tau, person, gain=gain, experiments=experiments)
+            for mapping, tau in track(jobs, "playing", console=console(), transient=True)
+        ]
+        grid = Table(title=f"synthetic user, K = {gain:g}, {experiments} experiments a cell", title_justify="left")
+        for column in ("mapping", "tau (s)", "time (s)", "mean (s)", "clicks", "psi, theta (deg)"):
+            grid.add_column(column, justify="right")
+        for cell in cells:
+            times = " ".join(f"{v:.0f}" for v in cell.elapsed_s)
+            psi, theta = cell.rotation_deg
+            clicks = f"{sum(cell.clicks) / len(cell.clicks):.1f}"
+            grid.add_row(
+                cell.mapping, f"{cell.response_s:g}", times, f"{cell.mean_s:.1f}", clicks, f"{psi:.1f}, {theta:.1f}"
+            )
+        data_console().print(grid)
+        rows = [
+            {
+                "mapping": cell.mapping,
+                "response_s": cell.response_s,
+                "elapsed_s": list(cell.elapsed_s),
+                "mean_s": cell.mean_s,
+                "clicks": list(cell.clicks),
+                "rotation_deg": list(cell.rotation_deg),
+                "done": cell.done,
+            }
+            for cell in cells
+        ]
+        write_json({"format": 1, "gain": gain, "rows": rows}, json_file)
+        if not all(cell.done for cell in cells):
+            raise typer.Exit(Exit.FAILED)
