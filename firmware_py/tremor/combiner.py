@@ -1,40 +1,45 @@
-"""WFLC-FLC on tip acceleration: displacement now and ahead, by turning the weights.
+"""FLC, WFLC and WFLC-FLC: displacement now and ahead, by turning the weights.
 
-The WFLC sees the band-passed acceleration and gives frequency and phase; the FLC fits sine and cosine of that
-phase to the raw acceleration (with a bias weight in place of a high-pass, so it adds no phase). Amplitude and
-phase of RC filter, double integration and loop delay at the tracked frequency are one complex number, which
-turns the FLC's weights into displacement.
+The WFLC sees the band-passed samples and gives frequency and phase; the FLC fits sine and cosine of that phase. For an
+accelerometer it fits the raw samples (with a bias weight in place of a high-pass, so it adds no phase): voluntary
+motion is small there. Displacement holds far more voluntary motion than tremor, so there the FLC fits the band-passed
+samples and the prefilter's phase and gain at the tracked frequency are undone as well.
 """
 
 from __future__ import annotations
 
-from math import atan2, cos, sin, sqrt
+from cmath import exp
+from math import pi, sqrt
 
 import numpy as np
 
 from firmware_py.records import Record, new_record
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.flc import flc_step
-from firmware_py.tremor.prefilter import prefilter_sections, prefilter_step
+from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
+from firmware_py.tremor.seen import SEEN, seen_params, undo
 from firmware_py.tremor.wflc import WFLC, WFLC_STATE, wflc_params, wflc_step
 from hal.compiled import kernel
+
+TRAILING, OWN, FIXED = 0, 1, 2  # whose weights: WFLC-FLC, WFLC, FLC at the start frequency
 
 COMBINER = np.dtype(
     [
         ("wflc", WFLC),
+        ("seen", SEEN),
         ("sections", "f8", (3, 5)),
         ("trailing_gain", "f8"),
         ("bias_gain", "f8"),
-        ("tick_hz", "f8"),
-        ("cutoff_rad_s", "f8"),
-        ("delay_s", "f8"),
+        ("behind_prefilter", "i8"),  # the FLC's input
+        ("weights_of", "i8"),
     ]
 )
 COMBINER_STATE = np.dtype(
     [
         ("wflc", WFLC_STATE),
         ("memory", "f8", (3, 2)),  # of the prefilter
-        ("weights", "f8", (3,)),  # sine, cosine, bias of the acceleration, m/s^2
+        ("weights", "f8", (3,)),  # sine, cosine, bias of the FLC, in the sample's unit
+        ("fixed_phase", "f8"),
     ]
 )
 
@@ -44,36 +49,51 @@ def combiner_params(config: TremorConfig) -> Record:
     return new_record(
         COMBINER,
         wflc=wflc_params(config.wflc, config.tick_hz),
+        seen=seen_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
         trailing_gain=config.wflc.trailing_gain,
         bias_gain=config.wflc.bias_gain,
-        tick_hz=config.tick_hz,
-        cutoff_rad_s=config.filter_cutoff_rad_s,
-        delay_s=config.loop_delay_s,
+        behind_prefilter=int(config.sees == "displacement"),
+        weights_of={"wflc": OWN, "flc": FIXED}.get(config.method, TRAILING),
     )
 
 
-@kernel
-def combiner_step(acceleration: float, state: Record, params: Record) -> None:
-    """One sample of the tip's acceleration m/s^2, behind the RC filter."""
-    wflc_step(prefilter_step(acceleration, state.memory, params.sections), state.wflc, params.wflc)
-    flc_step(acceleration, state.wflc.phase, state.weights, params.trailing_gain, params.bias_gain)
+def combiner_state(config: TremorConfig) -> Record:
+    """Start frequency, no amplitude."""
+    wflc = new_record(WFLC_STATE, omega=2.0 * pi * config.wflc.start_hz / config.tick_hz, miss=1.0)
+    return new_record(COMBINER_STATE, wflc=wflc)
 
 
 @kernel
-def combiner_coast(state: Record) -> None:
+def combiner_step(sample: float, state: Record, params: Record) -> None:
+    """One sample, behind the RC filter."""
+    in_band = prefilter_step(sample, state.memory, params.sections)
+    wflc_step(in_band, state.wflc, params.wflc)
+    state.fixed_phase = (state.fixed_phase + params.wflc.start) % (2.0 * pi)
+    phase = state.fixed_phase if params.weights_of == FIXED else state.wflc.phase
+    fitted = in_band if params.behind_prefilter else sample
+    flc_step(fitted, phase, state.weights, params.trailing_gain, params.bias_gain)
+
+
+@kernel
+def combiner_coast(state: Record, params: Record) -> None:
     """One tick without a sample: the phase runs on."""
     state.wflc.phase += state.wflc.omega
+    state.fixed_phase += params.wflc.start
 
 
 @kernel
 def combiner_displacement(state: Record, params: Record, ahead_s: float) -> float:
-    """Tremor displacement m at ``ahead_s`` after the last sample.
-
-    x = Re[W e^(j phase) G], W = cosine - j sine, G = -e^(j w t) (1 + j w / cutoff) / w^2.
-    """
-    w = state.wflc.omega * params.tick_hz
-    lag = w / params.cutoff_rad_s
-    size = -sqrt(1.0 + lag * lag) / (w * w)
-    angle = state.wflc.phase + atan2(lag, 1.0) + w * ahead_s
-    return size * (state.weights[1] * cos(angle) + state.weights[0] * sin(angle))
+    """Tremor displacement m at ``ahead_s`` after the last sample: Re[(cosine - j sine) e^(j phase) undo]."""
+    omega, phase = state.wflc.omega, state.wflc.phase
+    sine, cosine = state.weights[0], state.weights[1]
+    filtered = params.behind_prefilter != 0
+    if params.weights_of == FIXED:
+        omega, phase = params.wflc.start, state.fixed_phase
+    elif params.weights_of == OWN:
+        size = sqrt(state.wflc.power)
+        sine, cosine, filtered = size * state.wflc.sine, size * state.wflc.cosine, True
+    phasor = (cosine - 1j * sine) * exp(1j * phase) * undo(omega * params.seen.tick_hz, ahead_s, params.seen)
+    if filtered:
+        phasor /= prefilter_gain(params.sections, omega)
+    return phasor.real

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from math import inf
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -10,15 +11,32 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hal.bench import validate_table
 
 Positive = Annotated[float, Field(gt=0.0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Edge = tuple[Positive, Positive]
+
+Method = Literal["adaptive", "kalman", "wflc_flc", "flc", "wflc", "bmflc", "ebmflc", "bmflc_kalman", "ar_kalman"]
+METHODS: tuple[Method, ...] = (
+    "adaptive",
+    "kalman",
+    "wflc_flc",
+    "flc",
+    "wflc",
+    "bmflc",
+    "ebmflc",
+    "bmflc_kalman",
+    "ar_kalman",
+)
 
 
-class KalmanConfig(BaseModel):
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class KalmanConfig(_Table):
     """Tremor as a sum of narrow-band oscillators, sensor noise and drift, all seen through the RC filter.
 
     The gain depends only on ratios, so ``tremor_rms_m`` is the size the filter is best at, not a limit.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     frequencies_hz: tuple[Positive, ...] = (8.5, 9.2, 10.0, 10.8, 11.5)
     bandwidth_hz: Positive = 0.8
@@ -29,13 +47,11 @@ class KalmanConfig(BaseModel):
     reading_noise_m_s2: Positive = 0.8e-3  # quantisation, after the RC filter
 
 
-class WflcConfig(BaseModel):
+class WflcConfig(_Table):
     """Weighted-frequency Fourier linear combiner and the combiner that trails it (000, 5.2).
 
     Gains belong to a signal of unit power: the input is normalised by its own (ERRATA 56).
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
 
     start_hz: Positive = 10.0
     low_hz: Positive = 7.0
@@ -50,27 +66,108 @@ class WflcConfig(BaseModel):
     attenuation_dB: Positive = 40.0
 
 
-class TremorConfig(BaseModel):
-    """Estimator, its horizon and when it counts as settled."""
+class BmflcConfig(_Table):
+    """Band-limited multiple Fourier linear combiner in its three forms (Veluvolu, Ang 2011).
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    ``memory_s`` is the window of E-BMFLC; its band follows the centroid of the weights by ``band_gain`` per second.
+    ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise.
+    """
+
+    low_hz: Positive = 7.0
+    high_hz: Positive = 13.0
+    step_hz: Positive = 0.5
+    gain: Positive = 0.01
+    bias_gain: Positive = 0.003
+    memory_s: Positive = 1.0
+    band_gain: Positive = 0.5
+    walk: Positive = 0.05
+
+
+class ArConfig(_Table):
+    """Direct multi-step autoregressive predictor, its coefficients tracked by a Kalman filter (Tatinati, Ang 2013)."""
+
+    order: Annotated[int, Field(ge=2, le=12)] = 6
+    spacing_s: Positive = 0.01
+    walk: Positive = 1e-4
+    noise: Positive = 0.1  # of the signal's rms
+
+
+class AdaptiveConfig(_Table):
+    """Causal linear filter learned from the hand itself (firmware_py/tremor/adaptive.py).
+
+    ``memory_s`` is how long the hand is remembered, ``prior_s`` how many seconds of data the prior counts for.
+    ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out.
+    """
+
+    centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
+    bandwidth_hz: Positive = 3.0
+    slow_hz: tuple[Positive, ...] = (0.5, 2.0, 20.0)
+    cancel_from_hz: Edge = (2.0, 4.0)
+    cancel_to_hz: Edge = (16.0, 20.0)
+    emphasis: Annotated[float, Field(ge=1.0, le=20.0)] = 4.0
+    emphasis_hz: Positive = 9.8
+    emphasis_q: Positive = 1.5
+    block_s: Positive = 0.01
+    half_width_s: Positive = 0.4
+    memory_s: Positive = 15.0
+    prior_s: Positive = 3.0
+    share: Share = 0.3
+    outlier: Positive = 16.0
+    # the prior: a hand as it is expected
+    tremor_rms_m: Positive = 15e-6
+    least_rms_m: Positive = 2e-6
+    tremor_hz: Positive = 10.0
+    tremor_half_width_hz: Positive = 1.7
+    voluntary_m: Positive = 300e-6
+    voluntary_hz: Positive = 0.6
+    unsteadiness_m: Positive = 4e-6
+    sensor_noise_m_s2_rtHz: Positive = 2e-3
+    reading_noise_m_s2: Positive = 0.8e-3
+    drift_m_s2: Positive = 0.03
+    drift_s: Positive = 3.0
+    reading_noise_m: Positive = 1e-6  # of a displacement sensor, per sample
+
+    @model_validator(mode="after")
+    def _check(self) -> AdaptiveConfig:
+        (a, b), (c, d) = self.cancel_from_hz, self.cancel_to_hz
+        if not a < b < c < d:
+            raise ValueError("adaptive: cancel_from_hz and cancel_to_hz must rise: from low to high")
+        return self
+
+
+class TremorConfig(_Table):
+    """Estimator, its horizon, what it sees and when it counts as settled.
+
+    ``sees`` acceleration: samples in m/s^2 of the tip behind the RC filter of ``filter_cutoff_rad_s``. displacement:
+    samples in m behind the same filter; a sensor without a filter has ``filter_cutoff_rad_s`` inf.
+    """
 
     tick_hz: Positive = 1000.0
-    method: Literal["kalman", "wflc_flc"] = "kalman"
+    method: Method = "adaptive"
+    sees: Literal["acceleration", "displacement"] = "acceleration"
     # from the instant a scan is taken to the middle of the interval in which its command moves the tip
     loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0021  # tuned against the emulated tip, one seed
-    filter_cutoff_rad_s: Positive = 1.0 / (32_000.0 * 0.33e-6)
+    filter_cutoff_rad_s: Annotated[float, Field(gt=0.0, le=inf)] = 1.0 / (32_000.0 * 0.33e-6)
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.7
     smoothing_s: Positive = 0.5
     floor_m: Positive = 0.3e-6
     max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
     kalman: KalmanConfig = KalmanConfig()
     wflc: WflcConfig = WflcConfig()
+    bmflc: BmflcConfig = BmflcConfig()
+    ar: ArConfig = ArConfig()
+    adaptive: AdaptiveConfig = AdaptiveConfig()
 
     @model_validator(mode="after")
     def _check(self) -> TremorConfig:
         if not self.wflc.low_hz < self.wflc.start_hz < self.wflc.high_hz < 0.5 * self.tick_hz:
             raise ValueError("wflc: low_hz < start_hz < high_hz < tick_hz / 2 is needed")
+        if not self.bmflc.low_hz < self.bmflc.high_hz < 0.5 * self.tick_hz:
+            raise ValueError("bmflc: low_hz < high_hz < tick_hz / 2 is needed")
+        if self.ar.order * self.ar.spacing_s > 0.25:
+            raise ValueError("ar: order times spacing_s must be below 0.25 s")
+        if self.method == "kalman" and self.sees != "acceleration":
+            raise ValueError("method 'kalman' models an accelerometer: sees must be 'acceleration'")
         return self
 
     @classmethod

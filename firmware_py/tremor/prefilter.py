@@ -6,6 +6,7 @@ frequency, so whoever uses its output can undo phase and gain.
 
 from __future__ import annotations
 
+from cmath import exp
 from math import pi
 
 import numpy as np
@@ -54,3 +55,14 @@ def prefilter_step(x: float, memory: NDArray[np.float64], sections: NDArray[np.f
         memory[j, 1] = sections[j, 2] * x - sections[j, 4] * y
         x = y
     return x
+
+
+@kernel
+def prefilter_gain(sections: NDArray[np.float64], omega: float) -> complex:
+    """Complex gain at ``omega`` rad per sample."""
+    z = exp(-1j * omega)
+    gain = 1.0 + 0.0j
+    for j in range(len(sections)):
+        b0, b1, b2, a1, a2 = sections[j, 0], sections[j, 1], sections[j, 2], sections[j, 3], sections[j, 4]
+        gain *= (b0 + z * (b1 + z * b2)) / (1.0 + z * (a1 + z * a2))
+    return gain

@@ -1,7 +1,8 @@
 """Weighted-frequency Fourier linear combiner (000 (5.6)-(5.10), ERRATA 51-56): tracks the tremor's frequency.
 
 The input is divided by the square root of its own smoothed power, so the gains hold for 5 um and for 500 um.
-Frequency is limited to the band, amplitude weights leak a little towards zero.
+Frequency is limited to the band, amplitude weights leak a little towards zero. It is locked while the combiner explains
+most of the band-passed signal.
 """
 
 from __future__ import annotations
@@ -32,6 +33,7 @@ WFLC_STATE = np.dtype(
         ("sine", "f8"),
         ("cosine", "f8"),
         ("power", "f8"),
+        ("miss", "f8"),  # smoothed error^2 of the normalised signal: 0 locked .. 1 nothing explained
     ]
 )
 
@@ -52,16 +54,6 @@ def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
 
 
 @kernel
-def wflc_restart(state: Record, params: Record) -> None:
-    """Start frequency, no amplitude."""
-    state.omega = params.start
-    state.phase = 0.0
-    state.sine = 0.0
-    state.cosine = 0.0
-    state.power = 0.0
-
-
-@kernel
 def wflc_step(signal: float, state: Record, params: Record) -> None:
     """One sample of the band-passed signal, any unit: advances phase, weights and frequency.
 
@@ -76,6 +68,7 @@ def wflc_step(signal: float, state: Record, params: Record) -> None:
     # a transient far above the smoothed power must not throw the frequency
     normal = max(-3.0, min(3.0, signal / sqrt(state.power)))
     error = normal - state.sine * s - state.cosine * c
+    state.miss += params.power_smoothing * (error * error - state.miss)
     omega = state.omega + 2.0 * params.frequency_gain * error * (state.sine * c - state.cosine * s)
     state.omega = max(params.low, min(params.high, omega))
     state.sine = params.keep * state.sine + 2.0 * params.weight_gain * s * error

@@ -6,13 +6,12 @@ Tuned on seeds 0-5; printed for seeds 100 and up, three axes at a time, at horiz
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 import numba
 import numpy as np
 
 from firmware_py.frame import LAYOUT, STATUS, TICK, TIP_ACCELERATION, TREMOR_AHEAD
-from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.config import METHODS, Method, TremorConfig
 from firmware_py.tremor.stage import Tremor, estimate_kernel
 from tests.unit.tremor.synthetic import KINDS, RATE_HZ, Array, make_record, residual_percent
 
@@ -39,9 +38,7 @@ def predictions(config: TremorConfig, acceleration: Array) -> Array:
     return ahead
 
 
-def residuals(
-    method: Literal["kalman", "wflc_flc"], delay_ms: int, kind: str, seeds: Iterable[int], seconds: float = 20.0
-) -> Array:
+def residuals(method: Method, delay_ms: int, kind: str, seeds: Iterable[int], seconds: float = 20.0) -> Array:
     """Residual percent of each seed."""
     config = TremorConfig(method=method, loop_delay_s=delay_ms * 1e-3)
     records = [make_record(seed, kind, seconds) for seed in seeds]
@@ -56,7 +53,7 @@ def residuals(
 
 def main() -> None:
     print(f"{'residual tremor, % rms in 8-12 Hz':36}" + "".join(f"{d:>8} ms" for d in (4, 8, 12)))
-    for method in ("kalman", "wflc_flc"):
+    for method in METHODS:
         for kind in KINDS:
             row = [residuals(method, delay, kind, HELD_OUT) for delay in (4, 8, 12)]
             print(f"{method:12}{kind:24}" + "".join(f"{np.mean(r):5.1f} ±{np.std(r):4.1f}" for r in row))

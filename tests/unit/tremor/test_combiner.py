@@ -8,22 +8,22 @@ from scipy.signal import ellip, sosfilt, sosfreqz
 
 from firmware_py.records import attributes, new_record
 from firmware_py.tremor.combiner import (
-    COMBINER_STATE,
     combiner_displacement,
     combiner_params,
+    combiner_state,
     combiner_step,
 )
 from firmware_py.tremor.config import TremorConfig, WflcConfig
 from firmware_py.tremor.flc import flc_step
 from firmware_py.tremor.prefilter import prefilter_response, prefilter_sections, prefilter_step
-from firmware_py.tremor.wflc import WFLC_STATE, wflc_params, wflc_restart, wflc_step
+from firmware_py.tremor.wflc import WFLC_STATE, wflc_params, wflc_step
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 
 
 def locked_frequency_hz(signal: np.ndarray, config: WflcConfig) -> float:
     """WFLC frequency after ``signal``, mean of the last second."""
-    params, state = wflc_params(config, RATE_HZ), new_record(WFLC_STATE)
-    wflc_restart(attributes(state)[0], attributes(params)[0])
+    params = wflc_params(config, RATE_HZ)
+    state = new_record(WFLC_STATE, omega=2 * np.pi * config.start_hz / RATE_HZ, miss=1.0)
     tail = []
     for s in signal:
         wflc_step(s, state[0], params[0])
@@ -82,9 +82,7 @@ def test_flc_settles_on_the_fourier_weights_and_the_bias() -> None:
 def test_a_steady_tone_is_predicted_to_one_percent(hz: float, delay_s: float) -> None:
     """RC filter, double integration and delay undone in amplitude and phase."""
     config = TremorConfig(method="wflc_flc", loop_delay_s=delay_s)
-    params, state = combiner_params(config), new_record(COMBINER_STATE)
-    at = attributes(params)[0]
-    wflc_restart(attributes(state)[0].wflc, at.wflc)
+    params, state = combiner_params(config), combiner_state(config)
     n, w = 15_000, 2 * np.pi * hz
     t = np.arange(n) / RATE_HZ
     rc = CUTOFF_RAD_S / (1j * w + CUTOFF_RAD_S)
@@ -100,9 +98,7 @@ def test_a_steady_tone_is_predicted_to_one_percent(hz: float, delay_s: float) ->
 def test_kernels_and_python_agree() -> None:
     config = TremorConfig(method="wflc_flc")
     params = combiner_params(config)
-    a, b = new_record(COMBINER_STATE), new_record(COMBINER_STATE)
-    for state in (a, b):
-        wflc_restart(attributes(state)[0].wflc, attributes(params)[0].wflc)
+    a, b = combiner_state(config), combiner_state(config)
     twin, at = attributes(b)[0], attributes(params)[0]
     for k in range(300):
         s = 0.07 * np.sin(0.06 * k) + 0.01

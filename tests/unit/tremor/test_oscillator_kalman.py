@@ -85,7 +85,7 @@ def test_a_steady_tone_comes_out_with_its_amplitude_and_phase(delay_s: float) ->
     t = np.arange(8000) / RATE_HZ
     rc = CUTOFF_RAD_S / (1j * w + CUTOFF_RAD_S)
     acceleration = np.real(-(w**2) * size * rc * np.exp(1j * w * t)) + 0.02
-    ahead = predictions(TremorConfig(loop_delay_s=delay_s), np.stack([acceleration] * 3, axis=1))
+    ahead = predictions(TremorConfig(method="kalman", loop_delay_s=delay_s), np.stack([acceleration] * 3, axis=1))
     true = size * np.cos(w * (t + delay_s))
     assert np.max(np.abs(ahead[-1000:, 1] - true[-1000:])) < 0.1 * size
 
@@ -105,7 +105,7 @@ def test_voluntary_motion_passes() -> None:
     t = np.arange(10_000) / RATE_HZ
     w = 2 * np.pi
     acceleration = np.stack([-(w**2) * 1e-3 * np.sin(w * t)] * 3, axis=1)
-    ahead = predictions(TremorConfig(), acceleration)
+    ahead = predictions(TremorConfig(method="kalman"), acceleration)
     assert np.max(np.abs(ahead[5000:])) < 0.01 * 1e-3
 
 

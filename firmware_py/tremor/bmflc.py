@@ -1,0 +1,196 @@
+"""Band-limited multiple Fourier linear combiner: a comb of frequencies over the tremor band (Veluvolu, Ang 2011).
+
+Three ways to the weights: LMS (BMFLC); LMS that forgets over a memory window while its band follows the tremor
+(E-BMFLC); a Kalman filter with weights as random walk (BMFLC-KF), whose gain depends on the regressors alone and so is
+the same for all axes. Each frequency's sensor factor is known, so the weights give displacement now and ahead.
+"""
+
+from __future__ import annotations
+
+from cmath import exp as cexp
+from math import exp, pi
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.records import Record, new_record
+from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.prefilter import prefilter_gain, prefilter_sections, prefilter_step
+from firmware_py.tremor.seen import SEEN, seen_params, undo
+from hal.compiled import kernel
+
+Array = NDArray[np.float64]
+AXES = 3
+FOLLOW_TICKS = 50  # the band of E-BMFLC moves this often
+
+
+def comb_size(config: TremorConfig) -> int:
+    """Frequencies in the comb."""
+    return int((config.bmflc.high_hz - config.bmflc.low_hz) / config.bmflc.step_hz + 1.0 + 1e-9)
+
+
+def bmflc_dtype(size: int) -> np.dtype[Any]:
+    return np.dtype(
+        [
+            ("seen", SEEN),
+            ("sections", "f8", (3, 5)),
+            ("behind_prefilter", "i8"),
+            ("omega", "f8", (size,)),  # rad per sample
+            ("gain", "f8"),
+            ("bias_gain", "f8"),
+            ("keep", "f8"),
+            ("follow", "f8"),  # of the centroid, per FOLLOW_TICKS; 0: the band stays
+            ("kalman", "i8"),
+            ("walk2", "f8"),
+        ]
+    )
+
+
+def bmflc_state_dtype(size: int) -> np.dtype[Any]:
+    return np.dtype(
+        [
+            ("memory", "f8", (AXES, 3, 2)),
+            ("phasor", "c16", (AXES, size)),
+            ("turn", "c16", (AXES, size)),  # of the phasor, per sample
+            ("undo", "c16", (AXES, 2, size)),  # now, ahead
+            ("shift", "f8", (AXES,)),  # of the band, rad per sample
+            ("weights", "f8", (AXES, 2 * size + 1)),  # sine, cosine of each frequency; bias
+            ("regressor", "f8", (2 * size + 1,)),
+            ("covariance", "f8", (2 * size + 1, 2 * size + 1)),
+            ("kalman_gain", "f8", (2 * size + 1,)),
+            ("ticks", "i8"),
+        ]
+    )
+
+
+def bmflc_params(config: TremorConfig) -> Record:
+    """The kernels' numbers for ``config.method``."""
+    c = config.bmflc
+    size = comb_size(config)
+    moves = config.method == "ebmflc"
+    return new_record(
+        bmflc_dtype(size),
+        seen=seen_params(config),
+        sections=prefilter_sections(config.wflc, config.tick_hz),
+        behind_prefilter=int(config.sees == "displacement"),
+        omega=2.0 * pi * (c.low_hz + c.step_hz * np.arange(size)) / config.tick_hz,
+        gain=c.gain,
+        bias_gain=c.bias_gain,
+        keep=exp(-1.0 / (c.memory_s * config.tick_hz)) if moves else 1.0,
+        follow=c.band_gain * FOLLOW_TICKS / config.tick_hz if moves else 0.0,
+        kalman=int(config.method == "bmflc_kalman"),
+        walk2=c.walk**2,
+    )
+
+
+def bmflc_state(config: TremorConfig) -> Record:
+    """No amplitude, band as configured, weights unknown."""
+    size = comb_size(config)
+    return new_record(bmflc_state_dtype(size), phasor=1.0, covariance=100.0 * np.eye(2 * size + 1))
+
+
+@kernel
+def _tune(state: Record, axis: int, params: Record) -> None:
+    """Turns and sensor factors of one axis for its present band."""
+    rate = params.seen.tick_hz
+    for r in range(len(params.omega)):
+        omega = params.omega[r] + state.shift[axis]
+        state.turn[axis, r] = cexp(1j * omega)
+        behind = prefilter_gain(params.sections, omega) if params.behind_prefilter else 1.0 + 0.0j
+        state.undo[axis, 0, r] = undo(omega * rate, 0.0, params.seen) / behind
+        state.undo[axis, 1, r] = undo(omega * rate, params.seen.delay_s, params.seen) / behind
+
+
+@kernel
+def bmflc_predict(state: Record, params: Record) -> None:
+    """One tick of time: phases run on, weights walk."""
+    size = len(params.omega)
+    if state.ticks == 0:
+        for i in range(AXES):
+            _tune(state, i, params)
+    for i in range(AXES):
+        for r in range(size):
+            z = state.phasor[i, r] * state.turn[i, r]
+            state.phasor[i, r] = z * (1.5 - 0.5 * (z.real * z.real + z.imag * z.imag))  # back to length 1
+    state.ticks += 1
+    if params.follow > 0.0 and state.ticks % FOLLOW_TICKS == 0:
+        for i in range(AXES):
+            _follow(state, i, params)
+    if params.kalman:
+        for j in range(2 * size + 1):
+            state.covariance[j, j] += params.walk2
+
+
+@kernel
+def _follow(state: Record, axis: int, params: Record) -> None:
+    """The band's middle goes towards the centroid of the weights' power, within half its width."""
+    size = len(params.omega)
+    total, moment = 0.0, 0.0
+    for r in range(size):
+        power = state.weights[axis, 2 * r] ** 2 + state.weights[axis, 2 * r + 1] ** 2
+        total += power
+        moment += power * params.omega[r]
+    if total <= 0.0:
+        return
+    middle = 0.5 * (params.omega[0] + params.omega[size - 1])
+    limit = 0.25 * (params.omega[size - 1] - params.omega[0])
+    shift = state.shift[axis] + params.follow * (moment / total - middle)
+    state.shift[axis] = max(-limit, min(limit, shift))
+    _tune(state, axis, params)
+
+
+@kernel
+def bmflc_correct(state: Record, samples: Array, params: Record) -> None:
+    """``samples`` (3,) of the present tick."""
+    size = len(params.omega)
+    x = state.regressor
+    for i in range(AXES):
+        sample = samples[i]
+        if params.behind_prefilter:
+            sample = prefilter_step(sample, state.memory[i], params.sections)
+        w = state.weights[i]
+        error = sample - w[2 * size]
+        for r in range(size):
+            x[2 * r], x[2 * r + 1] = state.phasor[i, r].imag, state.phasor[i, r].real
+            error -= w[2 * r] * x[2 * r] + w[2 * r + 1] * x[2 * r + 1]
+        x[2 * size] = 1.0
+        if params.kalman:
+            if i == 0:
+                _kalman_gain(state)
+            for j in range(2 * size + 1):
+                w[j] += state.kalman_gain[j] * error
+        else:
+            for j in range(2 * size):
+                w[j] = params.keep * w[j] + 2.0 * params.gain * x[j] * error
+            w[2 * size] += 2.0 * params.bias_gain * error
+
+
+@kernel
+def _kalman_gain(state: Record) -> None:
+    """Gain for the present regressor and the covariance after it; reading noise is the unit."""
+    p, x, gain = state.covariance, state.regressor, state.kalman_gain
+    n = len(x)
+    spread = 1.0
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += p[i, j] * x[j]
+        gain[i] = total
+        spread += total * x[i]
+    for i in range(n):
+        for j in range(i + 1):
+            p[i, j] -= gain[i] * gain[j] / spread
+            p[j, i] = p[i, j]
+    for i in range(n):
+        gain[i] /= spread
+
+
+@kernel
+def bmflc_output(state: Record, axis: int, output: int) -> float:
+    """Tremor m: ``output`` 0 now, 1 over the loop's delay."""
+    total = 0.0
+    for r in range(state.phasor.shape[1]):
+        weight = state.weights[axis, 2 * r + 1] - 1j * state.weights[axis, 2 * r]
+        total += (weight * state.phasor[axis, r] * state.undo[axis, output, r]).real
+    return total

@@ -1,0 +1,39 @@
+"""From what the sensor shows back to displacement, at one frequency: amplitude and phase known and undone.
+
+A sensor sees the tip's displacement (or its second derivative) through the RC filter. At one frequency both are a
+complex factor; its inverse, turned on by the phase that passes in the loop's delay, takes the weights of a Fourier
+model of the samples to displacement ahead.
+"""
+
+from __future__ import annotations
+
+from cmath import exp
+from math import isfinite
+
+import numpy as np
+
+from firmware_py.records import Record, new_record
+from firmware_py.tremor.config import TremorConfig
+from hal.compiled import kernel
+
+SEEN = np.dtype([("tick_hz", "f8"), ("lag_s", "f8"), ("accelerates", "i8"), ("delay_s", "f8")])
+
+
+def seen_params(config: TremorConfig) -> Record:
+    """``lag_s`` is the RC filter's time constant, 0 without one."""
+    return new_record(
+        SEEN,
+        tick_hz=config.tick_hz,
+        lag_s=1.0 / config.filter_cutoff_rad_s if isfinite(config.filter_cutoff_rad_s) else 0.0,
+        accelerates=int(config.sees == "acceleration"),
+        delay_s=config.loop_delay_s,
+    )
+
+
+@kernel
+def undo(omega_rad_s: float, ahead_s: float, seen: Record) -> complex:
+    """Factor from a sample's phasor to the displacement's phasor ``ahead_s`` later."""
+    factor = (1.0 + 1j * omega_rad_s * seen.lag_s) * exp(1j * omega_rad_s * ahead_s)
+    if seen.accelerates:
+        return -factor / (omega_rad_s * omega_rad_s)
+    return factor
