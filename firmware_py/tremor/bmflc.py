@@ -75,7 +75,7 @@ def bmflc_params(config: TremorConfig) -> Record:
         sections=prefilter_sections(config.wflc, config.tick_hz),
         behind_prefilter=int(config.sees == "displacement"),
         omega=2.0 * pi * (c.low_hz + c.step_hz * np.arange(size)) / config.tick_hz,
-        gain=c.gain,
+        gain=c.memory_gain if moves else c.gain,
         bias_gain=c.bias_gain,
         keep=exp(-1.0 / (c.memory_s * config.tick_hz)) if moves else 1.0,
         follow=c.band_gain * FOLLOW_TICKS / config.tick_hz if moves else 0.0,
@@ -94,10 +94,15 @@ def bmflc_state(config: TremorConfig) -> Record:
 def _tune(state: Record, axis: int, params: Record) -> None:
     """Turns and sensor factors of one axis for its present band."""
     rate = params.seen.tick_hz
-    for r in range(len(params.omega)):
+    size = len(params.omega)
+    middle = 0.5 * (params.omega[0] + params.omega[size - 1]) + state.shift[axis]
+    for r in range(size):
         omega = params.omega[r] + state.shift[axis]
         state.turn[axis, r] = cexp(1j * omega)
-        behind = prefilter_gain(params.sections, omega) if params.behind_prefilter else 1.0 + 0.0j
+        behind = 1.0 + 0.0j
+        if params.behind_prefilter:
+            # a short memory smears the tremor over the comb; the band's middle is where it is
+            behind = prefilter_gain(params.sections, middle if params.follow > 0.0 else omega)
         state.undo[axis, 0, r] = undo(omega * rate, 0.0, params.seen) / behind
         state.undo[axis, 1, r] = undo(omega * rate, params.seen.delay_s, params.seen) / behind
 

@@ -69,16 +69,18 @@ class WflcConfig(_Table):
 class BmflcConfig(_Table):
     """Band-limited multiple Fourier linear combiner in its three forms (Veluvolu, Ang 2011).
 
-    ``memory_s`` is the window of E-BMFLC; its band follows the centroid of the weights by ``band_gain`` per second.
+    ``memory_s`` is the window of E-BMFLC, ``memory_gain`` its gain; its band follows the centroid of the weights by
+    ``band_gain`` per second.
     ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise.
     """
 
     low_hz: Positive = 7.0
     high_hz: Positive = 13.0
     step_hz: Positive = 0.5
-    gain: Positive = 0.01
+    gain: Positive = 0.002
+    memory_gain: Positive = 0.01
     bias_gain: Positive = 0.003
-    memory_s: Positive = 1.0
+    memory_s: Positive = 0.3
     band_gain: Positive = 0.5
     walk: Positive = 0.05
 

@@ -103,10 +103,11 @@ def estimator_params(config: TremorConfig) -> Record:
             ("floor2", "f8"),  # m^2
         ]
     )
+    chosen = {"kalman": kalman_params(config)} if config.method == "kalman" else {}
     return new_record(
         dtype,
+        **chosen,
         adaptive=adaptive_params(config, design),
-        kalman=kalman_params(config),
         combiner=combiner_params(config),
         comb=comb,
         ar=ar_params(config),

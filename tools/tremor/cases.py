@@ -1,0 +1,166 @@
+"""A recorded hand as the instrument would meet it: samples at 1 kHz, and the tremor that they hold.
+
+Recorded motion is a Fourier series in time. Its involuntary part is what lies in ``INVOLUNTARY_HZ`` (soft edges, no
+phase); below is the voluntary motion (and the tilt that an accelerometer takes for it). Samples are the whole motion,
+slow part and all, through the sensor's RC filter, with the sensor's noise. Hands differ in size by a factor of 1000
+and the sensor's noise does not: unless told otherwise a hand is scaled to the instrument's 50 um peak to peak.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, lfilter, sosfiltfilt
+
+from firmware_py.tremor.config import TremorConfig
+from tools.errors import InputError
+from tools.reports.tremor_figures import band_pass
+from tools.tremor.signals import TremorSignal
+from tools.tremor.spectrum import highest_line, periodogram
+
+Array = NDArray[np.float64]
+
+RATE_HZ = 1000.0
+INVOLUNTARY_HZ = (2.0, 4.0, 16.0, 20.0)
+TREMOR_RMS_M = 50e-6 / (2.0 * np.sqrt(2.0))
+LEVER_M = 0.15  # an angular rate moves a tip this far away
+TREMOR_SEARCH_HZ = (3.0, 14.0)
+LONGEST_S = 40.0
+_FADE_S = 0.5
+_SIZE_BAND_HZ = (4.0, 13.0)
+
+
+@dataclass(frozen=True)
+class Case:
+    """``samples`` (n, k) in m/s^2 or m as ``sees`` says, ``truth`` (n, k) m: involuntary motion without any sensor.
+
+    ``slow`` (n, k) m: the voluntary path where it is known (synthetic hands), else ``None``.
+    """
+
+    name: str
+    group: str
+    subject: str
+    sees: Literal["acceleration", "displacement"]
+    samples: Array
+    truth: Array
+    frequency_hz: float
+    slow: Array | None = None
+    notes: tuple[str, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        return len(self.samples) / RATE_HZ
+
+
+def case_of(signal: TremorSignal, seed: int = 0, scale: bool = True, noise: bool = True) -> Case:
+    """One recorded signal as a case. Raises InputError when it is no motion (pixels) or holds nothing."""
+    if signal.quantity not in ("acceleration", "angular rate", "displacement"):
+        raise InputError(
+            f"{signal.name}: {signal.quantity} in {signal.unit} is no motion of a hand; choose another signal"
+        )
+    notes: list[str] = []
+    if signal.seconds > LONGEST_S:
+        signal = signal.part(0.0, LONGEST_S)
+        notes.append(f"first {LONGEST_S:g} s")
+    config = TremorConfig()
+    count = round(signal.seconds * RATE_HZ)
+    fade = np.ones(len(signal.values))
+    edge = int(_FADE_S * signal.rate_hz)
+    fade[:edge] = 0.5 - 0.5 * np.cos(np.pi * (np.arange(edge) + 0.5) / edge)
+    fade[-edge:] = fade[:edge][::-1]
+    lines = np.fft.rfft((signal.values - signal.values.mean(axis=0)) * fade[:, None], axis=0)
+    hz = np.fft.rfftfreq(len(signal.values), 1.0 / signal.rate_hz)
+    w = 2.0 * np.pi * np.maximum(hz, hz[1])
+    top = 0.45 * signal.rate_hz
+    if signal.quantity == "acceleration":
+        to_path = -1.0 / w**2
+    elif signal.quantity == "angular rate":
+        to_path = LEVER_M / (1j * w)
+    else:
+        to_path = np.ones(len(w), dtype=np.complex128)
+    path = lines * (to_path * np.clip((top - hz) / (0.1 * top), 0.0, 1.0))[:, None]
+    path[0] = 0.0
+    low, full, fall, none = INVOLUNTARY_HZ
+    band = np.clip((hz - low) / (full - low), 0.0, 1.0) * np.clip((none - hz) / (none - fall), 0.0, 1.0)
+    band = 0.5 - 0.5 * np.cos(np.pi * band)
+    lag = 1.0 / (1.0 + 1j * w / config.filter_cutoff_rad_s)
+
+    def in_time(spectrum: NDArray[np.complex128]) -> Array:
+        return np.asarray(np.fft.irfft(spectrum, count, axis=0) * (count / len(signal.values)))
+
+    truth = in_time(path * band[:, None])
+    samples = in_time(path * (-(w**2) * lag)[:, None])
+    size = band_pass(truth, RATE_HZ, _SIZE_BAND_HZ)
+    rms = float(np.sqrt(np.mean(np.var(size, axis=0))))
+    if rms < 1e-12:
+        raise InputError(f"{signal.name}: nothing moves between {_SIZE_BAND_HZ[0]:g} and {_SIZE_BAND_HZ[1]:g} Hz")
+    factor = TREMOR_RMS_M / rms if scale else 1.0
+    truth, samples = truth * factor, samples * factor
+    if noise:
+        samples = samples + sensor_noise(samples.shape, seed)
+    reference = signal.reference.drive_hz
+    frequency = reference if reference is not None else highest_line(periodogram(truth, RATE_HZ), TREMOR_SEARCH_HZ)
+    cut = slice(edge * 10, count - edge * 10)
+    return Case(
+        signal.name,
+        signal.data_set,
+        signal.subject,
+        "acceleration",
+        samples[cut],
+        truth[cut],
+        float(frequency),
+        notes=tuple(notes),
+    )
+
+
+def sensor_noise(shape: tuple[int, ...], seed: int) -> Array:
+    """m/s^2: white noise of the tip's acceleration behind the RC filter, and quantisation after it."""
+    a, config = TremorConfig().adaptive, TremorConfig()
+    rng = np.random.default_rng(seed)
+    white = a.sensor_noise_m_s2_rtHz * np.sqrt(0.5 * RATE_HZ) * rng.standard_normal(shape)
+    behind = _first_order(white, np.exp(-config.filter_cutoff_rad_s / RATE_HZ))
+    return behind + a.reading_noise_m_s2 * rng.standard_normal(shape)
+
+
+def emulated_hand(seed: int, seconds: float = 30.0) -> Case:
+    """The emulated instrument's stochastic hand; one seed, one person."""
+    from sim_devices.config import HandConfig
+    from sim_devices.plant.hand import SyntheticHand
+
+    hand = SyntheticHand(HandConfig(), seed)
+    n = round(seconds * RATE_HZ)
+    pose, parts = np.zeros((n, 18)), np.zeros((n, 6))
+    hand.fill(pose, parts)
+    lag = TremorConfig().filter_cutoff_rad_s / RATE_HZ
+    acceleration = _first_order(pose[:, 12:15], np.exp(-lag)) + sensor_noise((n, 3), seed + 1000)
+    return Case(
+        f"emulated hand {seed}",
+        "emulated hands",
+        str(seed),
+        "acceleration",
+        acceleration,
+        parts[:, 3:],
+        hand.tremor_frequency_hz,
+        slow=parts[:, :3],
+    )
+
+
+def _first_order(x: Array, keep: float) -> Array:
+    """The RC filter by the trapezoidal rule: no time of its own beyond the filter's."""
+    centred = 0.5 * (1.0 - keep)
+    return np.asarray(lfilter([centred, centred], [1.0, -keep], x, axis=0))
+
+
+def shorter(case: Case, seconds: float) -> Case:
+    """The first ``seconds`` of a case."""
+    n = round(seconds * RATE_HZ)
+    slow = None if case.slow is None else case.slow[:n]
+    return replace(case, samples=case.samples[:n], truth=case.truth[:n], slow=slow)
+
+
+def low_pass(x: Array, hz: float) -> Array:
+    """Without phase."""
+    return np.asarray(sosfiltfilt(butter(4, hz, fs=RATE_HZ, output="sos"), x, axis=0))
