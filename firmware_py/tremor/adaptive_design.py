@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite, pi
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +95,8 @@ def sensor_response(config: TremorConfig, hz: Array) -> Complex:
     """From displacement to sample: RC filter, and -w^2 for an accelerometer."""
     w = 2.0 * pi * hz
     cutoff = config.filter_cutoff_rad_s
-    low_pass: Complex = 1.0 / (1.0 + (1j * w / cutoff if isfinite(cutoff) else 0j * w))
-    return -(w**2) * low_pass if config.sees == "acceleration" else low_pass
+    low_pass = 1.0 / (1.0 + (1j * w / cutoff if isfinite(cutoff) else 0j * w))
+    return _complex(-(w**2) * low_pass if config.sees == "acceleration" else low_pass)
 
 
 def spectra(config: TremorConfig) -> _Spectra:
@@ -139,8 +140,8 @@ def target_taps(config: TremorConfig, block_ticks: int, advance_s: float) -> Arr
 
 def block_response(hz: Array, block_ticks: int, tick_hz: float) -> Complex:
     """Of the mean over a block, timed at its last sample."""
-    lag: Complex = np.exp(-1j * pi * hz * (block_ticks - 1) / tick_hz)
-    return lag * np.sinc(hz * block_ticks / tick_hz) / np.sinc(hz / tick_hz)
+    lag = np.exp(-1j * pi * hz * (block_ticks - 1) / tick_hz)
+    return _complex(lag * np.sinc(hz * block_ticks / tick_hz) / np.sinc(hz / tick_hz))
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:
@@ -148,6 +149,10 @@ def solve_scaled(matrix: Array, right: Array) -> Array:
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-9 * np.eye(len(matrix))
     return np.asarray(np.linalg.solve(scaled, (right * scale).T).T * scale)
+
+
+def _complex(x: Any) -> Complex:
+    return np.asarray(x, dtype=np.complex128)
 
 
 def _polynomial(coefficients: Array, x: Complex) -> Complex:
@@ -162,10 +167,10 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     block = max(1, round(a.block_s * config.tick_hz))
     s = spectra(config)
     w = 2.0 * pi * s.hz
-    z = np.exp(1j * w / config.tick_hz)
+    z = _complex(np.exp(1j * w / config.tick_hz))
     b, denominator = (np.asarray(c, dtype=np.float64) for c in iirpeak(a.emphasis_hz, a.emphasis_q, fs=config.tick_hz))
     numerator = denominator + (a.emphasis - 1.0) * b
-    back: Complex = 1.0 / z
+    back = _complex(1.0 / z)
     weight = _polynomial(numerator, back) / _polynomial(denominator, back)
     plain = bank.response(z)
     phi = plain * weight

@@ -36,7 +36,7 @@ def bank_features(samples: Array, design: AdaptiveDesign) -> Array:
     """(n, m) features of ``samples`` (n,)."""
     columns: list[Array] = []
     for pole in design.bank.pole:
-        z = np.asarray(lfilter([1.0 - abs(pole)], [1.0, -pole], samples.astype(np.complex128)))
+        z = np.asarray(lfilter([1.0 - abs(pole)], [1.0, -pole], samples.astype(np.complex128)), dtype=np.complex128)
         columns += [z.real, z.imag]
     columns += [np.asarray(lfilter([1.0 - keep], [1.0, -keep], samples)) for keep in design.bank.slow]
     return np.stack([*columns, samples], axis=1)
