@@ -14,7 +14,7 @@ from typing import Any
 from firmware_py.app import RunRequest, run_in_process
 from tools.reports.tremor_figures import TremorFigures, tremor_figures
 
-METHODS = ("kalman", "wflc_flc")
+METHODS = ("adaptive", "kalman", "wflc_flc")
 SETTLE_S = 2.0
 HANDS = (
     ("physiological tremor of a stretched arm", "tremor_duke_adxl345/data.npz#arm_extended_no_tremor"),
