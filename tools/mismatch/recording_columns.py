@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import itertools
 import json
 import zipfile
 from collections.abc import Mapping
@@ -91,9 +92,17 @@ def _csv(path: Path, names: list[str]) -> dict[str, Array]:
                 if header.count(name) > 1:
                     raise RecordingError(f"{path}: line 1: column '{name}' appears twice; rename one")
             use = [header.index(n) for n in names]
+            if not (rest := f.readlines(1)):
+                raise RecordingError(f"{path}: a header and no samples")
             try:
                 data = np.loadtxt(
-                    f, delimiter=delimiter, usecols=use, ndmin=2, comments=None, quotechar='"', dtype=np.float64
+                    itertools.chain(rest, f),
+                    delimiter=delimiter,
+                    usecols=use,
+                    ndmin=2,
+                    comments=None,
+                    quotechar='"',
+                    dtype=np.float64,
                 )
             except ValueError as error:
                 raise RecordingError(f"{path}: {_first_bad_line(path, delimiter, header, use) or error}") from None

@@ -17,6 +17,8 @@ from tools.mismatch.recording_columns import read_columns
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
 
 MIN_SAMPLES = 50
+MIN_SPAN = 30  # samples of a [split] range
+MOST_SIZE = 1e100  # of any value: squares must stay finite
 _TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
 _CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution"}
 
@@ -81,6 +83,11 @@ def load_recording(path: Path) -> Recording:
     parts: dict[str, dict[str, Array]] = {"input": {}, "output": {}, "context": {}}
     for c in channels:
         values = units.convert(columns[c.column], c.unit, c.to)
+        size = float(np.max(np.abs(values)))
+        if size > MOST_SIZE or 0 < size < 1 / MOST_SIZE:
+            raise RecordingError(
+                f"{data_path}: column '{c.column}' reaches {size:g} {c.to}; the unit or the data are wrong"
+            )
         if np.ptp(values) == 0.0:
             if c.role == "output":
                 raise RecordingError(
@@ -303,6 +310,21 @@ def _same_data(path: Path, channels: list[_Channel], columns: dict[str, Array], 
                 notes.append(f"columns '{b.column}' and '{a.column}' hold the same numbers")
 
 
+def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initialization: int) -> None:
+    """Ranges that a fit and a score can stand on, and that do not share samples."""
+    for key, skip in (("fit", 0), ("test", initialization)):
+        span = found.get(key)
+        if isinstance(span, tuple) and span[1] - span[0] - skip < MIN_SPAN:
+            raise RecordingError(
+                f"{path}: [split] {key}: {span[1] - span[0] - skip} samples to go by; at least {MIN_SPAN} are needed"
+            )
+        if isinstance(span, Path) and span.resolve() == path.resolve():
+            raise RecordingError(f"{path}: [split] {key} names this recording itself; give a range of samples")
+    fit, test = found.get("fit"), found.get("test")
+    if isinstance(fit, tuple) and isinstance(test, tuple) and fit[0] < test[1] and test[0] < fit[1]:
+        raise RecordingError(f"{path}: [split] fit {list(fit)} and test {list(test)} share samples")
+
+
 def _split(path: Path, value: object, n: int) -> Split:
     if value is None:
         return Split()
@@ -324,5 +346,6 @@ def _split(path: Path, value: object, n: int) -> Split:
             found[key] = (v[0], v[1])
         else:
             raise RecordingError(f"{at} must be [start, stop] in samples or the name of another .toml, got {v!r}")
+    _enough(path, found, initialization or 0)
     others = {k: v for k, v in found.items() if k not in ("fit", "test")}
     return Split(found.get("fit"), found.get("test"), others, initialization)

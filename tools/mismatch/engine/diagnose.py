@@ -30,16 +30,29 @@ from tools.mismatch.twins.make import make
 
 Progress = Callable[[str, int, int], None]
 
+LEAST_PART = 30  # samples of a part that can be fitted or scored
+
 
 def make_split(recording: Recording, held_out: float, seed: int, restart: bool) -> Split:
     """The recording's own split when it brings one, else ours: few segments for a twin that starts each afresh."""
-    given = recording.split
-    if isinstance(given.test, tuple):
-        fit_span = given.fit if isinstance(given.fit, tuple) else (0, given.test[0])
-        return given_split(recording.n, fit_span, given.test, initialization=given.initialization or 0)
+    given = ranges_of(recording)
+    if given is not None:
+        return given_split(recording.n, *given, initialization=recording.split.initialization or 0)
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
     guard = max(4, recording.n // 2000)
     return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6)
+
+
+def ranges_of(recording: Recording) -> tuple[tuple[int, int], tuple[int, int]] | None:
+    """Fit and test range that the recording brings; for one alone, the longer rest is the other. None: own split."""
+    fit, test, n = recording.split.fit, recording.split.test, recording.n
+    given = next((r for r in (test, fit) if isinstance(r, tuple)), None)
+    if given is None:
+        return None
+    rest = max((0, given[0]), (given[1], n), key=lambda r: r[1] - r[0])
+    span = fit if isinstance(fit, tuple) else rest
+    held = test if isinstance(test, tuple) else rest
+    return (span, held) if min(span[1] - span[0], held[1] - held[0]) >= LEAST_PART else None
 
 
 def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
@@ -150,7 +163,7 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     """The problem with its noise floors, the twin as given and recalibrated."""
     twin = make(recording)
     init = recording.split.initialization or 0
-    own = not isinstance(recording.split.test, tuple)
+    own = ranges_of(recording) is None
     if own:
         twin, init = free_run(recording, twin)
     split = make_split(recording, held_out, seed, twin.restart)
@@ -160,6 +173,9 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     if not own and twin.restart:
         init = max(init, 20)
         split = shot(split, init)
+    else:
+        # of a short record something must be left to score
+        init = min(init, min(b - a for a, b in split.held_out) // 3)
     problem = Problem(recording, twin, split, init, seed)
     raw = as_given(problem)
     rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}

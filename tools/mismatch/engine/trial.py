@@ -24,6 +24,7 @@ LEAST_FITS = 3  # per output, whatever their share
 MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
+PARALLEL_WORK = 4_000_000  # samples times candidates above which processes pay
 TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is accepted is fitted on every row
 
 
@@ -132,7 +133,7 @@ def try_all(
     what: str = "candidates",
 ) -> list[Trial]:
     """Every candidate screened, the hopeful ones fitted. The answer does not depend on ``jobs``."""
-    heavy = problem.recording.n * len(problem.twin.outputs) * len(candidates) > 4_000_000
+    heavy = problem.recording.n * len(problem.twin.outputs) * len(candidates) > PARALLEL_WORK
     parallel = Parallel(n_jobs=jobs, return_as="generator") if jobs > 1 and heavy else None
 
     def run(function: Callable[..., Any], items: Sequence[Any], extra: tuple[Any, ...], label: str) -> list[Any]:

@@ -59,7 +59,7 @@ def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
     return plans, kinds
 
 
-BATCH = 12
+BATCH = 4
 
 
 def _batch(

@@ -142,7 +142,7 @@ def _while_felt(free: Array, window: int) -> Array:
 class StartState:
     """Sets the state at each start by least squares over the first measured samples, for every column alike.
 
-    ``free[o]`` (while it is felt, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
+    ``free[o]`` (while felt, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
     free responses over the window.
     """
 

@@ -158,7 +158,7 @@ def _one(recording: Recording, value: object, name: str, output: str, i: int) ->
     if value is None:
         return float("nan")
     if isinstance(value, Mapping):
-        value = value.get(output, value.get(output[-1], float("nan")))
+        value = value.get(output, value.get(output[-1]))
     elif isinstance(value, Sequence) and not isinstance(value, str):
         if len(value) != len(recording.outputs):
             raise RecordingError(
@@ -166,8 +166,8 @@ def _one(recording: Recording, value: object, name: str, output: str, i: int) ->
                 f" expected one or {len(recording.outputs)}"
             )
         value = value[i]
+    if value is None:
+        return float("nan")
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-        if isinstance(value, float) and np.isnan(value):
-            return float("nan")
         raise RecordingError(f"{recording.path}: [twin.parameters] {name} must be a finite number, got {value!r}")
     return float(value)
