@@ -116,7 +116,7 @@ def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Sp
     return Split(n, (fit,), held, cut(held, 30), cut((fit,), 48), own=False)
 
 
-def shot(split: Split, init: int, pieces: int = 8) -> Split:
+def shot(split: Split, init: int, pieces: int = 24) -> Split:
     """The same parts in about ``pieces`` stretches each, for a twin that starts every stretch afresh (multiple
     shooting: Bock, Springer Series in Chemical Physics 18, 1981). The free run of an integrator over a whole record
     says more about its start than about its physics.
@@ -126,7 +126,7 @@ def shot(split: Split, init: int, pieces: int = 8) -> Split:
         total = sum(b - a for a, b in spans)
         out: list[Span] = []
         for a, b in spans:
-            parts = max(1, round(pieces * (b - a) / max(total, 1)))
+            parts = max(1, min(round(pieces * (b - a) / max(total, 1)), (b - a) // (6 * init + 60)))
             edges = np.linspace(a, b, parts + 1).astype(int)
             out += [(int(p) + (skip if p != a else 0), int(q)) for p, q in itertools.pairwise(edges)]
         return tuple(s for s in out if s[1] - s[0] > 2 * init + 16)
