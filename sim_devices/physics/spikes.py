@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parts, Settings, Signature
-from sim_devices.physics.statistics import robust_rms, smooth, whiten
+from sim_devices.physics.statistics import after_jumps, robust_rms, smooth, whiten
 
 MOST_SHARE = 0.05  # of all samples; more is not "short and isolated"
 THRESHOLD = 6.0
@@ -56,8 +56,17 @@ def _where(ctx: Context, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
     return residual, ctx.keep
 
 
+def not_driven(bursts: list[tuple[int, int, float]], ctx: Context) -> list[tuple[int, int, float]]:
+    """Bursts less those that begin at a jump of a signal, when more do so than chance has it: a response."""
+    lively = after_jumps(ctx.signals.values(), ctx.t.size, 0.1)
+    at = np.array([lively[min(a + 2, lively.size - 1)] for a, _, _ in bursts], np.bool_)
+    if at.sum() <= max(1.0, 3.0 * float(lively.mean()) * len(bursts)):
+        return bursts
+    return [b for b, driven in zip(bursts, at, strict=True) if not driven]
+
+
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    bursts = find_bursts(*_where(ctx, residual))
+    bursts = not_driven(find_bursts(*_where(ctx, residual)), ctx)
     return {
         "starts": tuple(float(b[0]) for b in bursts),
         "stops": tuple(float(b[1]) for b in bursts),
@@ -85,7 +94,7 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _test(x: Array, residual: Array, ctx: Context) -> Signature:
     """Bursts beyond what heavy tails of the rest allow: Student-t with 4 degrees of freedom as the null."""
     keep = ctx.keep
-    bursts = find_bursts(residual, keep)
+    bursts = not_driven(find_bursts(residual, keep), ctx)
     if not bursts:
         return Signature(1.0, 0.0, "no burst")
     taken = np.zeros(residual.size, np.bool_)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,6 +57,28 @@ def _fences(x: Array) -> tuple[float, float]:
         return (-np.inf, np.inf)
     m, s = float(np.median(x)), robust_rms(x)
     return (m - 6 * s, m + 6 * s) if s > 0 else (-np.inf, np.inf)
+
+
+def jumps(x: Array) -> NDArray[np.int64]:
+    """Samples at which a signal that is quiet otherwise has jumped: the levels of a staircase, a saw's flyback."""
+    d = np.abs(np.diff(x))
+    if d.size == 0:
+        return np.zeros(0, np.int64)
+    return np.flatnonzero(d > max(10.0 * float(np.quantile(d, 0.9)), 0.02 * float(np.ptp(x)))) + 1
+
+
+def after_jumps(signals: Iterable[Array], n: int, most: float = 0.2) -> Bool:
+    """(n,) true in a short stretch after each jump of any signal, one sample before included; all stretches
+    together are no more than about ``most`` of the record.
+    """
+    out = np.zeros(n, np.bool_)
+    every = [j for x in signals for j in jumps(x)]
+    if not every:
+        return out
+    width = int(np.clip(most * n / len(every), 2, 50))
+    for j in every:
+        out[max(0, j - 1) : j + width] = True
+    return out
 
 
 def long_run_rms(x: Array, blocks: int = 64) -> float:

@@ -21,7 +21,7 @@ from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
-from tools.mismatch.engine.unexplained import leftover, stranger
+from tools.mismatch.engine.unexplained import about, leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
@@ -144,7 +144,9 @@ def _diagnose(
     strange = selection.strange
     if strange is None:
         said = {t.name for t in selection.steps}
-        strange = next((f for o in twin.outputs if (f := stranger(problem, base, selection.fitted, o, said))), None)
+        known = {s for t in selection.first if t.fitted is not None for s in about(t.placed.effect)}
+        found = (stranger(problem, base, selection.fitted, o, said) for o in twin.outputs)
+        strange = next((f for f in found if f is not None and f.signal not in known), None)
         if strange is not None:
             # the effects only imitated it: nothing is named
             selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_devices.physics.statistics import after_jumps
 from tools.mismatch.engine.noise import NoiseFloor
 from tools.mismatch.engine.split import Span, Split
 from tools.mismatch.recording import Recording
@@ -97,6 +98,11 @@ class Problem:
     @cached_property
     def fit_spans(self) -> list[Span]:
         return self.rows(self.split.fit)
+
+    @cached_property
+    def lively(self) -> NDArray[np.bool_]:
+        """Rows of the view shortly after a jump of an input: what is far out there is a response and no outlier."""
+        return after_jumps(self.recording.inputs.values(), self.recording.n)[self.index]
 
     @cached_property
     def measured(self) -> dict[str, Array]:

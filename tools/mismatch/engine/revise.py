@@ -118,7 +118,10 @@ def simplify_pass(
         mine = size(placed)
         now = misfits(problem, fitted)
         room = sum(max(now[o] - 1.0, 0.0) for o in placed.outputs)
-        taken = sum(max(start[o] - now[o], 0.0) for o in placed.outputs)
+        with np.errstate(all="ignore"):
+            rest = reduced(problem, fitted, k)
+        without = misfits(problem, rest) if held else start
+        taken = sum(max(without[o] - now[o], 0.0) for o in placed.outputs)
         limit = tie * room + 0.02 + shape * taken
         elsewhere = {p.effect.name for p in held}
         order = sorted(enumerate(pool), key=lambda r: (r[1].effect.name not in elsewhere, size(r[1]), r[0]))
@@ -135,7 +138,7 @@ def simplify_pass(
             if tried > most:
                 break
             with np.errstate(all="ignore"):
-                candidate = replaced(problem, fitted, k, rival)
+                candidate = added(problem, rest, rival)
             after = misfits(problem, candidate)
             left = sum(max(after[o] - 1.0, 0.0) for o in placed.outputs)
             if candidate.ok and left <= limit:

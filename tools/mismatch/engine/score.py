@@ -15,7 +15,8 @@ from tools.mismatch.engine.problem import Problem
 Array = NDArray[np.float64]
 Span = tuple[int, int]
 
-CLIP = 6.0
+CLIP = 30.0  # robust scales; the same outlier in two models cancels in their difference
+CLIP_WHITE = 8.0
 
 
 @dataclass(frozen=True)
@@ -57,10 +58,11 @@ class Comparison:
         return float(norm.logsf(self.z))
 
 
-def winsorised(r: Array, floor: float) -> Array:
-    """Residual with outliers pulled in to six robust scales."""
+def winsorised(r: Array, floor: float, lively: NDArray[np.bool_] | None = None) -> Array:
+    """Residual with outliers pulled in to thirty robust scales, but for samples that answer a jump of the input."""
     limit = CLIP * robust_scale(r, floor)
-    return np.clip(r, -limit, limit)
+    clipped = np.clip(r, -limit, limit)
+    return clipped if lively is None else np.where(lively, r, clipped)
 
 
 def held_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
@@ -79,7 +81,7 @@ def block_energy(problem: Problem, fitted: Fit, blocks: list[Span]) -> Array:
     """Mean square over noise variance per block (blocks, outputs), outliers pulled in."""
     out = np.empty((len(blocks), len(problem.twin.outputs)))
     for j, o in enumerate(problem.twin.outputs):
-        r = winsorised(fitted.residual[o], problem.sigma(o)) / problem.sigma(o)
+        r = winsorised(fitted.residual[o], problem.sigma(o), problem.lively) / problem.sigma(o)
         for i, (a, b) in enumerate(blocks):
             out[i, j] = float(np.mean(r[a:b] ** 2)) if b > a else 0.0
     return out
@@ -91,7 +93,8 @@ def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
     out: dict[str, float] = {}
     for o in problem.twin.outputs:
         s = problem.sigma(o)
-        out[o] = float(np.mean((winsorised(fitted.residual[o][rows], s) / s) ** 2)) if fitted.ok else np.inf
+        r = winsorised(fitted.residual[o][rows], s, problem.lively[rows])
+        out[o] = float(np.mean((r / s) ** 2)) if fitted.ok else np.inf
     return out
 
 
@@ -135,7 +138,9 @@ def direction_z(
         white = whiten(f, r, usable)
         moved = whiten(f, d, usable)
         s = 1.4826 * float(np.median(np.abs(white))) or 1.0
-        white = np.clip(white / s, -CLIP, CLIP)
+        white = white / s
+        lively = np.concatenate([problem.lively[a + f.warm_up : b] for a, b in usable])
+        white = np.where(lively, white, np.clip(white, -CLIP_WHITE, CLIP_WHITE))
         spread = max(float(np.std(white)), 1.0)
         top += float(white @ moved) / (s * spread)
         bottom += float(moved @ moved) / s**2

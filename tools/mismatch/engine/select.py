@@ -10,11 +10,11 @@ import numpy as np
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import pair_search, prune, simplify_pass, size, swap_pass
-from tools.mismatch.engine.score import block_energy, misfits, paired_t
-from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.revise import added, pair_search, prune, simplify_pass, size, swap_pass, total
+from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
+from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
-from tools.mismatch.engine.unexplained import Stranger, stranger
+from tools.mismatch.engine.unexplained import Stranger, about, stranger
 from tools.mismatch.simulate import Model, Placed
 
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
@@ -25,20 +25,36 @@ class Rule:
     """The margins of a decision; calibrated on null simulations (docs/mismatch-calibration.md).
 
     ``z`` whitened held-out correlation in standard deviations, over all candidates and places; ``gain`` least
-    share of the mean square; ``excess`` least share of what stands above the noise; ``form`` share of what is
-    already explained below which a leftover counts as the accepted effect's own form; ``tie`` excess of a rival
-    relative to the best at which fewer parameters win, ``shape`` share of what is explained that the form of a
-    model may cost on top; ``p_tested`` for effects with a test of their own.
+    share of the mean square; ``excess`` least share of what stands above the noise; ``form`` times
+    ``own_form`` the share of what is explained below which a leftover counts as the accepted effect's own; ``tie``
+    excess of a rival relative to the best at which fewer parameters win, ``shape`` share of what is explained that
+    the form of a model may cost on top; ``p_tested`` for effects with a test of their own.
     """
 
     z: float = 5.5
     gain: float = 0.04
     excess: float = 0.25
-    form: float = 0.05
+    form: float = 1.0
     tie: float = 1.3
     shape: float = 0.004
     p_tested: float = 1e-7
     most: int = 4
+
+
+EXACT = frozenset(
+    (
+        "dead_time", "channel_delay", "clock_skew", "dropped_samples", "first_order_lag", "misalignment", "soft_iron",
+        "mains_interference", "vibration", "step_shift", "centripetal_acceleration", "sensor_position_error",
+        "current_coupling",
+    )
+)  # fmt: skip
+"""Effects of which there is one form: what they leave is something else."""
+LOOSE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "random_walk", "stribeck_friction"))
+
+
+def own_form(names: Iterable[str]) -> float:
+    """Share of what the named effects took that their true form may leave over."""
+    return max((0.004 if n in EXACT else 0.05 if n in LOOSE else 0.015 for n in names), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -56,10 +72,10 @@ class Selection:
     """A context signal whose free curve does better than the next effect would have done: the search ended there."""
 
 
-def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
+def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
     """May this effect be named at all: better on held-out data by more than chance and by more than a trifle.
 
-    ``explained``: mean square over noise variance that earlier effects took on the same outputs.
+    ``taken``: mean square over noise variance that the form of earlier effects may leave on the same outputs.
     """
     c = trial.comparison
     if trial.fitted is None or c is None or not trial.fitted.ok:
@@ -69,7 +85,11 @@ def acceptable(trial: Trial, rule: Rule, explained: float) -> bool:
         return (p < rule.p_tested and share > 0.2) or (share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
-    return c.z > rule.z and c.gain > rule.gain and c.excess_gain > rule.excess and c.improvement > rule.form * explained
+    if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess:
+        return False
+    # what the form of an earlier effect leaves over, no other effect explains down to the noise
+    clean = max(c.after.values(), default=np.inf) < 1.25 and c.gain > 0.4 and c.z > 2 * rule.z
+    return c.improvement > taken or (clean and trial.name not in LOOSE)
 
 
 def search(
@@ -95,11 +115,19 @@ def search(
     decoupled = bool(getattr(problem.twin, "static", False))
     while len(steps) < rule.most * len(problem.twin.outputs):
         now = misfits(problem, current)
+        form = {
+            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in p.outputs)
+            * max(start[o] - now[o], 0.0)
+            for o in now
+        }  # fmt: skip
         pool = [
             p
             for p in places(problem, effects, current.model.placed)
             if p.effect.claims is not None
-            or any(now[o] - 1 > max(0.5 * rule.gain, rule.form * (start[o] - now[o])) for o in p.outputs)
+            or any(
+                now[o] - 1 > max(0.5 * rule.gain, form[o] if p.effect.name in LOOSE else min(form[o], 0.5))
+                for o in p.outputs
+            )
         ]
         todo = [p for p in pool if _key(p) not in known]
         for t in try_all(
@@ -109,7 +137,7 @@ def search(
         trials = [known[_key(p)] for p in pool]
         if not steps:
             first = tuple(trials)
-        good = [t for t in trials if acceptable(t, rule, sum(max(start[o] - now[o], 0.0) for o in t.placed.outputs))]
+        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in t.placed.outputs))]
         if not good and not steps and max(now.values()) > WORTH_A_PAIR:
             pair = pair_search(problem, current, trials, z=rule.z + 1, gain=rule.gain)
             if pair is None:
@@ -130,16 +158,87 @@ def search(
         found = (stranger(problem, current, refined.fitted, o, (best.name,)) for o in best.placed.outputs)
         strange = next((f for f in found if f is not None), None)
         if strange is not None:
-            break
+            served = [t for t in good if serves(t, strange)]
+            if not served:
+                break
+            # a context signal that the vocabulary knows: its own effect first
+            best = choose(served, rule, now, frozenset(t.name for t in steps))
+            refined, strange = refine(problem, current, best), None
+            assert refined.fitted is not None
         steps.append(refined)
         shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
         rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))
         current = refined.fitted
         touched = set(best.placed.outputs)
         known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
+    if steps and steps[0].name in FLEXIBLE:
+        parted = part_flexible(problem, base, steps[0], first)
+        if parted is not None:
+            fitted, two = parted
+            if len(steps) == 1 or total(problem, fitted) <= total(problem, current) + 0.05:
+                current, steps, rivals = fitted, list(two), [(steps[0], *rivals[0]), ()]
     if len(steps) > 1:
         current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, first, rule)
     return Selection(base, current, tuple(steps), tuple(rivals), first, strange)
+
+
+FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
+
+
+def part_flexible(
+    problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial]
+) -> tuple[Fit, tuple[Trial, Trial]] | None:
+    """Two specific effects in place of one flexible family that took both of them; None when no two do as well."""
+    outputs = flexible.placed.outputs
+    excess = sum(max(flexible.misfits[o] - 1.0, 0.0) for o in outputs)
+    limit = 0.5 * excess if excess > 0.1 else excess
+    specific = [
+        t
+        for t in first
+        if t.fitted is not None and t.fitted.ok and t.placed.effect.claims is None
+        and t.name not in LOOSE and size(t.placed) <= 5 and set(t.placed.outputs) & set(outputs)
+    ]  # fmt: skip
+    specific.sort(key=lambda t: (sum(t.misfits[o] for o in outputs if o in t.misfits), t.label))
+    best: tuple[float, Fit, tuple[Trial, Trial]] | None = None
+    for one in specific[:2]:
+        assert one.fitted is not None
+        beside = [
+            p
+            for p in places(problem, [t.placed.effect for t in first if t.name not in LOOSE], one.fitted.model.placed)
+            if p.effect.claims is None and p.effect.test is None and set(p.outputs) & set(outputs)
+        ]
+        unique = list({_key(p): p for p in beside}.values())
+        with np.errstate(all="ignore"):
+            bends = bend(problem, one.fitted)
+            looked = [one_step(problem, one.fitted, p, bends) for p in unique]
+        looked.sort(key=lambda c: (-c.share, c.placed.label))
+        for other in [c for c in looked if c.share > 0.3][:2]:
+            both = added(problem, one.fitted, other.placed)
+            value = misfits(problem, both)
+            left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
+            if both.ok and left <= limit and (best is None or left < best[0]):
+                energy = block_energy(problem, both, problem.held_blocks)
+                second = Trial(
+                    both.model.placed[-1],
+                    other,
+                    both,
+                    compare(problem, one.fitted, both),
+                    value,
+                    energy,
+                    0,
+                    one.outputs,
+                )
+                head = replace(one, fitted=both, misfits=value, energy=energy)
+                best = (left, both, (head, second))
+    return None if best is None else (best[1], best[2])
+
+
+def serves(trial: Trial, found: Stranger) -> bool:
+    """Is a trial about a context signal, and no worse than twice a free curve of it."""
+    if found.signal not in about(trial.placed.effect) or found.output not in trial.misfits or trial.comparison is None:
+        return False
+    before = trial.comparison.before.get(found.output, 1.0)
+    return trial.misfits[found.output] - 1 < 2.0 * max((1 - found.share) * before - 1, 0.1) + 0.05 * before
 
 
 def second_thoughts(

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.dependence import Dependence, dependences
 from tools.mismatch.engine.features import Feature, curve, rate_of, standard
 from tools.mismatch.engine.fit import Fit
@@ -42,7 +43,7 @@ def leftover(
 ) -> Leftover:
     """Judge what one output has left."""
     s = problem.sigma(output)
-    r = winsorised(fitted.residual[output][problem.held_rows], s)
+    r = winsorised(fitted.residual[output][problem.held_rows], s, problem.lively[problem.held_rows])
     ratio = float(np.mean((r / s) ** 2))
     found, memory = follow(problem, fitted, output)
     said = [d for d in found if d.p_value < p_limit and d.strength > least]
@@ -72,6 +73,11 @@ class Stranger:
     feature: str
     share: float
     p_value: float
+
+
+def about(effect: Effect) -> tuple[str, ...]:
+    """Recorded conditions that an effect is about."""
+    return ("actuator_current", "current") if effect.name == "current_coupling" else effect.needs
 
 
 def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> list[Feature]:
@@ -115,15 +121,19 @@ def stranger(
     Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
     these (``said``) are shapeless, which imitate whatever changes, it may leave up to twice as much.
     """
-    used = {s for p in after.model.placed if output in p.outputs for s in p.effect.needs}
+    used = {s for p in after.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
     said = set(said)
     if not names or not said:
         return None
     s = problem.sigma(output)
     rows = problem.held_rows
-    start = float(np.mean((winsorised(before.residual[output][rows], s) / s) ** 2))
-    end = float(np.mean((winsorised(after.residual[output][rows], s) / s) ** 2))
+
+    def level(fitted: Fit) -> float:
+        r = winsorised(fitted.residual[output][rows], s, problem.lively[rows])
+        return float(np.mean((r / s) ** 2))
+
+    start, end = level(before), level(after)
     if end < 1.15:
         return None
     e = thinned(problem, before, output)[0]
