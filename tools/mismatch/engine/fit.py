@@ -89,7 +89,7 @@ class _Projected:
             r = residual[o][self.rows]
             s = robust_scale(r, self.problem.sigma(o))
             robust = np.sqrt(huber_weights((r - np.median(r)) / s))
-            robust[self.problem.lively[self.pick]] = 1.0
+            robust[self.problem.lively[self.rows]] = 1.0
             self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
 
     def evaluate(self, theta: Array) -> tuple[Array, Array]:

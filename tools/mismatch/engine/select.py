@@ -158,13 +158,16 @@ def search(
         found = (stranger(problem, current, refined.fitted, o, (best.name,)) for o in best.placed.outputs)
         strange = next((f for f in found if f is not None), None)
         if strange is not None:
-            served = [t for t in good if serves(t, strange)]
-            if not served:
+            signal = strange.signal
+            own = [t for t in good if signal in about(t.placed.effect) and strange.output in t.placed.outputs]
+            if not any(signal in about(t.placed.effect) for t in trials) or (own and not serves(own[0], strange)):
                 break
-            # a context signal that the vocabulary knows: its own effect first
-            best = choose(served, rule, now, frozenset(t.name for t in steps))
-            refined, strange = refine(problem, current, best), None
-            assert refined.fitted is not None
+            strange = None
+            if own:
+                # a context signal that the vocabulary knows: its own effect first
+                best = choose(own, rule, now, frozenset(t.name for t in steps))
+                refined = refine(problem, current, best)
+                assert refined.fitted is not None
         steps.append(refined)
         shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
         rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))

@@ -80,9 +80,9 @@ def about(effect: Effect) -> tuple[str, ...]:
     return ("actuator_current", "current") if effect.name == "current_coupling" else effect.needs
 
 
-def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> list[Feature]:
+def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> tuple[list[Feature], Array]:
     """What a context signal may do that no effect is about: an offset by a curve of it, and that curve times the
-    drive, the plant's motion, or the rate of either.
+    drive, the plant's motion, or the rate of either. And what these do on their own (n, k): such products hold it too.
     """
     _, signals, dt = thinned(problem, before, output)
     movers: dict[str, Array] = {}
@@ -103,7 +103,11 @@ def context_features(problem: Problem, before: Fit, output: str, names: Iterable
             found.append(Feature(name, "cross product", np.column_stack([bend, *gains])))
             found.append(Feature(name, "cross product with rate", np.column_stack([bend, *gains, *slopes])))
         found.append(Feature(name, "rate", np.column_stack([bend, curve(rate_of(signals[name], dt), 4)])))
-    return found
+    n = next(iter(signals.values())).size
+    own = [np.ones((n, 1))]
+    for m in movers.values():
+        own += [m[:, None], standard(rate_of(m, dt))[:, None]]
+    return found, np.column_stack(own)
 
 
 def block_means(x: Array, dt: float, problem: Problem) -> Array:
@@ -119,7 +123,7 @@ def stranger(
     """Does a free curve of a context signal explain what the effects between ``before`` and ``after`` do not?
 
     Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
-    these (``said``) are shapeless, which imitate whatever changes, it may leave up to twice as much.
+    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much.
     """
     used = {s for p in after.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
@@ -137,16 +141,21 @@ def stranger(
     if end < 1.15:
         return None
     e = thinned(problem, before, output)[0]
+    features, own = context_features(problem, before, output, names)
+    size = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
+    beyond = e - own @ (np.linalg.lstsq(own / size, e, rcond=1e-8)[0] / size)
+    part = float(np.var(beyond) / max(float(np.var(e)), 1e-300))
     best: Stranger | None = None
-    for d in dependences(e, context_features(problem, before, output, names), own_colour=True):
-        left = (1 - d.strength) * start
-        limit = (2.0 if said <= SHAPELESS else 1.0) * (end - 1)
+    for d in dependences(beyond, features, own_colour=True):
+        share = d.strength * part
+        left = (1 - share) * start
+        limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
         # the plainest feature that comes close to the best
         close = best is None or (
-            best.signal == d.signal and d.strength > 0.95 * best.share and plainer(d.feature, best.feature)
+            best.signal == d.signal and share > 0.95 * best.share and plainer(d.feature, best.feature)
         )
         if d.p_value < p_limit and left - 1 < limit and close:
-            best = Stranger(output, d.signal, d.feature, d.strength, d.p_value)
+            best = Stranger(output, d.signal, d.feature, share, d.p_value)
     return best
 
 
