@@ -13,6 +13,7 @@ from tools.cli import (
     doctor,
     endoscope,
     hands,
+    imu,
     mismatch,
     noise,
     placement,
@@ -60,6 +61,7 @@ app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.add_typer(calibrate.calibrate, name="calibrate")
 app.add_typer(endoscope.endoscope, name="endoscope")
+app.add_typer(imu.imu, name="imu")
 app.add_typer(mismatch.app, name="mismatch")
 app.add_typer(tremor.app, name="tremor")
 

@@ -131,9 +131,9 @@ def gyroscope_mean(series: Series) -> Array:
 
 
 def moved(series: Series) -> str | None:
-    """Why the sensor cannot have lain still, or None: its mean over half seconds wanders more than 30 mg or 3 deg/s."""
+    """Why the sensor cannot have lain still, or None: its mean over half seconds jumps by more than 50 mg or 3 deg/s."""
     blocks = max(2, int(series.seconds / 0.5))
-    for data, limit, unit in ((series.accel_g, 0.03, "g"), (series.gyro_dps, 3.0, "deg/s")):
+    for data, limit, unit in ((series.accel_g, 0.05, "g"), (series.gyro_dps, 3.0, "deg/s")):
         if data is None:
             continue
         means = np.array([part.mean(axis=0) for part in np.array_split(data, blocks)])
