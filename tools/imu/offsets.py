@@ -131,7 +131,7 @@ def gyroscope_mean(series: Series) -> Array:
 
 
 def moved(series: Series) -> str | None:
-    """Why the sensor cannot have lain still, or None: its mean over half seconds jumps by more than 50 mg or 3 deg/s."""
+    """Why the sensor cannot have lain still, or None: means of half seconds jump by more than 50 mg or 3 deg/s."""
     blocks = max(2, int(series.seconds / 0.5))
     for data, limit, unit in ((series.accel_g, 0.05, "g"), (series.gyro_dps, 3.0, "deg/s")):
         if data is None:
