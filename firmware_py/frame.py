@@ -84,6 +84,8 @@ class FrameStatus(IntFlag):
     RESTARTED = 64  # a gap was too long to coast over: alignment starts again
     COMMANDED = 128  # the newest scan of its tick, and the outputs were free to move: a command was computed
     MANUAL = 256  # the command was chosen by hand (bench page), not computed
+    JERK = 512  # the hand twitches: a burst between voluntary motion and tremor
+    DRIFT = 1024  # acceleration has stayed away from zero: bias or attitude drifts
 
 
 class Clip(IntFlag):
@@ -171,6 +173,8 @@ INVALID = int(FrameStatus.INVALID)
 ALIGNING = int(FrameStatus.ALIGNING)
 SETTLING = int(FrameStatus.SETTLING)
 RESTARTED = int(FrameStatus.RESTARTED)
+JERK = int(FrameStatus.JERK)
+DRIFT = int(FrameStatus.DRIFT)
 CLIP_WORKSPACE = int(Clip.WORKSPACE)
 CLIP_VOLTAGE = int(Clip.VOLTAGE)
 CLIP_SLEW = int(Clip.SLEW)

@@ -47,7 +47,8 @@ class Subject:
 def subjects(signals: list[TremorSignal], making: Making) -> list[Subject]:
     """One per person with a gyroscope recording: the calmest ``files`` stretches of 16 s, not overlapping.
 
-    The angle along the axis that trembles most, scaled to metres.
+    The one of median size comes first: it is what networks are trained on. The angle along the axis
+    that trembles most, scaled to metres.
     """
     found: list[Subject] = []
     for number, s in enumerate(s for s in signals if s.quantity == "angular rate"):
@@ -56,8 +57,9 @@ def subjects(signals: list[TremorSignal], making: Making) -> list[Subject]:
         path = _at_rate(angle[:, axis], s.rate_hz)
         length = round(FILE_S * RATE_HZ)
         pieces = path[: len(path) // length * length].reshape(-1, length)
-        calm = np.sort(np.argsort(np.std(pieces, axis=1), kind="stable")[: making.files])
-        pieces = pieces[calm]
+        calm = np.argsort(np.std(pieces, axis=1), kind="stable")[: making.files]
+        middle = len(calm) // 2
+        pieces = pieces[[calm[middle], *calm[:middle], *calm[middle + 1 :]]]
         pieces = pieces * (making.error_rms_m / np.mean(np.std(pieces, axis=1)))
         noise = np.random.default_rng((7, number)).standard_normal(pieces.shape) * making.noise_rms_m
         found.append(Subject(s.subject, tuple(pieces + noise)))

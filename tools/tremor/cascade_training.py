@@ -33,19 +33,19 @@ class Training:
 
     window: int = 75
     spacing: int = 1
-    units: int = 6
+    units: int = 4
     target: Target = "voluntary"
     centred: bool = False
-    restarts: int = 3
-    epochs: int = 30
-    candidate_rows: int = 2000
+    restarts: int = 2
+    epochs: int = 20
+    candidate_rows: int = 1000
     quickprop_rate: float = 2.0
     passes: int = 2
     spread: float = 0.3
     noise: float = 0.05
     growth: float = 0.0
     refine: bool = True
-    patience: int = 2
+    patience: int = 1
     seed: int = 1
 
 
@@ -58,9 +58,11 @@ class Paths:
 
 @dataclass(frozen=True)
 class Trained:
-    """The network, and rms errors (of the target's rms) on training and validation paths for 0, 1, ... hidden units."""
+    """The network, the same without hidden units (the best linear filter of its window), and rms errors (over the
+    target's rms) on training and validation paths for 0, 1, ... hidden units."""
 
     network: CascadeNetwork
+    linear: CascadeNetwork
     training_error: tuple[float, ...]
     validation_error: tuple[float, ...]
     candidates_tried: int
@@ -122,24 +124,32 @@ def train(fitting: Paths, holding: Paths, rate_hz: float, how: Training, note: s
         states.append((output.copy(), len(kinds)))
         train_error.append(_rms(features, output, fit_y))
         hold_error.append(_rms(held, output, hold_y))
-    output, units = states[int(np.argmin(hold_error))]
-    table = np.zeros((units, first + units))
-    for h in range(units):
-        table[h, : first + h] = hidden[h]
-    network = CascadeNetwork(
-        how.window,
-        how.spacing,
-        rate_hz,
-        how.target,
-        scale,
-        how.centred,
-        tuple(KINDS[k] for k in kinds[:units]),
-        table,
-        output,
-        note,
-    )
+
+    def network(output: Array, units: int) -> CascadeNetwork:
+        table = np.zeros((units, first + units))
+        for h in range(units):
+            table[h, : first + h] = hidden[h]
+        return CascadeNetwork(
+            how.window,
+            how.spacing,
+            rate_hz,
+            how.target,
+            scale,
+            how.centred,
+            tuple(KINDS[k] for k in kinds[:units]),
+            table,
+            output,
+            note,
+        )
+
     fit_rms, hold_rms = (sqrt(float(np.mean(y**2))) for y in (fit_y, hold_y))
-    return Trained(network, tuple(e / fit_rms for e in train_error), tuple(e / hold_rms for e in hold_error), tried)
+    return Trained(
+        network(*states[int(np.argmin(hold_error))]),
+        network(*states[0]),
+        tuple(e / fit_rms for e in train_error),
+        tuple(e / hold_rms for e in hold_error),
+        tried,
+    )
 
 
 def _matrices(paths: Paths, how: Training, scale: float) -> tuple[Array, Array]:

@@ -1,0 +1,194 @@
+"""Jerk (myoclonus) and drift, detected on the acceleration of the tip and told to the supervisor.
+
+Jerk: between voluntary motion and tremor (below 1 Hz, above 8 Hz) a quiet hand does little. Each axis is band-passed
+there and divided by its own smoothed rms; the sum of squares is then chi-squared with three degrees of freedom whatever
+the hand's tremor and the sensor's noise are, and a jerk is what stands out of that. The smoothed power sees values
+limited to ``limit`` sigma, so that a jerk does not hide the next one.
+
+Drift: what is left of gravity and bias must stay small. A cumulative sum of what the smoothed acceleration has beyond
+``drift_allowed_m_s2`` alarms at ``drift_limit_m_s``, which is a velocity: how wrong integration has become (000, 5.2.2).
+"""
+
+from __future__ import annotations
+
+from math import exp, sqrt
+from typing import Annotated, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+from scipy.signal import ellip
+
+from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
+from firmware_py.records import Record, attributes, copy_record, new_record
+from firmware_py.tremor.prefilter import prefilter_step
+from hal.compiled import kernel
+
+Positive = Annotated[float, Field(gt=0.0)]
+SECTIONS = 3
+
+
+class DetectorConfig(BaseModel):
+    """``jerk_chi2`` 25 with three degrees of freedom: false alarms below one in ten minutes (docs/limits.md)."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    jerk_low_hz: Positive = 1.8
+    jerk_high_hz: Positive = 6.0
+    ripple_dB: Positive = 1.0
+    attenuation_dB: Positive = 30.0
+    jerk_chi2: Positive = 25.0
+    background_s: Positive = 6.0
+    limit: Positive = 3.0
+    floor_m_s2: Positive = 1e-3
+    jerk_hold_s: Positive = 0.3
+    settle_s: Positive = 6.0
+    drift_smoothing_s: Positive = 0.5
+    drift_allowed_m_s2: Positive = 0.1
+    drift_limit_m_s: Positive = 0.05
+
+
+DETECT = np.dtype(
+    [
+        ("sections", "f8", (SECTIONS, 5)),
+        ("chi2", "f8"),
+        ("keep", "f8"),
+        ("limit", "f8"),
+        ("floor2", "f8"),
+        ("hold", "f8"),
+        ("settle", "f8"),
+        ("slow", "f8"),
+        ("allowed", "f8"),
+        ("drift_limit", "f8"),
+        ("dt", "f8"),
+    ]
+)
+DETECT_STATE = np.dtype(
+    [
+        ("memory", "f8", (3, SECTIONS, 2)),
+        ("power", "f8", (3,)),
+        ("mean", "f8", (3,)),
+        ("statistic", "f8"),
+        ("excess", "f8"),  # m/s
+        ("held", "f8"),  # ticks that the jerk flag stays up
+        ("ticks", "f8"),
+    ]
+)
+
+
+def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
+    """The kernel's numbers."""
+    sos = np.asarray(
+        ellip(
+            SECTIONS,
+            config.ripple_dB,
+            config.attenuation_dB,
+            [config.jerk_low_hz, config.jerk_high_hz],
+            btype="bandpass",
+            output="sos",
+            fs=tick_hz,
+        )
+    )
+    return new_record(
+        DETECT,
+        sections=sos[:, [0, 1, 2, 4, 5]],
+        chi2=config.jerk_chi2,
+        keep=1.0 - exp(-1.0 / (config.background_s * tick_hz)),
+        limit=config.limit,
+        floor2=config.floor_m_s2**2,
+        hold=config.jerk_hold_s * tick_hz,
+        settle=config.settle_s * tick_hz,
+        slow=1.0 - exp(-1.0 / (config.drift_smoothing_s * tick_hz)),
+        allowed=config.drift_allowed_m_s2,
+        drift_limit=config.drift_limit_m_s,
+        dt=1.0 / tick_hz,
+    )
+
+
+@kernel
+def detect_step(x: NDArray[np.float64], state: Record, param: Record) -> int:
+    """One sample of acceleration (3,), m/s^2; the bits ``JERK`` and ``DRIFT`` that are up now.
+
+    The background is the running mean over what has come until ``settle`` ticks, then smoothed; no jerk before that.
+    """
+    state.ticks += 1.0
+    gain = max(param.keep, 1.0 / state.ticks)
+    slow = max(param.slow, 1.0 / state.ticks)
+    settled = state.ticks > param.settle
+    total = 0.0
+    size2 = 0.0
+    for i in range(3):
+        state.mean[i] += slow * (x[i] - state.mean[i])
+        size2 += state.mean[i] * state.mean[i]
+        y = prefilter_step(x[i], state.memory[i], param.sections)
+        power = state.power[i] + param.floor2
+        total += y * y / power
+        square = y * y
+        if settled:
+            square = min(square, param.limit * param.limit * power)
+        state.power[i] += gain * (square - state.power[i])
+    state.statistic = total
+    if settled and total > param.chi2:
+        state.held = param.hold
+    elif state.held > 0.0:
+        state.held -= 1.0
+    state.excess = max(0.0, state.excess + (sqrt(size2) - param.allowed) * param.dt)
+    # a cumulative sum without a ceiling would remember a drift long after it is over
+    state.excess = min(state.excess, 2.0 * param.drift_limit)
+    bits = 0
+    if state.held > 0.0:
+        bits |= JERK
+    if state.excess > param.drift_limit:
+        bits |= DRIFT
+    return bits
+
+
+@kernel
+def detect_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
+    """Add ``JERK`` and ``DRIFT`` to the frame's status; a tick without a valid new sample changes nothing."""
+    state = states[0]
+    status = int(frame[STATUS])
+    if status & (ALIGNING | RESTARTED):
+        state.memory[:, :, :] = 0.0
+        state.power[:] = 0.0
+        state.mean[:] = 0.0
+        state.statistic = 0.0
+        state.excess = 0.0
+        state.held = 0.0
+        state.ticks = 0.0
+    elif status & (INVALID | STALE) == 0:
+        frame[STATUS] = status | detect_step(frame[TIP_ACCELERATION : TIP_ACCELERATION + 3], state, params[0])
+
+
+@kernel
+def detect_run(samples: NDArray[np.float64], states: Record, params: Record, bits: NDArray[np.int64]) -> None:
+    """``detect_step`` over samples (n, 3) into ``bits`` (n,)."""
+    for i in range(len(samples)):
+        bits[i] = detect_step(samples[i], states[0], params[0])
+
+
+class Detectors:
+    """Both detectors with their state."""
+
+    def __init__(self, config: DetectorConfig, tick_hz: float) -> None:
+        self.config = config
+        self.params = detect_params(config, tick_hz)
+        self.state = new_record(DETECT_STATE)
+
+    def step(self, frame: NDArray[np.float64]) -> None:
+        detect_kernel(frame, self.state, self.params)
+
+    def run(self, samples: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Bits (n,) over accelerations (n, 3); the state goes on."""
+        bits = np.zeros(len(samples), dtype=np.int64)
+        detect_run(np.ascontiguousarray(samples, dtype=np.float64), self.state, self.params, bits)
+        return bits
+
+    def reset(self) -> None:
+        copy_record(self.state, new_record(DETECT_STATE))
+
+
+def described(state: Record) -> dict[str, Any]:
+    """The detectors' levels, for people."""
+    view = attributes(state)[0]
+    return {"jerk_statistic": float(view.statistic), "drift_m_s": float(view.excess)}
