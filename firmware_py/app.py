@@ -216,6 +216,7 @@ def make_outcome(
         "samples": {"expected": counts.expected, "received": counts.received, "lost": counts.lost},
         "commands": {"sent": counts.commands, "clipped": counts.clipped},
         "magnetometer_errors": counts.magnetometer_errors,
+        "warnings": dict(supervisor.warnings),
         "safe_state": {
             "reached": supervisor.safe_reached,
             "reason": reason,

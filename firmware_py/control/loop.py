@@ -107,6 +107,7 @@ class InstrumentLoop:
         self._field_fresh = False
         self._started_ns = 0
         self._bad_since: dict[str, int] = {}
+        self._warned = 0
         self._interrupted = ""
         self.supervisor = Supervisor(devices.amplifier)
         self.counts = LoopCounts()
@@ -301,6 +302,13 @@ class InstrumentLoop:
 
     def _estimate(self, info: TickInfo) -> None:
         self.stages.estimate()
+        status = int(self._frame[STATUS]) & (FrameStatus.JERK | FrameStatus.DRIFT)
+        if status != self._warned:
+            for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):
+                if status & ~self._warned & bit:
+                    self.supervisor.warn(what)
+                    self._note({"event": what})
+            self._warned = status
 
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:

@@ -59,6 +59,8 @@ class Supervisor:
         self.trip_cause: Trip | None = None
         self.safe_reached = False
         self.ramp_failure = ""
+        self.warnings: dict[str, int] = {"jerk": 0, "drift": 0}
+        """How often each was reported: what the run's report shows beside the reason of its end."""
 
     @property
     def may_move(self) -> bool:
@@ -80,6 +82,10 @@ class Supervisor:
         if self.trip_cause is None:
             self.trip_cause = Trip(reason, tick, t_ns, normal)
             self.state = State.SAFE_RAMP
+
+    def warn(self, what: str) -> None:
+        """Something is not as it should be and does not end the run."""
+        self.warnings[what] = self.warnings.get(what, 0) + 1
 
     def step(self) -> bool:
         """One tick of the ramp; True once neutral is reached or has to be given up.

@@ -20,6 +20,7 @@ from firmware_py.frame import COMMAND, LAYOUT, STATUS, FrameStatus
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing
 from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.detectors import Detectors
 from firmware_py.tremor.stage import Tremor
 
 Frame = NDArray[np.float64]
@@ -56,6 +57,7 @@ class Stages:
         self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
         self.sensing = Sensing(configs.sensing)
         self.tremor = Tremor(configs.tremor)
+        self.detectors = Detectors(configs.tremor.detectors, configs.tremor.tick_hz)
         self.actuation = Actuation(configs.actuation)
 
     def sense(self) -> None:
@@ -63,6 +65,7 @@ class Stages:
 
     def estimate(self) -> None:
         self.tremor.step(self.frame)
+        self.detectors.step(self.frame)
 
     def actuate(self) -> None:
         """Compute the command for the newest scan and mark the frame as one that was commanded."""
@@ -84,6 +87,6 @@ class Stages:
 
     def reset(self) -> None:
         """As before the first sample."""
-        for stage in (self.sensing, self.tremor, self.actuation):
+        for stage in (self.sensing, self.tremor, self.detectors, self.actuation):
             stage.reset()
         self.frame[:] = 0.0

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from firmware_py.tremor.detector_config import DetectorConfig
 from hal.bench import validate_table
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -159,6 +160,7 @@ class TremorConfig(_Table):
     bmflc: BmflcConfig = BmflcConfig()
     ar: ArConfig = ArConfig()
     adaptive: AdaptiveConfig = AdaptiveConfig()
+    detectors: DetectorConfig = DetectorConfig()
 
     @model_validator(mode="after")
     def _check(self) -> TremorConfig:

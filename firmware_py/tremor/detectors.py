@@ -1,57 +1,35 @@
 """Jerk (myoclonus) and drift, detected on the acceleration of the tip and told to the supervisor.
 
-Jerk: between voluntary motion and tremor (below 1 Hz, above 8 Hz) a quiet hand does little. Each axis is band-passed
-there and divided by its own smoothed rms; the sum of squares is then chi-squared with three degrees of freedom whatever
-the hand's tremor and the sensor's noise are, and a jerk is what stands out of that. The smoothed power sees values
-limited to ``limit`` sigma, so that a jerk does not hide the next one.
+Jerk: between voluntary motion and tremor (below 1 Hz, above 8 Hz) and beyond tremor a quiet hand does little. In both
+bands each axis is divided by its own smoothed rms; the sum of squares is then chi-squared with three degrees of freedom
+whatever the hand's tremor and the sensor's noise are, and a jerk is what stands out of that. The smoothed power sees
+values limited to ``limit`` sigma, so that a jerk does not hide the next one.
 
 Drift: what is left of gravity and bias must stay small. A cumulative sum of what the smoothed acceleration has beyond
-``drift_allowed_m_s2`` alarms at ``drift_limit_m_s``, which is a velocity: how wrong integration has become (000, 5.2.2).
+``drift_allowed_m_s2`` alarms at ``drift_limit_m_s``, a velocity: how wrong integration has become (000, 5.2.2).
 """
 
 from __future__ import annotations
 
 from math import exp, sqrt
-from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.signal import ellip
 
 from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
-from firmware_py.records import Record, attributes, copy_record, new_record
+from firmware_py.records import Record, copy_record, new_record
+from firmware_py.tremor.detector_config import DetectorConfig
 from firmware_py.tremor.prefilter import prefilter_step
 from hal.compiled import kernel
 
-Positive = Annotated[float, Field(gt=0.0)]
 SECTIONS = 3
-
-
-class DetectorConfig(BaseModel):
-    """``jerk_chi2`` 25 with three degrees of freedom: false alarms below one in ten minutes (docs/limits.md)."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    jerk_low_hz: Positive = 1.8
-    jerk_high_hz: Positive = 6.0
-    ripple_dB: Positive = 1.0
-    attenuation_dB: Positive = 30.0
-    jerk_chi2: Positive = 25.0
-    background_s: Positive = 6.0
-    limit: Positive = 3.0
-    floor_m_s2: Positive = 1e-3
-    jerk_hold_s: Positive = 0.3
-    settle_s: Positive = 6.0
-    drift_smoothing_s: Positive = 0.5
-    drift_allowed_m_s2: Positive = 0.1
-    drift_limit_m_s: Positive = 0.05
-
+BANDS = 2
 
 DETECT = np.dtype(
     [
-        ("sections", "f8", (SECTIONS, 5)),
-        ("chi2", "f8"),
+        ("sections", "f8", (BANDS, SECTIONS, 5)),
+        ("chi2", "f8", (BANDS,)),
         ("keep", "f8"),
         ("limit", "f8"),
         ("floor2", "f8"),
@@ -65,10 +43,10 @@ DETECT = np.dtype(
 )
 DETECT_STATE = np.dtype(
     [
-        ("memory", "f8", (3, SECTIONS, 2)),
-        ("power", "f8", (3,)),
-        ("mean", "f8", (3,)),
-        ("statistic", "f8"),
+        ("memory", "f8", (BANDS, 3, SECTIONS, 2)),
+        ("power", "f8", (BANDS, 3)),
+        ("slow_mean", "f8", (3,)),
+        ("statistic", "f8", (BANDS,)),
         ("excess", "f8"),  # m/s
         ("held", "f8"),  # ticks that the jerk flag stays up
         ("ticks", "f8"),
@@ -78,21 +56,18 @@ DETECT_STATE = np.dtype(
 
 def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
     """The kernel's numbers."""
-    sos = np.asarray(
-        ellip(
-            SECTIONS,
-            config.ripple_dB,
-            config.attenuation_dB,
-            [config.jerk_low_hz, config.jerk_high_hz],
-            btype="bandpass",
-            output="sos",
-            fs=tick_hz,
-        )
+    sections = np.stack(
+        [
+            np.asarray(
+                ellip(SECTIONS, config.ripple_dB, config.attenuation_dB, band, "bandpass", output="sos", fs=tick_hz)
+            )
+            for band in (config.slow_hz, config.brisk_hz)
+        ]
     )
     return new_record(
         DETECT,
-        sections=sos[:, [0, 1, 2, 4, 5]],
-        chi2=config.jerk_chi2,
+        sections=sections[:, :, [0, 1, 2, 4, 5]],
+        chi2=(config.slow_chi2, config.brisk_chi2),
         keep=1.0 - exp(-1.0 / (config.background_s * tick_hz)),
         limit=config.limit,
         floor2=config.floor_m_s2**2,
@@ -115,20 +90,26 @@ def detect_step(x: NDArray[np.float64], state: Record, param: Record) -> int:
     gain = max(param.keep, 1.0 / state.ticks)
     slow = max(param.slow, 1.0 / state.ticks)
     settled = state.ticks > param.settle
-    total = 0.0
+    # a jerk is no background; still some, or a hand that has become livelier for good would alarm for ever
+    learn = gain if state.held <= 0.0 else 0.1 * gain
     size2 = 0.0
     for i in range(3):
-        state.mean[i] += slow * (x[i] - state.mean[i])
-        size2 += state.mean[i] * state.mean[i]
-        y = prefilter_step(x[i], state.memory[i], param.sections)
-        power = state.power[i] + param.floor2
-        total += y * y / power
-        square = y * y
-        if settled:
-            square = min(square, param.limit * param.limit * power)
-        state.power[i] += gain * (square - state.power[i])
-    state.statistic = total
-    if settled and total > param.chi2:
+        state.slow_mean[i] += slow * (x[i] - state.slow_mean[i])
+        size2 += state.slow_mean[i] * state.slow_mean[i]
+    jerk = False
+    for band in range(BANDS):
+        total = 0.0
+        for i in range(3):
+            y = prefilter_step(x[i], state.memory[band, i], param.sections[band])
+            power = state.power[band, i] + param.floor2
+            square = y * y
+            total += square / power
+            if settled:
+                square = min(square, param.limit * param.limit * power)
+            state.power[band, i] += learn * (square - state.power[band, i])
+        state.statistic[band] = total
+        jerk = jerk or total > param.chi2[band]
+    if settled and jerk:
         state.held = param.hold
     elif state.held > 0.0:
         state.held -= 1.0
@@ -149,10 +130,10 @@ def detect_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
     state = states[0]
     status = int(frame[STATUS])
     if status & (ALIGNING | RESTARTED):
-        state.memory[:, :, :] = 0.0
+        state.memory[:] = 0.0
         state.power[:] = 0.0
-        state.mean[:] = 0.0
-        state.statistic = 0.0
+        state.slow_mean[:] = 0.0
+        state.statistic[:] = 0.0
         state.excess = 0.0
         state.held = 0.0
         state.ticks = 0.0
@@ -186,9 +167,3 @@ class Detectors:
 
     def reset(self) -> None:
         copy_record(self.state, new_record(DETECT_STATE))
-
-
-def described(state: Record) -> dict[str, Any]:
-    """The detectors' levels, for people."""
-    view = attributes(state)[0]
-    return {"jerk_statistic": float(view.statistic), "drift_m_s": float(view.excess)}

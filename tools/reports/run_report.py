@@ -90,6 +90,8 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
     ]
     if voluntary["gain"] is not None:
         lines.append(f"voluntary motion below 1 Hz: gain {voluntary['gain']:.4f}, delay {voluntary['delay_ms']:.2f} ms")
+    if any(result.get("warnings", {}).values()):
+        lines.append("hand: " + ", ".join(f"{n} {what}(s)" for what, n in result["warnings"].items() if n))
     reached = "reached" if safe["reached"] else "NOT CONFIRMED"
     lines.append(f"safe state {reached}: {safe['reason']}")
     lines.append(f"scheduling: {result['realtime']}")

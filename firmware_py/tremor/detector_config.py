@@ -1,0 +1,33 @@
+"""What the jerk and drift detectors need to know: [firmware.tremor.detectors] of the bench."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[float, Field(gt=0.0)]
+
+
+class DetectorConfig(BaseModel):
+    """Bands and limits of chi-squared for slow and brisk jerks, how much acceleration may be left over.
+
+    With three degrees of freedom the limits give less than one false alarm in ten minutes (test_detectors.py).
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    slow_hz: tuple[Positive, Positive] = (1.8, 6.0)
+    brisk_hz: tuple[Positive, Positive] = (15.0, 45.0)
+    ripple_dB: Positive = 1.0
+    attenuation_dB: Positive = 30.0
+    slow_chi2: Positive = 25.0
+    brisk_chi2: Positive = 32.0
+    background_s: Positive = 6.0
+    limit: Positive = 3.0
+    floor_m_s2: Positive = 1e-3
+    jerk_hold_s: Positive = 0.3
+    settle_s: Positive = 6.0
+    drift_smoothing_s: Positive = 0.5
+    drift_allowed_m_s2: Positive = 0.1
+    drift_limit_m_s: Positive = 0.05
