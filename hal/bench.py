@@ -270,7 +270,8 @@ def open_bench(
 ) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
-    ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps. Raises ``OpenFailed`` with every cause.
+    ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps.
+    Raises ``OpenFailed`` with every cause.
     """
     description = bench.description
     emulated = description.emulated_buses()

@@ -35,7 +35,10 @@ _ROWS_MAGIC, _BYTES_MAGIC = 0x4D52_4F57, 0x4D42_5954
 
 
 def shared_file(size: int) -> int:
-    """An anonymous file of ``size`` bytes that other processes can map. ``RecordingError`` on a weakly ordered machine."""
+    """An anonymous file of ``size`` bytes that other processes can map.
+
+    ``RecordingError`` on a weakly ordered machine.
+    """
     machine = platform.machine()
     if machine not in ("x86_64", "AMD64"):
         raise RecordingError(f"the recording ring relies on the memory ordering of x86-64; this machine is {machine}")

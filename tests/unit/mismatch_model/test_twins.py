@@ -15,8 +15,8 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model, Placed
-from tools.mismatch.simulate_view import View
 from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins import make
 from tools.mismatch.twins.feedback import run_feedback
 from tools.mismatch.twins.linear import discretise, free_response, run_output, run_states, start_state
