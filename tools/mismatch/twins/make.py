@@ -6,7 +6,8 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.axis import axis_twin
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cluster import cluster_twin
-from tools.mismatch.twins.opaque import fmu_twin, user_twin
+from tools.mismatch.twins.fmu import fmu_twin
+from tools.mismatch.twins.opaque import user_twin
 from tools.mismatch.twins.state_space import state_space_twin
 from tools.mismatch.twins.static import static_twin
 from tools.mismatch.twins.vocabulary import user_kinds

@@ -1,4 +1,4 @@
-"""Twins that are somebody else's program: a Python object from an entry point, an FMU, the emulated instrument.
+"""Twins that are somebody else's program: a Python object from an entry point; FMUs and the emulated instrument too.
 
 Nothing is known of the inside: effects sit at inputs and outputs only, base parameters are the numbers in
 ``[twin.parameters]``, all searched (none is known to be linear).
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -153,57 +152,3 @@ def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
             raise RecordingError(f"twin '{recording.twin.kind}' ({entry.value}) failed: {error!r}") from error
 
     return opaque_twin(recording, call, str(entry.value))
-
-
-def fmu_twin(recording: Recording) -> OpaqueTwin:
-    """An FMI 2 or 3 co-simulation FMU; ``[twin.parameters] path`` names it beside the descriptor."""
-    where = f"{recording.path}: [twin.parameters]"
-    name = recording.twin.parameters.get("path")
-    if not isinstance(name, str):
-        raise RecordingError(f"{where} path must name the .fmu file, got {name!r}")
-    path = (recording.path.parent / name).resolve()
-    if not path.is_file():
-        raise RecordingError(f"{where} path: {path} does not exist")
-    return opaque_twin(recording, _fmu_call(recording, path), str(path), fixed=("path",))
-
-
-def _fmu_call(recording: Recording, path: Path) -> Simulate:
-    try:
-        import fmpy  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise RecordingError(
-            f"{recording.path}: [twin] kind 'fmu' needs FMPy: install this package with its extra 'fmu'"
-        ) from None
-    fm = cast(Any, fmpy)
-    description = fm.read_model_description(str(path))
-    if description.coSimulation is None:
-        raise RecordingError(f"{path}: not a co-simulation FMU; export it again for co-simulation")
-    names = {v.name for v in description.modelVariables}
-    lost = [s for s in (*recording.inputs, *recording.outputs) if s not in names]
-    lost += [k for k in recording.twin.parameters if k != "path" and k not in names]
-    if lost:
-        raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
-    unpacked = fm.extract(str(path))
-    instance = fm.instantiate_fmu(unpacked, description, "CoSimulation")
-
-    def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
-        t = inputs["t"]
-        table = np.zeros(t.size, [("time", float), *((s, float) for s in recording.inputs)])
-        table["time"] = t
-        for s in recording.inputs:
-            table[s] = inputs[s]
-        instance.reset()
-        result = fm.simulate_fmu(
-            unpacked,
-            model_description=description,
-            fmu_instance=instance,
-            start_time=float(t[0]),
-            stop_time=float(t[-1]),
-            output_interval=recording.dt,
-            start_values={k: v for k, v in parameters.items() if k != "path"},
-            input=table,
-            output=list(recording.outputs),
-        )
-        return {o: np.interp(t, result["time"], result[o]) for o in recording.outputs}
-
-    return call

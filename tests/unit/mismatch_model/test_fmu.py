@@ -1,0 +1,90 @@
+"""A real FMU (built here from Python) as a twin, against the closed form; needs FMPy and PythonFMU."""
+
+from __future__ import annotations
+
+import pickle
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit.mismatch_model.made import recording
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.make import make
+
+pytest.importorskip("fmpy", reason="the extra 'fmu' is not installed")
+
+HEATED = """
+import math
+from pythonfmu import Fmi2Causality, Fmi2Slave, Fmi2Variability, Real
+
+class Heated(Fmi2Slave):
+    def __init__(self, **kwargs):
+        super().__init__(**kwargs)
+        self.power = self.position = self.warm = 0.0
+        self.um_per_W, self.time_constant_s = 2.0, 0.5
+        self.register_variable(Real("power", causality=Fmi2Causality.input))
+        self.register_variable(Real("position", causality=Fmi2Causality.output))
+        for name in ("um_per_W", "time_constant_s"):
+            self.register_variable(Real(name, causality=Fmi2Causality.parameter, variability=Fmi2Variability.tunable))
+
+    def do_step(self, current_time, step_size):
+        decay = math.exp(-step_size / self.time_constant_s)
+        self.warm = decay * self.warm + (1 - decay) * self.power
+        self.position = self.um_per_W * self.warm
+        return True
+"""
+N, DT = 300, 0.02
+POWER = 1 + np.sin(2 * np.pi * 0.7 * np.arange(N) * DT)
+
+
+@pytest.fixture(scope="module")
+def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    builder = pytest.importorskip("pythonfmu.builder", reason="PythonFMU is not installed")
+    folder = tmp_path_factory.mktemp("fmu")
+    (folder / "heated.py").write_text(HEATED)
+    return Path(builder.FmuBuilder.build_FMU(folder / "heated.py", dest=folder))
+
+
+def of(path: Path, **more: object) -> Recording:
+    given = {"path": str(path), "um_per_W": 2.0, "time_constant_s": 0.5, **more}
+    return recording("fmu", DT, {"power": POWER}, {"position": 2.0 * POWER}, {}, given)
+
+
+def truth(gain: float, tau: float) -> np.ndarray:
+    a, y = np.exp(-DT / tau), np.zeros(N)
+    for k in range(N - 1):
+        y[k + 1] = a * y[k] + (1 - a) * gain * POWER[k]
+    return y
+
+
+def test_runs_with_its_parameters_and_from_its_own_start(fmu: Path) -> None:
+    rec = of(fmu)
+    model = Model(make(rec))
+    assert [p.name for p in model.parameters] == ["um_per_W", "time_constant_s"]
+    for gain, tau in ((2.0, 0.5), (3.0, 0.5), (2.0, 0.1), (2.0, 0.5)):
+        got = model.simulate(View.whole(rec), np.array([gain, tau]))["position"]
+        np.testing.assert_allclose(got, truth(gain, tau), atol=1e-12)
+
+
+def test_goes_to_another_process(fmu: Path) -> None:
+    rec = of(fmu)
+    twin = make(rec)
+    first = Model(twin).simulate(View.whole(rec), np.array([2.0, 0.5]))["position"]
+    there = Model(pickle.loads(pickle.dumps(twin)))
+    np.testing.assert_array_equal(there.simulate(View.whole(rec), np.array([2.0, 0.5]))["position"], first)
+
+
+def test_what_is_no_fmu_or_lacks_a_variable_is_said(fmu: Path, tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="no variable heat in the FMU"):
+        make(of(fmu, heat=1.0))
+    (tmp_path / "text.fmu").write_text("no zip")
+    with pytest.raises(RecordingError, match="cannot be opened as an FMU"):
+        make(of(tmp_path / "text.fmu"))
+    with zipfile.ZipFile(tmp_path / "empty.fmu", "w") as z:
+        z.writestr("readme.txt", "nothing")
+    with pytest.raises(RecordingError, match="cannot be opened as an FMU"):
+        make(of(tmp_path / "empty.fmu"))

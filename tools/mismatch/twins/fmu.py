@@ -1,0 +1,109 @@
+"""An FMI 2 or 3 co-simulation FMU as a twin, through FMPy (an extra)."""
+
+from __future__ import annotations
+
+import shutil
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from sim_devices.physics.effect import Array
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
+
+
+class FmuRun:
+    """One free run per call. The unpacked FMU and its instance belong to one process; a copy unpacks its own.
+
+    RecordingError for a file that is no co-simulation FMU, and for a run that fails.
+    """
+
+    def __init__(self, path: Path, inputs: tuple[str, ...], outputs: tuple[str, ...], dt: float) -> None:
+        self.path, self.inputs, self.outputs, self.dt = path, inputs, outputs, dt
+        self._open: tuple[Any, str, Any] | None = None
+
+    def __getstate__(self) -> dict[str, object]:
+        return {**self.__dict__, "_open": None}
+
+    def names(self) -> set[str]:
+        """Variables of the FMU."""
+        return {v.name for v in self._opened()[0].modelVariables}
+
+    def _opened(self) -> tuple[Any, str, Any]:
+        if self._open is None:
+            fm = _fmpy(self.path)
+            try:
+                description = fm.read_model_description(str(self.path))
+                if description.coSimulation is None:
+                    raise RecordingError(f"{self.path}: not a co-simulation FMU; export it again for co-simulation")
+                folder = str(fm.extract(str(self.path)))
+                weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+                instance = fm.instantiate_fmu(folder, description, "CoSimulation")
+            except RecordingError:
+                raise
+            except Exception as error:
+                raise RecordingError(f"{self.path}: cannot be opened as an FMU ({_line(error)})") from error
+            self._open = (description, folder, instance)
+        return self._open
+
+    def __call__(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        fm = _fmpy(self.path)
+        description, folder, instance = self._opened()
+        t = inputs["t"]
+        table = np.zeros(t.size, [("time", float), *((s, float) for s in self.inputs)])
+        table["time"] = t
+        for s in self.inputs:
+            table[s] = inputs[s]
+        try:
+            instance.reset()
+            result = fm.simulate_fmu(
+                folder,
+                model_description=description,
+                fmu_instance=instance,
+                start_time=float(t[0]),
+                stop_time=float(t[-1]),
+                output_interval=self.dt,
+                start_values={k: v for k, v in parameters.items() if k != "path"},
+                input=table,
+                output=list(self.outputs),
+            )
+        except Exception as error:
+            raise RecordingError(
+                f"{self.path}: the FMU stopped ({_line(error)}); parameters {dict(parameters)}"
+            ) from error
+        return {o: np.interp(t, result["time"], result[o]) for o in self.outputs}
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200] or type(error).__name__
+
+
+def _fmpy(where: Path) -> Any:
+    try:
+        import fmpy  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        raise RecordingError(
+            f"{where}: [twin] kind 'fmu' needs FMPy: install this package with its extra 'fmu'"
+        ) from None
+    return cast(Any, fmpy)
+
+
+def fmu_twin(recording: Recording) -> OpaqueTwin:
+    """An FMI 2 or 3 co-simulation FMU; ``[twin.parameters] path`` names it beside the descriptor."""
+    where = f"{recording.path}: [twin.parameters]"
+    name = recording.twin.parameters.get("path")
+    if not isinstance(name, str):
+        raise RecordingError(f"{where} path must name the .fmu file, got {name!r}")
+    path = (recording.path.parent / name).resolve()
+    if not path.is_file():
+        raise RecordingError(f"{where} path: {path} does not exist")
+    run = FmuRun(path, tuple(recording.inputs), tuple(recording.outputs), recording.dt)
+    known = run.names()
+    lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
+    lost += [k for k in recording.twin.parameters if k != "path" and k not in known]
+    if lost:
+        raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
+    return opaque_twin(recording, run, str(path), fixed=("path",))
