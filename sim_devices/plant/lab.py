@@ -1,8 +1,9 @@
 """The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
-``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops]``
+``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops]
+[--twin FILE]``
 drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
-contract.
+contract. With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
 """
@@ -27,6 +28,7 @@ from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin,
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays, start_temperature_C
+from sim_devices.twin_file import FileTwin, load_twin
 
 Array = NDArray[np.float64]
 
@@ -78,9 +80,15 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
 
 
 def measure_piezo(
-    config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float, amplitude_V: float
+    config: EmulationConfig,
+    axis: int,
+    profile: str,
+    rate_hz: float,
+    seconds: float,
+    amplitude_V: float,
+    twin: FileTwin | None = None,
 ) -> tuple[dict[str, Array], str]:
-    """Columns of the recording and its ``recording.toml``."""
+    """Columns of the recording and its ``recording.toml``. ``twin``: a corrected piezo twin in place of the stack."""
     if axis not in (0, 1, 2):
         raise LabError(f"axis {axis}: the stacks are 0, 1 and 2")
     if not 0.0 < rate_hz <= 200.0:
@@ -93,14 +101,21 @@ def measure_piezo(
         raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
     temperature_C = start_temperature_C(config)
     volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
-    params, state = drive_channel(stack_unit(config.stack, config.unit, axis), config.amplifier, STEP_S, temperature_C)
-    extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
-    drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
+    room_C = np.full(len(volts), temperature_C)
+    if twin is not None:
+        if twin.kind != "piezo_stack":
+            raise LabError(f"{twin.path}: a twin of kind {twin.kind}; the interferometer measures a piezo_stack")
+        extension = 1e-6 * twin.run(1.0 / RATE_HZ, {"command": volts, "temperature": room_C})["displacement"]
+    else:
+        unit = stack_unit(config.stack, config.unit, axis)
+        params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
+        extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
+        drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
     noise = INTERFEROMETER_RMS_UM * stream(config.seed, f"lab.piezo.{axis}.{profile}").standard_normal(len(volts))
     columns = {
         "command_V": volts,
         "displacement_um": extension * 1e6 + noise,
-        "temperature_C": np.full(len(volts), temperature_C),
+        "temperature_C": room_C,
     }
     descriptor = f"""format = 1
 title = "piezo stack {axis} of unit {config.unit}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
@@ -245,6 +260,7 @@ def main(arguments: list[str] | None = None) -> int:
     piezo.add_argument("--rate-hz", type=float, default=10.0)
     piezo.add_argument("--seconds", type=float, default=10.0)
     piezo.add_argument("--amplitude-V", type=float, default=41.7, help="half of peak to peak, about 50 V")
+    piezo.add_argument("--twin", type=Path, help="corrected twin (micron mismatch apply) instead of the unit's stack")
     tumble = what.add_parser("tumble", help="the resting instrument in many attitudes")
     tumble.add_argument("--positions", type=int, default=100)
     tumble.add_argument("--seconds", type=float, default=5.0, help="averaging at each position")
@@ -257,12 +273,13 @@ def main(arguments: list[str] | None = None) -> int:
         config = load_config(given.bench, given.unit)
         if given.what == "piezo":
             columns, descriptor = measure_piezo(
-                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V
-            )
+                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V,
+                None if given.twin is None else load_twin(given.twin),
+            )  # fmt: skip
         else:
             columns, descriptor = measure_tumble(config, given.positions, given.seconds)
         write_recording(given.out, columns, descriptor)
-    except LabError as error:
+    except BenchError as error:
         sys.stderr.write(f"lab: {error}\n")
         return 2
     sys.stderr.write(f"{given.out / 'recording.toml'}: {len(next(iter(columns.values())))} rows\n")

@@ -133,8 +133,13 @@ def static_twin(recording: Recording) -> StaticTwin:
         drives[o] = drive
     text = recording.twin.parameters
     known = {offset, scale}
+    if text.get("hold", "linear") not in ("zero", "linear"):
+        raise RecordingError(
+            f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {text['hold']!r}"
+        )
     for key in text:
-        if key not in known:
+        # at the samples, where it is compared, a twin without memory is the same for either hold
+        if key not in known and key != "hold":
             raise RecordingError(
                 f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {sorted(known)}"
             )
