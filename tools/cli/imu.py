@@ -120,7 +120,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
                         "gyroscope_dps": dict(zip(AXES, calibrated.found_dps, strict=True)),
                     }
                     after = still["drift_deg_per_min"]["before"]
-                    before = {a: after[a] + 60.0 * v for a, v in zip(AXES, calibrated.found_dps, strict=True)}
+                    before = {a: after[a] - 60.0 * v for a, v in zip(AXES, calibrated.written_dps, strict=True)}
                     still["drift_deg_per_min"] = {"before": before, "after": after}
                 found.append({**still, "auto_calibration": None if calibrated is None else calibrated.as_dict()})
         finally:

@@ -10,6 +10,7 @@ from tools.reproduce.rows import Table
 MODULES: dict[str, str] = {
     "sensing": "tools.reproduce.sensing",
     "real-sensors": "tools.reproduce.real_sensors",
+    "endoscope": "tools.reproduce.endoscope",
 }
 
 
