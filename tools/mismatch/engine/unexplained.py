@@ -123,7 +123,8 @@ def stranger(
     """Does a free curve of a context signal explain what the effects between ``before`` and ``after`` do not?
 
     Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
-    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much.
+    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much,
+    or whatever it leaves when it takes nearly all.
     """
     used = {s for p in after.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
@@ -150,6 +151,8 @@ def stranger(
         share = d.strength * part
         left = (1 - share) * start
         limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
+        if said <= SHAPELESS and share > 0.85:
+            limit = np.inf
         # the plainest feature that comes close to the best
         close = best is None or (
             best.signal == d.signal and share > 0.95 * best.share and plainer(d.feature, best.feature)
