@@ -35,7 +35,8 @@ def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int
     out: list[tuple[int, int, float]] = []
     for group in np.split(index, breaks):
         a, b = int(group[0]), int(group[-1]) + 1
-        local = float(np.median(np.concatenate([residual[max(0, a - 60) : max(1, a - 5)], residual[b + 5 : b + 60]])))
+        around = np.concatenate([residual[max(0, a - 60) : max(1, a - 5)], residual[b + 5 : b + 60]])
+        local = float(np.median(around)) if around.size else 0.0
         while a > 0 and abs(residual[a - 1] - local) > 2.5 * usual:
             a -= 1
         while b < n and abs(residual[b] - local) > 2.5 * usual:

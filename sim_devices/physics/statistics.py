@@ -138,5 +138,5 @@ def rank_starts(
     Of candidates within half a percent, the one that is listed first.
     """
     found = [(affine_misfit(output_of(q)[k], measured[k]), i) for i, q in enumerate(candidates)]
-    steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found]
-    return [candidates[i] for _, i in sorted(steps)]
+    steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found if np.isfinite(f)]
+    return [candidates[i] for _, i in sorted(steps)] or candidates[:1]

@@ -115,7 +115,7 @@ class _Projected:
             kept.append((a, b, at))
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled = gram / np.outer(size, size)
-        if self.penalty.size:
+        if np.any(self.penalty):
             # rows are in units of weight; weak against what the data see
             rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
             scaled = scaled + (rows.T @ rows) / np.outer(size, size)
