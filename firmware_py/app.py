@@ -31,7 +31,8 @@ from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
-from hal.bench import BenchFile, OpenBench, load_bench, open_bench
+from hal.bench import BenchFile, OpenBench, Port, load_bench, open_bench
+from hal.contracts import Clock
 from hal.errors import Disconnected, HalError
 
 StatusSink = Callable[[dict[str, Any]], None]
@@ -67,25 +68,27 @@ def run_in_process(
     on_status: StatusSink | None = None,
     runtime_dir: Path | None = None,
     on_open: Callable[[OpenBench], None] | None = None,
+    wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Run the instrument; returns the outcome (JSON values) and, from an emulated world, the truth.
 
     Raises ``HalError`` when the bench cannot be opened. What goes wrong later is in the outcome's
-    ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the opened bench (fault tests).
+    ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the bench before its devices are
+    opened, ``wrap`` put middleware around its ports (fault tests).
     """
     bench = load_bench(request.bench)
     if is_endoscope(bench.description):
         from firmware_py.endoscope.app import run_request
 
-        return run_request(request, bench, on_status, runtime_dir, on_open)
+        return run_request(request, bench, on_status, runtime_dir, on_open, wrap)
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
     _, configs = load_firmware_config(bench, {})
     Stages(configs).warm_up()
     with contextlib.ExitStack() as stack:
-        opened = stack.enter_context(open_requested(request, bench, runtime_dir))
-        devices = open_devices(opened)
+        opened = stack.enter_context(open_requested(request, bench, runtime_dir, wrap))
         if on_open is not None:
             on_open(opened)
+        devices = open_devices(opened)
         config, configs = load_firmware_config(bench, devices.sensing_table)
         if request.stale_ms is not None:
             safety = config.safety.model_copy(update={"stale_ms": request.stale_ms})
@@ -122,7 +125,12 @@ def run_in_process(
 
 
 @contextlib.contextmanager
-def open_requested(request: RunRequest, bench: BenchFile, runtime_dir: Path | None) -> Iterator[OpenBench]:
+def open_requested(
+    request: RunRequest,
+    bench: BenchFile,
+    runtime_dir: Path | None,
+    wrap: Callable[[str, Port, Clock], Port] | None = None,
+) -> Iterator[OpenBench]:
     """The bench opened as the request says; without ``runtime_dir`` in a folder of its own."""
     with contextlib.ExitStack() as stack:
         folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
@@ -135,6 +143,7 @@ def open_requested(request: RunRequest, bench: BenchFile, runtime_dir: Path | No
                 hand_scale=request.hand_scale,
                 seed=request.seed,
                 truth_s=request.truth_s,
+                wrap=wrap,
             )
         )
 
@@ -213,7 +222,13 @@ def make_outcome(
             "announced": {item.reason: item.as_dict() for item in snapshot.ignored},
         },
         "latency": {"sample_to_command_us": counts.latency.distribution().as_dict()},
-        "samples": {"expected": counts.expected, "received": counts.received, "lost": counts.lost},
+        "samples": {
+            "expected": counts.expected,
+            "received": counts.received,
+            "lost": counts.lost,
+            "unread": counts.unread,
+        },
+        "noticed": dict(counts.noticed),
         "commands": {"sent": counts.commands, "clipped": counts.clipped},
         "magnetometer_errors": counts.magnetometer_errors,
         "warnings": dict(supervisor.warnings),

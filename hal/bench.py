@@ -267,11 +267,12 @@ def open_bench(
     hand_scale: float | None = None,
     seed: int | None = None,
     truth_s: float | None = None,
+    wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
-    ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps.
-    Raises ``OpenFailed`` with every cause.
+    ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps;
+    ``wrap(bus, port, clock)`` may put middleware (trace, faults) around a port. Raises ``OpenFailed`` with every cause.
     """
     description = bench.description
     emulated = description.emulated_buses()
@@ -301,7 +302,8 @@ def open_bench(
         failures: list[HalError] = []
         for name, spec in description.bus.items():
             try:
-                opened.ports[name] = _open_port(name, spec, opened)
+                port = _open_port(name, spec, opened)
+                opened.ports[name] = port if wrap is None else wrap(name, port, clock)
                 opened.closers.append(opened.ports[name].close)
             except HalError as error:
                 failures.append(error)

@@ -12,6 +12,9 @@ from hal.contracts import Clock, Float64Array
 from hal.errors import ErrorKind, SafetyTrip
 from hal.types import OutputLimit
 
+LONGEST_RAMP_STEP = 3
+"""Steps of the ramp at once after a delay: still slower than any slew limit that a healthy command has."""
+
 
 class OutputGuard:
     """Decides what may go out next; the driver sends ``next_V`` and then calls ``sent()``.
@@ -27,6 +30,7 @@ class OutputGuard:
         clock: Clock,
         *,
         ramp_steps: int = 20,
+        ramp_step_s: float = 0.001,
         longest_gap_s: float = 0.005,
     ) -> None:
         self.device = device
@@ -39,9 +43,12 @@ class OutputGuard:
         self.slew_limited = 0
         self._clock = clock
         self._ramp_steps = ramp_steps
+        self._ramp_step_ns = ramp_step_s * 1e9
         self._longest_gap_s = longest_gap_s
         self._sent_ns = clock.now_ns()
-        self._ramp_step = 0
+        self._ramp_done = -1  # steps of the ramp that the device has been told; -1: no ramp
+        self._ramp_next = 0
+        self._ramp_start_ns = 0
         self._ramp_from = list(self.last_V)
         self._bounds = [(limit.lo_V, limit.hi_V, limit.slew_V_per_s) for limit in limits]
 
@@ -88,20 +95,24 @@ class OutputGuard:
             next_V.append(value)
             bit <<= 1
         self.next_V = next_V
-        self._ramp_step = 0
+        self._ramp_done = -1
         return mask
 
     def ramp(self) -> bool:
         """Disarm and fill ``next_V`` with the next step of a straight ramp to the safe state.
 
         True when that step is the safe state itself. Call again only after ``sent()``: a step that failed on
-        the bus is offered once more.
+        the bus is offered once more. Time that was lost is made up for, by at most three steps at once.
         """
         self.armed = False
-        if self._ramp_step == 0:
+        now_ns = self._clock.now_ns()
+        if self._ramp_done < 0:
             self._ramp_from = list(self.last_V)
-            self._ramp_step = 1
-        part = self._ramp_step / self._ramp_steps
+            self._ramp_done = 0
+            self._ramp_start_ns = now_ns
+        due = 1 + round((now_ns - self._ramp_start_ns) / self._ramp_step_ns)
+        self._ramp_next = min(max(due, self._ramp_done + 1), self._ramp_done + LONGEST_RAMP_STEP)
+        part = self._ramp_next / self._ramp_steps
         for i, limit in enumerate(self.limits):
             start = self._ramp_from[i]
             self.next_V[i] = limit.safe_V if part >= 1.0 else start + (limit.safe_V - start) * part
@@ -111,15 +122,15 @@ class OutputGuard:
         """The device has been told ``next_V``."""
         self.last_V[:] = self.next_V
         self._sent_ns = self._clock.now_ns()
-        if self._ramp_step:
-            self._ramp_step += 1
+        if self._ramp_done >= 0:
+            self._ramp_done = self._ramp_next
         else:
             self.writes += 1
 
     def start_from(self, values_V: Sequence[float]) -> None:
         """Believe that the device is at ``values_V``: after a readback, before a ramp."""
         self.last_V[:] = [float(v) for v in values_V]
-        self._ramp_step = 0
+        self._ramp_done = -1
 
     def at_safe_state(self) -> bool:
         return all(v == limit.safe_V for v, limit in zip(self.last_V, self.limits, strict=True))

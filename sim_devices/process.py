@@ -166,7 +166,7 @@ class WorldProcess:
             order = json.loads(message)
             ptys = self._ptys | self._slcan
             unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in ptys.items()}
-            inject(self.world, str(order["fault"]), str(order.get("target", "")), unplug, self._bus_of)
+            inject(self.world, str(order["fault"]), str(order.get("target", "")), unplug, self._bus_of, self._now_ns)
             answer = {"ok": True}
         except (ValueError, KeyError, TypeError, UnknownFault) as error:
             answer = {"ok": False, "error": str(error)}

@@ -110,7 +110,7 @@ class LockstepWorld:
     def inject(self, fault: str, target: str = "") -> None:
         """Do one of ``sim_devices.faults.FAULTS``; raises ``UnknownFault``."""
         unplug: dict[str, Callable[[], None]] = {name: port.unplug for name, port in self._ports.items()}
-        inject(self.world, fault, target, unplug, self._bus_of)
+        inject(self.world, fault, target, unplug, self._bus_of, self._clock.now_ns())
         self._reschedule()
 
     def _reschedule(self) -> None:

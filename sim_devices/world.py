@@ -33,6 +33,7 @@ from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
 from sim_devices.plant.imu import BMX055_SPEC, LSM6DS3_SPEC, MPU6050_SPEC, Imu, ImuSpec
 from sim_devices.transports.can_hub import CanHub
 from sim_devices.transports.i2c_line import I2cLine
+from sim_devices.wiring_faults import WiringFaults
 
 SIM_SCHEME = "sim://"
 AMPLIFIER_GAIN = 20.0  # the emulated amplifier's own; what the firmware believes is in its device table
@@ -51,6 +52,7 @@ class Plant(Protocol):
     def advance_to(self, t_ns: int) -> None: ...
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None: ...
     def strap(self, pulse: Literal["set", "reset"]) -> None: ...
+    def sag_supply(self, part: float) -> None: ...
     def motion(self) -> BodyMotion: ...
     def truth(self) -> Truth: ...
     def truth_row(self) -> Mapping[str, NDArray[np.float64]]: ...
@@ -73,6 +75,7 @@ class World:
         self.epoch_ns = epoch_ns
         self.devices: dict[str, Any] = {}
         self.buses = EmulatedBuses()
+        self.faults = WiringFaults(int(description.get("emulation", {}).get("seed", 1)))
         self._timed: list[TimedFace] = []
         self._adc_wiring = np.zeros(4, dtype=np.intp)
         self._adc_volts = np.zeros(4)
@@ -127,7 +130,8 @@ class World:
 
     def _analog_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
-        return self.plant.analog_V if self._spike_channel is None else self._spiked(self.plant.analog_V, t_ns)
+        volts = self.plant.analog_V if self._spike_channel is None else self._spiked(self.plant.analog_V, t_ns)
+        return self.faults.inputs(volts, t_ns)
 
     def spike(self, channel: int) -> None:
         """The wire of DAQ input ``channel`` picks up a pulse of ``SPIKE_V`` for ``SPIKE_NS``, from the next look on."""
@@ -155,11 +159,16 @@ class World:
 
     def _amplifier_input(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
-            self.plant.set_demand_V(channel, volts * AMPLIFIER_GAIN, t_ns - self.epoch_ns)
+            self._piezo_demand(channel, volts * AMPLIFIER_GAIN, t_ns)
 
     def _piezo_demand(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
-            self.plant.set_demand_V(channel, volts, t_ns - self.epoch_ns)
+            self.plant.set_demand_V(channel, self.faults.demand(channel, volts), t_ns - self.epoch_ns)
+
+    def break_actuator(self, channel: int, kind: str, amount: float | None, t_ns: int) -> None:
+        """Begin a fault of one amplifier channel; the stack sees it at once."""
+        volts = self.faults.actuator(channel, kind, amount, t_ns)
+        self.plant.set_demand_V(channel, volts, t_ns - self.epoch_ns)
 
     def _stroke_um(self, axis: int, t_ns: int) -> float:
         self.plant.advance_to(t_ns - self.epoch_ns)

@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.control.plausibility import PlausibilityLimits
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.stages import StageConfigs
 from hal.bench import BenchFile, validate_table
@@ -32,6 +33,7 @@ class FirmwareConfig(BaseModel):
 
     safety: SafetyLimits = SafetyLimits()
     self_test: SelfTestLimits = SelfTestLimits()
+    plausibility: PlausibilityLimits = PlausibilityLimits()
     budget_us: dict[str, float] = Field(default_factory=dict[str, float])
     calibration: tuple[str, ...] = ()
     sensing: dict[str, Any] = Field(default_factory=dict[str, Any])

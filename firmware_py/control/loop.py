@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.manual import ManualDrive
+from firmware_py.control.plausibility import ScanCheck
 from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.wiring import Devices
@@ -45,6 +46,7 @@ from hal.types import ScanBlock, TimeSource
 
 MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
+LATE_PART = 0.9  # of a period: the prediction bridges a known delay, not this one
 BUDGETS_US = {
     "sense": 60.0,
     "estimate": 30.0,
@@ -53,7 +55,9 @@ BUDGETS_US = {
     "magnetometer": 350.0,  # 220 us of bus time
     "supervise": 300.0,
     "telemetry": 300.0,
+    "verify": 340.0,  # 260 us of bus time
 }
+VERIFY_PHASES = (1, 4, 8)
 
 
 class Recorder(Protocol):
@@ -65,14 +69,22 @@ class Recorder(Protocol):
 
 @dataclass
 class LoopCounts:
-    """What the loop counted besides the scheduler's figures. ``clipped``: commands that ran into a limit."""
+    """What the loop counted besides the scheduler's figures.
+
+    ``lost``: scans known to be missing; ``unread``: scans that were due after the last
+    one read, when the loop stopped.
+    ``clipped``: commands that ran into a limit. ``noticed``: bench time at which something that does not end a run
+    was first seen.
+    """
 
     expected: int = 0
     received: int = 0
     lost: int = 0
+    unread: int = 0
     commands: int = 0
     clipped: int = 0
     magnetometer_errors: int = 0
+    noticed: dict[str, int] = field(default_factory=dict[str, int])
     latency: DurationHistogram = field(default_factory=DurationHistogram)
 
 
@@ -105,10 +117,15 @@ class InstrumentLoop:
         self._ticks: Ticks | None = None
         self._field_V = np.zeros(3)
         self._field_fresh = False
+        self._field_hangs = False
         self._started_ns = 0
+        self._last_scan_ns = 0
         self._bad_since: dict[str, int] = {}
         self._warned = 0
         self._interrupted = ""
+        wired = devices.sensing_table
+        watched = (*wired["channels"], wired["supply_channel"], wired["temperature_channel"])
+        self._check = ScanCheck(config.plausibility, wired["lsb_V"], watched, devices.scan_labels)
         self.supervisor = Supervisor(devices.amplifier)
         self.counts = LoopCounts()
         self.error: HalError | None = None
@@ -152,6 +169,10 @@ class InstrumentLoop:
                 table.append(
                     task(f"magnetometer_{axis}", self._poll_magnetometer, 4, 10, phase, budget_of="magnetometer")
                 )
+        if self._devices.verify_output is not None:
+            # in ticks that leave the bus free for it
+            for phase in VERIFY_PHASES:
+                table.append(task(f"verify_{phase}", self._verify_output, 4, 10, phase, budget_of="verify"))
         if self._devices.telemetry is not None:
             table.append(task("telemetry", self._send_telemetry, 6, 20, 5))
         return table
@@ -178,6 +199,7 @@ class InstrumentLoop:
             self._ramp_without_scans()
             self._tell_end()
             self._stop()
+            self._count_unread()
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
@@ -207,6 +229,10 @@ class InstrumentLoop:
         while self.supervisor.state is not State.SAFE:
             ticks = ticker.wait()
             self._ticks = ticks
+            if ticks.n > 1:
+                self._notice("scans came late")
+                if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
+                    self._trip(f"the host stood still: {ticks.n} scans of {self._devices.daq.name} came at once")
             newest_ns = ticks.due_ns + (ticks.n - 1) * ticks.dt_ns
             if ticks.source is TimeSource.HOST:
                 self._trip(f"{self._devices.daq.name}: no new scan for {limits.stale_ms:g} ms; check its link")
@@ -229,10 +255,22 @@ class InstrumentLoop:
             self._trip_for(self._devices.daq.name, error)
             raise
         self._block = block
+        if block.n:
+            self._last_scan_ns = block.t0_ns + (block.n - 1) * block.dt_ns
         self.counts.received += block.n
-        self.counts.lost += block.lost
+        if block.lost:
+            self._notice("scans were lost")
+            self.counts.lost += block.lost
         self.counts.expected += block.n + block.lost
         return block
+
+    def _notice(self, what: str) -> None:
+        self.counts.noticed.setdefault(what, self._clock.now_ns())
+
+    def _count_unread(self) -> None:
+        """Scans that the device has had time for since the last one that was read."""
+        if self._last_scan_ns:
+            self.counts.unread = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
 
     def _ramp_without_scans(self) -> None:
         """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
@@ -293,7 +331,10 @@ class InstrumentLoop:
         else:
             row = info.k - ticks.k0
             frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
-            frame[COUNTS : COUNTS + self._rows.shape[1]] = self._rows[row]
+            scan = self._rows[row]
+            frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
+            if impossible := self._check.scan(scan, info.k):
+                self._trip(impossible)
         frame[MAGNETOMETER_FRESH] = float(self._field_fresh)
         if self._field_fresh:
             frame[MAGNETOMETER_RAW : MAGNETOMETER_RAW + 3] = self._field_V
@@ -323,7 +364,10 @@ class InstrumentLoop:
                 self.error = error
                 self._trip_for(self._devices.amplifier.name, error)
                 return
-            self.counts.latency.add(self._clock.now_ns() - info.due_ns, info.k)
+            latency_ns = self._clock.now_ns() - info.due_ns
+            if latency_ns > LATE_PART * self._period_ns:
+                self._notice("commands were late")
+            self.counts.latency.add(latency_ns, info.k)
             self.counts.commands += 1
             self.counts.clipped += bool(clipped != 0 or self._frame[CLIP] != 0)
         elif self.supervisor.step():
@@ -344,13 +388,25 @@ class InstrumentLoop:
         assert magnetometer is not None
         try:
             if magnetometer.poll():
-                self._field_V[:] = magnetometer.volts
-                self._field_fresh = True
-            self._bad_since.pop("magnetometer", None)
+                volts = magnetometer.volts
+                # three axes never read the same twice; one converter that hangs gives its last word for all
+                hangs = bool(volts[0] == volts[1] == volts[2])
+                if hangs and self._field_hangs:
+                    self._notice("magnetometer's converter hangs")
+                self._field_hangs = hangs
+                self._field_V[:] = volts
+                self._field_fresh = not hangs
+            self._bad_for(
+                "magnetometer",
+                self._field_hangs,
+                info.due_ns,
+                self._config.safety.magnetometer_ms,
+                f"{magnetometer.name}: its converter gives one reading for all axes; it hangs",
+            )
         except HalError as error:
-            # heading may coast for a while; a dead magnetometer is a fault
             self.counts.magnetometer_errors += 1
-            self._bad_for("magnetometer", True, info.due_ns, 500.0, str(error))
+            self._notice("magnetometer does not answer")
+            self._bad_for("magnetometer", True, info.due_ns, self._config.safety.magnetometer_ms, str(error))
 
     def _supervise(self, info: TickInfo) -> None:
         """100 Hz: everything that may end the run and is not seen by the task that needs it."""
@@ -375,6 +431,8 @@ class InstrumentLoop:
         ):
             outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
             self._bad_for(name, outside, t_ns, 100.0, f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}")
+        if not status & FrameStatus.INVALID and (apart := self._check.pairs(frame, 0.01)):
+            self._trip(apart)
         telemetry = self._devices.telemetry
         if telemetry is not None:
             if telemetry.poll():
@@ -405,6 +463,19 @@ class InstrumentLoop:
     def _note(self, event: dict[str, object]) -> None:
         if self._recorder is not None:
             self._recorder.event({"t_ns": self._clock.now_ns(), "tick": int(self._frame[TICK]), **event})
+
+    def _verify_output(self, info: TickInfo) -> None:
+        """300 Hz: the amplifier must hold what it was told; a DAC that restarted or misheard does not."""
+        assert self._devices.verify_output is not None
+        if not self.supervisor.may_move:
+            return
+        name = self._devices.amplifier.name
+        try:
+            if wrong := self._devices.verify_output():
+                self._trip(f"{name}: {wrong}; check its supply and the bus")
+        except HalError as error:
+            self.error = error
+            self._trip_for(name, error)
 
     def _bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
         """Trip when ``bad`` has held for ``limit_ms``."""

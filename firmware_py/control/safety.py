@@ -29,7 +29,12 @@ class State(IntEnum):
 
 
 class SafetyLimits(BaseModel):
-    """When data count as stale, what is too hot, how long an axis may sit at its limit."""
+    """When data count as stale, what is too hot, how long an axis may sit at its limit.
+
+    ``stalled_ms``: scans that come in one piece after so long say that the host stood still, uncontrolled.
+    ``magnetometer_ms``: how long the heading may coast; a rate that is integrated from accelerations does not keep it
+    for longer.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -37,6 +42,8 @@ class SafetyLimits(BaseModel):
     temperature_C: tuple[float, float] = (0.0, 60.0)
     supply_V: tuple[float, float] = (4.5, 5.5)
     saturated_ms: float = 50.0
+    stalled_ms: float = 100.0
+    magnetometer_ms: float = 150.0
 
 
 @dataclass(frozen=True)

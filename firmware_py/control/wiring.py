@@ -47,7 +47,11 @@ class Daq(AnalogInputScan, Protocol):
 
 @dataclass
 class Devices:
-    """The instrument's devices, configured and not yet running. ``identities`` is what each probe found."""
+    """The instrument's devices, configured and not yet running. ``identities`` is what each probe found.
+
+    ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
+    amplifier back in less than a tick and says what differs from the last command, where the device can do that.
+    """
 
     daq: Daq
     scan: ScanInfo
@@ -55,6 +59,8 @@ class Devices:
     magnetometer: Hmc2003 | None
     telemetry: CanTelemetry | None
     sensing_table: dict[str, Any]
+    scan_labels: tuple[str, ...]
+    verify_output: Callable[[], str] | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
 
 
@@ -118,7 +124,10 @@ def open_devices(bench: OpenBench) -> Devices:
         for _ in magnetometer.measure_offset():
             wait_s(bench.clock, 0.001)
         sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
-    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, identities)
+    labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in ACCELEROMETERS)
+    labels += tuple(f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature"))
+    verify = amplifier.verify if isinstance(amplifier, DacAmplifier) else None
+    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, identities)
 
 
 def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:

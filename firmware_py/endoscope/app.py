@@ -17,7 +17,8 @@ from firmware_py.endoscope.wiring import open_sensors
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
 from firmware_py.sensing.fusion import Fusion
-from hal.bench import BenchFile, OpenBench
+from hal.bench import BenchFile, OpenBench, Port
+from hal.contracts import Clock
 
 StateSink = Callable[[GameState, int], None]
 
@@ -28,10 +29,11 @@ def run_request(
     on_status: Callable[[dict[str, Any]], None] | None,
     runtime_dir: Path | None,
     on_open: Callable[[OpenBench], None] | None,
+    wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """What ``firmware_py.app.run_in_process`` does, for an endoscope bench."""
     config = load_endoscope_config(bench)  # before a device is touched
-    with open_requested(request, bench, runtime_dir) as opened:
+    with open_requested(request, bench, runtime_dir, wrap) as opened:
         if on_open is not None:
             on_open(opened)
         _, outcome = run_endoscope(request, bench, opened, on_status, config=config)

@@ -58,6 +58,12 @@ class Ad5696r:
         self.reference_on = True
         self._pointer = 0
 
+    def brown_out(self, t_ns: int) -> None:
+        """Fault hook: the supply dips, the part starts anew with its power-up outputs."""
+        self._reset()
+        for channel in range(CHANNELS):
+            self._drive(channel, t_ns)
+
     def acknowledges(self) -> bool:
         return not self.nack_address
 

@@ -144,6 +144,15 @@ class Di4108:
         """Samples that the host has not read yet."""
         return (len(self._out) + len(self._partial) + self.unread) // 2
 
+    def set_clock_error_ppb(self, ppb: int, t_ns: int) -> None:
+        """Fault hook: from the last conversion on the crystal runs fast by ``ppb``."""
+        self.advance_to(t_ns)
+        self._clock_error_ppb = ppb
+        self._start_ns += self._conversion * self._num // self._den
+        self._conversion = 0
+        self._den = DIVIDEND_HZ * (10**9 + ppb) * self._conversions
+        self._next_ns = self._start_ns + self._num // self._den
+
     def force_overflow(self) -> None:
         """Fault hook: as if the host had not read for too long."""
         if self.scanning:

@@ -49,6 +49,7 @@ class Instrument:
         self.unit = build_unit(config, seed if unit is None else unit)
         self._plant, self._state = plant_arrays(config, self.unit, hand.frame)
         self._hand, self._quiet = hand, quiet
+        self._supply_V = float(self._plant[0]["supply_V"])
         self._tip_m = np.array(config.instrument.tip_mm) * 1e-3
         self._rng = stream(seed, "instrument.noise")
         self._nodes, self._parts = np.zeros((BLOCK_MS + 1, 18)), np.zeros((BLOCK_MS, 6))
@@ -126,6 +127,14 @@ class Instrument:
             raise ValueError(f"strap pulse {pulse!r}: it is 'set' or 'reset'")
         self._state[0]["strap"] = 1.0 if pulse == "set" else -1.0
         outputs_later(self._plant, self._state, 0.0)
+
+    def sag_supply(self, part: float) -> None:
+        """Fault hook: the sensors' supply is ``part`` of what it was when the unit was built, from the next step on."""
+        self._plant[0]["supply_V"] = self._supply_V * part
+
+    def redraw_noise(self, seed: int) -> None:
+        """From the next block on the noise is another: what a run would have been on another day."""
+        self._rng = stream(seed, "instrument.noise.redrawn")
 
     def motion(self) -> BodyMotion:
         """Of the body at the last step; the specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""

@@ -62,6 +62,9 @@ class Scanner:
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None:
         """There is no manipulator on this bench."""
 
+    def sag_supply(self, part: float) -> None:
+        """The IMU regulates its own supply."""
+
     def strap(self, pulse: Literal["set", "reset"]) -> None:
         """There is no bridge magnetometer on this bench."""
 

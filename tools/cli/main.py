@@ -12,6 +12,7 @@ from tools.cli import (
     calibrate,
     doctor,
     endoscope,
+    faults,
     hands,
     imu,
     mismatch,
@@ -54,6 +55,7 @@ app.command("bench")(bench.bench)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("hands")(hands.hands)
+app.command("faults")(faults.faults)
 app.command("reproduce")(reproduce.reproduce)
 app.command("noise")(noise.noise)
 app.command("placement")(placement.placement)

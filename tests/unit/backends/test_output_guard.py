@@ -72,3 +72,15 @@ def test_wrong_number_of_values():
     out, _ = guard()
     with pytest.raises(SafetyTrip, match="3 values for 2"):
         out.admit(np.zeros(3))
+
+
+def test_a_ramp_that_was_held_up_makes_up_by_three_steps_at_most():
+    out, clock = guard()
+    out.start_from([90.0, 50.0])
+    parts = []
+    for gap_ms in (0, 1, 2, 9, 0, 0):
+        clock.burn_ns(gap_ms * 1_000_000)
+        out.ramp()
+        out.sent()
+        parts.append(round((90.0 - out.last_V[0]) / 2.0))
+    assert parts == [1, 2, 4, 7, 10, 13]

@@ -11,7 +11,7 @@ import pytest
 from drivers.daq.di4108 import Di4108
 from hal.clock import VirtualClock
 from hal.errors import BenchError, Disconnected, ErrorKind, I2cNack, ProtocolError
-from hal.middleware.fault import FaultCan, FaultI2c, FaultPlan, FaultSerial
+from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
 from hal.middleware.share import SharedCan
 from hal.middleware.trace import Entry, TraceCan, TraceI2c, TraceSerial, read_transcript
 from hal.types import CanFrame, I2cRead, I2cWrite, ScanConfig

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -18,10 +20,10 @@ PROBE = [
     (A, [("w", b"\x40\x00\x00")]),  # normal operation
     (A, [("w", b"\x18\x5a\xa5")]),  # input register D
     (A, [("w", b"\x08"), ("r", b"\x5a\xa5")]),
-    (A, [("w", b"\x18\xa5\x5a")]),
-    (A, [("w", b"\x08"), ("r", b"\xa5\x5a")]),
     (A, [("w", b"\x18\x00\x00")]),
     (A, [("w", b"\x08"), ("r", b"\x00\x00")]),
+    (A, [("w", b"\x18\xa5\x5a")]),
+    (A, [("w", b"\x08"), ("r", b"\xa5\x5a")]),
 ]
 NEUTRAL = bytes.fromhex("800080008000")
 
@@ -131,7 +133,7 @@ def test_safe_ramp_takes_twenty_steps_and_disarms():
         update(*(round((v + (50.0 - v) * k / 20) * 655.36) for v in (100.0 - 100.0 / 65536, 0.0, 50.0)))
         for k in range(1, 21)
     ]
-    amplifier, bus, _ = armed(far, *ramp, slew_V_per_s=1e9)
+    amplifier, bus, _ = armed(far, *ramp, readback(NEUTRAL), slew_V_per_s=1e9)
     amplifier.write(np.array([100.0, 0.0, 50.0]))
     assert [amplifier.safe_step() for _ in range(20)] == [False] * 19 + [True]
     bus.done()
@@ -151,12 +153,36 @@ def test_a_failed_step_is_offered_again():
 
 def test_close_goes_to_neutral_first():
     ramp = [update(0x8000 + round(655.36 * (20 - k) / 2), 0x8000, 0x8000) for k in range(1, 21)]
-    amplifier, bus, clock = armed(update(0x8000 + 6554, 0x8000, 0x8000), *ramp, slew_V_per_s=1e9)
+    amplifier, bus, clock = armed(update(0x8000 + 6554, 0x8000, 0x8000), *ramp, readback(NEUTRAL), slew_V_per_s=1e9)
     amplifier.write(np.array([60.0, 50.0, 50.0]))
     t0 = clock.now_ns()
     amplifier.close()
     assert clock.now_ns() - t0 < 20 * MS
     amplifier.close()
+    bus.done()
+
+
+def test_the_ramp_is_over_when_the_dac_says_so():
+    jumps = [update(0x8000, 0x8000, 0x8000), readback(bytes.fromhex("8000800033b0"))] * 2
+    amplifier, bus, _ = armed(*jumps, slew_V_per_s=1e9)
+    for _ in range(2):
+        with pytest.raises(SafetyTrip, match=r"13232"):
+            amplifier.safe_step()
+    bus.done()
+
+
+@pytest.mark.parametrize(
+    ("held", "says"),
+    [
+        ("800080008000a55a", ""),
+        ("8000800080008000", "has restarted .*0x8000 instead of 0xA55A"),
+        ("8000c0008000a55a", r"output 2 holds 75\.000 V and was told 50\.000 V"),
+    ],
+)
+def test_verify_reads_all_four_registers(held: str, says: str):
+    amplifier, bus, _ = armed(readback(bytes.fromhex(held)))
+    found = amplifier.verify()
+    assert re.search(says, found) if says else found == ""
     bus.done()
 
 

@@ -27,6 +27,9 @@ class FakePlant:
         self.t_ns = t_ns
         self.demands.append((channel, volts, t_ns))
 
+    def sag_supply(self, part: float) -> None:
+        self.supply_part = part
+
     def strap(self, pulse: str) -> None:
         self.straps.append(pulse)
 

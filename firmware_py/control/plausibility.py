@@ -1,0 +1,138 @@
+"""Is a scan physically possible? Per input, from raw counts, before anybody believes the motion that they tell.
+
+Six axes and six unknowns leave no parity while the instrument moves (ERRATA no. 15). What is left: a sensor behind
+its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails; and of axes that point the
+same way at two places the slow parts must agree, because turning hands do not accelerate for long.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from firmware_py.frame import ACCELEROMETER
+from hal.compiled import kernel
+
+SENSORS, SUPPLY = 6, 6  # accelerometers come first, the supply after them
+PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
+"""Places in AXES of two sensors along one body axis: 1x and 3x, 1z and 2z, 2y and 3y."""
+
+
+class PlausibilityLimits(BaseModel):
+    """What no healthy sensor does. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    jump_V: float = Field(default=0.03, gt=0.0)
+    rail_V: tuple[float, float] = (0.4, 4.6)
+    stuck_ticks: int = Field(default=20, ge=5)
+    pair_m_s2: float = Field(default=0.6, gt=0.0)
+    pair_s: float = Field(default=0.1, gt=0.0)
+
+
+class Finding(IntEnum):
+    """What is wrong with an input."""
+
+    NONE = 0
+    RAIL = 1
+    JUMP = 2
+    STUCK = 3
+
+
+WORDS = {
+    Finding.RAIL: "is at the end of its range; broken wire or short circuit",
+    Finding.JUMP: "jumped faster than its filter allows; loose contact, crossed wires, a damaged transfer or a blow",
+    Finding.STUCK: "has repeated one reading {n} times; the sensor or the converter is stuck",
+}
+
+
+@kernel
+def check_counts(
+    counts: NDArray[np.int16],
+    noisy: int,
+    last: NDArray[np.int64],
+    same: NDArray[np.int64],
+    steps: int,
+    jump: int,
+    lo: int,
+    hi: int,
+    stuck: int,
+) -> int:
+    """16 * channel + Finding of the first impossible input, else 0; only the first ``noisy`` can be stuck.
+
+    ``last``, ``same`` (n,) are the state: the last counts (``same[0] < 0`` before the first scan) and how often they
+    have come in a row. ``steps``: ticks since the last scan that was seen.
+    """
+    found = 0
+    first = same[0] < 0
+    for i in range(len(counts)):
+        c = np.int64(counts[i])
+        if first:
+            same[i] = 0
+        elif c == last[i]:
+            same[i] += 1
+        else:
+            same[i] = 0
+        if found == 0:
+            if c <= lo or c >= hi:
+                found = 16 * i + 1
+            elif not first and abs(c - last[i]) > jump * steps:
+                found = 16 * i + 2
+            elif i < noisy and same[i] >= stuck:
+                found = 16 * i + 3
+        last[i] = c
+    return found
+
+
+class ScanCheck:
+    """Looks at every scan, before it is believed.
+
+    ``columns``: places in a scan of the accelerometers (AXES order), the supply and the temperature; ``labels`` names
+    them for people.
+    """
+
+    def __init__(self, limits: PlausibilityLimits, lsb_V: float, columns: Sequence[int], labels: Sequence[str]) -> None:
+        self.limits = limits
+        self._order = np.array(columns, dtype=np.intp)
+        self._labels = tuple(labels)
+        n = len(columns)
+        self._counts, self._last = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int64)
+        self._same = np.full(n, -1, dtype=np.int64)
+        self._jump, self._lo, self._hi = round(limits.jump_V / lsb_V), *(round(v / lsb_V) for v in limits.rail_V)
+        self._apart = np.zeros(len(PAIRS))
+        self._tick = -1
+
+    def scan(self, row: NDArray[np.int16], tick: int) -> str:
+        """Counts of scan ``tick``: empty, or what is wrong, in words."""
+        steps = tick - self._tick if self._tick >= 0 else 1
+        self._tick = tick
+        np.take(row, self._order, out=self._counts)
+        supply_before = int(self._last[SUPPLY])
+        found = check_counts(
+            self._counts, SENSORS, self._last, self._same, steps, self._jump, self._lo, self._hi,
+            self.limits.stuck_ticks,
+        )  # fmt: skip
+        if not found:
+            return ""
+        channel, finding = divmod(found, 16)
+        if supply_before and abs(int(self._counts[SUPPLY]) - supply_before) > self._jump // 2:
+            # the sensors are ratiometric: all of them follow their supply
+            return f"{self._labels[SUPPLY]} jumped; check the sensors' supply, its wire and the DAQ's line"
+        return f"{self._labels[channel]} {WORDS[Finding(finding)].format(n=self.limits.stuck_ticks)}"
+
+    def pairs(self, frame: NDArray[np.float64], elapsed_s: float) -> str:
+        """Slow difference of parallel axes, every ``elapsed_s``: empty, or which two disagree."""
+        part = min(1.0, elapsed_s / self.limits.pair_s)
+        for n, (i, j, axis) in enumerate(PAIRS):
+            apart = float(frame[ACCELEROMETER + i] - frame[ACCELEROMETER + j])
+            self._apart[n] += part * (apart - self._apart[n])
+            if abs(self._apart[n]) > self.limits.pair_m_s2:
+                return (
+                    f"{self._labels[i]} and {self._labels[j]} disagree by {self._apart[n]:.2f} m/s^2 along {axis}: "
+                    "one of them has drifted or is calibrated wrongly"
+                )
+        return ""

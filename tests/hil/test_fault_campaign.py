@@ -1,0 +1,53 @@
+"""A part of the fault campaign in virtual time: one fault of each room, one hand, one seed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.conftest import DEFAULT_BENCH
+from tools.faults.campaign import FaultRow, totals
+from tools.faults.catalogue import faults
+from tools.faults.points import POINTS, write_bench
+from tools.faults.trial import observe_running, observe_start
+
+NAMES = (
+    "serial: silence",
+    "daq: FIFO overflow",
+    "sensor: stuck",
+    "sensor: sign turned round",
+    "output bus: DAC holds its outputs",
+    "output bus: DAC restarts",
+    "magnetometer: ADC never ready",
+    "can: stop button pressed",
+    "host: stalls for 500 ms",
+)
+
+
+def test_every_name_is_there_once():
+    names = [fault.name for fault in faults()]
+    assert len(set(names)) == len(names) >= 60
+    assert set(NAMES) <= set(names)
+
+
+@pytest.mark.timeout(200)
+def test_answers_are_as_expected_and_nothing_is_unsafe_or_uncounted(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    chosen = [fault for fault in faults() if fault.name in NAMES]
+    observations = observe_running(bench, "typical", chosen, 5)
+    rows = [FaultRow(fault, "typical", (o,)) for fault, o in zip(chosen, observations, strict=True)]
+    for row in rows:
+        assert row.as_expected == 1, row.as_dict()
+        assert row.wrong_messages == 0, row.as_dict()
+    total = totals(rows)
+    assert total["unsafe_outputs"] == 0
+    assert total["uncounted_samples"] == 0
+
+
+def test_a_bench_with_a_broken_sensor_does_not_start(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH, POINTS[0], tmp_path)
+    fault = next(fault for fault in faults() if fault.name == "sensor: wire broken at start")
+    o = observe_start(bench, "steady", fault, 1)
+    assert o.answer == "refused"
+    assert "acc1.z (DAQ input 1)" in o.message

@@ -1,0 +1,104 @@
+"""What a scan may not do, found in the tick in which it does it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck, check_counts
+from firmware_py.frame import ACCELEROMETER, LAYOUT
+
+LSB_V = 5.0 / 32768.0
+LABELS = ("1x", "1z", "2y", "2z", "3x", "3y", "supply", "temperature")
+LEVEL_V = np.array([2.6, 2.2, 3.5, 2.4, 2.5, 3.4, 2.5, 0.75])
+
+
+def check(**limits: float) -> ScanCheck:
+    return ScanCheck(PlausibilityLimits(**limits), LSB_V, range(8), LABELS)  # type: ignore[arg-type]
+
+
+def scans(n: int, seed: int = 1) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    return np.round((LEVEL_V + 0.001 * rng.standard_normal((n, 8))) / LSB_V).astype(np.int16)
+
+
+def findings(made: ScanCheck, rows: np.ndarray) -> list[tuple[int, str]]:
+    return [(k, text) for k, row in enumerate(rows) if (text := made.scan(row, k))]
+
+
+def test_noise_around_any_level_is_plausible():
+    assert findings(check(), scans(5000)) == []
+
+
+@pytest.mark.parametrize(
+    ("channel", "volts", "at", "words"),
+    [
+        (0, 0.0, 100, "1x is at the end of its range"),
+        (3, 5.0, 100, "2z is at the end of its range"),
+        (1, 2.3, 100, "1z jumped"),
+        (7, 0.0, 100, "temperature is at the end"),
+        (6, 2.2, 100, "supply jumped"),
+    ],
+)
+def test_a_sudden_change_is_found_in_its_own_scan(channel: int, volts: float, at: int, words: str):
+    rows = scans(200)
+    rows[at:, channel] = round(min(volts, 4.9998) / LSB_V)
+    first, text = findings(check(), rows)[0]
+    assert first == at
+    assert text.startswith(words)
+
+
+def test_a_sag_of_the_supply_is_blamed_on_the_supply_not_on_a_sensor():
+    rows = scans(200)
+    rows[100:, :7] = (rows[100:, :7] * 0.9).astype(np.int16)
+    assert findings(check(), rows)[0][1].startswith("supply jumped")
+
+
+def test_a_stuck_sensor_is_found_when_its_noise_has_been_missing_for_twenty_scans():
+    rows = scans(200)
+    rows[100:, 4] = rows[100, 4]
+    first, text = findings(check(), rows)[0]
+    assert first == 120
+    assert "3x has repeated one reading 20 times" in text
+
+
+def test_the_supply_may_stand_still():
+    rows = scans(200)
+    rows[:, 6:] = rows[0, 6:]
+    assert findings(check(), rows) == []
+
+
+def test_what_may_have_changed_during_lost_scans_is_no_jump():
+    rows = scans(2)
+    rows[1, 0] += round(0.1 / LSB_V)
+    made = check(jump_V=0.03)
+    assert made.scan(rows[0], 0) == ""
+    assert made.scan(rows[1], 5) == ""
+    made = check(jump_V=0.03)
+    made.scan(rows[0], 0)
+    assert "jumped" in made.scan(rows[1], 1)
+
+
+def test_parallel_axes_must_agree_slowly_and_may_differ_in_tremor():
+    t = np.arange(1000) * 0.01
+    made, frame = check(), LAYOUT.new_frame()
+    for k in range(1000):
+        frame[ACCELEROMETER + 4] = 1.0 * np.sin(2 * np.pi * 9.7 * t[k])
+        assert made.pairs(frame, 0.01) == ""
+    frame[ACCELEROMETER + 4] = 1.0
+    texts = [made.pairs(frame, 0.01) for _ in range(30)]
+    # a low-pass of 0.1 s passes 0.6 of a step of 1 m/s^2 after 0.92 time constants
+    assert 5 <= next(k for k, text in enumerate(texts) if text) <= 13
+    assert "1x and 3x disagree" in texts[-1]
+
+
+def test_kernel_and_python_agree():
+    rows = scans(300)
+    rows[50, 2] += 2000
+    rows[200:, 5] = rows[200, 5]
+    results = []
+    for function in (check_counts, check_counts.py_func):  # type: ignore[attr-defined]
+        last, same = np.zeros(8, dtype=np.int64), np.full(8, -1, dtype=np.int64)
+        results.append([function(row, 6, last, same, 1, 197, 2621, 30147, 20) for row in rows])
+    assert results[0] == results[1]
+    assert {value for value in results[0] if value} == {16 * 2 + 2, 16 * 5 + 3}

@@ -1,0 +1,165 @@
+"""All faults, at all operating points, with all seeds; then one row per fault and point."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tools.faults.fault import Fault
+from tools.faults.judge import Observation
+from tools.faults.points import POINTS, Point, write_bench
+from tools.faults.trial import observe_running, observe_start
+
+WITHIN_MS = 20.0  # from the moment at which the tip has gone 5 um astray
+
+
+@dataclass(frozen=True)
+class FaultRow:
+    """What one fault did at one operating point, over all seeds. ``late``: runs in which the tip went more than 5 um
+    astray and nothing was known of it 20 ms later."""
+
+    fault: Fault
+    point: str
+    observations: tuple[Observation, ...]
+
+    @property
+    def seeds(self) -> int:
+        return len(self.observations)
+
+    @property
+    def detected(self) -> int:
+        """Runs in which the instrument tripped, noticed, or refused to start."""
+        return sum(o.answer != "none" for o in self.observations)
+
+    @property
+    def answer(self) -> str:
+        """The commonest answer."""
+        answers = [o.answer for o in self.observations]
+        return max(sorted(set(answers)), key=answers.count)
+
+    @property
+    def as_expected(self) -> int:
+        quiet = self.fault.expected in ("harmless", "cannot be seen")
+        return sum(o.answer == self.fault.expected or (quiet and o.answer == "none") for o in self.observations)
+
+    @property
+    def late(self) -> int:
+        return sum(moved_unseen(o) for o in self.observations)
+
+    @property
+    def unsafe(self) -> int:
+        """Unsafe demands that were the firmware's; what the fault itself does to the output is counted apart."""
+        return 0 if self.fault.own_output else sum(o.unsafe for o in self.observations)
+
+    @property
+    def wrong_messages(self) -> int:
+        """Trips and refusals whose message names none of the words that belong to the fault."""
+        told = [o for o in self.observations if o.answer in ("safe state", "refused")]
+        return sum(not any(word.lower() in o.message.lower() for word in self.fault.names) for o in told)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Row of the contract's JSON, and what else is known."""
+        return {
+            "fault": self.fault.name,
+            "point": self.point,
+            "seeds": self.seeds,
+            "detected": self.detected,
+            "detect_ms": _spread([o.detect_ms for o in self.observations]),
+            "answer": self.answer,
+            "answer_ms": _spread([o.neutral_ms for o in self.observations if o.answer == "safe state"]),
+            "unsafe_outputs": self.unsafe,
+            "uncounted_samples": sum(o.uncounted for o in self.observations),
+            "tip_error_um_max": max(o.astray_um for o in self.observations),
+            "message_names_cause": self.wrong_messages == 0,
+            "expected": self.fault.expected,
+            "as_expected": self.as_expected,
+            "moved_unseen": self.late,
+            "not_confirmed": sum(not o.confirmed for o in self.observations),
+            "message": next((o.message for o in self.observations if o.answer in ("safe state", "refused")), ""),
+            "why": self.fault.why,
+        }
+
+
+def moved_unseen(o: Observation) -> bool:
+    """The tip was 5 um astray and 20 ms later nothing was known of it."""
+    if o.moved_ms is None:
+        return False
+    return o.detect_ms is None or o.detect_ms > o.moved_ms + WITHIN_MS
+
+
+def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
+    """Sums over the campaign; the goals are those of the reliability page."""
+    runs = [o for row in rows for o in row.observations]
+    moving = [o for o in runs if o.moved_ms is not None]
+    return {
+        "faults": len({row.fault.name for row in rows}),
+        "points": len({row.point for row in rows}),
+        "runs": len(runs),
+        "as_expected": sum(row.as_expected for row in rows),
+        "moving_the_tip_5_um": len(moving),
+        "of_these_known_within_20_ms": sum(not moved_unseen(o) for o in moving),
+        "unsafe_outputs": sum(row.unsafe for row in rows),
+        "jumps_of_the_fault": sum(o.unsafe for row in rows if row.fault.own_output for o in row.observations),
+        "uncounted_samples": sum(o.uncounted for o in runs),
+        "wrong_messages": sum(row.wrong_messages for row in rows),
+    }
+
+
+def run_campaign(
+    bench: Path,
+    faults: Sequence[Fault],
+    *,
+    points: Sequence[Point] = POINTS,
+    seeds: Sequence[int],
+    jobs: int,
+    progress: Callable[[str], None],
+) -> list[FaultRow]:
+    """Every fault at every point with every seed, in virtual time, in ``jobs`` processes. Deterministic."""
+    folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
+    try:
+        benches = {point.name: write_bench(bench, point, folder) for point in points}
+        tasks = [(benches[point.name], point.name, tuple(faults), seed) for point in points for seed in seeds]
+        found: dict[tuple[str, str], list[Observation]] = {}
+        for observations in _in_parallel(tasks, jobs):
+            progress(f"{observations[0].point} hand, seed {observations[0].seed}")
+            for o in observations:
+                found.setdefault((o.fault, o.point), []).append(o)
+        return [
+            FaultRow(fault, point.name, tuple(sorted(found[fault.name, point.name], key=lambda o: o.seed)))
+            for fault in faults
+            for point in points
+        ]
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def _one(bench: Path, point: str, faults: Sequence[Fault], seed: int) -> list[Observation]:
+    running = [fault for fault in faults if not fault.at_start]
+    observations = observe_running(bench, point, running, seed) if running else []
+    return observations + [observe_start(bench, point, fault, seed) for fault in faults if fault.at_start]
+
+
+def _in_parallel(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[list[Observation]]:
+    if jobs <= 1:
+        for task in tasks:
+            yield _one(*task)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        waiting: set[Future[list[Observation]]] = {pool.submit(_one, *task) for task in tasks}
+        while waiting:
+            done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+
+
+def _spread(times_ms: Sequence[float | None]) -> dict[str, float | None]:
+    known = [t for t in times_ms if t is not None]
+    return {"p50": float(np.median(known)), "max": max(known)} if known else {"p50": None, "max": None}

@@ -1,0 +1,170 @@
+"""Every fault of the campaign, by the room in which it happens. Names are stable: results are compared by them."""
+
+from __future__ import annotations
+
+from tools.faults.fault import Fault, InWorld, OnBus, OnHost
+
+DAC, ADC = 0x0C, 0x48
+DAQ = ("daq", "acc", "DAQ input")
+NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
+NO_FEEDBACK = "nothing on this bench measures the amplifier's output or the stack's stroke; fit a monitor input"
+ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 300 Hz only"
+
+
+NOBODY = "while the host stands still only a watchdog at the amplifier could act; the CAN node has one (10 ms)"
+
+
+def faults() -> tuple[Fault, ...]:
+    """All of them, in the order of the table."""
+    rooms = (serial_line, daq_device, sensors, output_bus, magnetometer, can_bus, actuators, host)
+    return tuple(fault for room in rooms for fault in room())
+
+
+def serial_line() -> tuple[Fault, ...]:
+    def line(name: str, expected: str, *, names: tuple[str, ...] = DAQ, why: str = "", **plan: float) -> Fault:
+        return Fault(f"serial: {name}", OnBus("daq0", plan), expected, names, effect=1, why=why)  # type: ignore[arg-type]
+
+    return (
+        line("one byte in a thousand lost", "safe state", loss=0.001),
+        line("a burst of lost bytes", "safe state", loss=0.3, for_s=0.004),
+        line("one bit in ten thousand bytes flipped", "cannot be seen", corruption=1e-4, why=NO_SUM),
+        line("one bit in a hundred bytes flipped", "safe state", corruption=0.01),
+        line("bytes doubled", "safe state", duplication=0.001),
+        line("neighbouring bytes exchanged", "safe state", reorder=0.05),
+        line("reads cut short", "safe state", truncation=0.02),
+        line("every tenth read 2 ms late", "noticed", delay=0.1, delay_s=0.002),
+        line("a read 20 ms late now and then", "noticed", delay=0.02, delay_s=0.020, why=NOBODY),
+        line("silence of 3 ms", "noticed", silent_after_s=0.0, silent_for_s=0.003),
+        line("silence of 50 ms", "safe state", silent_after_s=0.0, silent_for_s=0.05),
+        line("silence", "safe state", silent_after_s=0.0),
+        line("cable pulled", "safe state", disconnect_after_s=0.0),
+        line("cable pulled for 100 ms", "safe state", disconnect_after_s=0.0, reconnect_after_s=0.1),
+    )
+
+
+def daq_device() -> tuple[Fault, ...]:
+    small = "100 ppm of a sample period is 0.1 us a tick; the time line follows it"
+    return (
+        Fault("daq: unplugged", InWorld("unplug", "daq"), "safe state", ("daq",)),
+        Fault("daq: frozen", InWorld("freeze", "daq"), "safe state", ("daq",)),
+        Fault("daq: frozen for 3 ms", InWorld("freeze", "daq", "thaw", 0.003), "noticed", ("daq",)),
+        Fault("daq: FIFO overflow", InWorld("overflow", "daq"), "safe state", ("overflow",)),
+        Fault("daq: crystal 100 ppm fast", InWorld("clock=100", "daq"), "harmless", why=small, redraws=True),
+        Fault("daq: crystal 100 ppm slow", InWorld("clock=-100", "daq"), "harmless", why=small, redraws=True),
+        Fault("daq: does not answer at start", InWorld("freeze", "daq"), "refused", ("daq",), at_start=True),
+    )
+
+
+def sensors() -> tuple[Fault, ...]:
+    def one(name: str, fault: str, expected: str, channel: int = 1, why: str = "", watch_s: float = 0.15) -> Fault:
+        words = ("acc", "DAQ input")
+        return Fault(f"sensor: {name}", InWorld(fault, str(channel)), expected, words, watch_s, why=why)  # type: ignore[arg-type]
+
+    slow = "50 mV/s is within what motion can do for seconds; parallel axes disagree after some seconds"
+    fast = "1 mV/ms is as fast as tremor; only the slow disagreement of parallel axes shows it"
+    return (
+        one("stuck", "sensor_stuck", "safe state"),
+        one("wire broken", "sensor_open", "safe state"),
+        one("short to the supply", "sensor_short", "safe state"),
+        one("at the end of its range", "sensor_saturate", "safe state"),
+        one("drifts 0.05 V/s", "sensor_drift", "cannot be seen", why=slow),
+        one("drifts 1 V/s", "sensor_drift=1", "safe state", watch_s=0.3, why=fast),
+        one("one spike of 0.5 V", "sensor_spike", "safe state"),
+        one("50 mV of noise", "sensor_noise", "safe state"),
+        one("half the sensitivity", "sensor_gain", "safe state"),
+        one("sign turned round", "sensor_sign", "safe state"),
+        one("exchanged with its neighbour", "sensor_swap", "safe state", 2),
+        Fault("sensor: supply sags to 4.25 V", InWorld("supply=0.85", ""), "safe state", ("supply",), 0.3),
+        Fault("sensor: supply sags by 1 %", InWorld("supply=0.99", ""), "harmless", why="ratiometric: it cancels"),
+        Fault("sensor: temperature wire broken", InWorld("sensor_open", "7"), "safe state", ("temperature",)),
+        Fault("sensor: supply wire broken", InWorld("sensor_open", "6"), "safe state", ("supply",)),
+        Fault("sensor: supply reading stuck", InWorld("sensor_stuck", "6"), "harmless", why="the supply moves slowly"),
+        Fault("sensor: stuck at start", InWorld("sensor_stuck", "1"), "refused", ("acc", "DAQ input"), at_start=True),
+        Fault("sensor: wire broken at start", InWorld("sensor_open", "1"), "refused", ("acc", "DAQ"), at_start=True),
+        Fault("sensor: exchanged at start", InWorld("sensor_swap", "2"), "refused", ("acc", "DAQ"), at_start=True),
+    )
+
+
+def output_bus() -> tuple[Fault, ...]:
+    def piezo(name: str, expected: str, *, why: str = "", **plan: float) -> Fault:
+        how, own = OnBus("i2c0", plan, only=DAC), "write_corruption" in plan
+        return Fault(f"output bus: {name}", how, expected, ("piezo",), own_output=own, effect=4, why=why)  # type: ignore[arg-type]
+
+    return (
+        Fault("output bus: DAC refuses its address", InWorld("nack", "piezo"), "safe state", ("piezo",)),
+        Fault("output bus: DAC refuses data", InWorld("nack_data", "piezo"), "safe state", ("piezo",)),
+        Fault("output bus: DAC deaf for 2 ms", InWorld("nack", "piezo", "ack", 0.002), "safe state", ("piezo",)),
+        Fault("output bus: SDA stuck", InWorld("stuck", "i2c0"), "safe state", ("piezo", "i2c", "SDA")),
+        Fault("output bus: SDA stuck for 5 ms", InWorld("stuck", "i2c0", "free", 0.005), "safe state", ("SDA",)),
+        Fault("output bus: DAC restarts", InWorld("brown_out", "piezo"), "safe state", ("piezo",), own_output=True),
+        Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", ("piezo",)),
+        piezo("one transfer in a hundred refused", "safe state", nack=0.01),
+        piezo("half of the transfers lost", "safe state", loss=0.5),
+        piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0),
+        piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1),
+        piezo("a bit wrong in one transfer of a thousand", "cannot be seen", write_corruption=0.001, why=ONE_BYTE),
+        piezo("transfers 1 ms late", "noticed", delay=1.0, delay_s=0.001),
+        piezo("transfers sent twice", "noticed", duplication=1.0),
+        piezo("silence", "safe state", silent_after_s=0.0),
+        piezo("adapter unplugged", "safe state", disconnect_after_s=0.0),
+        Fault("output bus: no DAC at start", InWorld("nack", "piezo"), "refused", ("piezo", "0x0c"), at_start=True),
+        Fault("output bus: DAC holds at start", InWorld("freeze", "piezo"), "refused", ("piezo",), at_start=True),
+    )
+
+
+def magnetometer() -> tuple[Fault, ...]:
+    coasts = "the heading coasts for 150 ms"
+    return (
+        Fault("magnetometer: ADC refuses its address", InWorld("nack", "mag_adc"), "safe state", ("mag", "0x48"), 0.3),
+        Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "safe state", ("mag",), 0.3),
+        Fault("magnetometer: one transfer in ten refused", OnBus("i2c0", {"nack": 0.1}, ADC), "noticed", ("mag",)),
+        Fault(
+            "magnetometer: bits of its readings flipped", OnBus("i2c0", {"corruption": 0.1}, ADC), "harmless",
+            why="gated by the field's norm; " + coasts,
+        ),
+        Fault("magnetometer: no ADC at start", InWorld("nack", "mag_adc"), "refused", ("0x48",), at_start=True),
+    )  # fmt: skip
+
+
+def can_bus() -> tuple[Fault, ...]:
+    def frames(name: str, expected: str, *, watch_s: float = 0.3, why: str = "", **plan: float) -> Fault:
+        names = ("CAN", "stop button", "can0", "bus-off")
+        return Fault(f"can: {name}", OnBus("can0", plan), expected, names, watch_s, effect=1, why=why)  # type: ignore[arg-type]
+
+    heard = "the button is heard often enough"
+    return (
+        Fault("can: stop button pressed", InWorld("press", ""), "safe state", ("stop button",), 0.3),
+        Fault("can: bus silent", InWorld("silence", "can0"), "safe state", ("stop button",), 1.8),
+        frames("one frame in five lost", "harmless", loss=0.2, why=heard),
+        frames("bits of frames flipped", "harmless", corruption=0.2, why="counters and range checks; " + heard),
+        frames("frames doubled", "harmless", duplication=0.5, why=heard),
+        frames("frames out of order", "harmless", reorder=0.5, why=heard),
+        frames("frames cut short", "harmless", truncation=0.2, why=heard),
+        frames("controller bus-off", "safe state", watch_s=1.8, bus_off_after_s=0.0),
+        frames("error frames", "harmless", error_frames_hz=500.0, why=heard),
+        frames("a node babbles", "harmless", babble_hz=4000.0, why="a poll reads a bounded number of frames"),
+        frames("adapter unplugged", "safe state", watch_s=1.8, disconnect_after_s=0.0),
+    )
+
+
+def actuators() -> tuple[Fault, ...]:
+    def one(name: str, fault: str) -> Fault:
+        how = InWorld(f"actuator_{fault}", "1")
+        return Fault(f"actuator: {name}", how, "cannot be seen", ("piezo", "output"), why=NO_FEEDBACK)
+
+    return (
+        one("open", "open"),
+        one("short to the rail", "rail"),
+        one("stuck", "stuck"),
+        one("slow", "slow"),
+        one("half its gain", "weak"),
+    )
+
+
+def host() -> tuple[Fault, ...]:
+    return (
+        Fault("host: stalls for 3 ms", OnHost(3.0), "noticed", ("daq",), effect=0),
+        Fault("host: stalls for 5 ms", OnHost(5.0), "noticed", ("daq",), effect=0),
+        Fault("host: stalls for 50 ms", OnHost(50.0), "noticed", ("daq",), effect=0, why=NOBODY),
+        Fault("host: stalls for 500 ms", OnHost(500.0), "safe state", ("daq",), effect=0, why=NOBODY),
+    )

@@ -1,0 +1,60 @@
+"""One fault: what is done, where, and what a good answer to it is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+Expected = Literal["safe state", "noticed", "harmless", "refused", "cannot be seen"]
+
+
+@dataclass(frozen=True)
+class InWorld:
+    """A fault of the emulated world (sim_devices.faults), ended by ``heal`` after ``for_s``."""
+
+    fault: str
+    target: str
+    heal: str = ""
+    for_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class OnBus:
+    """Middleware around the port of ``bus``; times of ``plan`` count from the strike. ``only``: one I2C address."""
+
+    bus: str
+    plan: Mapping[str, Any] = field(default_factory=dict[str, Any])
+    only: int | None = None
+
+
+@dataclass(frozen=True)
+class OnHost:
+    """The host does nothing for so long, as if another process had the processor."""
+
+    stall_ms: float
+
+
+How = InWorld | OnBus | OnHost
+
+
+@dataclass(frozen=True)
+class Fault:
+    """``names``: one of these must be in the message. ``at_start``: it is there before the bench is opened.
+
+    ``redraws``: the fault also shifts when samples are taken, so they carry other noise; the tip may then stray as
+    far as it would with other noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
+    ``effect``: how much it disturbs a real bench, by the scale of the HIL tests (0 reads .. 4 motion); 9 is for the
+    emulated world only. ``why``: for what cannot be seen, comes late or is harmless.
+    """
+
+    name: str
+    how: How
+    expected: Expected
+    names: tuple[str, ...] = ()
+    watch_s: float = 0.15
+    at_start: bool = False
+    redraws: bool = False
+    own_output: bool = False
+    effect: int = 9
+    why: str = ""

@@ -1,0 +1,148 @@
+"""What one run with a fault says: when it was seen, what was done, what it cost."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+LO_V, HI_V, NEUTRAL_V = 0.0, 100.0, 50.0
+RAMP_MS = 21.0  # 20 steps, and the tick in which it was decided
+SLEW_V_PER_MS = 20.0
+MOVED_M = 5e-6
+ENDED_WELL = ("run finished", "stopped by the operator")
+
+
+@dataclass(frozen=True)
+class Seen:
+    """From both sides of one run: outcome of the firmware; path of the tip, demands at the amplifier (t_ns, channel,
+    volts) and scans taken from the world."""
+
+    strike_ns: int
+    outcome: dict[str, Any]
+    t_ns: NDArray[np.int64]
+    tip_m: NDArray[np.float64]
+    demands: list[tuple[int, int, float]]
+    scans: int
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Times in ms from the strike; ``None``: did not happen.
+
+    ``unsafe``: demands at the amplifier beyond its range, faster than the slew limit, or not neutral 20 ms after the
+    decision although the report says so. ``uncounted``: scans of the device that the firmware cannot account for.
+    ``astray_um``: largest distance of the tip from the same run without the fault, until the decision; ``moved_ms``:
+    when it passed 5 um.
+    """
+
+    fault: str
+    point: str
+    seed: int
+    refused: bool
+    tripped_ms: float | None
+    noticed_ms: float | None
+    noticed: str
+    neutral_ms: float | None
+    message: str
+    confirmed: bool
+    unsafe: int
+    uncounted: int
+    astray_um: float
+    moved_ms: float | None
+
+    @classmethod
+    def refusal(cls, fault: str, point: str, seed: int, message: str) -> Observation:
+        """The bench could not be opened, and nothing moved."""
+        return cls(fault, point, seed, True, None, None, "", None, message, True, 0, 0, 0.0, None)
+
+    @property
+    def answer(self) -> str:
+        """What the instrument did."""
+        if self.refused:
+            return "refused"
+        if self.tripped_ms is not None:
+            return "safe state"
+        return "noticed" if self.noticed_ms is not None else "none"
+
+    @property
+    def detect_ms(self) -> float | None:
+        """When anything was known of the fault."""
+        times = [t for t in (self.tripped_ms, self.noticed_ms) if t is not None]
+        return min(times) if times else None
+
+
+def judge(
+    fault: str,
+    point: str,
+    seed: int,
+    seen: Seen,
+    reference_m: NDArray[np.float64],
+    other_noise_m: NDArray[np.float64] | None = None,
+) -> Observation:
+    """``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms; ``other_noise_m``: the same
+    with other noise from the strike on, for faults that redraw the noise."""
+    outcome = seen.outcome
+    safe = outcome["safe_state"]
+    reason = str(safe["reason"])
+    decided_ns = int(outcome["safe_ns"])
+    confirmed = bool(safe["reached"])
+    noticed = {what: t_ns for what, t_ns in outcome["noticed"].items() if t_ns >= seen.strike_ns}
+    first = min(noticed, key=noticed.__getitem__) if noticed else ""
+    n = min(len(seen.tip_m), len(reference_m))
+    away_m = np.linalg.norm(seen.tip_m[:n] - reference_m[:n], axis=1)
+    t_ns = seen.t_ns[:n]
+    before = (t_ns >= seen.strike_ns) & (t_ns <= decided_ns)
+    limit_m = np.full(n, MOVED_M)
+    if other_noise_m is not None:
+        m = min(n, len(other_noise_m))
+        limit_m[:m] += np.maximum.accumulate(np.linalg.norm(other_noise_m[:m] - reference_m[:m], axis=1))
+    moved = np.flatnonzero(before & (away_m > limit_m))
+    neutral = neutral_ms(seen.demands, decided_ns) if confirmed else None
+    samples = outcome["samples"]
+    counted = samples["received"] + samples["lost"] + samples["unread"] + 1  # and the one under way
+    return Observation(
+        fault=fault,
+        point=point,
+        seed=seed,
+        refused=outcome["armed_ns"] is None,
+        tripped_ms=None if reason.startswith(ENDED_WELL) else (decided_ns - seen.strike_ns) * 1e-6,
+        noticed_ms=(noticed[first] - seen.strike_ns) * 1e-6 if noticed else None,
+        noticed=first,
+        neutral_ms=neutral,
+        message=reason,
+        confirmed=confirmed,
+        unsafe=rough_demands(seen.demands) + (confirmed and (neutral is None or neutral > RAMP_MS)),
+        uncounted=max(0, seen.scans - counted),
+        astray_um=1e6 * float(away_m[before].max(initial=0.0)),
+        moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size else None,
+    )
+
+
+def neutral_ms(demands: list[tuple[int, int, float]], decided_ns: int) -> float | None:
+    """From the decision until the last change of a demand; ``None`` when one is not neutral in the end."""
+    last_ns = decided_ns
+    volts_of: dict[int, float] = {}
+    for t_ns, channel, volts in demands:
+        if volts != volts_of.get(channel):
+            last_ns = max(last_ns, t_ns)
+        volts_of[channel] = volts
+    if any(abs(volts - NEUTRAL_V) > 0.01 for volts in volts_of.values()):
+        return None
+    return (last_ns - decided_ns) * 1e-6
+
+
+def rough_demands(demands: list[tuple[int, int, float]]) -> int:
+    """Demands beyond the range or faster than the slew limit (after a pause at most five ticks' worth)."""
+    count = 0
+    previous: dict[int, tuple[int, float]] = {}
+    for t_ns, channel, volts in demands:
+        count += not LO_V <= volts <= HI_V
+        if channel in previous:
+            earlier_ns, before_V = previous[channel]
+            gap_ms = min(5.0, max(1.0, (t_ns - earlier_ns) * 1e-6))
+            count += abs(volts - before_V) > SLEW_V_PER_MS * gap_ms * 1.01
+        previous[channel] = (t_ns, volts)
+    return count

@@ -1,0 +1,88 @@
+"""The campaign as a page: docs/reliability.md is made by ``micron faults --out``."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from tools.faults.campaign import FaultRow, totals
+
+HEAD = """# Reliability: what breaks, what the instrument does
+
+Made by `{command}`, firmware revision {revision}. The emulated bench in virtual time: {faults} kinds of fault at
+{points} operating points ({names}), {seeds} seeds each, {runs} runs. Each fault strikes a running closed loop at a
+random instant, or is there when the bench is opened ("at start").
+
+| figure | goal | measured |
+|---|---|---|
+| runs that moved the tip more than 5 um and were known of within 20 ms of that | all | {known} of {moving} |
+| unsafe outputs | 0 | {unsafe_outputs} |
+| jumps of outputs that the fault itself makes (restarted DAC, bits flipped on I2C) | - | {jumps_of_the_fault} |
+| samples that nobody counted | 0 | {uncounted_samples} |
+| messages that do not name the cause | 0 | {wrong_messages} |
+| answers as expected below | all | {as_expected} of {runs} |
+
+How it is measured. Known: the firmware tripped, or counted it under a name (`noticed` in the run's JSON), or refused
+to start. The tip's error is its distance from the same run without the fault, until the decision. Unsafe: a demand
+that arrives at the amplifier beyond 0..100 V or faster than 20 V/ms, or a channel that is not neutral 21 ms after the
+decision although the report says that it is; a report that says "neutral NOT confirmed" makes no such claim.
+Uncounted: scans that the device took and that are neither received, nor reported lost, nor unread at the end.
+
+## What is not seen, or too late
+
+{unseen}
+
+## All faults
+
+Times in ms; error in um; "hand" is the operating point.
+
+| fault | hand | answer | known after p50 / max | neutral after max | tip error max | as expected |
+|---|---|---|---|---|---|---|
+{rows}
+"""
+
+
+def markdown(rows: Sequence[FaultRow], command: str, revision: str) -> str:
+    """The whole page."""
+    total = totals(rows)
+    return HEAD.format(
+        command=command,
+        revision=revision,
+        names=", ".join(dict.fromkeys(row.point for row in rows)),
+        seeds=max((row.seeds for row in rows), default=0),
+        known=total["of_these_known_within_20_ms"],
+        moving=total["moving_the_tip_5_um"],
+        unseen="\n".join(_unseen(rows)) or "Nothing.",
+        rows="\n".join(_line(row) for row in rows),
+        **{key: value for key, value in total.items() if f"{{{key}}}" in HEAD},
+    )
+
+
+def _unseen(rows: Sequence[FaultRow]) -> list[str]:
+    lines: list[str] = []
+    for name in dict.fromkeys(row.fault.name for row in rows):
+        mine = [row for row in rows if row.fault.name == name]
+        late, unsafe = sum(row.late for row in mine), sum(o.unsafe for row in mine for o in row.observations)
+        blind = mine[0].fault.expected == "cannot be seen"
+        if not (late or blind or unsafe):
+            continue
+        runs = sum(row.seeds for row in mine)
+        detected = sum(row.detected for row in mine)
+        worst_um = max(o.astray_um for row in mine for o in row.observations)
+        text = f"- **{name}**: known in {detected} of {runs} runs, in {late} later than 20 ms after 5 um; "
+        text += f"tip error up to {worst_um:.0f} um"
+        text += f"; {unsafe} {'jumps of its own' if mine[0].fault.own_output else 'unsafe demands'}" if unsafe else ""
+        lines.append(text + (f". {mine[0].fault.why}." if mine[0].fault.why else "."))
+    return lines
+
+
+def _line(row: FaultRow) -> str:
+    table = row.as_dict()
+    detect, answer = table["detect_ms"], table["answer_ms"]
+    known = "-" if detect["p50"] is None else f"{detect['p50']:.1f} / {detect['max']:.1f}"
+    neutral = "-" if answer["max"] is None else f"{answer['max']:.1f}"
+    if table["not_confirmed"]:
+        neutral = f"NOT confirmed ({table['not_confirmed']} of {row.seeds})"
+    return (
+        f"| {row.fault.name} | {row.point} | {row.answer} | {known} | {neutral} | {table['tip_error_um_max']:.1f} | "
+        f"{row.as_expected}/{row.seeds} |"
+    )

@@ -1,0 +1,189 @@
+"""One hand, one seed, every fault: a run in virtual time that forks at the instant of the strike.
+
+The way to the strike is the same for all faults, bit for bit, so it is gone once; then a child process per fault
+breaks something and goes on to the end of its own run. The first child breaks nothing: it is the reference.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import signal
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NoReturn, cast
+
+import numpy as np
+
+from firmware_py.app import RunRequest, run_in_process
+from hal.bench import OpenBench, Port
+from hal.clock import VirtualClock
+from hal.contracts import CanBus, Clock, I2cBus, SerialPort
+from hal.errors import HalError
+from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
+from tools.faults.fault import Fault, InWorld, OnBus, OnHost
+from tools.faults.judge import Observation, Seen, judge
+
+STRIKE_S = 2.0  # the run proper begins at about 0.58 s, commands 0.7 s after the first scan
+SPREAD_S = 0.1  # one period of the tremor
+
+Sabotaged = FaultSerial | FaultI2c | FaultCan
+
+
+def strike_s(seed: int) -> float:
+    """When, on the bench clock; anywhere within a tick and within a period of the tremor."""
+    return STRIKE_S + SPREAD_S * float(np.random.default_rng([seed, 4711]).random())
+
+
+@dataclass
+class _Bench:
+    """The opened bench from the far side: its clock, world, ports, and every demand at the amplifier."""
+
+    clock: VirtualClock = field(default_factory=VirtualClock)
+    world: Any = None
+    ports: dict[str, Sabotaged] = field(default_factory=dict[str, Sabotaged])
+    demands: list[tuple[int, int, float]] = field(default_factory=list[tuple[int, int, float]])
+
+    def attach(self, opened: OpenBench) -> None:
+        self.clock, self.world = cast(VirtualClock, opened.clock), cast(Any, opened.world)
+        self.world.world.faults.on_demand = lambda channel, volts: self.demands.append(
+            (self.clock.now_ns(), channel, volts)
+        )
+
+    def wrap(self, bus: str, port: Port, clock: Clock) -> Port:
+        """Every port can be sabotaged later; until then its plan is empty."""
+        made: Sabotaged
+        if hasattr(port, "transfer"):
+            made = FaultI2c(cast(I2cBus, port), clock, FaultPlan())
+        elif hasattr(port, "recv"):
+            made = FaultCan(cast(CanBus, port), clock, FaultPlan())
+        else:
+            made = FaultSerial(cast(SerialPort, port), clock, FaultPlan())
+        self.ports[bus] = made
+        return made
+
+    def strike(self, how: InWorld | OnBus | OnHost, seed: int) -> None:
+        now_ns = self.clock.now_ns()
+        match how:
+            case InWorld(name, target, heal, for_s):
+                self.world.inject(name, target)
+                if heal:
+                    self.clock.at(now_ns + round(for_s * 1e9), lambda _: self.world.inject(heal, target))
+            case OnBus(bus, plan, only):
+                port, full = self.ports[bus], FaultPlan(**{**plan, "seed": seed})
+                if isinstance(port, FaultI2c):
+                    port.arm(full, only=only)
+                else:
+                    port.arm(full)
+            case OnHost(stall_ms):
+                self.clock.burn_ns(round(stall_ms * 1e6))
+
+    def scans(self) -> int:
+        return int(self.world.world.devices["daq"].scans)
+
+
+def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observation:
+    """A fault that is there before the devices are opened."""
+    far = _Bench()
+
+    def open_hook(opened: OpenBench) -> None:
+        far.attach(opened)
+        far.strike(fault.how, seed)
+
+    try:
+        outcome, truth = run_in_process(RunRequest(bench, 0.2, virtual=True, seed=seed), on_open=open_hook)
+    except HalError as error:
+        return Observation.refusal(fault.name, point, seed, str(error))
+    assert truth is not None
+    seen = Seen(0, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans())
+    return judge(fault.name, point, seed, seen, truth["tip_m"])
+
+
+class _AllStruck(BaseException):
+    """The parent has sent out every child; its own run is not needed any more."""
+
+
+def observe_running(
+    bench: Path, point: str, faults: Sequence[Fault], seed: int, done: Callable[[], None] = lambda: None
+) -> list[Observation]:
+    """Each of ``faults`` strikes the same run at the same instant; ``done`` is called after each."""
+    far = _Bench()
+    at_ns = round(strike_s(seed) * 1e9)
+    answers: list[Any] = []
+    me = _Child()
+
+    def at_strike(_: int) -> None:
+        longest_s = max(fault.watch_s for fault in faults)
+        references = [(lambda: None, longest_s), (lambda: far.world.world.plant.redraw_noise(seed), longest_s)]
+        strikes = [(lambda f=fault: far.strike(f.how, seed), fault.watch_s) for fault in faults]
+        for strike, watch_s in [*references, *strikes]:
+            if me.fork(answers):
+                strike()
+                far.clock.at(at_ns + round(watch_s * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
+                return
+            done()
+        raise _AllStruck
+
+    def open_hook(opened: OpenBench) -> None:
+        far.attach(opened)
+        far.clock.at(at_ns, at_strike)
+
+    request = RunRequest(bench, 60.0, virtual=True, seed=seed)
+    try:
+        outcome, truth = run_in_process(request, on_open=open_hook, wrap=far.wrap)
+    except _AllStruck:
+        pass
+    except BaseException as error:
+        if me.is_child:
+            me.answer(error)
+        raise
+    else:
+        if not me.is_child:
+            raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
+        assert truth is not None
+        me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans()))
+    reference, other_noise, *seen_of = answers
+    return [
+        judge(fault.name, point, seed, seen, reference.tip_m, other_noise.tip_m if fault.redraws else None)
+        for fault, seen in zip(faults, seen_of, strict=True)
+    ]
+
+
+class _Child:
+    """Forks one child at a time and takes its answer through a pipe."""
+
+    def __init__(self) -> None:
+        self._pipe = -1
+
+    @property
+    def is_child(self) -> bool:
+        return self._pipe >= 0
+
+    def fork(self, answers: list[Any]) -> bool:
+        """True in the child. The parent waits for the child's answer and appends it; raises what the child raised."""
+        reader, writer = os.pipe()
+        pid = os.fork()
+        if pid == 0:
+            os.close(reader)
+            self._pipe = writer
+            return True
+        os.close(writer)
+        with os.fdopen(reader, "rb") as pipe:
+            data = pipe.read()
+        os.waitpid(pid, 0)
+        if not data:
+            raise RuntimeError("a run with a fault died without an answer")
+        answer = pickle.loads(data)
+        if isinstance(answer, BaseException):
+            raise answer
+        answers.append(answer)
+        return False
+
+    def answer(self, value: Any) -> NoReturn:
+        """Tell the parent and end this process at once: nothing of the parent's is to be cleaned up here."""
+        try:
+            with os.fdopen(self._pipe, "wb") as pipe:
+                pickle.dump(value, pipe)
+        finally:
+            os._exit(0)
