@@ -29,6 +29,8 @@ RING_S = 0.5  # of the longest horizon (one period at 7 Hz and the loop) and the
 
 def chain_sections(config: TremorConfig) -> Array:
     """(5, 5) from sample to band-passed displacement."""
+    if config.isolated:
+        return np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (SECTIONS, 1))
     band = prefilter_sections(config.wflc, config.tick_hz)
     through = np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (SECTIONS - len(band), 1))
     first = through if config.sees == "displacement" else integrator_sections(config.tick_hz)

@@ -73,7 +73,7 @@ def bmflc_params(config: TremorConfig) -> Record:
         bmflc_dtype(size),
         seen=seen_params(config),
         sections=prefilter_sections(config.wflc, config.tick_hz),
-        behind_prefilter=int(config.sees == "displacement"),
+        behind_prefilter=int(config.behind_prefilter),
         omega=2.0 * pi * (c.low_hz + c.step_hz * np.arange(size)) / config.tick_hz,
         gain=c.memory_gain if moves else c.gain,
         bias_gain=c.bias_gain,

@@ -53,7 +53,7 @@ def combiner_params(config: TremorConfig) -> Record:
         sections=prefilter_sections(config.wflc, config.tick_hz),
         trailing_gain=config.wflc.trailing_gain,
         bias_gain=config.wflc.bias_gain,
-        behind_prefilter=int(config.sees == "displacement"),
+        behind_prefilter=int(config.behind_prefilter),
         weights_of={"wflc": OWN, "flc": FIXED}.get(config.method, TRAILING),
     )
 

@@ -142,12 +142,14 @@ class TremorConfig(_Table):
     """Estimator, its horizon, what it sees and when it counts as settled.
 
     ``sees`` acceleration: samples in m/s^2 of the tip behind the RC filter of ``filter_cutoff_rad_s``. displacement:
-    samples in m behind the same filter; a sensor without a filter has ``filter_cutoff_rad_s`` inf.
+    samples in m behind the same filter; a sensor without a filter has ``filter_cutoff_rad_s`` inf. Displacement holds
+    voluntary motion, so all but the adaptive method look at it through the band-pass, unless it is ``isolated``.
     """
 
     tick_hz: Positive = 1000.0
     method: Method = "adaptive"
     sees: Literal["acceleration", "displacement"] = "acceleration"
+    isolated: bool = False
     # from the instant a scan is taken to the middle of the interval in which its command moves the tip
     loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0021  # tuned against the emulated tip, one seed
     filter_cutoff_rad_s: Annotated[float, Field(gt=0.0, le=inf)] = 1.0 / (32_000.0 * 0.33e-6)
@@ -170,9 +172,16 @@ class TremorConfig(_Table):
             raise ValueError("bmflc: low_hz < high_hz < tick_hz / 2 is needed")
         if self.ar.order * self.ar.spacing_s > 0.25:
             raise ValueError("ar: order times spacing_s must be below 0.25 s")
+        if self.isolated and self.sees != "displacement":
+            raise ValueError("isolated: only samples of a displacement can hold tremor alone")
         if self.method == "kalman" and self.sees != "acceleration":
             raise ValueError("method 'kalman' models an accelerometer: sees must be 'acceleration'")
         return self
+
+    @property
+    def behind_prefilter(self) -> bool:
+        """Whether the Fourier methods fit band-passed samples."""
+        return self.sees == "displacement" and not self.isolated
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.tremor]") -> TremorConfig:

@@ -11,6 +11,7 @@ MODULES: dict[str, str] = {
     "sensing": "tools.reproduce.sensing",
     "real-sensors": "tools.reproduce.real_sensors",
     "endoscope": "tools.reproduce.endoscope",
+    "tremor": "tools.reproduce.tremor",
 }
 
 

@@ -9,6 +9,7 @@ and the sensor's noise does not: unless told otherwise a hand is scaled to the i
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 from firmware_py.tremor.config import TremorConfig
 from tools.errors import InputError
 from tools.reports.tremor_figures import band_pass
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signals import TremorSignal, load_signals
 from tools.tremor.spectrum import highest_line, periodogram
 
 Array = NDArray[np.float64]
@@ -72,7 +73,7 @@ def case_of(signal: TremorSignal, seed: int = 0, scale: bool = True, noise: bool
     fade[:edge] = 0.5 - 0.5 * np.cos(np.pi * (np.arange(edge) + 0.5) / edge)
     fade[-edge:] = fade[:edge][::-1]
     lines = np.fft.rfft((signal.values - signal.values.mean(axis=0)) * fade[:, None], axis=0)
-    hz = np.fft.rfftfreq(len(signal.values), 1.0 / signal.rate_hz)
+    hz = np.asarray(np.fft.rfftfreq(len(signal.values), 1.0 / signal.rate_hz), dtype=np.float64)
     w = 2.0 * np.pi * np.maximum(hz, hz[1])
     top = 0.45 * signal.rate_hz
     if signal.quantity == "acceleration":
@@ -83,9 +84,7 @@ def case_of(signal: TremorSignal, seed: int = 0, scale: bool = True, noise: bool
         to_path = np.ones(len(w), dtype=np.complex128)
     path = lines * (to_path * np.clip((top - hz) / (0.1 * top), 0.0, 1.0))[:, None]
     path[0] = 0.0
-    low, full, fall, none = INVOLUNTARY_HZ
-    band = np.clip((hz - low) / (full - low), 0.0, 1.0) * np.clip((none - hz) / (none - fall), 0.0, 1.0)
-    band = 0.5 - 0.5 * np.cos(np.pi * band)
+    band = involuntary_band(hz)
     lag = 1.0 / (1.0 + 1j * w / config.filter_cutoff_rad_s)
 
     def in_time(spectrum: NDArray[np.complex128]) -> Array:
@@ -114,6 +113,50 @@ def case_of(signal: TremorSignal, seed: int = 0, scale: bool = True, noise: bool
         float(frequency),
         notes=tuple(notes),
     )
+
+
+def cases_from(source: str, scale: bool = True, noise: bool = True) -> list[Case]:
+    """Cases of ``hand:SEED`` (emulated), of a run's recording (.mcap), or of anything that ``load_signals`` reads.
+
+    Signals that are no motion (a cursor in pixels) are left out when others are there. Raises InputError.
+    """
+    if source.startswith("hand:"):
+        seed = source.removeprefix("hand:")
+        if not seed.isdigit():
+            raise InputError(f"{source}: an emulated hand is hand:SEED, for example hand:3")
+        return [emulated_hand(int(seed))]
+    if source.endswith(".mcap"):
+        return [case_of_run(Path(source))]
+    signals = load_signals(source)
+    motions = [s for s in signals if s.quantity in ("acceleration", "angular rate", "displacement")]
+    return [case_of(s, seed, scale, noise) for seed, s in enumerate(motions or signals)]
+
+
+def case_of_run(path: Path) -> Case:
+    """What an instrument saw in a run: tip acceleration as recorded; its own band, RC filter undone, is the truth."""
+    from firmware_py.recording.reader import Recording
+
+    if not path.is_file():
+        raise InputError(f"{path}: there is no such recording")
+    recording = Recording(path)
+    samples = np.asarray(recording.array([f"tip_acceleration_{a}" for a in "xyz"]), dtype=np.float64)
+    samples = samples[np.all(np.isfinite(samples), axis=1)]
+    if len(samples) < 8.0 * RATE_HZ:
+        raise InputError(f"{path}: {len(samples) / RATE_HZ:.1f} s; at least 8 s are needed")
+    lines = np.fft.rfft(samples - samples.mean(axis=0), axis=0)
+    w = 2.0 * np.pi * np.maximum(np.fft.rfftfreq(len(samples), 1.0 / RATE_HZ), 0.1)
+    undone = -(1.0 + 1j * w / TremorConfig().filter_cutoff_rad_s) / w**2 * involuntary_band(w / (2.0 * np.pi))
+    truth = np.asarray(np.fft.irfft(lines * undone[:, None], len(samples), axis=0))
+    frequency = highest_line(periodogram(truth, RATE_HZ), TREMOR_SEARCH_HZ)
+    note = "truth is the recording itself, sensor noise included"
+    return Case(path.name, "runs", path.stem, "acceleration", samples, truth, float(frequency), notes=(note,))
+
+
+def involuntary_band(hz: Array) -> Array:
+    """1 inside ``INVOLUNTARY_HZ``, soft edges."""
+    low, full, fall, none = INVOLUNTARY_HZ
+    band = np.clip((hz - low) / (full - low), 0.0, 1.0) * np.clip((none - hz) / (none - fall), 0.0, 1.0)
+    return 0.5 - 0.5 * np.cos(np.pi * band)
 
 
 def sensor_noise(shape: tuple[int, ...], seed: int) -> Array:

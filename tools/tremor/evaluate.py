@@ -18,7 +18,7 @@ from tools.tremor.cases import RATE_HZ, Case
 from tools.tremor.scores import Score, score
 
 Array = NDArray[np.float64]
-OTHERS, ORACLE = "limit (other hands)", "limit (this record)"
+OTHERS, ORACLE = "limit: others", "limit: oracle"
 HORIZONS_MS = (0, 2, 8, 20)
 
 
