@@ -54,6 +54,8 @@ class RunRequest:
     """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
     stale_ms: float | None = None
     """Another limit for missing scans than the bench file's."""
+    realtime: bool = True
+    """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
     truth_s: float | None = None
     """How much truth an emulated world keeps; None: all of it."""
 
@@ -115,7 +117,7 @@ def run_in_process(
         report = RealtimeReport()
         summary: RecordingSummary | None = None
         try:
-            with scheduling(request.virtual) as report:
+            with scheduling(request.virtual or not request.realtime) as report:
                 loop.run(request.seconds)
         finally:
             if recorder is not None:
@@ -159,8 +161,8 @@ def truth_of(opened: OpenBench) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def scheduling(virtual: bool) -> Iterator[RealtimeReport]:
-    if virtual:
+def scheduling(plain: bool) -> Iterator[RealtimeReport]:
+    if plain:
         yield RealtimeReport()
         return
     with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
@@ -254,6 +256,8 @@ def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
     """Which real-time settings the loop ran with, in words."""
     if virtual:
         return "virtual time"
+    if not report.settings:
+        return "no real-time settings asked for"
     return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
 
 

@@ -2,11 +2,81 @@
 
 from __future__ import annotations
 
-from starlette.routing import BaseRoute
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
 
+from starlette.requests import Request
+from starlette.responses import FileResponse
+from starlette.routing import BaseRoute, Route
+
+from hal.bench import load_bench
+from hal.errors import HalError
+from tools.bench.calibrate import calibrate_routes
+from tools.bench.collect import collect_routes
+from tools.bench.jobs import Jobs
+from tools.bench.mismatch import mismatch_routes
+from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
+from tools.bench.shadow import METHODS
+from tools.errors import InputError
 
 
-def more_routes(session: Session) -> list[BaseRoute]:
+def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     """Everything besides the core."""
-    return []
+    return [
+        *_attitude(session),
+        *_targets(session),
+        *collect_routes(session, jobs),
+        *mismatch_routes(session, jobs),
+        *calibrate_routes(session, jobs),
+    ]
+
+
+def _targets(session: Session) -> list[BaseRoute]:
+    targets = session.targets
+
+    def benches() -> dict[str, Path]:
+        with_card: dict[str, Path] = {}
+        for path in sorted(session.choice.bench.parent.glob("*.toml")):
+            with suppress(HalError):
+                if load_bench(path).description.devices_with("motion_card"):
+                    with_card[str(path)] = path
+        return with_card
+
+    async def state(_: Request) -> Any:
+        return {"reports": targets.reports(), "benches": list(benches())}
+
+    async def start(request: Request) -> Any:
+        table = await body(request)
+        seed = table.get("seed", 1)
+        if not isinstance(seed, int) or not 0 <= seed < 1 << 31:
+            raise InputError("seed must be a whole number, 0 or more")
+        name = text(table, "user", "user", longest=60)
+        bench = benches().get(text(table, "bench"))
+        await targets.start(name, text(table, "mapping", "position"), text(table, "source", "mouse"), bench, seed)
+
+    async def report(request: Request) -> Any:
+        path = targets.report(request.path_params["name"])
+        return FileResponse(path, filename=path.name)
+
+    return [
+        Route("/api/targets", clear(state)),
+        Route("/api/targets/start", clear(start), methods=["POST"]),
+        Route("/api/targets/reports/{name}", clear(report)),
+    ]
+
+
+def _attitude(session: Session) -> list[BaseRoute]:
+    async def filters(_: Request) -> Any:
+        stages = json.loads(session.metadata().get("stages", "{}"))
+        return {"methods": METHODS, "running": stages.get("sensing", {}).get("attitude_method", ""), "stages": stages}
+
+    async def compare(request: Request) -> Any:
+        await session.compare(text(await body(request), "method"))
+
+    return [
+        Route("/api/filters", clear(filters)),
+        Route("/api/compare", clear(compare), methods=["POST"]),
+    ]

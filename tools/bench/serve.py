@@ -15,6 +15,7 @@ import uvicorn
 from tools.bench.app import make_app
 from tools.bench.firmware import Choice
 from tools.bench.guard import Access
+from tools.bench.jobs import Jobs
 from tools.bench.routes import more_routes
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -30,6 +31,7 @@ def bind(address: str, port: int) -> socket.socket:
         sock = socket.socket(family)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((address, port))
+        sock.listen(128)  # who comes before the server is ready waits instead of being refused
     except ValueError:
         raise InputError(f"--listen {address}: not an IP address") from None
     except OSError as error:
@@ -71,7 +73,8 @@ def serve(
 
     async def run() -> None:
         session = Session(choice, recordings)
-        app = make_app(session, access, more_routes(session))
+        jobs = Jobs()
+        app = make_app(session, access, more_routes(session, jobs))
         config = uvicorn.Config(
             app,
             ws="websockets-sansio",
@@ -94,6 +97,10 @@ def serve(
             loop.add_signal_handler(number, leave)
         shown = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
         announce(f"http://{shown if ':' not in shown else f'[{shown}]'}:{port}/#token={token}")
-        await server.serve(sockets=[sock])
+        try:
+            await server.serve(sockets=[sock])
+        finally:
+            await session.targets.stop()
+            await jobs.close()
 
     asyncio.run(run())

@@ -13,11 +13,15 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.frame import LAYOUT
-from hal.bench import load_bench
+from hal.bench import BenchFile, load_bench
+from hal.errors import BenchError
 from tools.bench.firmware import Choice, Firmware
 from tools.bench.history import History
 from tools.bench.recorder import RunRecorder
+from tools.bench.shadow import Shadow, make_shadow
+from tools.bench.targets import Targets
 
 FRAME_S = 1 / 60
 STATUS_S = 0.1
@@ -25,6 +29,16 @@ DISK_S = 2.0
 STALE_S = 0.25
 DISK_LOW_BYTES = 2 << 30
 DISK_LOW_SHARE = 0.03
+
+
+def instrument_bench(path: Path) -> BenchFile:
+    """The bench file, if the page can run it. Raises ``BenchError``."""
+    bench = load_bench(path)
+    if is_endoscope(bench.description):
+        raise BenchError(
+            f"{path}: the page runs the instrument; a motion card is used in its Targets view"
+        )
+    return bench
 
 
 @dataclass
@@ -59,13 +73,15 @@ class Session:
 
     def __init__(self, choice: Choice, recordings: Path) -> None:
         self.choice = choice
-        self.bench = load_bench(choice.bench)
+        self.bench = instrument_bench(choice.bench)
         self.firmware: Firmware | None = None
         self.run = Run()
         self.run_number = 0
         self.history = self._new_history()
         self.recorder = RunRecorder(recordings)
+        self.targets = Targets(recordings / "targets")
         self.disk = Disk()
+        self.shadow: Shadow | None = None
         self.log: deque[dict[str, Any]] = deque(maxlen=500)
         self.log_number = 0
         self.missed_rows = 0
@@ -83,10 +99,10 @@ class Session:
     async def start(self, choice: Choice | None = None) -> None:
         """End what runs and start again, with another bench if ``choice`` says so. ``HalError`` for a wrong bench."""
         async with self._lock:
-            bench = load_bench((choice or self.choice).bench)
+            bench = instrument_bench((choice or self.choice).bench)
             await self._end()
             self.choice, self.bench = choice or self.choice, bench
-            self.run, self.history, self._row = Run(), self._new_history(), 0
+            self.run, self.history, self._row, self.shadow = Run(), self._new_history(), 0, None
             self.run_number += 1
             run = self.run
             self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
@@ -158,7 +174,9 @@ class Session:
     def alerts(self) -> list[dict[str, str]]:
         """What must be said at once, in words; the worst first."""
         run, found = self.run, list[tuple[str, str]]()
-        if run.phase == "failed":
+        if run.phase == "starting":
+            found.append(("info", "Starting. The first start on a machine compiles for about a minute."))
+        elif run.phase == "failed":
             found.append(("error", f"The firmware failed: {run.reason}"))
         elif run.phase == "ended":
             found.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
@@ -198,12 +216,13 @@ class Session:
             "stale_s": self.stale_s() if run.phase == "running" else 0.0,
             "alerts": self.alerts(),
             "disk": {"free": self.disk.free_bytes, "total": self.disk.total_bytes},
+            "shadow": self.shadow.method if self.shadow is not None else "",
             "recording": self.recorder.state(),
             "log": self.log_number,
         }
 
     def counts(self) -> dict[str, dict[str, list[int]]]:
-        """The non-empty buckets of every histogram, for drawing: lower bounds in ns and counts."""
+        """The non-empty buckets of every histogram, for drawing: lower bounds and widths in ns, counts."""
         from firmware_py.scheduler.histogram import bucket_bounds_ns
 
         firmware = self.firmware
@@ -213,7 +232,8 @@ class Session:
         for index, name in enumerate(self.run.histograms):
             counts = firmware.memory.histogram(index).counts()
             used = np.flatnonzero(counts)
-            found[name] = {"ns": [bucket_bounds_ns(int(i))[0] for i in used], "n": [int(c) for c in counts[used]]}
+            bounds = [bucket_bounds_ns(int(i)) for i in used]
+            found[name] = {"ns": [b[0] for b in bounds], "w": [b[1] for b in bounds], "n": counts[used].tolist()}
         return found
 
     # -- rows -----------------------------------------------------------------------------------------------
@@ -248,13 +268,24 @@ class Session:
             self.history.append(rows.values)
             if self.recorder.active:
                 self.recorder.push(rows)
+            if self.shadow is not None:
+                self.shadow.follow(rows.values)
+
+    async def compare(self, method: str) -> None:
+        """Run another attitude filter beside the firmware's; an empty name ends that."""
+        self.shadow = None
+        if method:
+            self.shadow = await make_shadow(self.metadata(), method)
+
+    def metadata(self) -> dict[str, Any]:
+        """Of the running firmware; empty when there is none."""
+        return self.firmware.metadata() if self.firmware is not None else {}
 
     # -- recording ------------------------------------------------------------------------------------------
 
     async def start_recording(self, name: str, notes: str) -> None:
         """Raises ``RecordingError`` or ``InputError`` when that cannot be."""
-        metadata = self.firmware.metadata() if self.firmware is not None else {}
-        await self.recorder.start(name, notes, metadata)
+        await self.recorder.start(name, notes, self.metadata())
         self.note("info", f"recording {self.recorder.name}")
 
     async def stop_recording(self) -> dict[str, Any]:

@@ -76,6 +76,7 @@ class Viewer:
         self._nonsense = 0
         self._armed = False
         self._wants_counts = False
+        self._wants_game = False
         self._orders = 0
         self._orders_since_s = 0.0
         self._run = -1
@@ -130,6 +131,13 @@ class Viewer:
                 self._range(message)
             case "counts" if self._may_look:
                 self._wants_counts = message.get("on") is True
+            case "game" if self._may_look:
+                self._wants_game = message.get("on") is True
+            case "pointer" if self._may_order:
+                psi, theta = _number(message, "psi", -180, 180), _number(message, "theta", -180, 180)
+                self._session.targets.pointer(psi, theta, message.get("pressed") is True)
+            case "pointer":
+                pass
             case "order" if self._may_order:
                 self._order(message)
             case "order":
@@ -189,6 +197,11 @@ class Viewer:
                         await self._greet_new_run()
                         for subscription in list(self._subscriptions.values()):
                             await self._send_new(subscription)
+                        shadow = self._session.shadow
+                        if shadow is not None:
+                            await self._socket.send_json({"type": "shadow", "q": shadow.quaternion})
+                        if self._wants_game:
+                            await self._socket.send_json({"type": "game", "game": self._session.targets.as_dict()})
                         while self._ranges:
                             await self._socket.send_bytes(self._ranges.pop(next(iter(self._ranges))))
                         if now_s - state_s >= STATUS_S:

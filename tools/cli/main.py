@@ -10,6 +10,7 @@ import typer
 from tools.cli import (
     bench,
     calibrate,
+    diagnose,
     doctor,
     endoscope,
     faults,
@@ -61,6 +62,14 @@ app.command("noise")(noise.noise)
 app.command("placement")(placement.placement)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
+app.command("scan")(diagnose.scan)
+app.command("scope")(diagnose.scope)
+app.command("latency")(diagnose.latency)
+app.command("ramp")(diagnose.ramp)
+app.command("capture")(diagnose.capture)
+app.add_typer(diagnose.can, name="can")
+app.add_typer(diagnose.golden, name="golden")
+app.add_typer(diagnose.log, name="log")
 app.add_typer(calibrate.calibrate, name="calibrate")
 app.add_typer(endoscope.endoscope, name="endoscope")
 app.add_typer(imu.imu, name="imu")

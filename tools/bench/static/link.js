@@ -96,6 +96,10 @@ export class Link extends EventTarget {
     } else if (message.type === "hello") {
       for (const subscription of this.subscriptions.values()) subscription.buckets.clear();
       this.emit("run", message.run);
+    } else if (message.type === "game") {
+      this.emit("game", message.game);
+    } else if (message.type === "shadow") {
+      this.shadow = message.q;
     } else if (message.type === "counts") {
       this.emit("counts", message.counts);
     } else if (message.type === "log") {

@@ -1,1 +1,112 @@
-export function mount(root) { root.textContent = "coming"; }
+// The instrument in space, its numbers, its drift, and another filter beside it.
+import { get, post } from "../api.js";
+import { canvas, css, digits, h, persistent } from "../dom.js";
+import { Strip, interleave, times } from "../plot.js";
+import { angleBetween, drawInstrument, euler, orbit } from "../solid.js";
+
+const CHANNELS = ["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z", "rate_x", "rate_y", "rate_z"];
+
+function palette() {
+  const dark = document.documentElement.dataset.theme === "dark";
+  return {
+    parts: dark ? [[126, 146, 156], [208, 219, 224], [236, 205, 140]] : [[120, 138, 150], [214, 222, 228], [214, 170, 80]],
+    mark: [45, 212, 191], grid: css("--grid"), soft: css("--soft"), accent: css("--accent"), mono: css("--mono"),
+    x: css("--c7"), y: css("--c3"), z: css("--c1"),
+  };
+}
+
+export function mount(root, { link }) {
+  const settings = persistent("attitude", { compare: "" });
+  const subscription = link.subscribe(CHANNELS, 100, 100);
+  const history = link.subscribe(CHANNELS.slice(4), 10000, 600);
+  let colours = palette();
+  let reference = null;
+  let q = null;
+  let other = null;
+
+  const main = canvas((g, w, hgt) => q && drawInstrument(g, w, hgt, q, colours, reference), "Instrument in space");
+  const second = canvas((g, w, hgt) => other && drawInstrument(g, w, hgt, other, colours, q), "Instrument in space, other filter");
+  [main, second].forEach(orbit);
+  const title = h("h2", {}, "Firmware");
+  const choice = h("select", { "aria-label": "Filter beside it", onchange: () => compare(choice.value) });
+  const gap = h("span.num.soft");
+  const secondPanel = h("section.panel", { style: "display:flex;flex-direction:column", hidden: true },
+    h("h2", {}, "Beside it: ", gap), h("div", { style: "flex:1;min-height:0" }, second));
+  const numbers = h("table");
+  const error = h("p.note");
+  const strip = new Strip(["x", "y", "z"].map((a) => ({ label: `rate ${a}`, unit: "°/s" })), { least: 2 });
+
+  async function compare(method) {
+    settings.compare = method;
+    settings.save();
+    error.textContent = "";
+    try { await post("/api/compare", { method }); } catch (problem) { error.textContent = problem.message; }
+  }
+
+  get("/api/filters").then(({ methods, running }) => {
+    title.replaceChildren("Firmware: ", h("b", { style: "color:var(--text)" }, running));
+    choice.replaceChildren(h("option", { value: "" }, "nothing"), ...methods.map((m) => h("option", { value: m }, m)));
+    choice.value = link.state?.shadow || "";
+  }).catch(() => {});
+
+  root.append(h("div.cols", { style: "grid-template:minmax(0,1fr) 170px / minmax(0,1fr) 270px" },
+    h("div", { style: "display:flex;gap:12px;min-height:0" },
+      h("section.panel", { style: "flex:1;display:flex;flex-direction:column;min-width:0" }, title, h("div", { style: "flex:1;min-height:0" }, main)),
+      h("div", { style: "flex:1;display:contents" }, secondPanel)),
+    h("div.stack",  { style: "overflow:auto" },
+      h("section.panel", {}, h("h2", {}, "Attitude ", h("small", {}, "body to world")), numbers,
+        h("div.row", { style: "margin-top:10px" }, h("button", { onclick: () => { reference = q; } }, "Zero the drift here"))),
+      h("section.panel", {}, h("h2", {}, "Compare with"), choice, error,
+        h("p.note", {}, "Drag the picture to look from elsewhere. The other filter runs in the server on the same raw samples; the firmware keeps its own filter. Change that with attitude_method in the bench file."))),
+    h("div", { style: "grid-column:1/3;display:flex" }, strip.element)));
+  secondPanel.style.flex = "1";
+
+  let frame = 0;
+  let turn = 0;
+  function draw() {
+    frame = requestAnimationFrame(draw);
+    if (++turn % 2) return; // 30 pictures a second are enough here
+    const b = subscription.buckets;
+    if (b.n) {
+      q = [0, 1, 2, 3].map((c) => b.last(c));
+      const size = Math.hypot(...q);
+      if (size < 0.5) q = null;
+      if (q && !reference) reference = q;
+    }
+    const method = link.state?.shadow;
+    secondPanel.hidden = !method;
+    other = method && link.shadow && Math.hypot(...link.shadow) > 0.5 ? link.shadow : null;
+    main.redraw();
+    if (other) {
+      second.redraw();
+      gap.textContent = `${method}, ${digits((angleBetween(q, other) * 180) / Math.PI, 3)}° apart`;
+    }
+    if (history.buckets.n) {
+      const t = history.buckets.times();
+      const end = t[t.length - 1];
+      strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0);
+    }
+  }
+  const timer = setInterval(() => {
+    if (!q) return;
+    const [roll, pitch, yaw] = euler(q);
+    const rows = [["roll (x)", `${roll.toFixed(2)}°`], ["pitch (y)", `${pitch.toFixed(2)}°`], ["yaw (z)", `${yaw.toFixed(2)}°`],
+      ...["w", "x", "y", "z"].map((n, i) => [`q ${n}`, q[i].toFixed(5)]),
+      ["turned since zero", `${((angleBetween(reference, q) * 180) / Math.PI).toFixed(3)}°`]];
+    numbers.replaceChildren(...rows.map(([name, value]) => h("tr", {}, h("td", { style: "color:var(--soft)" }, name), h("td.num", {}, value))));
+  }, 100);
+  const retheme = () => { colours = palette(); strip.build(); };
+  window.addEventListener("themechange", retheme);
+  const offRun = link.on("run", () => { reference = null; });
+  draw();
+  return () => {
+    cancelAnimationFrame(frame);
+    clearInterval(timer);
+    window.removeEventListener("themechange", retheme);
+    offRun();
+    link.drop(subscription);
+    link.drop(history);
+    strip.destroy();
+    if (link.state?.shadow && link.mayOrder) post("/api/compare", { method: "" }).catch(() => {});
+  };
+}

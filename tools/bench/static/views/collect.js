@@ -1,1 +1,102 @@
-export function mount(root) { root.textContent = "coming"; }
+// Recordings: start, stop, notes, list, quick look, export. The server records; this page may be closed.
+import { download, get, post } from "../api.js";
+import { bytes, colours, duration, h } from "../dom.js";
+import { Strip } from "../plot.js";
+
+const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["temperature", "temperature"]];
+
+export function mount(root, { link }) {
+  let chosen = null;
+  let what = LOOKS[0][0];
+  let strip = null;
+
+  const name = h("input", { type: "text", placeholder: "Name (the time if empty)", maxLength: 80, style: "width:230px", "aria-label": "Name of the recording" });
+  const notes = h("input", { type: "text", placeholder: "Notes", maxLength: 2000, style: "flex:1", "aria-label": "Notes" });
+  const start = h("button.primary", { id: "rec-start", onclick: () => act(() => post("/api/recording/start", { name: name.value.trim(), notes: notes.value })) }, "Start recording");
+  const stop = h("button", { id: "rec-stop", onclick: () => act(() => post("/api/recording/stop")) }, "Stop recording");
+  const note = h("button", { onclick: () => act(async () => { await post("/api/recording/note", { text: notes.value }); notes.value = ""; }) }, "Add note");
+  const status = h("span.num.soft", { id: "rec-status" });
+  const problem = h("p.bad", { role: "alert", style: "margin:6px 0 0" });
+  const body = h("tbody");
+  const folder = h("small");
+  const look = h("section.panel", { style: "display:flex;flex-direction:column;min-height:0" }, h("p.empty", {}, "Choose a recording to look at it."));
+
+  root.append(h("div.cols", { style: "grid-template-rows:auto minmax(0,1fr) minmax(0,1fr)" },
+    h("section.panel", {}, h("div.row", {}, start, stop, name, notes, note, status), problem),
+    h("section.panel", { style: "overflow:auto" }, h("h2", {}, "Recordings ", folder),
+      h("table", {}, h("thead", {}, h("tr", {}, ["name", "notes"].map((t) => h("th", {}, t)), ["length", "lost", "size", "when"].map((t) => h("th.num", {}, t)), h("th"))), body)),
+    look));
+
+  async function act(work) {
+    problem.textContent = "";
+    try { await work(); } catch (error) { problem.textContent = error.message; }
+    refresh();
+  }
+
+  async function refresh() {
+    let list;
+    try { list = await get("/api/recordings"); } catch (error) { problem.textContent = error.message; return; }
+    folder.textContent = list.folder;
+    body.replaceChildren(...list.recordings.map((r) => h("tr", { style: r.name === chosen ? "background:var(--raised)" : "" },
+      h("td", {}, h("button.quiet", { onclick: () => show(r.name), style: "padding:2px 4px;font-weight:600", disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
+      h("td.soft", { title: r.notes.join("\n"), style: "max-width:260px;overflow:hidden;text-overflow:ellipsis;white-space:nowrap" }, r.notes.join(" · ")),
+      h("td.num", {}, r.ticks === null ? "–" : duration(r.ticks / 1000)),
+      h("td.num", { className: r.dropped ? "num bad" : "num" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", {}, bytes(r.bytes)),
+      h("td.num.soft", {}, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
+      h("td", { style: "white-space:nowrap;text-align:right" }, r.recording ? null : actions(r)))));
+    if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));
+  }
+
+  function actions(r) {
+    const path = `/api/recordings/${encodeURIComponent(r.name)}`;
+    const formats = h("select", { "aria-label": `Export ${r.name}`, onchange: () => { exportAs(path, formats.value); formats.value = ""; } },
+      h("option", { value: "" }, "export …"), ["csv", "npz", "parquet"].map((f) => h("option", { value: f }, f)));
+    let sure = false;
+    const remove = h("button.quiet", { disabled: !link.mayOrder, onclick: () => {
+      if (sure) act(() => post(`${path}/delete`));
+      else { sure = true; remove.textContent = "Really delete?"; remove.classList.add("bad"); }
+    } }, "Delete");
+    return [h("button.quiet", { onclick: () => act(() => download(`${path}/file`, `${r.name}.mcap`)) }, "Download"), formats, remove];
+  }
+
+  async function exportAs(path, format) {
+    if (!format) return;
+    await act(async () => {
+      await post(`${path}/export`, { format });
+      for (;;) {
+        const job = await get("/api/jobs/export");
+        if (job.state === "done") { await download(`/api/jobs/export/files/${encodeURIComponent(job.files[0])}`, job.files[0]); return; }
+        if (job.state !== "running") throw new Error(job.lines.at(-1) || "the export failed");
+        await new Promise((resolve) => setTimeout(resolve, 300));
+      }
+    });
+  }
+
+  async function show(which) {
+    chosen = which;
+    strip?.destroy();
+    strip = null;
+    look.replaceChildren(h("p.empty", {}, `Reading ${which} …`));
+    let data;
+    try { data = await get(`/api/recordings/${encodeURIComponent(which)}/look?channels=${what}`); } catch (error) { look.replaceChildren(h("p.empty.bad", {}, error.message)); return; }
+    const palette = colours();
+    strip = new Strip(data.channels.map((label, i) => ({ label, unit: data.units[i], colour: palette[i] })));
+    const x = Float64Array.from(data.t.flatMap((t) => [t, t]));
+    const ys = data.low.map((low, c) => Float32Array.from(low.flatMap((v, i) => [v, data.high[c][i]])));
+    const picker = h("select", { "aria-label": "What to look at", onchange: () => { what = picker.value; show(which); } }, LOOKS.map(([value, title]) => h("option", { value, selected: value === what }, title)));
+    look.replaceChildren(h("h2", {}, which, picker), strip.element, h("p.note", { className: data.lost ? "note bad" : "note" }, data.health.join(" · ")));
+    strip.show(x, ys, x[0], x[x.length - 1]);
+    refresh();
+  }
+
+  const off = link.on("state", (state) => {
+    const on = Boolean(state.recording);
+    if (stop.disabled === on) refresh();
+    start.disabled = on || !link.mayOrder || state.phase !== "running";
+    stop.disabled = !on || !link.mayOrder;
+    note.disabled = !on || !link.mayOrder;
+    status.textContent = on ? `${state.recording.name}: ${duration(state.recording.seconds)}, ${state.recording.written} ticks written, ${state.recording.dropped} lost` : `${bytes(state.disk.free)} free`;
+  });
+  refresh();
+  return () => { off(); strip?.destroy(); };
+}

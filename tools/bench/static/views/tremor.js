@@ -1,1 +1,182 @@
-export function mount(root) { root.textContent = "coming"; }
+// The tremor as the firmware sees it: path of the tip before and after, size and pace over time, spectrum, reduction.
+import { canvas, colours, css, digits, h, persistent, segments } from "../dom.js";
+import { spectrum } from "../fourier.js";
+import { Strip, interleave, times } from "../plot.js";
+
+const AXES = ["x", "y", "z"];
+const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahead_${a}`), ...AXES.map((a) => `confidence_${a}`), "status"];
+const SLOW = [...AXES.map((a) => `tremor_amplitude_${a}`), ...AXES.map((a) => `tremor_frequency_${a}`)];
+const UM = 1e6;
+const HZ = 1000;
+const PATH = 700;
+const COMMANDED = 128;
+const MANUAL = 256;
+
+export function mount(root, { link }) {
+  const settings = persistent("tremor", { plane: "xy" });
+  const fast = link.subscribe(FAST, 4200, 4200);
+  const slow = link.subscribe(SLOW, 60000, 900);
+  let before = null;
+  let after = null;
+  let size = 60;
+
+  const path = canvas(drawPath, "Path of the tip before and after");
+  const spectra = canvas(drawSpectrum, "Spectrum of the tremor");
+  const reduction = h("div.big");
+  const bar = h("i", { style: "width:0" });
+  const table = h("table");
+  const amplitude = new Strip(AXES.map((a) => ({ label: `amplitude ${a}`, unit: "µm" })), { noTimeAxis: true, least: 5 });
+  const frequency = new Strip(AXES.map((a) => ({ label: `frequency ${a}`, unit: "Hz" })), { least: 2 });
+  const gain = h("input", { type: "range", min: 0, max: 1.2, step: 0.05, value: 1, "aria-label": "Gain of the compensation", style: "flex:1" });
+  const gainText = h("b.num");
+  const setGain = (value) => { link.order("gain", { value }); gain.value = value; };
+  gain.oninput = () => setGain(Number(gain.value));
+  const onOff = segments([["0", "off"], ["1", "on"]], "1", (v) => setGain(Number(v)), "Compensation");
+
+  root.append(h("div.cols", { style: "grid-template:minmax(0,1fr) 200px / minmax(0,1fr) minmax(0,1fr) 250px" },
+    h("section.panel", { style: "display:flex;flex-direction:column" },
+      h("h2", {}, "Tip, last 0.7 s ", h("span", { style: "color:var(--c2)" }, "before"), h("span", { style: "color:var(--accent)" }, "after"),
+        h("span.grow"), segments([["xy", "x y"], ["xz", "x z"], ["yz", "y z"]], settings.plane, (v) => { settings.plane = v; settings.save(); }, "Plane")),
+      h("div", { style: "flex:1;min-height:0" }, path)),
+    h("section.panel", { style: "display:flex;flex-direction:column" }, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div", { style: "flex:1;min-height:0" }, spectra)),
+    h("div.stack", { style: "overflow:auto" },
+      h("section.panel", {}, h("h2", {}, "Reduction, 4 s"), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
+        h("p.note", {}, "Estimated: tremor now against its prediction one loop delay ago. Errors of the stacks are not in it; micron run measures those on the emulated bench.")),
+      h("section.panel", {}, h("h2", {}, "Compensation"), h("div.row", {}, onOff, gainText), h("div.row", { style: "margin-top:8px" }, h("span.soft", {}, "gain"), gain))),
+    h("div", { style: "grid-column:1/4;display:flex;flex-direction:column;gap:6px;min-height:0" }, amplitude.element, frequency.element)));
+
+  /** Tremor now and what is left of it: what was commanded acts `delay` later. */
+  function split() {
+    const b = fast.buckets;
+    if (b.perBucket !== 1 || b.n < 200) return;
+    const delay = 2; // loop delay of the bench file, in ticks
+    const status = b.lows(9);
+    const g = link.state?.status?.gain ?? 1;
+    before = AXES.map((_, c) => b.lows(c));
+    after = AXES.map((_, c) => {
+      const now = b.lows(c);
+      const ahead = b.lows(3 + c);
+      const sure = b.lows(6 + c);
+      const rest = new Float32Array(now.length);
+      let held = 0; // a skipped tick leaves the outputs where they are
+      for (let i = 0; i < now.length; i++) {
+        const j = Math.max(0, i - delay);
+        if (status[j] & MANUAL) held = 0;
+        else if (status[j] & COMMANDED) held = sure[j] > 0 ? g * ahead[j] : 0;
+        rest[i] = now[i] - held;
+      }
+      return rest;
+    });
+  }
+
+  const rms = (parts) => Math.sqrt(parts.reduce((sum, p) => sum + p.reduce((s, v) => s + v * v, 0) / Math.max(1, p.length), 0)) * UM;
+
+  function drawPath(g, w, hgt) {
+    if (!before) return;
+    const [a, b] = [...settings.plane].map((axis) => AXES.indexOf(axis));
+    const most = Math.max(...[a, b].map((c) => before[c].slice(-PATH).reduce((m, v) => Math.max(m, Math.abs(v)), 0))) * UM;
+    const wanted = Math.max(10, 1.25 * most);
+    size += (wanted - size) * (wanted > size ? 0.3 : 0.02);
+    const scale = Math.min(w, hgt) / 2 / size;
+    const step = [5, 10, 20, 50, 100, 200, 500].find((s) => size / s <= 4) || 1000;
+    g.font = `10px ${css("--mono")}`;
+    g.strokeStyle = css("--grid");
+    g.fillStyle = css("--faint");
+    for (let r = step; r <= size * 1.4; r += step) {
+      g.beginPath();
+      g.arc(w / 2, hgt / 2, r * scale, 0, 7);
+      g.stroke();
+      g.fillText(`${r} µm`, w / 2 + 4, hgt / 2 - r * scale - 3);
+    }
+    for (const [data, colour, width] of [[before, css("--c2"), 1.1], [after, css("--accent"), 1.8]]) {
+      const x = data[a].slice(-PATH);
+      const y = data[b].slice(-PATH);
+      g.strokeStyle = colour;
+      g.lineWidth = width;
+      g.lineJoin = "round";
+      g.beginPath();
+      for (let i = 0; i < x.length; i++) g.lineTo(w / 2 + x[i] * UM * scale, hgt / 2 - y[i] * UM * scale);
+      g.stroke();
+    }
+    g.fillStyle = css("--soft");
+    g.fillText(settings.plane[0], w - 12, hgt / 2 - 5);
+    g.fillText(settings.plane[1], w / 2 + 6, 10);
+  }
+
+  let lines = null;
+  function drawSpectrum(g, w, hgt) {
+    if (!lines) return;
+    const [left, bottom, top, most] = [40, 20, 6, 30];
+    const peak = Math.max(1, ...lines[0].values);
+    const x = (hz) => left + ((w - left - 6) * hz) / most;
+    const y = (v) => hgt - bottom - ((hgt - bottom - top) * v) / (1.1 * peak);
+    g.font = `10px ${css("--mono")}`;
+    g.fillStyle = `color-mix(in srgb, ${css("--accent")} 9%, transparent)`;
+    g.fillRect(x(8), top, x(12) - x(8), hgt - bottom - top);
+    g.strokeStyle = css("--grid");
+    g.fillStyle = css("--faint");
+    for (let hz = 0; hz <= most; hz += 5) {
+      g.beginPath(); g.moveTo(x(hz), top); g.lineTo(x(hz), hgt - bottom); g.stroke();
+      g.fillText(hz === most ? "Hz" : String(hz), x(hz) - (hz === most ? 14 : 4), hgt - 6);
+    }
+    for (const share of [0.5, 1]) g.fillText(`${digits(peak * share, 2)} µm`, 2, y(peak * share) + 3);
+    for (const { values, step, colour } of lines) {
+      g.strokeStyle = colour;
+      g.lineWidth = 1.5;
+      g.beginPath();
+      for (let i = 0; i * step <= most; i++) g.lineTo(x(i * step), y(values[i]));
+      g.stroke();
+    }
+  }
+
+  function powers(data, colour) {
+    const parts = data.map((p) => spectrum(p, HZ));
+    const values = Array.from(parts[0].amplitude, (_, i) => Math.hypot(...parts.map((p) => p.amplitude[i])) * UM);
+    return { values, step: parts[0].step, colour };
+  }
+
+  let frame = 0;
+  let turn = 0;
+  function draw() {
+    frame = requestAnimationFrame(draw);
+    if (++turn % 2) return; // 30 pictures a second are enough here
+    split();
+    path.redraw();
+    const t = slow.buckets.times();
+    if (t.length && turn % 8 === 0) {
+      const x = times(slow.buckets, t[t.length - 1]);
+      amplitude.show(x, [0, 1, 2].map((c) => interleave(slow.buckets, c, UM)), -60, 0);
+      frequency.show(x, [3, 4, 5].map((c) => interleave(slow.buckets, c)), -60, 0);
+    }
+  }
+  const timer = setInterval(() => {
+    if (!before) return;
+    lines = [powers(before, css("--c2")), powers(after, css("--accent"))];
+    spectra.redraw();
+    const [a, b] = [rms(before), rms(after)];
+    const percent = a > 0 ? 100 * (1 - b / a) : 0;
+    reduction.replaceChildren(percent > 0.5 ? percent.toFixed(0) : "0", h("span.unit", {}, "% less"));
+    bar.style.width = `${Math.max(0, Math.min(100, percent))}%`;
+    const s = link.state?.status || {};
+    const palette = colours();
+    table.replaceChildren(h("tr", {}, ...["rms", "before", "after"].map((n, i) => h(i ? "th.num" : "th", {}, n))),
+      ...AXES.map((axis, c) => h("tr", {}, h("td", { style: `color:${palette[c]}` }, axis), h("td.num", {}, `${rms([before[c]]).toFixed(1)} µm`), h("td.num", {}, `${rms([after[c]]).toFixed(1)} µm`))));
+    if (s.gain !== undefined) {
+      gainText.textContent = `gain ${s.gain.toFixed(2)}`;
+      if (document.activeElement !== gain) gain.value = s.gain;
+      onOff.show(s.gain === 0 ? "0" : s.gain === 1 ? "1" : "");
+    }
+    gain.disabled = !link.mayOrder;
+    onOff.querySelectorAll("button").forEach((button) => { button.disabled = !link.mayOrder; });
+  }, 250);
+  const retheme = () => { amplitude.build(); frequency.build(); };
+  window.addEventListener("themechange", retheme);
+  draw();
+  return () => {
+    cancelAnimationFrame(frame);
+    clearInterval(timer);
+    window.removeEventListener("themechange", retheme);
+    [fast, slow].forEach((s) => link.drop(s));
+    [amplitude, frequency].forEach((s) => s.destroy());
+  };
+}

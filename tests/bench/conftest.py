@@ -1,0 +1,181 @@
+"""A bench server of its own for the real-time tests, and a browser to look at it.
+
+Chromium is Debian's; it is installed here where that is possible, else the browser tests are skipped and say why.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import urllib.error
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+START_S = 220.0
+ARTEFACTS = Path(__file__).parents[2] / "out" / "browser"
+
+
+@dataclass
+class Server:
+    """A running ``micron bench``."""
+
+    process: subprocess.Popen[str]
+    base: str
+    token: str
+    recordings: Path
+    folder: Path
+
+    def request(self, method: str, path: str, body: bytes | None = None, token: str | None = "") -> tuple[int, Any]:
+        """Status and JSON; ``token`` "" is the right one, None sends none."""
+        headers = {"Content-Type": "application/json"}
+        if token is not None:
+            headers["X-Micron-Token"] = token or self.token
+        asked = urllib.request.Request(self.base + path, body, headers, method=method)
+        try:
+            with urllib.request.urlopen(asked, timeout=30) as answer:
+                return answer.status, json.loads(answer.read() or b"null")
+        except urllib.error.HTTPError as error:
+            with error:
+                return error.code, json.loads(error.read() or b"null")
+
+    @property
+    def live(self) -> str:
+        return self.base.replace("http", "ws") + "/live"
+
+    def state(self) -> dict[str, Any]:
+        """The next status message, as a page gets it."""
+        from websockets.sync.client import connect
+
+        with connect(self.live, open_timeout=30) as ws:
+            while True:
+                message = ws.recv(30)
+                if isinstance(message, str) and (table := json.loads(message))["type"] == "state":
+                    return table
+
+    def wait_for(self, good: Callable[[dict[str, Any]], bool], what: str, limit_s: float = 60.0) -> dict[str, Any]:
+        """The first status for which ``good`` holds."""
+        deadline_s = time.monotonic() + limit_s
+        while time.monotonic() < deadline_s:
+            state = self.state()
+            if good(state):
+                return state
+            time.sleep(0.1)
+        pytest.fail(f"{what} did not come within {limit_s:.0f} s: {state['phase']}: {state['reason']}")
+
+    def wait_running(self) -> dict[str, Any]:
+        """Start the firmware unless it runs; wait until it is armed."""
+        state = self.state()
+        if state["phase"] not in ("starting", "running"):
+            assert self.request("POST", "/api/firmware/start", b"{}")[0] == 200
+        return self.wait_for(
+            lambda s: s["phase"] == "running" and s["status"].get("state") == "running", "running", START_S
+        )
+
+    def inject(self, fault: str, target: str) -> None:
+        """A fault in the emulated world that the firmware process has started."""
+        jobs = sorted(self.folder.glob("micron-bench-*/world-*/job.json"), key=lambda p: p.stat().st_mtime)
+        sockets = json.loads(jobs[-1].read_text())["socket_dir"]
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+            sock.connect(f"{sockets}/control.sock")
+            sock.send(json.dumps({"fault": fault, "target": target}).encode())
+
+    def memory_bytes(self) -> int:
+        """Resident memory of the server process."""
+        pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
+        return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """One server for all tests of a session; its files are in a short path, for the sake of Unix sockets."""
+    folder = Path(tempfile.mkdtemp(prefix="mb", dir="/tmp"))
+    recordings = folder / "recordings"
+    command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
+    process = subprocess.Popen(
+        [*command, "--recordings", str(recordings)],
+        stdin=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "TMPDIR": str(folder), "COLUMNS": "400"},
+    )
+    assert process.stderr is not None
+    line = process.stderr.readline()
+    rest = threading.Thread(target=process.stderr.read, daemon=True)
+    rest.start()
+    address = next(word for word in line.split() if word.startswith("http"))
+    base, _, token = address.partition("/#token=")
+    running = Server(process, base, token, recordings, folder)
+    try:
+        running.wait_running()
+        yield running
+    finally:
+        process.send_signal(signal.SIGTERM)
+        try:
+            process.wait(40)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        rest.join()
+        process.stderr.close()
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def find_chromium() -> str | None:
+    """Path of Debian's Chromium, installed if need be."""
+    found = shutil.which("chromium")
+    if found is None and shutil.which("apt-get") and os.geteuid() == 0:
+        for command in (["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]):
+            subprocess.run(command, capture_output=True, timeout=200, check=False)
+        found = shutil.which("chromium")
+    return found
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium without a window."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="the python package playwright is not installed")
+    path = find_chromium()
+    if path is None:
+        pytest.skip("no Chromium: install Debian's package 'chromium' to run the browser tests")
+    with sync_api.sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(
+            executable_path=path, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+        )
+        yield chromium
+        chromium.close()
+
+
+@pytest.fixture
+def page(browser: Any, server: Server) -> Iterator[Any]:
+    """The bench page with the token, 1280 x 720; an error in the page fails the test."""
+    server.wait_running()
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True)
+    context.set_default_timeout(60_000)
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.goto(f"{server.base}/#token={server.token}")
+    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
+    yield tab
+    context.close()
+    assert not errors
+
+
+@pytest.fixture
+def artefacts() -> Path:
+    """Where screenshots are kept."""
+    ARTEFACTS.mkdir(parents=True, exist_ok=True)
+    return ARTEFACTS

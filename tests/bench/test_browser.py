@@ -1,0 +1,209 @@
+"""The page as a person uses it: Chromium against a real server, a real firmware process and the emulated world."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.bench.conftest import Server
+
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
+
+VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
+
+
+def go(page: Any, view: str) -> None:
+    page.evaluate(f"location.hash = '/{view}'")
+    page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_every_view_opens(page: Any, artefacts: Path, theme: str):
+    page.evaluate(f"document.documentElement.dataset.theme === '{theme}' || document.getElementById('theme').click()")
+    for number, view in enumerate(VIEWS, 1):
+        if theme == "dark":
+            page.keyboard.press(str(number))
+        else:
+            go(page, view)
+        page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
+        page.wait_for_timeout(800)
+        assert page.locator("#view").inner_text().strip() or page.locator("#view canvas").count()
+        assert page.locator("#safe").is_visible()
+        overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")
+        assert overflow <= 0, f"{view} is wider than 1280 pixels"
+        page.screenshot(path=artefacts / f"{view}-{theme}.png")
+
+
+def test_live_data_move(page: Any):
+    go(page, "scope")
+    page.wait_for_function("micron.scope.subscription.buckets.n > 100")
+    newest = "(() => { const t = micron.scope.subscription.buckets.times(); return t[t.length - 1]; })()"
+    first, frames = page.evaluate(newest), page.evaluate("micron.link.frames")
+    picture = page.locator(".plot canvas").first.screenshot()
+    page.wait_for_function(f"{newest} > {first} + 1.0")
+    assert page.evaluate("micron.link.frames") > frames
+    assert page.locator(".plot canvas").first.screenshot() != picture
+
+
+def test_a_spike_of_two_milliseconds_is_seen_at_full_zoom_out(page: Any, server: Server, artefacts: Path):
+    go(page, "scope")
+    page.evaluate("micron.scope.setWindow(600000)")
+    page.wait_for_function("micron.scope.subscription.buckets.n > 1")
+    top = "micron.scope.subscription.buckets.highs(0).reduce((m, v) => Math.max(m, v), -1e9)"
+    before = page.evaluate(top)
+    server.inject("spike", "0")
+    page.wait_for_function(f"{top} > {before} + 0.3")
+    page.wait_for_timeout(500)
+    # on the screen: pixels of the trace's colour above everything that it did before
+    pixels = page.evaluate(
+        f"""(() => {{
+            const plot = micron.scope.strips[0].strip.plot, g = plot.ctx;
+            const high = plot.valToPos({before} + 0.35, "y", true), low = plot.valToPos({before} + 0.1, "y", true);
+            const x = plot.bbox.left + plot.bbox.width;
+            const data = g.getImageData(x - 60, high, 60, Math.max(1, low - high)).data;
+            let n = 0;
+            for (let i = 0; i < data.length; i += 4) if (data[i + 2] > 150 && data[i] < 130 && data[i + 3] > 100) n++;
+            return n;
+        }})()"""
+    )
+    page.screenshot(path=artefacts / "spike.png")
+    assert pixels > 3
+
+
+def test_the_game_is_won_with_a_scripted_mouse(page: Any, server: Server, artefacts: Path):
+    page.evaluate("micron.seed = 7")
+    go(page, "targets")
+    page.fill("input[placeholder='Your name']", "robot")
+    page.click("#target-start")
+    page.wait_for_function("micron.game() && micron.game().of === 5 && !micron.game().done")
+    box = page.locator("#target-screen").bounding_box()
+    assert box is not None
+    px_per_deg = box["width"] / 90.0
+    centre = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    gain = 8.0
+
+    def state() -> dict[str, Any]:
+        return page.evaluate("micron.game()")
+
+    def move_to(psi: float, theta: float) -> None:
+        page.mouse.move(centre[0] + psi * px_per_deg, centre[1] + theta * px_per_deg, steps=8)
+
+    def press(seconds: float, status: int) -> None:
+        page.mouse.down()
+        page.wait_for_timeout(1000 * seconds)
+        page.mouse.up()
+        page.wait_for_function(f"micron.game().done || micron.game().status === {status}")
+
+    deadline_s = time.monotonic() + 240
+    while not (now := state())["done"]:
+        assert time.monotonic() < deadline_s, f"still at target {now['reached']}"
+        if now["status"]:
+            press(0.1, 0)
+            continue
+        reached = now["reached"]
+        size = (now["target"]["size"] - now["view"]["size"]) / gain
+        if abs(size * gain) > 5:
+            move_to(-size / 2, 0)
+            press(0.7, 2)
+            move_to(size / 2, 0)
+            page.wait_for_timeout(1500)
+            continue
+        psi, theta = ((now["target"][k] - now["view"][k]) / gain for k in "xy")
+        move_to(-psi / 2, -theta / 2)
+        press(0.1, 1)
+        move_to(psi / 2, theta / 2)
+        for _ in range(30):
+            page.wait_for_timeout(100)
+            if state()["reached"] > reached:
+                break
+    page.wait_for_timeout(300)
+    page.screenshot(path=artefacts / "game.png")
+    final = state()
+    assert final["result"]["reached"] == 5
+    report = (server.recordings / "targets" / final["report"]).read_text()
+    assert report.startswith("# user robot\n")
+    assert len([line for line in report.splitlines() if line[0].isdigit()]) == 5
+
+
+def test_the_safe_button_reaches_the_safe_state(page: Any, server: Server, artefacts: Path):
+    page.click("#safe")
+    page.wait_for_function("micron.link.state.phase === 'safe'")
+    state = server.wait_for(lambda s: s["safe_ms"] is not None, "the time")
+    # asked when the server sent the order, reached when the amplifier confirmed neutral: both on the firmware's clock
+    print(f"safe state {state['safe_ms']:.1f} ms after the order (goal 100 ms)")
+    assert state["reason"] == "stopped by the operator (safe button of the bench page)"
+    page.wait_for_selector("#alerts >> text=Safe state, outputs at neutral")
+    page.screenshot(path=artefacts / "safe.png")
+    page.click("#alerts button")
+    server.wait_running()
+
+
+def test_without_the_token_one_may_look_and_touch_nothing(browser: Any, server: Server):
+    server.wait_running()
+    context = browser.new_context(bypass_csp=True)  # playwright evaluates text
+    page = context.new_page()
+    page.goto(f"{server.base}/#token=wrong")
+    page.wait_for_selector("#alerts >> text=View only")
+    page.click("#safe")
+    page.wait_for_function("micron.link.frames >= 0 && micron.link.state.phase === 'running'")
+    request = "{method: 'POST', headers: {'X-Micron-Token': 'wrong'}}"
+    refused = page.evaluate(f"fetch('/api/safe', {request}).then((a) => a.status)")
+    assert refused == 403
+    page.wait_for_timeout(500)
+    assert server.state()["phase"] == "running"
+    context.close()
+
+
+def test_a_recording_survives_a_reload_and_a_closed_browser(page: Any, browser: Any, server: Server):
+    go(page, "collect")
+    page.fill("input[placeholder^='Name']", "survivor")
+    page.fill("input[placeholder='Notes']", "made by a robot")
+    page.click("#rec-start")
+    page.wait_for_selector("#rec:not([hidden])")
+    page.reload()
+    page.wait_for_selector("#rec:not([hidden])")
+    page.close()
+    written = server.state()["recording"]["written"]
+    server.wait_for(lambda s: s["recording"]["written"] > written + 500, "more rows")
+    code, summary = server.request("POST", "/api/recording/stop", b"{}")
+    assert code == 200
+    assert summary["ticks"] > 500
+    assert summary["dropped"] == 0
+    assert summary["problem"] == ""
+    listed = server.request("GET", "/api/recordings")[1]["recordings"]
+    mine = next(r for r in listed if r["name"] == "survivor")
+    assert mine["notes"] == ["made by a robot"]
+    look = server.request("GET", "/api/recordings/survivor/look?channels=command_1")[1]
+    assert look["channels"] == ["command_1"]
+    assert 0 < len(look["t"]) <= summary["ticks"]
+
+
+def test_jog_moves_while_held_and_only_then(page: Any, server: Server):
+    go(page, "actuators")
+    page.wait_for_function("!document.getElementById('arm').disabled")
+    page.click("#arm")
+    page.wait_for_function("micron.link.state.status.manual === 'armed'")
+    volts = "micron.link.state.status.command_V[0]"
+    rest = page.evaluate(volts)
+    button = page.locator("button.jog").nth(1)
+    page.wait_for_function("!document.querySelectorAll('button.jog')[1].disabled")
+    button.hover()
+    page.mouse.down()
+    page.wait_for_function(f"{volts} > {rest} + 5")
+    page.mouse.up()
+    seen: list[float] = []
+
+    def rests(state: dict[str, Any]) -> bool:
+        """Armed, and where it was at the last look; a starved page may let the switch lapse in between."""
+        if state["status"]["manual"] == "armed":
+            seen.append(state["status"]["command_V"][0])
+        return len(seen) > 1 and seen[-1] == seen[-2]
+
+    server.wait_for(rests, "rest after the release")
+    if page.evaluate("document.getElementById('arm').getAttribute('aria-checked')") == "true":
+        page.click("#arm")
+    server.wait_for(lambda s: s["status"]["manual"] == "off", "the end of manual drive")
+    assert server.state()["phase"] == "running"

@@ -1,0 +1,145 @@
+"""Requests of the Collect view: recordings on disk, notes, quick look, download, export."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from starlette.requests import Request
+from starlette.responses import FileResponse
+from starlette.routing import BaseRoute, Route
+
+from firmware_py.recording.reader import Recording
+from tools.bench.history import extremes
+from tools.bench.jobs import Jobs
+from tools.bench.recorder import SUFFIX, check_name
+from tools.bench.requests import body, clear, text
+from tools.bench.session import Session
+from tools.errors import InputError
+
+FORMATS = ("csv", "npz", "parquet")
+MAX_LISTED = 500
+LOOK_PIXELS = 900
+LOOK_CHANNELS = 8
+
+
+def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
+    """Recordings in ``folder``, newest first; the one being written is marked."""
+    found: list[dict[str, Any]] = []
+    files = sorted(folder.glob(f"*{SUFFIX}"), key=lambda p: p.stat().st_mtime, reverse=True)
+    for path in files[:MAX_LISTED]:
+        sidecar = path.with_suffix(".json")
+        table: dict[str, Any] = {}
+        if sidecar.is_file():
+            try:
+                table = json.loads(sidecar.read_text(encoding="utf-8"))
+            except ValueError:
+                table = {"notes": ["(its notes cannot be read)"]}
+        status = path.stat()
+        found.append(
+            {
+                "name": path.stem,
+                "bytes": status.st_size,
+                "modified": status.st_mtime,
+                "recording": path.stem == recording,
+                "notes": table.get("notes", []),
+                "ticks": table.get("ticks"),
+                "dropped": table.get("dropped"),
+                "problem": table.get("problem", ""),
+            }
+        )
+    return found
+
+
+@lru_cache(maxsize=2)
+def _open(path: Path, _modified: float) -> Recording:
+    return Recording(path)
+
+
+def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
+    """Smallest and largest value per pixel of a few channels over the whole recording."""
+    recording = _open(path, path.stat().st_mtime)
+    wanted = [name for name in channels if name in recording.names][:LOOK_CHANNELS]
+    index = [recording.names.index(name) for name in (*wanted, "t")]
+    parts = [block.data[index] for block in recording.blocks()]
+    if not parts:
+        raise InputError(f"{path.name} holds no ticks")
+    data = np.concatenate(parts, axis=1)
+    k = max(1, data.shape[1] // LOOK_PIXELS)
+    values = data[:-1].astype(np.float32)
+    low, high = extremes(values, values, k)
+    return {
+        "channels": wanted,
+        "units": [dict(recording.columns)[name] for name in wanted],
+        "t": data[-1, ::k].tolist(),
+        "low": np.nan_to_num(low).tolist(),
+        "high": np.nan_to_num(high).tolist(),
+        "health": recording.health.lines(),
+        "lost": recording.health.lost,
+        "names": list(recording.names),
+    }
+
+
+def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
+    recorder = session.recorder
+
+    def existing(request: Request) -> Path:
+        path = recorder.path(check_name(request.path_params["name"]))
+        if not path.is_file():
+            raise InputError(f"there is no recording {path.stem!r}")
+        return path
+
+    async def recordings(_: Request) -> Any:
+        now = recorder.name if recorder.active else ""
+        return {"folder": str(recorder.folder), "recordings": listing(recorder.folder, now)}
+
+    async def start(request: Request) -> Any:
+        table = await body(request)
+        await session.start_recording(text(table, "name", longest=80), text(table, "notes"))
+        return {"name": recorder.name}
+
+    async def stop(_: Request) -> Any:
+        return await session.stop_recording()
+
+    async def note(request: Request) -> Any:
+        recorder.note(text(await body(request), "text"))
+
+    async def look(request: Request) -> Any:
+        channels = request.query_params.get("channels", "command_1,command_2,command_3").split(",")
+        return await asyncio.to_thread(quick_look, existing(request), channels)
+
+    async def download(request: Request) -> Any:
+        path = existing(request)
+        return FileResponse(path, filename=path.name)
+
+    async def export(request: Request) -> Any:
+        path, kind = existing(request), text(await body(request), "format")
+        if kind not in FORMATS:
+            raise InputError(f"{kind!r} is not a format; there are {', '.join(FORMATS)}")
+        folder = jobs.new_folder()
+        out = folder / f"{path.stem}.{kind}"
+        command = ["tools.cli.main", "export", str(path), "--out", str(out)]
+        return jobs.start("export", f"export {out.name}", [command], folder).as_dict()
+
+    async def delete(request: Request) -> Any:
+        path = existing(request)
+        if recorder.active and path == recorder.path(recorder.name):
+            raise InputError("this recording is running; stop it first")
+        path.unlink()
+        path.with_suffix(".json").unlink(missing_ok=True)
+        session.note("info", f"deleted {path.stem}")
+
+    return [
+        Route("/api/recordings", clear(recordings)),
+        Route("/api/recording/start", clear(start), methods=["POST"]),
+        Route("/api/recording/stop", clear(stop), methods=["POST"]),
+        Route("/api/recording/note", clear(note), methods=["POST"]),
+        Route("/api/recordings/{name}/look", clear(look)),
+        Route("/api/recordings/{name}/file", clear(download)),
+        Route("/api/recordings/{name}/export", clear(export), methods=["POST"]),
+        Route("/api/recordings/{name}/delete", clear(delete), methods=["POST"]),
+    ]

@@ -1,0 +1,42 @@
+"""The instrument's six accelerometers from resting poses turned by hand: no stage, only the size of gravity is known.
+
+Sensors 1x, 2y, 1z and 3x, 3y, 2z are one triad each; at rest both feel the same gravity wherever they sit. Each triad
+is fitted as in ``tools.calibrate.multi_position``. Bias and scale go into the calibration file; directions of the axes
+stay as they are, since a triad's own axes are known only up to a turn.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.calibrate.multi_position import fit_poses
+from tools.errors import InputError
+
+AXES = ("1x", "1z", "2y", "2z", "3x", "3y")
+TRIADS = ((0, 2, 1), (4, 5, 3))
+"""Columns x, y, z of each triad in the firmware's sensor order."""
+MIN_POSES = 12
+
+
+def identify(means_V: NDArray[np.float64], gravity_m_s2: float) -> dict[str, Any]:
+    """``means_V`` (n, 6) volts, one row per pose. ``InputError`` for too few poses or too similar ones."""
+    if means_V.ndim != 2 or means_V.shape[1] != len(AXES) or len(means_V) < MIN_POSES:
+        raise InputError(f"at least {MIN_POSES} poses of 6 voltages are needed, these are {means_V.shape}")
+    if not np.isfinite(means_V).all():
+        raise InputError("a voltage of a pose is not a number")
+    bias, scale = np.zeros(6), np.zeros(6)
+    residual: list[float] = []
+    for triad in TRIADS:
+        fit = fit_poses(means_V[:, triad], np.ones(len(means_V)), gravity_m_s2)
+        for axis, column in zip("xyz", triad, strict=True):
+            bias[column] = fit.parameters[f"bias_{axis}"].value
+            scale[column] = gravity_m_s2 / fit.parameters[f"scale_{axis}"].value
+        residual.append(fit.residual_m_s2)
+    return {
+        "table": {"bias_V": bias.tolist(), "scale_V_per_g": scale.tolist()},
+        "poses": len(means_V),
+        "residual_m_s2": residual,
+    }

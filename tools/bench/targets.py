@@ -1,0 +1,170 @@
+"""The targeting experiment on the page: the firmware's state machine, driven by the pointer that a browser reports or
+by the motion card of an endoscope bench, read in a process of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Literal
+
+from firmware_py.endoscope.control import ControlConfig
+from firmware_py.endoscope.report import experiment, report_csv
+from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
+from hal.bench import load_bench
+from tools.bench.recorder import check_name
+from tools.cli.common import write_text_atomic
+from tools.errors import InputError
+
+Source = Literal["mouse", "card"]
+MAX_ANGLE_DEG = 180.0
+
+
+class Game:
+    """One run of one user. ``tell`` gets every state, as the page draws it."""
+
+    def __init__(self, config: GameConfig, user: str, folder: Path) -> None:
+        self.user = check_name(user or "user")
+        self._folder = folder
+        self._game = TargetGame(config)
+        self._started_s = time.monotonic()
+        self._report: Path | None = None
+        self.state: GameState = self._game.state()
+
+    @property
+    def config(self) -> GameConfig:
+        return self._game.config
+
+    def _now_s(self) -> float:
+        return time.monotonic() - self._started_s
+
+    def pointer(self, psi_deg: float, theta_deg: float, pressed: bool) -> None:
+        """What the mouse says; angles that are no angles are dropped."""
+        if all(math.isfinite(v) and abs(v) <= MAX_ANGLE_DEG for v in (psi_deg, theta_deg)):
+            self.state = self._game.step((psi_deg, theta_deg), pressed, self._now_s())
+            self._keep_report()
+
+    def card(self, psi_deg: float, theta_deg: float, status: int, use: bool) -> None:
+        """What the motion card says."""
+        self.state = self._game.step_card((psi_deg, theta_deg), status, self._now_s(), use=use)
+        self._keep_report()
+
+    def _keep_report(self) -> None:
+        if self.state.done and self._report is None:
+            self._folder.mkdir(parents=True, exist_ok=True)
+            stamp = datetime.now(UTC).strftime("%Y-%m-%d %H.%M.%S")
+            self._report = self._folder / f"{self.user} {stamp}.csv"
+            write_text_atomic(self._report, report_csv(self.user, self.result()))
+
+    def result(self) -> dict[str, Any]:
+        """The experiment so far."""
+        return experiment(self._game)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the page; the whole result once it is done."""
+        c = self._game.config.control
+        table: dict[str, Any] = {**self.state.as_dict(), "user": self.user, "screen": [c.width_px, c.height_px]}
+        table["tolerance_px"] = self._game.config.tolerance_px
+        if self._report is not None:
+            table["report"] = self._report.name
+            table["result"] = self.result()
+        return table
+
+
+class CardReader:
+    """``python -m tools.bench.card BENCH`` and what it says, a JSON line per sample."""
+
+    def __init__(self, process: asyncio.subprocess.Process, on_sample: Callable[[dict[str, Any]], None]) -> None:
+        self._process = process
+        self.error = ""
+        self._task = asyncio.create_task(self._read(on_sample))
+
+    @classmethod
+    async def start(cls, bench: Path, on_sample: Callable[[dict[str, Any]], None]) -> CardReader:
+        """``InputError`` for a bench without a motion card."""
+        if not load_bench(bench).description.devices_with("motion_card"):
+            raise InputError(f"{bench} has no motion_card; choose a bench like endoscope.toml")
+        process = await asyncio.create_subprocess_exec(
+            sys.executable,
+            "-m",
+            "tools.bench.card",
+            str(bench),
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.PIPE,
+        )
+        return cls(process, on_sample)
+
+    async def _read(self, on_sample: Callable[[dict[str, Any]], None]) -> None:
+        assert self._process.stdout is not None
+        assert self._process.stderr is not None
+        async for line in self._process.stdout:
+            with contextlib.suppress(ValueError):
+                on_sample(json.loads(line))
+        told = (await self._process.stderr.read()).decode(errors="replace").strip()
+        if await self._process.wait() > 0:
+            self.error = told.splitlines()[-1] if told else "the motion card's reader ended"
+
+    async def stop(self) -> None:
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                self._process.terminate()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+
+class Targets:
+    """The experiment that is on; one for all viewers of the bench."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.game: Game | None = None
+        self.source: Source = "mouse"
+        self._reader: CardReader | None = None
+
+    async def start(self, user: str, mapping: str, source: str, bench: Path | None, seed: int) -> None:
+        """A new run. ``InputError`` when it cannot be."""
+        if mapping not in ("position", "speed"):
+            raise InputError(f"{mapping!r} is not a mapping; there are position and speed")
+        await self.stop()
+        game = Game(GameConfig(control=ControlConfig(mapping=mapping), seed=seed), user, self._folder)  # pyright: ignore[reportArgumentType]
+        if source == "card":
+            if bench is None:
+                raise InputError("name the bench file whose motion card shall be used")
+            self._reader = await CardReader.start(
+                bench, lambda s: game.card(s["psi"], s["theta"], s["status"], s["use"])
+            )
+        elif source != "mouse":
+            raise InputError(f"{source!r} is not a pointer; there are mouse and card")
+        self.game, self.source = game, "card" if source == "card" else "mouse"
+
+    async def stop(self) -> None:
+        reader, self._reader, self.game = self._reader, None, None
+        if reader is not None:
+            await reader.stop()
+
+    def pointer(self, psi_deg: float, theta_deg: float, pressed: bool) -> None:
+        if self.game is not None and self.source == "mouse":
+            self.game.pointer(psi_deg, theta_deg, pressed)
+
+    def as_dict(self) -> dict[str, Any] | None:
+        """For the page; None when nothing is played."""
+        if self.game is None:
+            return None
+        error = self._reader.error if self._reader is not None else ""
+        return {**self.game.as_dict(), "source": self.source, "error": error}
+
+    def reports(self) -> list[str]:
+        return sorted((p.name for p in self._folder.glob("*.csv")), reverse=True)
+
+    def report(self, name: str) -> Path:
+        """A report file. ``InputError`` when there is none of that name."""
+        path = self._folder / Path(name).name
+        if not path.is_file():
+            raise InputError(f"there is no report {name!r}")
+        return path

@@ -1,0 +1,368 @@
+"""The diagnostic commands: thin over ``tools.diagnose``."""
+
+from __future__ import annotations
+
+import sys
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.live import Live
+from rich.markup import escape
+from rich.table import Table
+from rich.text import Text
+
+from hal.bench import load_bench
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import (
+    Exit,
+    InputError,
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+)
+
+VirtualOption = Annotated[
+    bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
+]
+YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
+
+
+class ProbeChoice(StrEnum):
+    """How an I2C address is asked."""
+
+    READ = "read"
+    WRITE = "write"
+
+
+class PolicyChoice(StrEnum):
+    """Which scheduling is measured."""
+
+    OTHER = "other"
+    FIFO = "fifo"
+    BOTH = "both"
+
+
+def _ask(question: str, yes: bool) -> None:
+    if not yes and not typer.confirm(question, err=True):
+        raise InputError("nothing was done")
+
+
+def scan(
+    bench: BenchOption = None,
+    probe: Annotated[ProbeChoice, typer.Option(help="How I2C addresses are asked.")] = ProbeChoice.READ,
+    seconds: Annotated[float, typer.Option(min=0.0, max=3600.0, help="How long CAN is listened to.")] = 1.0,
+    yes: YesOption = False,
+    virtual: VirtualOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.
+
+    Example: micron scan --bench benches/lab.toml
+    """
+    from tools.diagnose.opened import opened_bench
+    from tools.diagnose.scan import PROBES, scan_bench
+
+    with clear_errors():
+        check_writable(json_file)
+        console().print(f"I2C probe '{probe}': {PROBES[probe]}")
+        if probe is ProbeChoice.WRITE:
+            _ask("Write to every address of every I2C bus of this bench?", yes)
+        with opened_bench(bench_path(bench), virtual=virtual) as opened:
+            result = scan_bench(opened, probe.value, seconds, lambda text: console().print(text, style="dim"))
+        out = data_console()
+        out.print("ports of this machine: " + (", ".join(result.ports) or "none"))
+        table = Table(title="I2C", title_justify="left")
+        for heading in ("bus", "address", "declared", "answers"):
+            table.add_column(heading)
+        for a in result.i2c:
+            table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", "yes" if a.answered else "[bold red]no[/]")
+        out.print(table)
+        traffic = Table(title=f"CAN, {seconds:g} s", title_justify="left")
+        for heading in ("bus", "id", "message", "frames", "rate (Hz)"):
+            traffic.add_column(heading)
+        for c in result.can:
+            traffic.add_row(c.bus, f"0x{c.can_id:03X}", c.name, str(c.frames), f"{c.rate_hz:.1f}")
+        out.print(traffic)
+        write_json({"format": 1, **result.as_dict()}, json_file)
+        if result.missing:
+            console().print(f"no answer from {', '.join(result.missing)}: check power, wiring and address")
+            raise typer.Exit(Exit.DEVICE_MISSING)
+
+
+def scope(
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=0.05, max=3600.0, help="How long to look.")] = 5.0,
+    width: Annotated[int, typer.Option(min=8, max=400, help="Characters per line.")] = 72,
+    virtual: VirtualOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """The analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.
+
+    Example: micron scope --seconds 10
+    """
+    from tools.diagnose.opened import opened_bench
+    from tools.diagnose.scope import Look, look, sparkline
+
+    def text(seen: Look) -> str:
+        rows = [f"{'input':<9}{'':<{width}} {'low (V)':>9} {'mean (V)':>9} {'high (V)':>9} {'rms (mV)':>9}"]
+        for line, volts in zip(seen.lines() if seen.volts.size else [], seen.volts, strict=False):
+            numbers = "".join(f" {v:9.4f}" for v in (line.low_V, line.mean_V, line.high_V))
+            rows.append(f"{line.name:<9}{sparkline(volts, width):<{width}}{numbers} {1e3 * line.rms_V:9.2f}")
+        rows.append(f"{seen.volts.shape[1] / seen.rate_hz:.1f} s at {seen.rate_hz:g} Hz, {seen.lost} scans lost")
+        return "\n".join(rows)
+
+    with clear_errors():
+        check_writable(json_file)
+        with (
+            opened_bench(bench_path(bench), virtual=virtual) as opened,
+            Live(console=console(), refresh_per_second=8, transient=True) as live,
+        ):
+            seen = look(opened, seconds, lambda so_far: live.update(Text(text(so_far), no_wrap=True)))
+        if json_file != "-":
+            typer.echo(text(seen))
+        lines = {x.name: {k: getattr(x, k) for k in ("low_V", "mean_V", "high_V", "rms_V")} for x in seen.lines()}
+        write_json({"format": 1, "rate_hz": seen.rate_hz, "lost": seen.lost, "inputs": lines}, json_file)
+        if seen.lost:
+            raise typer.Exit(Exit.DATA_LOST)
+
+
+def latency(
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="Length of each measurement.")] = 5.0,
+    policy: Annotated[PolicyChoice, typer.Option(help="Scheduling policy to measure.")] = PolicyChoice.BOTH,
+    firmware: Annotated[bool, typer.Option(help="Measure the firmware too, on the bench.")] = True,
+    json_file: JsonOption = None,
+) -> None:
+    """How late a 1 kHz loop is on this machine: bare, with a pty, as the firmware; with and without real time.
+
+    Example: micron latency --seconds 30 --policy both
+    """
+    from tools.diagnose.latency import Lateness, Policy, bare_loop, firmware_loop, octaves
+
+    with clear_errors():
+        check_writable(json_file)
+        path = bench_path(bench)
+        load_bench(path)
+        every: tuple[Policy, ...] = ("other", "fifo")
+        policies: list[Policy] = [p for p in every if policy is PolicyChoice.BOTH or p == policy.value]
+        found: list[Lateness] = []
+        for chosen in policies:
+            with console().status(f"bare loop, policy {chosen}, {seconds:g} s"):
+                found.append(bare_loop(seconds, chosen))
+            with console().status(f"loop and pty, policy {chosen}, {seconds:g} s"):
+                found.append(bare_loop(seconds, chosen, with_pty=True))
+            if firmware:
+                with console().status(f"firmware, policy {chosen}, {seconds:g} s"):
+                    found.append(firmware_loop(path, seconds, chosen))
+        out = data_console()
+        table = Table(title="Lateness of a 1 ms tick, us", title_justify="left")
+        for heading in ("loop", "policy", "ticks", "p50", "p99", "p99.9", "worst", "scheduling granted"):
+            table.add_column(heading, justify="left" if heading in ("loop", "policy") else "right")
+        for one in found:
+            d = one.histogram.distribution()
+            numbers = (d.p50_us, d.p99_us, d.p99_9_us, d.max_us)
+            table.add_row(one.what, one.policy, str(d.n), *(f"{v:.0f}" for v in numbers), one.scheduling)
+        out.print(table)
+        for one in found:
+            out.print(f"{one.what}, {one.policy}:")
+            total = max(1, one.histogram.n)
+            for bound_us, n in octaves(one.histogram):
+                out.print(f"  < {bound_us:>9.1f} us {n:>8} {'█' * max(1, round(50 * n / total))}")
+        write_json({"format": 1, "seconds": seconds, "rows": [one.as_dict() for one in found]}, json_file)
+
+
+def ramp(
+    bench: BenchOption = None,
+    arm: Annotated[bool, typer.Option("--arm", help="Without it nothing is moved.")] = False,
+    channel: Annotated[list[int] | None, typer.Option(min=1, help="Output, from 1; default all.")] = None,
+    steps: Annotated[int, typer.Option(min=2, max=1000, help="Stairs between the limits.")] = 11,
+    dwell_s: Annotated[float, typer.Option(min=0.001, max=60.0, help="Time on each stair.")] = 0.05,
+    tolerance_V: Annotated[float, typer.Option("--tolerance", min=0.0, help="Largest error allowed, V.")] = 0.05,
+    yes: YesOption = False,
+    virtual: VirtualOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """A staircase on the outputs, over their full range, with read-back. Exit 1 when a stair is off.
+
+    Example: micron ramp --arm --channel 1 --steps 21
+    """
+    from tools.diagnose.opened import opened_bench
+    from tools.diagnose.ramp import RampStep
+    from tools.diagnose.ramp import ramp as climb
+
+    with clear_errors():
+        check_writable(json_file)
+        if not arm:
+            raise InputError("this moves the actuators over their full range; say so with --arm")
+        path = bench_path(bench)
+        emulated = set(load_bench(path).description.emulated_buses())
+        if len(emulated) < len(load_bench(path).description.bus):
+            _ask("Move the actuators of this bench over their full range?", yes)
+        channels = [c - 1 for c in channel or [1, 2, 3]]
+        if max(channels) > 2:
+            raise InputError(f"--channel {max(channels) + 1}: this instrument has outputs 1 to 3")
+        table = Table(title="Staircase", title_justify="left")
+        for heading in ("output", "wanted (V)", "read back (V)", "error (mV)"):
+            table.add_column(heading, justify="right")
+
+        def show(step: RampStep) -> None:
+            bad = abs(step.error_V) > tolerance_V
+            error = f"{1e3 * step.error_V:.2f}"
+            table.add_row(
+                str(step.channel + 1),
+                f"{step.wanted_V:.2f}",
+                f"{step.read_V:.3f}",
+                f"[red]{error}[/]" if bad else error,
+            )
+
+        with opened_bench(path, virtual=virtual) as opened:
+            found = climb(opened, channels, steps, dwell_s, show)
+        data_console().print(table)
+        worst = max(found, key=lambda s: abs(s.error_V))
+        write_json(
+            {
+                "format": 1,
+                "tolerance_V": tolerance_V,
+                "worst_error_V": worst.error_V,
+                "rows": [
+                    {"output": s.channel + 1, "wanted_V": s.wanted_V, "read_V": s.read_V, "error_V": s.error_V}
+                    for s in found
+                ],
+            },
+            json_file,
+        )
+        if abs(worst.error_V) > tolerance_V:
+            console().print(f"output {worst.channel + 1} is {1e3 * worst.error_V:.1f} mV off at {worst.wanted_V:.2f} V")
+            raise typer.Exit(Exit.FAILED)
+
+
+can = typer.Typer(no_args_is_help=True, help="CAN buses of a bench.")
+
+
+@can.command("dump")
+def can_dump(
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=0.01, max=86_400.0, help="How long to listen.")] = 10.0,
+    count: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
+    virtual: VirtualOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Frames as they come, decoded where the id is known. Only listens.
+
+    Example: micron can dump --seconds 5
+    """
+    from tools.diagnose.can_dump import listen
+    from tools.diagnose.opened import opened_bench
+
+    with clear_errors():
+        check_writable(json_file)
+        path = bench_path(bench)
+        buses = [name for name, spec in load_bench(path).description.bus.items() if spec.kind == "can"]
+        if not buses:
+            raise InputError(f"{path}: this bench has no CAN bus")
+        heard = []
+        with opened_bench(path, virtual=virtual) as opened:
+            for one in listen(opened, buses, seconds, count):
+                heard.append(one.as_dict())
+                if json_file != "-":
+                    signals = "  ".join(f"{k}={v:g}" for k, v in one.signals.items())
+                    frame = f"{one.frame.can_id:03X} [{len(one.frame.data)}] {one.frame.data.hex(' ')}"
+                    typer.echo(f"{one.t_s:10.4f} {one.bus} {frame:<32} {one.message or '?'} {signals}")
+        console().print(f"{len(heard)} frames")
+        write_json({"format": 1, "frames": heard}, json_file)
+
+
+def capture(
+    out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="A new folder for the transcripts.")],
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=0.01, max=600.0, help="How long to scan.")] = 1.0,
+    virtual: VirtualOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.
+
+    Example: micron capture --bench benches/lab.toml --out golden/lab
+    """
+    from tools.diagnose.golden import capture as record
+
+    with clear_errors():
+        check_writable(json_file, out)
+        if out.exists():
+            raise InputError(f"{out}: is there already; a golden transcript is not overwritten")
+        counts = record(bench_path(bench), out, seconds, virtual=virtual)
+        for bus, lines in counts.items():
+            console().print(f"{bus}: {lines} transfers")
+        write_json({"format": 1, "out": str(out), "transfers": counts}, json_file)
+
+
+golden = typer.Typer(no_args_is_help=True, help="Golden transcripts.")
+
+
+@golden.command("diff")
+def golden_diff(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="What 'micron capture' wrote.")],
+    bench: BenchOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Replay a transcript against today's drivers and against the emulated devices, and show where they part.
+
+    Measured values differ between any two runs ("data"); questions and the form of answers must not ("protocol",
+    exit 1). The emulated bench is that of the transcript unless --bench names another.
+
+    Example: micron golden diff golden/lab --bench benches/micron.toml
+    """
+    from tools.diagnose.golden import diff
+
+    with clear_errors():
+        check_writable(json_file)
+        report = diff(folder, bench)
+        table = Table(title=f"{report.compared} transfers", title_justify="left")
+        for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
+            table.add_column(heading)
+        for d in report.differences:
+            table.add_row(d.bus, d.side, str(d.entry), d.kind, escape(d.recorded), escape(d.found))
+        if report.differences:
+            data_console().print(table)
+        console().print(f"{report.protocol} differences of protocol, {report.data} of data")
+        write_json({"format": 1, **report.as_dict()}, json_file)
+        if not report.same:
+            raise typer.Exit(Exit.FAILED)
+
+
+log = typer.Typer(no_args_is_help=True, help="The log of a running bench.")
+
+
+@log.command("follow")
+def log_follow(
+    url: Annotated[str, typer.Option(help="Address of the page, with its token if it is not on loopback.")] = (
+        "http://127.0.0.1:8750"
+    ),
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="How long; default until Ctrl-C.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Print what a running 'micron bench' says, as it says it. Exit 4 when there is none.
+
+    Example: micron log follow --url http://127.0.0.1:8750
+    """
+    from tools.diagnose.log_follow import follow
+
+    with clear_errors():
+        check_writable(json_file)
+        lines = []
+        try:
+            for line in follow(url, seconds):
+                lines.append(line)
+                if json_file != "-":
+                    typer.echo(f"{line['when']} {line['level']:<5} {line['text']}")
+                    sys.stdout.flush()
+        except ConnectionError as error:
+            console().print(f"[bold red]micron:[/] {escape(str(error))}", soft_wrap=True)
+            raise typer.Exit(Exit.DEVICE_MISSING) from error
+        except KeyboardInterrupt:
+            pass
+        write_json({"format": 1, "lines": lines}, json_file)

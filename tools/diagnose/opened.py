@@ -1,0 +1,20 @@
+"""A bench opened for a diagnostic command: the same few lines for all of them."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from hal.bench import OpenBench, load_bench, open_bench
+
+
+@contextmanager
+def opened_bench(path: Path, *, virtual: bool) -> Iterator[OpenBench]:
+    """Open every bus of the bench file ``path``. Raises ``HalError``."""
+    with (
+        tempfile.TemporaryDirectory(prefix="micron-") as folder,
+        open_bench(load_bench(path), virtual=virtual, runtime_dir=Path(folder)) as bench,
+    ):
+        yield bench
