@@ -35,9 +35,7 @@ def instrument_bench(path: Path) -> BenchFile:
     """The bench file, if the page can run it. Raises ``BenchError``."""
     bench = load_bench(path)
     if is_endoscope(bench.description):
-        raise BenchError(
-            f"{path}: the page runs the instrument; a motion card is used in its Targets view"
-        )
+        raise BenchError(f"{path}: the page runs the instrument; a motion card is used in its Targets view")
     return bench
 
 
