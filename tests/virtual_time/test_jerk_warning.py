@@ -1,0 +1,30 @@
+"""The whole instrument in virtual time: a hand that twitches is told to the supervisor, counted and shown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.app import RunRequest, run_in_process
+from tools.reports.run_report import summary_lines
+
+BENCH = Path(__file__).parents[2] / "benches" / "micron.toml"
+
+
+@pytest.mark.slow
+def test_jerks_reach_the_report(tmp_path: Path) -> None:
+    text = BENCH.read_text().replace('"calibration/', f'"{BENCH.parent}/calibration/')
+    text = text.replace(
+        "[emulation] # read only when a bus URI starts with sim://\n",
+        "[emulation]\nhand = { jerk_um = 1500.0, jerk_interval_s = 1.0 }\n",
+    )
+    text += "\n[firmware.tremor.detectors]\nsettle_s = 1.0\n"
+    bench = tmp_path / "twitching.toml"
+    bench.write_text(text)
+    outcome, truth = run_in_process(RunRequest(bench, 5.0, virtual=True, seed=3))
+    assert truth is not None
+    assert outcome["warnings"]["jerk"] >= 1
+    assert outcome["warnings"]["drift"] == 0
+    quiet = {"gain": None, "delay_ms": None}
+    assert any("jerk(s)" in line for line in summary_lines({**outcome, "voluntary": quiet}))
