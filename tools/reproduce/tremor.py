@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from firmware_py.tremor.config import Method, TremorConfig
+from tools.reproduce import tremor_hands
 from tools.reproduce.rows import Row, Table, build
 from tools.tremor.cases import case_of, emulated_hand
 from tools.tremor.evaluate import ORACLE, Summary, evaluate, summarise
@@ -178,4 +179,4 @@ def table() -> Table:
     notes = ["residual and reduction: rms over all axes from 5 s on; the first 5 s are adaptation"]
     if not DATA.is_dir():
         notes.append(f"{DATA} is not there: rows on recorded hands are left out")
-    return build("tremor", (_emulated, _recorded, _tasks), notes)
+    return build("tremor", (_emulated, _recorded, _tasks, tremor_hands.inspection, tremor_hands.cascade), notes)

@@ -1,0 +1,60 @@
+"""``docs/tremor-on-real-hands.md``: every section is computed from the recordings; nothing in it is typed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from textwrap import fill
+
+from tools.errors import InputError
+from tools.tremor.signals import TremorSignal, load_data_sets
+
+Progress = Callable[[str], None]
+Section = Callable[[list[TremorSignal], Progress], list[str]]
+"""Markdown lines, from '## heading' on."""
+
+SECTIONS = (
+    "tools.tremor.report_inspect",
+    "tools.tremor.report_cascade",
+    "tools.tremor.report_detectors",
+)
+"""Modules whose ``section(signals, progress)`` writes a part of the page, in order."""
+
+
+def report(data: Path, revision: str, progress: Progress) -> str:
+    """The page. Raises InputError when the recordings are not in ``data``."""
+    signals = load_data_sets(data) if data.is_dir() else []
+    if not signals:
+        raise InputError(f"{data}: no tremor recordings there; name the folder with --data FOLDER")
+    lines = [
+        "# Tremor on real hands",
+        "",
+        f"Made by `micron tremor report --out docs/tremor-on-real-hands.md`, revision {revision}.",
+        "",
+    ]
+    for name in SECTIONS:
+        section: Section = import_module(name).section
+        lines += [*filled(section(signals, progress)), ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def filled(lines: list[str]) -> list[str]:
+    """Neighbouring lines of plain text joined and broken at 118 characters; headings, tables and lists as they are."""
+    out: list[str] = []
+    text: list[str] = []
+    for line in [*lines, ""]:
+        if line and line[0] not in "#|-":
+            text.append(line)
+            continue
+        if text:
+            out += fill(" ".join(text), 118, break_long_words=False, break_on_hyphens=False).split("\n")
+            text = []
+        out.append(line)
+    return out[:-1]
+
+
+def table(head: list[str], rows: list[list[str]]) -> list[str]:
+    """A Markdown table, first column left, the others right."""
+    rule = "|---|" + "---:|" * (len(head) - 1)
+    return [f"| {' | '.join(head)} |", rule, *(f"| {' | '.join(row)} |" for row in rows)]
