@@ -245,7 +245,7 @@ def assemble(
         }
         guilty = [o for o in touched if gains[o] > 0.02] or touched[:1]
     elif verdict == "unexplained":
-        guilty = [o for o, v in left.items() if v.real]
+        guilty = sorted((o for o, v in left.items() if v.real), key=lambda o: (-left[o].ratio, o))
     else:
         guilty = []
     depends: list[DependsOn] = []

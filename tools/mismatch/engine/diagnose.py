@@ -21,7 +21,7 @@ from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.select import Rule, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
-from tools.mismatch.engine.unexplained import about, leftover, stranger
+from tools.mismatch.engine.unexplained import about, lead, leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
@@ -151,8 +151,12 @@ def _diagnose(
             # the effects only imitated it: nothing is named
             selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
     left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
-    if strange is not None:
-        left[strange.output] = left[strange.output].led_by(strange)
+    leads = (
+        [strange] if strange is not None else [lead(problem, selection.fitted, o) for o in twin.outputs if left[o].real]
+    )
+    for found in leads:
+        if found is not None:
+            left[found.output] = left[found.output].led_by(found)
     remarks = gross(recording, twin, raw)
     official = None
     if not problem.split.own and twin.restart:

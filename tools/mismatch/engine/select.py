@@ -160,7 +160,7 @@ def search(
         if strange is not None:
             signal = strange.signal
             own = [t for t in good if signal in about(t.placed.effect) and strange.output in t.placed.outputs]
-            if not any(signal in about(t.placed.effect) for t in trials) or (own and not serves(own[0], strange)):
+            if not any(signal in about(t.placed.effect) for t in trials):
                 break
             strange = None
             if own:
@@ -234,14 +234,6 @@ def part_flexible(
                 head = replace(one, fitted=both, misfits=value, energy=energy)
                 best = (left, both, (head, second))
     return None if best is None else (best[1], best[2])
-
-
-def serves(trial: Trial, found: Stranger) -> bool:
-    """Is a trial about a context signal, and no worse than twice a free curve of it."""
-    if found.signal not in about(trial.placed.effect) or found.output not in trial.misfits or trial.comparison is None:
-        return False
-    before = trial.comparison.before.get(found.output, 1.0)
-    return trial.misfits[found.output] - 1 < 2.0 * max((1 - found.share) * before - 1, 0.1) + 0.05 * before
 
 
 def second_thoughts(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,29 +85,33 @@ def context_features(problem: Problem, before: Fit, output: str, names: Iterable
     drive, the plant's motion, or the rate of either. And what these do on their own (n, k): such products hold it too.
     """
     _, signals, dt = thinned(problem, before, output)
-    movers: dict[str, Array] = {}
     drive = problem.twin.drive(output)
-    if drive in signals:
-        movers["drive"] = standard(signals[drive])
+    movers = [standard(signals[i]) for i in sorted(problem.twin.inputs, key=lambda i: i != drive)]
     if not problem.twin.static or drive not in signals:
-        movers["motion"] = standard(block_means(problem.measured[output] - before.residual[output], dt, problem))
+        movers.append(standard(block_means(problem.measured[output] - before.residual[output], dt, problem)))
     found: list[Feature] = []
     for name in names:
         bend = curve(signals[name], 10)
         if bend.shape[1] == 0:
             continue
-        gains = [bend * m[:, None] for m in movers.values()]
-        slopes = [bend * standard(rate_of(m, dt))[:, None] for m in movers.values()]
         found.append(Feature(name, "value", bend))
-        if gains:
-            found.append(Feature(name, "cross product", np.column_stack([bend, *gains])))
-            found.append(Feature(name, "cross product with rate", np.column_stack([bend, *gains, *slopes])))
+        for m in movers:
+            gain, slope = bend * m[:, None], bend * standard(rate_of(m, dt))[:, None]
+            found.append(Feature(name, "cross product", np.column_stack([bend, gain])))
+            found.append(Feature(name, "cross product with rate", np.column_stack([bend, gain, slope])))
         found.append(Feature(name, "rate", np.column_stack([bend, curve(rate_of(signals[name], dt), 4)])))
     n = next(iter(signals.values())).size
     own = [np.ones((n, 1))]
-    for m in movers.values():
+    for m in movers:
         own += [m[:, None], standard(rate_of(m, dt))[:, None]]
     return found, np.column_stack(own)
+
+
+def lead(problem: Problem, fitted: Fit, output: str, *, least: float = 0.3, p_limit: float = 1e-8) -> Stranger | None:
+    """The context signal, about which no placed effect is, that most of what is left follows, if there is one."""
+    used = {s for p in fitted.model.placed if output in p.outputs for s in about(p.effect)}
+    names = [s for s in problem.recording.context if s not in used]
+    return _plainest(problem, fitted, output, names, p_limit, lambda share: share > least)
 
 
 def block_means(x: Array, dt: float, problem: Problem) -> Array:
@@ -141,23 +145,32 @@ def stranger(
     start, end = level(before), level(after)
     if end < 1.15:
         return None
-    e = thinned(problem, before, output)[0]
-    features, own = context_features(problem, before, output, names)
+    limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
+    if said <= SHAPELESS:
+        return _plainest(
+            problem, before, output, names, p_limit, lambda share: share > 0.85 or (1 - share) * start - 1 < limit
+        )
+    return _plainest(problem, before, output, names, p_limit, lambda share: (1 - share) * start - 1 < limit)
+
+
+def _plainest(
+    problem: Problem, fitted: Fit, output: str, names: Sequence[str], p_limit: float, enough: Callable[[float], bool]
+) -> Stranger | None:
+    """Of the features of the context signal that takes most, the plainest that takes nearly as much."""
+    if not names:
+        return None
+    e = thinned(problem, fitted, output)[0]
+    features, own = context_features(problem, fitted, output, names)
     size = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
     beyond = e - own @ (np.linalg.lstsq(own / size, e, rcond=1e-8)[0] / size)
     part = float(np.var(beyond) / max(float(np.var(e)), 1e-300))
     best: Stranger | None = None
     for d in dependences(beyond, features, own_colour=True):
         share = d.strength * part
-        left = (1 - share) * start
-        limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
-        if said <= SHAPELESS and share > 0.85:
-            limit = np.inf
-        # the plainest feature that comes close to the best
         close = best is None or (
             best.signal == d.signal and share > 0.95 * best.share and plainer(d.feature, best.feature)
         )
-        if d.p_value < p_limit and left - 1 < limit and close:
+        if d.p_value < p_limit and enough(share) and close:
             best = Stranger(output, d.signal, d.feature, share, d.p_value)
     return best
 
