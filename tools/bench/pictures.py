@@ -1,0 +1,76 @@
+"""``python -m tools.bench.pictures [FOLDER]``: screenshots of every view of a running bench page, for the documents.
+
+Needs the package ``playwright`` and Debian's Chromium; starts its own server on a free port.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
+SETTLE_MS = {"scope": 9000, "tremor": 8000}
+
+
+def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
+    """One picture per view."""
+    page.wait_for_function("micron.link.state.status.state === 'running'", timeout=240_000)
+    for view in views:
+        page.goto(f"{base}/#/{view}")
+        page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
+        page.wait_for_timeout(SETTLE_MS.get(view, 3000))
+        page.screenshot(path=folder / f"{view}.png", timeout=90_000)
+
+
+def main(arguments: list[str]) -> int:
+    people = Console(stderr=True)
+    chromium = shutil.which("chromium")
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        people.print("the package playwright is missing: pip install playwright")
+        return 1
+    if chromium is None:
+        people.print("no Chromium: apt-get install chromium")
+        return 1
+    folder = Path(arguments[0] if arguments else "docs/pictures")
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="micron-") as recordings:
+        server = subprocess.Popen(
+            [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
+            + ["--recordings", recordings],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "COLUMNS": "400"},
+        )
+        try:
+            assert server.stderr is not None
+            address = next(word for word in server.stderr.readline().split() if word.startswith("http"))
+            threading.Thread(target=server.stderr.read, daemon=True).start()
+            with sync_playwright() as playwright:
+                browser = playwright.chromium.launch(
+                    executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+                )
+                page = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True).new_page()
+                page.goto(address)
+                page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
+                take(page, address.partition("/#")[0], folder, VIEWS)
+                browser.close()
+        finally:
+            server.send_signal(signal.SIGTERM)
+            server.wait(60)
+    people.print(f"pictures: {folder}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
