@@ -45,9 +45,9 @@ def main(arguments: list[str]) -> int:
     folder = Path(arguments[0] if arguments else "docs/pictures")
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="micron-") as recordings:
+        command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
         server = subprocess.Popen(
-            [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
-            + ["--recordings", recordings],
+            [*command, "--recordings", recordings],
             stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "COLUMNS": "400"},
