@@ -84,6 +84,6 @@ def section(signals: list[TremorSignal], progress: Progress) -> list[str]:
         "interpolating at the",
         "stamps instead doubles the power above 20 Hz. The share of tremor windows does not tell who has",
         "essential tremor:",
-        "it counts windows in which tremor is a third of all motion, and these hands move. The amplitude does tell.",
+        "it counts windows in which tremor is a third of all motion, and these hands move.",
     ]
     return lines
