@@ -35,6 +35,7 @@ from tools.mismatch.engine.score import compare, held_rms, misfits, paired_t
 from tools.mismatch.engine.select import Rule, Selection, as_good
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover
+from tools.mismatch.report.wording import scaled
 from tools.mismatch.simulate import Model
 
 Array = NDArray[np.float64]
@@ -74,12 +75,12 @@ def _rms(r: Array) -> float:
     return float(np.sqrt(np.mean(r**2)))
 
 
-def _units(problem: Problem, trial_unit: str, target: str, output: str) -> str:
+def _units(problem: Problem, trial_unit: str, target: str, output: str, site: str) -> str:
     units = problem.twin.units
     drive = problem.twin.drive(output) or target
-    return trial_unit.replace("{in}", units.get(target if target in units else drive, "1")).replace(
-        "{out}", units.get(output, "1")
-    )
+    # a force inside the equation of motion has the unit of what drives it
+    source = drive if site == "feedback" or target not in units else target
+    return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", units.get(output, "1"))
 
 
 def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
@@ -104,7 +105,7 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
             for i in (*range(a.start, a.stop), *range(b.start, b.stop))
         }
         parameters = {
-            n: ParameterValue(v.value, _units(problem, v.unit, placed.target, worst), v.ci95)
+            n: ParameterValue(v.value, _units(problem, v.unit, placed.target, worst, placed.site), v.ci95)
             for n, v in values.get(placed.label, {}).items()
         }
         out.append(
@@ -188,6 +189,10 @@ FLEXIBLE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "step_
 """Families with so much freedom that a real effect of theirs leaves little: one that leaves more is an imitation."""
 
 
+LOUD = 25.0
+"""Mean square over noise variance that no colour of noise accounts for, even when nothing is known to follow it."""
+
+
 def decide(
     problem: Problem, raw: Fit, base: Fit, selection: Selection, left: dict[str, Leftover], rule: Rule
 ) -> tuple[Verdict, float]:
@@ -207,6 +212,9 @@ def decide(
     if any(v.real and v.ratio > 1.05 for v in left.values()):
         p = min((d.p_value for v in left.values() for d in v.follows), default=1.0)
         return "unexplained", p
+    loud = [o for o, v in left.items() if v.ratio > LOUD and ljung_box(base.residual[o][problem.held_rows]) < 1e-6]
+    if loud:
+        return "unexplained", 1e-6
     moved = compare(problem, raw, base)
     if moved.z > rule.z and moved.gain > rule.gain:
         return "recalibrate", 1.0
@@ -246,6 +254,7 @@ def assemble(
         guilty = [o for o in touched if gains[o] > 0.02] or touched[:1]
     elif verdict == "unexplained":
         guilty = sorted((o for o, v in left.items() if v.real), key=lambda o: (-left[o].ratio, o))
+        guilty = guilty or [max(left, key=lambda o: (left[o].ratio, o))]
     else:
         guilty = []
     depends: list[DependsOn] = []
@@ -402,9 +411,10 @@ def summary(
     if verdict == "missing_physics":
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
+        factor, unit = scaled(b[o], problem.twin.units[o])
         return (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
-            f" from {a[o]:.3g} to {b[o]:.3g} {problem.twin.units[o]}."
+            f" from {factor * a[o]:.3g} to {factor * b[o]:.3g} {unit}."
         )
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
     return f"Something is left in {outputs} that no known effect explains{what}."

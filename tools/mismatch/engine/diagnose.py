@@ -144,7 +144,7 @@ def _diagnose(
     strange = selection.strange
     if strange is None:
         said = {t.name for t in selection.steps}
-        known = {s for t in selection.first if t.fitted is not None for s in about(t.placed.effect)}
+        known = {s for t in selection.first for s in about(t.placed.effect)}
         found = (stranger(problem, base, selection.fitted, o, said) for o in twin.outputs)
         strange = next((f for f in found if f is not None and f.signal not in known), None)
         if strange is not None:
