@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import typer
 
-from tools.cli import tremor_evaluate, tremor_inspect, tremor_report, tremor_train
+from tools.cli import tremor_budget, tremor_evaluate, tremor_inspect, tremor_report, tremor_train
 
 app = typer.Typer(help="Recorded hands: inspect them, train on them, evaluate estimators.", no_args_is_help=True)
 app.command("inspect")(tremor_inspect.inspect)
 app.command("evaluate")(tremor_evaluate.evaluate)
 app.command("train")(tremor_train.train)
 app.command("report")(tremor_report.report)
+app.command("budget")(tremor_budget.budget)
