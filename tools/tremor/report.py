@@ -16,6 +16,7 @@ Section = Callable[[list[TremorSignal], Progress], list[str]]
 
 SECTIONS = (
     "tools.tremor.report_inspect",
+    "tools.tremor.report_evaluate",
     "tools.tremor.report_cascade",
     "tools.tremor.report_detectors",
 )
