@@ -19,6 +19,7 @@ from rich.spinner import Spinner
 from rich.table import Table
 
 from firmware_py.app import RunRequest, run_in_process
+from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json
@@ -66,7 +67,8 @@ def run(
             record=record,
             seed=seed,
         )
-        load_bench(request.bench)
+        if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None):
+            raise InputError("--hand and --html belong to the instrument; an endoscope bench has neither")
         outcome, truth = _run_virtual(request) if virtual else _run_real(request)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)

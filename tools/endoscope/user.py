@@ -4,8 +4,10 @@ The hand follows McRuer's crossover model of the human operator (McRuer, Jex 196
 1974): whatever the controlled element is, operator and element together behave as omega_c exp(-s tau) / s. With
 position mapping behind the response filter, K / (T s + 1), the operator therefore integrates and leads with T; with
 speed mapping, K / (s (T s + 1)), the operator is proportional and leads with T. People lead by about a second at most,
-so from there on they become slower and ring. The rest (time to decide, to press, noise, reach of the wrist) is ordinary
-and not fitted to the document's tables.
+so from there on they become slower and ring. Where the hand's place is the view's place (position mapping), the first
+movement is an aimed one that needs no eyes (Woodworth's two components, 1899): it goes where the goal is, misses by
+some percent (Schmidt 1979), and correcting begins once the view has had its response time. The rest (time to decide, to
+press, noise, reach of the wrist) is ordinary and not fitted to the document's tables.
 """
 
 from __future__ import annotations
@@ -52,6 +54,8 @@ class UserConfig(BaseModel):
     tremor_deg: float = Field(default=0.15, ge=0.0)
     reach_deg: float = Field(default=30.0, gt=1.0, le=90.0)
     """Beyond it the user stops, turns the hand back and starts again."""
+    aim_spread: float = Field(default=0.08, ge=0.0, lt=0.5)
+    """Of an aimed movement: standard deviation of its length, relative."""
     fastest_deg_s: float = Field(default=60.0, gt=1.0)
     content: float = Field(default=0.6, gt=0.0, lt=1.0)
     """Stops steering when the error is this part of the tolerance, and has been for ``dwell_s``."""
@@ -94,6 +98,8 @@ class SyntheticUser:
         self._press_s = 0.0
         self._good_since: float | None = None
         self._end_since: float | None = None
+        self._aim: Pair | None = None
+        self._arrived: float | None = None
         self._command = [0.0, 0.0]
         self._error: Pair = (0.0, 0.0)
         self._slope = [0.0, 0.0]
@@ -130,6 +136,8 @@ class SyntheticUser:
             self._good_since = self._end_since = None
             self._slope = [0.0, 0.0]
             self._error = self._off(seen)
+            self._arrived = None
+            self._aim = self._aim_at(self._error) if self.task.mapping == "position" else None
             self._phase = "steer" if seen.status == self._goal else "look"
         elif self._phase == "steer":
             if seen.status != self._goal:
@@ -140,7 +148,7 @@ class SyntheticUser:
             stuck = self._at_the_end(t) and worst > self.task.tolerance_px
             if seen.target != self._target or stuck or self._content(worst, t):
                 self._stop(t)
-            else:
+            elif not self._aiming(error, t, dt):
                 self._steer(error, dt)
         else:
             self._phase = "look"
@@ -198,6 +206,31 @@ class SyntheticUser:
             return False
         self._good_since = t if self._good_since is None else self._good_since
         return t - self._good_since >= self.config.dwell_s
+
+    def _aim_at(self, error: Pair) -> Pair:
+        """Where the hand must be, as well as that can be told beforehand."""
+        c = self.config
+        goals = [self._command[i] - error[i] / self.task.gain * (1.0 + c.aim_spread * self._normal()) for i in range(2)]
+        x, y = (min(max(goal, -c.reach_deg), c.reach_deg) for goal in goals)
+        return x, y
+
+    def _aiming(self, error: Pair, t: float, dt: float) -> bool:
+        """One step of the aimed movement, or of waiting for what it did; False when there is nothing left of it."""
+        c = self.config
+        if self._aim is None:
+            return False
+        self._error = error
+        if self._arrived is None:
+            away = 0.0
+            for i in range(2):
+                gap, step = self._aim[i] - self._command[i], c.fastest_deg_s * dt
+                self._command[i] += min(max(gap, -step), step)
+                away = max(away, abs(self._aim[i] - self._command[i]))
+            self._arrived = t if away == 0.0 else None
+            return True
+        if t - self._arrived >= c.reaction_s + 2.0 * c.muscle_s + self.task.response_s:
+            self._aim = None
+        return True
 
     def _steer(self, error: Pair, dt: float) -> None:
         c, task = self.config, self.task

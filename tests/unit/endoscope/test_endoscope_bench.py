@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 import benches
 from firmware_py.app import RunRequest, run_in_process
@@ -15,6 +16,7 @@ from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.recording.reader import Recording
 from hal.bench import OpenBench, load_bench
 from hal.errors import BenchError
+from tools.cli.main import app
 from tools.endoscope.run_report import complete_run, inclination_errors_deg
 
 TEXT = """
@@ -145,3 +147,20 @@ def test_inclination_error_of_a_known_tilt() -> None:
     angles = inclination_errors_deg(rows, truth)
     assert angles[0] == pytest.approx(3.0)
     assert np.isnan(angles[1])
+
+
+def test_options_of_the_other_instrument_are_refused(tmp_path: Path) -> None:
+    arguments = ["run", "--bench", str(bench(tmp_path)), "--virtual", "--hand", "hand.csv"]
+    found = CliRunner().invoke(app, arguments)
+    assert found.exit_code == 2
+    assert "--hand" in found.output
+
+
+def test_the_run_command_reports(tmp_path: Path) -> None:
+    out = tmp_path / "run.json"
+    arguments = ["run", "--bench", str(bench(tmp_path)), "--virtual", "--seconds", "1", "--json", str(out)]
+    assert CliRunner().invoke(app, arguments).exit_code == 0
+    result = json.loads(out.read_text())
+    assert result["instrument"] == "endoscope"
+    assert "attitudes" not in result
+    assert result["attitude"]["imu"]["inclination_rms_deg"] < 0.2

@@ -74,6 +74,21 @@ def test_plays_through_the_wire_as_it_plays_directly() -> None:
     assert wired["experiment"]["elapsed_s"] == pytest.approx(direct["elapsed_s"], abs=2.0)
 
 
+def test_position_mapping_begins_with_an_aimed_movement() -> None:
+    """Without noise the hand goes straight to error over gain, and the target is placed without a correction."""
+    config = game(targets=1)
+    machine = TargetGame(config)
+    person = SyntheticUser(UserConfig(aim_spread=0.0, eye_px=0.0, tremor_deg=0.0), task_of(config))
+    start = machine.state().off_px
+    state, furthest = machine.state(), 0.0
+    for k in range(500):
+        hand = person.step(state, k * 0.01)
+        state = machine.step(hand.angles_deg, hand.pressed, k * 0.01)
+        furthest = max(furthest, abs(hand.angles_deg[0]))
+    # correcting afterwards may go half a degree further
+    assert abs(start[0]) / 8.0 - 0.1 < furthest < abs(start[0]) / 8.0 + 1.0
+
+
 def test_report_file() -> None:
     text = report_csv("user 7", play(UserConfig(seed=4), game()))
     assert text.startswith("# user user 7\n# mapping position\n# gain 8.0\n")
