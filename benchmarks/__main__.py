@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks import bench_page, latency, step, world
+from benchmarks import bench_page, latency, mismatch, step, world
 from benchmarks.row import Row
 
 RESULTS = Path(__file__).with_name("results.json")
@@ -19,7 +19,7 @@ RESULTS = Path(__file__).with_name("results.json")
 def main() -> None:
     measured: list[Row] = []
     people = Console(stderr=True)
-    for module in (step, world, latency, bench_page):
+    for module in (step, world, mismatch, latency, bench_page):
         people.print(f"measuring {module.__name__.split('.')[-1]} ...")
         measured.extend(module.rows())
     table = Table(title="Ratios within this run; absolute times are of this machine", title_justify="left")

@@ -147,8 +147,8 @@ def _by(result: NullResult, key: str, values: Sequence[str]) -> list[str]:
     return lines
 
 
-def document(result: NullResult) -> str:
-    """The text of docs/mismatch-false-alarms.md."""
+def document(result: NullResult, note: str = "") -> str:
+    """The text of docs/mismatch-false-alarms.md. ``note`` on the state of the tool and what was not run."""
     k, n = result.count()
     failed = sum(r["failed"] for r in result.rows)
     named: dict[str, int] = {}
@@ -167,6 +167,7 @@ def document(result: NullResult) -> str:
         "one third needs recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
         "Intervals are Clopper-Pearson, 95 %.",
         "",
+        *([note, ""] if note else []),
         f"{n} recordings, {result.seconds:.0f} s; seeds {', '.join(sorted({str(r['seed']) for r in result.rows}))}.",
         "",
         f"- false alarms: {_cell(k, n)}",

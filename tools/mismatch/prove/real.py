@@ -266,8 +266,9 @@ def _figure(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}"
 
 
-def document(rows: Sequence[RealRow]) -> str:
-    """The text of docs/mismatch-on-real-data.md."""
+def document(rows: Sequence[RealRow], note: str = "") -> str:
+    """The text of docs/mismatch-on-real-data.md. ``note``: state of the tool; sets that were not run are named."""
+    absent = [s.name for s in SETS if s.name not in {r.real.name for r in rows}]
     lines = [
         "# The mismatch tool on measured recordings",
         "",
@@ -276,6 +277,8 @@ def document(rows: Sequence[RealRow]) -> str:
         "test sweep, since the lag differs from run to run). Errors are rms on data that no fit has seen. The data "
         "are not part of the repository.",
         "",
+        *([note, ""] if note else []),
+        *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
         "| set | unit | naive | re-calibrated | with physics | noise floor (tool's) | published | what it said | s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
@@ -318,13 +321,14 @@ def reproduce(
     jobs: int = 1,
     doc: Path | None = DOC,
     rows_file: Path | None = None,
+    note: str = "",
 ) -> dict[str, Any]:
     """Run all sets, write the page, return the JSON of `micron reproduce mismatch-real`."""
     start = time.perf_counter()
     rows = run(data, only=only, jobs=jobs, rows_file=rows_file)
     if doc is not None:
         doc.parent.mkdir(parents=True, exist_ok=True)
-        doc.write_text(document(rows))
+        doc.write_text(document(rows, note))
     return rows_json(rows, time.perf_counter() - start)
 
 
@@ -340,9 +344,10 @@ def main() -> None:
     p.add_argument("--jobs", type=int, default=1)
     p.add_argument("--doc", type=Path, default=DOC)
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every set, and continued from")
+    p.add_argument("--note", default="", help="a line on the state of the tool, for the page")
     p.add_argument("--json", type=Path, default=None)
     a = p.parse_args()
-    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows)
+    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows, note=a.note)
     text = json.dumps(result, indent=1)
     if a.json:
         a.json.write_text(text)
