@@ -53,7 +53,7 @@ class RunRequest:
     live_fds: tuple[int, int] | None = None
     """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
     stale_ms: float | None = None
-    """Another limit for missing scans than the bench file's."""
+    """Another limit for missing or belated scans than the bench file's."""
     realtime: bool = True
     """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
     truth_s: float | None = None
@@ -93,7 +93,8 @@ def run_in_process(
         devices = open_devices(opened)
         config, configs = load_firmware_config(bench, devices.sensing_table)
         if request.stale_ms is not None:
-            safety = config.safety.model_copy(update={"stale_ms": request.stale_ms})
+            stalled_ms = max(request.stale_ms, config.safety.stalled_ms)
+            safety = config.safety.model_copy(update={"stale_ms": request.stale_ms, "stalled_ms": stalled_ms})
             config = config.model_copy(update={"safety": safety})
         stages = Stages(configs)
         recorder = _recorder(request, bench, configs, opened)
