@@ -51,7 +51,7 @@ def bench_with_method(bench: Path, method: str, folder: Path) -> Path:
     """A copy of ``bench`` whose estimator is ``method``; calibration paths stay those of the original."""
     text = bench.read_text(encoding="utf-8")
     copy = folder / f"{bench.stem}-{method}.toml"
-    calibration = bench.parent / "calibration"
+    calibration = bench.parent.resolve() / "calibration"
     text = text.replace('"calibration/', f'"{calibration}/')
     text = text.replace("[firmware.tremor]\n", f'[firmware.tremor]\nmethod = "{method}"\n')
     copy.write_text(text, encoding="utf-8")
