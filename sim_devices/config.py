@@ -203,6 +203,12 @@ class ManipulatorConfig(_Table):
     lever_spread: NotNegative = 0.02
     mount_spread_deg: NotNegative = 0.5
     """Turn of the manipulator frame against the body about z."""
+    tilt_spread_deg: NotNegative = 0.3
+    """And about x and y."""
+    length_spread: NotNegative = 0.01
+    """Relative, of circle and shaft."""
+    rest_spread_um: NotNegative = 20.0
+    """Ball heights at neutral: what the calibration screws leave (000, 6.2)."""
 
 
 class EnvironmentConfig(_Table):

@@ -32,6 +32,9 @@ class StackConfig(BaseModel):
     centre_V: float = 0.0
     """The plays see the drive less this: what a rate does to the slopes then leaves this voltage alone."""
 
+    level_um: float = 0.0
+    """Added to the plays' sum, so that every dead zone can be above zero."""
+
     slope_per_rate_s_per_V: tuple[float, ...] = ()
     """c_i of W_i(v) = W_i + c_i v, 000 (7.17), um/V per um/s; empty: rate-independent."""
     rate_low_um_per_s: Annotated[float, Field(ge=0.0)] = 0.0

@@ -71,7 +71,7 @@ def sizes_of(*stacks: StackConfig) -> tuple[int, int, int]:
 
     return (
         blocks(max(len(stack.play_thresholds_V) for stack in stacks), 16),
-        blocks(max(len(stack.dead_zone_thresholds_um) for stack in stacks), 4),
+        blocks(max(len(stack.dead_zone_thresholds_um) for stack in stacks), 8),
         blocks(max(len(stack.creep_times_s) for stack in stacks), 4),
     )
 
@@ -96,7 +96,7 @@ def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[in
     return new_record(
         operator_dtype(plays, zones, creep),
         centre_V=stack.centre_V,
-        level=slope[-1] * stack.centre_V,
+        level=slope[-1] * stack.centre_V + stack.level_um * UM,
         r=r,
         slope=slope,
         slope_per_rate=_fill(law, plays, law[-1]),

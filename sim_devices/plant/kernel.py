@@ -40,7 +40,9 @@ PLANT = np.dtype(
         ("circle_m", "f8"),
         ("shaft_m", "f8"),
         ("lever", "f8", (3,)),
-        ("mount", "f8", (2,)),  # cos, sin
+        ("mount", "f8", (3, 3)),  # manipulator to body
+        ("rest_m", "f8", (3,)),  # ball heights at neutral
+        ("rest_tip_m", "f8", (3,)),
         ("frame", "f8", (3, 3)),
         ("arm_m", "f8", (3, 3)),  # sensor locations from the tip, body
         ("gravity", "f8"),
@@ -181,16 +183,17 @@ def truth_row(p, s, part, row):
     z, d = np.empty(3), np.empty(3)
     for i in range(3):
         stroke = s["channel"][i]["mode"][0]
-        z[i] = p["lever"][i] * (stroke - p["channel"][i]["reference_m"])
+        z[i] = p["rest_m"][i] + p["lever"][i] * (stroke - p["channel"][i]["reference_m"])
         row[16 + i] = stroke
         row[19 + i] = s["channel"][i]["stack_V"]
     tip_displacement(z, p["circle_m"], p["shaft_m"], d)
-    co, si = p["mount"][0], p["mount"][1]
-    dx, dy = co * d[0] - si * d[1], si * d[0] + co * d[1]
+    e, m, rest = np.empty(3), p["mount"], p["rest_tip_m"]
+    for i in range(3):
+        e[i] = m[i, 0] * (d[0] - rest[0]) + m[i, 1] * (d[1] - rest[1]) + m[i, 2] * (d[2] - rest[2])
     c = s["attitude"]
     for i in range(3):
         rigid = s["pose"][i]
-        row[i] = rigid + c[i, 0] * dx + c[i, 1] * dy + c[i, 2] * d[2]
+        row[i] = rigid + c[i, 0] * e[0] + c[i, 1] * e[1] + c[i, 2] * e[2]
         row[3 + i] = rigid
         row[6 + i] = part[i]
         row[9 + i] = part[3 + i]

@@ -1,9 +1,11 @@
 """The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
-``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops]
+``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops|set]
 [--twin FILE]``
 drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
-contract. With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place.
+contract; ``set`` writes a folder of them, saw-teeth and sines of 0.1 to 40 Hz and loops, all that a calibration needs.
+With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place.
+``... manipulator --out FOLDER`` moves all three stacks through a grid and tracks the tip.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
 """
@@ -25,6 +27,7 @@ from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin, outputs
+from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays, start_temperature_C
@@ -79,6 +82,15 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
     raise LabError(f"profile '{profile}': it is sawtooth, sine, tremor or loops")
 
 
+CALIBRATION_SET = (
+    *(("sawtooth", hz, seconds) for hz, seconds in ((0.1, 25.0), (0.3, 12.0), (1.0, 7.0), (2.0, 5.0), (5.0, 4.0))),
+    *(("sawtooth", hz, 4.0) for hz in (10.0, 15.0, 20.0, 30.0, 40.0)),
+    *(("sine", hz, 4.0) for hz in (2.0, 10.0, 25.0)),
+    ("loops", 10.0, 20.0),
+)
+"""Profile, Hz, seconds: rates as in 000, sec. 7.4, and minor loops."""
+
+
 def measure_piezo(
     config: EmulationConfig,
     axis: int,
@@ -111,7 +123,8 @@ def measure_piezo(
         params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
         extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
         drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
-    noise = INTERFEROMETER_RMS_UM * stream(config.seed, f"lab.piezo.{axis}.{profile}").standard_normal(len(volts))
+    hiss = stream(config.seed, f"lab.piezo.{axis}.{profile}.{rate_hz:g}").standard_normal(len(volts))
+    noise = INTERFEROMETER_RMS_UM * hiss
     columns = {
         "command_V": volts,
         "displacement_um": extension * 1e6 + noise,
@@ -256,7 +269,7 @@ def main(arguments: list[str] | None = None) -> int:
     what = parser.add_subparsers(dest="what", required=True)
     piezo = what.add_parser("piezo", help="one stack under the interferometer")
     piezo.add_argument("--axis", type=int, default=0)
-    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor", "loops"), default="sine")
+    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor", "loops", "set"), default="sine")
     piezo.add_argument("--rate-hz", type=float, default=10.0)
     piezo.add_argument("--seconds", type=float, default=10.0)
     piezo.add_argument("--amplitude-V", type=float, default=41.7, help="half of peak to peak, about 50 V")
@@ -264,14 +277,26 @@ def main(arguments: list[str] | None = None) -> int:
     tumble = what.add_parser("tumble", help="the resting instrument in many attitudes")
     tumble.add_argument("--positions", type=int, default=100)
     tumble.add_argument("--seconds", type=float, default=5.0, help="averaging at each position")
-    for command in (piezo, tumble):
+    scan = what.add_parser("manipulator", help="the tip over a grid of voltages")
+    scan.add_argument("--per-axis", type=int, default=5, help="voltages per stack")
+    for command in (piezo, tumble, scan):
         command.add_argument("--out", type=Path, required=True, help="folder to write to")
         command.add_argument("--bench", type=Path, help="bench file whose [emulation] table describes the unit")
         command.add_argument("--unit", type=int, help="the unit, if not the bench's")
     given = parser.parse_args(arguments)
     try:
         config = load_config(given.bench, given.unit)
-        if given.what == "piezo":
+        if given.what == "piezo" and given.profile == "set":
+            for profile, rate_hz, seconds in CALIBRATION_SET:
+                columns, descriptor = measure_piezo(config, given.axis, profile, rate_hz, seconds, given.amplitude_V)
+                write_recording(given.out / f"{profile}-{rate_hz:g}Hz", columns, descriptor)
+            sys.stderr.write(f"{given.out}: {len(CALIBRATION_SET)} recordings\n")
+            return 0
+        if given.what == "manipulator":
+            if not 3 <= given.per_axis <= 12:
+                raise LabError(f"{given.per_axis} voltages per axis: give 3 to 12")
+            columns, descriptor = measure_scan(config, given.per_axis, stream(config.seed, "lab.manipulator"))
+        elif given.what == "piezo":
             columns, descriptor = measure_piezo(
                 config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V,
                 None if given.twin is None else load_twin(given.twin),

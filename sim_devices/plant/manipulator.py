@@ -19,22 +19,37 @@ from sim_devices.plant.streams import stream
 
 @dataclass(frozen=True)
 class ManipulatorUnit:
-    """One manipulator: ``lever`` (3,) gains; ``mount_rad`` turns its frame against the body about z."""
+    """One manipulator: ``lever`` (3,) gains, ``rest_m`` (3,) ball heights at neutral, ``mount`` (3, 3) its frame to
+    the body's."""
 
     circle_m: float
     shaft_m: float
     lever: NDArray[np.float64]
-    mount_rad: float
+    rest_m: NDArray[np.float64]
+    mount: NDArray[np.float64]
 
 
 def manipulator_unit(config: ManipulatorConfig, seed: int) -> ManipulatorUnit:
     draw = stream(seed, "manipulator").standard_normal(4)
+    more = stream(seed, "manipulator.geometry").standard_normal(7)
+    turn = np.radians([*(config.tilt_spread_deg * more[:2]), config.mount_spread_deg * draw[3]])
     return ManipulatorUnit(
-        circle_m=config.circle_mm * 1e-3,
-        shaft_m=config.shaft_mm * 1e-3,
+        circle_m=config.circle_mm * 1e-3 * (1.0 + config.length_spread * more[2]),
+        shaft_m=config.shaft_mm * 1e-3 * (1.0 + config.length_spread * more[3]),
         lever=config.lever_gain * (1.0 + config.lever_spread * draw[:3]),
-        mount_rad=math.radians(config.mount_spread_deg * draw[3]),
+        rest_m=config.rest_spread_um * 1e-6 * more[4:],
+        mount=rotation(turn),
     )
+
+
+def rotation(turn_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) of a rotation vector (Rodrigues)."""
+    x, y, z = turn_rad
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    angle = float(np.linalg.norm(turn_rad))
+    if angle < 1e-12:
+        return np.eye(3)
+    return np.eye(3) + math.sin(angle) / angle * cross + (1.0 - math.cos(angle)) / angle**2 * (cross @ cross)
 
 
 @kernel

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import NODE_S, PLANT, STATE, STEP_S
-from sim_devices.plant.manipulator import ManipulatorUnit, manipulator_unit
+from sim_devices.plant.manipulator import ManipulatorUnit, manipulator_unit, tip_displacement
 from sim_devices.plant.sensors import SensorUnit, field_gauss, sensor_unit
 from sim_devices.plant.stack import StackUnit, drive_channel, stack_unit
 
@@ -55,7 +55,8 @@ def plant_arrays(config: EmulationConfig, unit: Unit, frame: NDArray[np.float64]
         p["channel"][i], s["channel"][i] = channel[0], channel_state[0]
     m, sensors, e = unit.manipulator, unit.sensors, config.environment
     p["circle_m"], p["shaft_m"], p["lever"] = m.circle_m, m.shaft_m, m.lever
-    p["mount"] = math.cos(m.mount_rad), math.sin(m.mount_rad)
+    p["mount"], p["rest_m"] = m.mount, m.rest_m
+    tip_displacement(m.rest_m, m.circle_m, m.shaft_m, p["rest_tip_m"])
     p["frame"], p["gravity"] = frame, e.gravity_m_s2
     p["arm_m"] = sensors.positions_m - np.array(config.instrument.tip_mm) * 1e-3
     p["accelerometer"] = sensors.accelerometers

@@ -1,220 +1,306 @@
-"""Prandtl-Ishlinskii model of a piezo stack from recordings of drive and displacement (000, 7.2.3; ERRATA 74).
+"""Model of a piezo stack from recordings of drive and displacement (000, 7.2.3, 7.3.2; ERRATA 74-79).
 
-The forward model z = z0 + S(w . H_r[u]) is not linear in its weights, but S^-1(z - z0) = w . H_r[u] is: dead-zone
-weights of the inverse and play weights are found together by one linear least squares (Kuhnen). Play weights are
-kept from going negative, the first one and the zones' partial sums well above zero, so that the inverse always
-exists and a lag cannot hide in a steep first play. A lag between drive and
-displacement looks like hysteresis that grows with speed, so it is estimated first and reported.
+Saw-teeth and sinusoids of different rates and sizes go in together. In order: how the displacement lags (a delay, or
+amplifier lag and resonance); which thresholds and which parts (dead zones, rate-dependent slopes and where their law
+is held, creep) predict recordings that were left out; all parameters by one bounded least squares.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import lsq_linear, minimize_scalar
+from scipy.optimize import minimize_scalar
 
 from firmware_py.actuation.config import StackConfig
-from firmware_py.actuation.hysteresis import inverse_thresholds, inverse_weights
-from hal.compiled import kernel
 from tools.calibrate.calibration_file import calibration_toml
+from tools.calibrate.piezo_dynamics import MAX_LAG_S, Dynamics, delayed, fit_dynamics
+from tools.calibrate.piezo_excitation import determined_from, missing, one_loop
+from tools.calibrate.piezo_prediction import simulate
+from tools.calibrate.piezo_regression import Axes, Piece, Shape, Solution, axes_of, fit, play_states, residual, stack_of
 from tools.cli.common import InputError
 from tools.mismatch.recording import Recording
 
 Array = NDArray[np.float64]
 
-# fractions of half the drive's range: fine where a tremor's small loops run, coarse beyond (000, 7.2.1)
-PLAY_FRACTIONS = (0.0, 0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.3, 0.4, 0.5, 0.62, 0.76, 0.9)
-# fractions of the displacement's range
-ZONE_FRACTIONS = (0.0, 0.5, 0.7, 0.85)
-LEAST_SUM = 0.05  # smallest partial sum, relative to the mean slope
+# fine where a tremor's small loops run, coarse beyond (000, 7.2.1); fractions of half the drive's range
+FAMILIES: dict[str, tuple[float, ...]] = {
+    "8 plays": (0.0, 0.03, 0.08, 0.16, 0.28, 0.44, 0.64, 0.88),
+    "10 plays, 000": (0.0, 0.08, 0.16, 0.24, 0.32, 0.4, 0.5, 0.62, 0.76, 0.9),
+    "12 plays": (0.0, 0.02, 0.05, 0.09, 0.15, 0.22, 0.31, 0.41, 0.52, 0.64, 0.78, 0.93),
+    "16 plays": (0.0, 0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.29, 0.37, 0.46, 0.56, 0.66, 0.76, 0.86, 0.95),
+}
+ZONES = ((0.35, 0.6, 0.8), (0.5, 0.7, 0.85), (0.2, 0.35, 0.5, 0.65, 0.8), (0.15, 0.25, 0.35, 0.45, 0.55, 0.68, 0.84))
+CREEP_TIMES_S = (0.1, 1.0, 10.0)
+LEAST_GAIN = 0.99  # a part stays when it brings the unseen error below this share
 FIT_SHARE = 0.7
-MAX_LAG_S = 0.02
-ITERATIONS = 4
 
 
 @dataclass(frozen=True)
 class PiezoFit:
-    """One identified stack. Residuals in um; ``held_out`` is the last 30 % of the recording, which no fit saw,
-    simulated from the recording's start."""
+    """One identified stack. Errors in um. ``held_out``: of recordings that the fit had not seen (leave one out), or of
+    the last 30 % of a single one; ``unseen`` by recording, ``parts`` what was tried and what it left."""
 
     stack: StackConfig
+    dynamics: Dynamics
     lag_s: float
     rms_um: float
     held_out_rms_um: float
     held_out_max_um: float
     linear_rms_um: float
     range_um: float
+    top_rate_um_s: float
+    unseen_um: dict[str, float]
+    parts: tuple[tuple[str, float, bool], ...]
     warnings: tuple[str, ...]
+    others: tuple[StackConfig, ...]
+    """Models that lack one recording each."""
+    tick_hz: float
+    low_V: float
+    high_V: float
+    span_um: tuple[float, float]
+
+    @property
+    def neutral_V(self) -> float:
+        """Middle of the drive."""
+        return 0.5 * (self.low_V + self.high_V)
+
+    @property
+    def singular_um_s(self) -> float:
+        """Rate at which a slope of the model reaches zero: beyond, it has no inverse. Infinite when none falls."""
+        sums = np.cumsum(self.stack.play_weights_um_per_V)
+        law = np.array(self.stack.slope_per_rate_s_per_V or (0.0,) * len(sums))
+        high = np.array(self.stack.rate_high_um_per_s or (np.inf,) * len(sums))
+        falling = law < 0.0
+        at = sums[falling] / -law[falling]
+        at = at[at < high[falling]]
+        return float(at.min()) if len(at) else float("inf")
 
 
-@kernel
-def plays(drive: Array, r: Array) -> Array:
-    """(n, len(r)) outputs of the play operators for a drive that came up from zero to its first value."""
-    out = np.empty((len(drive), len(r)))
-    y = np.maximum(drive[0] - r, 0.0)
-    for k in range(len(drive)):
-        for i in range(len(r)):
-            y[i] = max(drive[k] - r[i], min(drive[k] + r[i], y[i]))
-            out[k, i] = y[i]
-    return out
+def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
+    """Fit one stack to recordings of kind ``piezo_stack``. Raises ``InputError`` when it cannot be."""
+    given = [recordings] if isinstance(recordings, Recording) else list(recordings)
+    if not given:
+        raise InputError("no recording was given")
+    dt = given[0].dt
+    notes: list[str] = []
+    for recording in given:
+        _check(recording, dt)
+    drives = [r.inputs["command"] for r in given]
+    zs = [r.outputs["displacement"] for r in given]
+    rows = [slice(determined_from(u), len(u)) for u in drives]
+    if len(given) == 1:
+        pieces = _halves(drives[0], zs[0], rows[0], dt)
+    else:
+        pieces = [Piece(u, z, np.zeros(len(u)), s, dt, np.ones(1)) for u, z, s in zip(drives, zs, rows, strict=True)]
+    folds = [[i] for i in range(len(pieces))] if len(given) > 1 else [[1]]
+    held = all(r.twin.parameters.get("hold") == "zero" for r in given) and dt < 2.5e-3
+
+    centre_V = 0.5 * (min(u.min() for u in drives) + max(u.max() for u in drives))
+    basic = Shape(FAMILIES["8 plays"])
+    dynamics = Dynamics()
+    # on loops of one size and rate a lag is just a wider loop
+    if one_loop(drives):
+        notes.append("all loops are alike, so a lag cannot be told from hysteresis: taken as none")
+    else:
+        pieces, dynamics = _lag(pieces, basic, centre_V)
+    pieces = rates_of(pieces, basic, centre_V)
+    shape, axes, _, _, parts = _select(pieces, folds, centre_V)
+    if held:
+        better, mode = _mode(pieces, drives, len(given) == 1, shape, axes)
+        before = float(np.nanmean(fit(pieces, shape, axes, folds)[1]))
+        after = float(np.nanmean(fit(better, shape, axes, folds)[1]))
+        parts = (*parts, ("amplifier lag and resonance", after, after < before))
+        if after < before:
+            pieces, dynamics = better, mode
+            pieces = rates_of(pieces, basic, centre_V)
+            shape, axes, _, _, again = _select(pieces, folds, centre_V)
+            parts = (*parts, *again)
+    partials: list[Solution] = []
+    solution, unseen = fit(pieces, shape, axes, folds, partials)
+    return _report(given, pieces, shape, axes, solution, unseen, dynamics, parts, notes, partials)
 
 
-def determined_from(drive: Array) -> int:
-    """First sample at which the plays no longer depend on what came before the recording: the drive has been at
-    its lowest and at its highest by then (the larger swing wipes out the memory of the smaller)."""
-    span = np.ptp(drive)
-    low = int(np.argmax(drive <= drive.min() + 0.01 * span))
-    high = int(np.argmax(drive >= drive.max() - 0.01 * span))
-    return max(low, high)
-
-
-def delayed(drive: Array, lag_s: float, dt: float) -> Array:
-    """``drive`` as it was ``lag_s`` ago, linear between samples."""
-    t = np.arange(len(drive)) * dt
-    return np.interp(t - lag_s, t, drive)
-
-
-def _solve(drive: Array, z: Array, r: Array, d: Array, rows: slice) -> tuple[Array, Array, float]:
-    """Play weights w, weights s' of the inverse dead zones (s'_0 = 1) and z0, thresholds ``d`` on z - z0."""
-    h = plays(drive, r)[rows]
-    z = z[rows]
-    slope = np.ptp(z) / np.ptp(drive)
-    z0 = float(z.min())
-    w = np.zeros(len(r))
-    s = np.zeros(len(d))
-    s[0] = 1.0
-    for _ in range(ITERATIONS):
-        zones = np.maximum(z[:, None] - z0 - d[1:], 0.0)
-        # sum_{j >= 1} s'_j S_j in the partial sums T_j = 1 + s'_1 + ... + s'_j: (T_j - T_{j-1}) S_j
-        steps = zones.copy()
-        steps[:, :-1] -= zones[:, 1:]
-        target = z - z0 - (zones[:, 0] if zones.shape[1] else 0.0)
-        scale = np.concatenate([np.ones(len(r)), np.full(steps.shape[1], slope), [slope * 100.0]])
-        low = np.concatenate([np.zeros(len(r)), np.full(steps.shape[1], LEAST_SUM), [-np.inf]])
-        low[0] = LEAST_SUM * slope
-        solution = _bounded(np.column_stack([h, -steps, np.ones(len(z))]) * scale, target, low / scale) * scale
-        w = solution[: len(r)].copy()
-        s[1:] = np.diff(solution[len(r) : -1], prepend=1.0)
-        shift = float(solution[-1])
-        z0 += shift
-        if abs(shift) < 1e-6 * np.ptp(z):
-            break
-    return w, s, z0
-
-
-def _bounded(design: Array, target: Array, low: Array) -> Array:
-    """Least squares with lower bounds; the many rows are first reduced to as many as there are columns."""
-    triangle: Any = np.linalg.qr(np.column_stack([design, target]), mode="r")
-    result: Any = lsq_linear(triangle[:, :-1], triangle[:, -1], bounds=(low, np.inf))
-    return np.asarray(result.x, dtype=np.float64)
-
-
-def simulate(stack: StackConfig, drive: Array) -> Array:
-    """Displacement um of the forward model for a drive V that came up from zero."""
-    y = plays(drive, np.array(stack.play_thresholds_V)) @ np.array(stack.play_weights_um_per_V)
-    d, s = np.array(stack.dead_zone_thresholds_um), np.array(stack.dead_zone_weights)
-    z = s[0] * y + np.maximum(y[:, None] - d[1:], 0.0) @ s[1:]
-    return z + stack.offset_um
-
-
-def _stack(r: Array, w: Array, d: Array, s: Array, z0: float) -> StackConfig:
-    # the zones were found for the inverse; transforming an inverse gives the forward operator back
-    return StackConfig(
-        play_thresholds_V=tuple(map(float, r)),
-        play_weights_um_per_V=tuple(map(float, w)),
-        dead_zone_thresholds_um=tuple(map(float, inverse_thresholds(d, s))),
-        dead_zone_weights=tuple(map(float, inverse_weights(s))),
-        offset_um=z0,
-    )
-
-
-def identify_stack(recording: Recording) -> PiezoFit:
-    """Fit one stack to one recording of kind ``piezo_stack``. Raises ``InputError`` when it cannot be."""
+def _check(recording: Recording, dt: float) -> None:
     where = recording.path
     if "command" not in recording.inputs or "displacement" not in recording.outputs:
         raise InputError(f"{where}: a piezo calibration needs channels with signals 'command' and 'displacement'")
-    drive, z = recording.inputs["command"], recording.outputs["displacement"]
-    span = float(np.ptp(drive))
-    start, stop = determined_from(drive), round(FIT_SHARE * len(drive))
-    if span <= 0.0 or stop - start < 20 * len(PLAY_FRACTIONS):
+    if abs(recording.dt - dt) > 1e-9:
+        raise InputError(f"{where}: {1.0 / recording.dt:g} Hz, the first recording has {1.0 / dt:g} Hz; use one rate")
+    drive = recording.inputs["command"]
+    usable = len(drive) - determined_from(drive)
+    if np.ptp(drive) <= 0.0 or usable < 280:
         raise InputError(
             f"{where}: the drive must visit its lowest and highest value early and then go on for a while; "
-            f"only {max(0, stop - start)} of {len(drive)} samples can be fitted"
+            f"only {max(0, usable)} of {len(drive)} samples can be fitted"
         )
-    rows = slice(start, stop)
-    r = 0.5 * span * np.array(PLAY_FRACTIONS)
-    d = float(np.ptp(z)) * np.array(ZONE_FRACTIONS)
-    few = slice(start, stop, 5)  # enough for one number
+
+
+def _halves(drive: Array, z: Array, rows: slice, dt: float) -> list[Piece]:
+    """A single recording as what is fitted and what is held out; both are simulated from its start."""
+    stop = max(rows.start + 1, round(FIT_SHARE * len(drive)))
+    nothing, one = np.zeros(len(drive)), np.ones(1)
+    return [
+        Piece(drive, z, nothing, slice(rows.start, stop), dt, one),
+        Piece(drive, z, nothing, slice(stop, len(drive)), dt, one),
+    ]
+
+
+def _lag(pieces: list[Piece], shape: Shape, centre_V: float) -> tuple[list[Piece], Dynamics]:
+    """The delay of the drive that a rate-independent model explains best; zero unless it matters."""
+
+    def shifted(lag_s: float) -> list[Piece]:
+        return [replace(p, drive=delayed(p.drive, lag_s, p.dt)) for p in pieces]
 
     def misfit(lag_s: float) -> float:
-        shifted = delayed(drive, lag_s, recording.dt)
-        w, s, z0 = _solve(shifted, z, r, d[:1], few)
-        return float(np.std(z[few] - simulate(_stack(r, w, d[:1], s, z0), shifted)[few]))
+        # every second sample is enough for one number
+        few = [replace(p, rows=slice(p.rows.start, p.rows.stop, 2)) for p in shifted(lag_s)]
+        axes = axes_of(few, shape, centre_V)
+        solution, _ = fit(few, shape, axes, [])
+        return float(np.mean([np.var(residual(p, shape, axes, solution)) for p in few]))
 
     found: Any = minimize_scalar(misfit, bounds=(0.0, MAX_LAG_S), method="bounded", options={"xatol": 2e-5})
     lag_s = float(found.x)
-    if misfit(0.0) < 1.02 * misfit(lag_s):
+    if misfit(0.0) < 1.04 * misfit(lag_s):
         lag_s = 0.0
-    shifted = delayed(drive, lag_s, recording.dt)
-    fits = [_stack(r, *_with_zones(shifted, z, r, zones, rows)) for zones in (d[:1], d)]
-    errors = [z - simulate(stack, shifted) for stack in fits]
-    # more zones only when they earn their place
-    best = 1 if np.std(errors[1][rows]) < 0.97 * np.std(errors[0][rows]) else 0
-    line = np.polyfit(drive[rows], z[rows], 1)
-    held = errors[best][stop:]
+    return shifted(lag_s), Dynamics(delay_s=lag_s)
+
+
+def _levels(drive: Array, shape: Shape, axes: Axes, solution: Solution) -> Array:
+    """Extension um of the rate-independent model, held drive, zones left out: good enough for rates and dynamics."""
+    steps = np.diff(solution.rest, prepend=0.0)
+    return play_states(drive, axes.r, axes.centre_V) @ steps
+
+
+def rates_of(pieces: list[Piece], shape: Shape, centre_V: float) -> list[Piece]:
+    """Rate of the wanted displacement in each sample, um/s: free of noise, from a rate-independent model."""
+    axes = axes_of(pieces, shape, centre_V)
+    solution, _ = fit(pieces, shape, axes, [])
+    return [replace(p, rate=rate_of(_levels(p.drive, shape, axes, solution), p.dt)) for p in pieces]
+
+
+def rate_of(x: Array, dt: float) -> Array:
+    """|dx/dt| by backward difference, 000 (7.16)."""
+    return np.abs(np.diff(x, prepend=x[0])) / dt
+
+
+def _select(
+    pieces: list[Piece], folds: list[list[int]], centre_V: float
+) -> tuple[Shape, Axes, Solution, float, tuple[tuple[str, float, bool], ...]]:
+    """Thresholds and parts by what they leave in recordings that were not seen."""
+
+    def score(shape: Shape) -> tuple[Axes, Solution, float]:
+        axes = axes_of(pieces, shape, centre_V)
+        solution, unseen = fit(pieces, shape, axes, folds)
+        return axes, solution, float(np.nanmean(unseen))
+
+    tried: list[tuple[str, float, bool]] = []
+    shape = Shape(FAMILIES["8 plays"])
+    axes, solution, best = score(shape)
+    tried.append(("8 plays", best, True))
+    families = [(name, {"plays": fractions}) for name, fractions in FAMILIES.items()]
+    zones = [(f"dead zones at {', '.join(map(str, at))}", {"zones": at}) for at in ZONES]
+    steps: list[tuple[str, dict[str, Any]]] = [
+        *families,
+        *zones,
+        ("slopes by rate", {"rate": True}),
+        ("creep", {"creep_times_s": CREEP_TIMES_S}),
+        ("law held below 20 um/s", {"rate_low_um_per_s": 20.0}),
+        ("law of the first two slopes held above 200 um/s", {"rate_high_um_per_s": 200.0}),
+        # again: what the thresholds had to make up for may have been something else
+        *zones,
+        *families,
+    ]
+    for name, change in steps:
+        if name.startswith("law") and not shape.rate:
+            continue
+        candidate = replace(shape, **change)
+        if candidate == shape:
+            continue
+        found = score(candidate)
+        better = found[2] < LEAST_GAIN * best
+        tried.append((name, found[2], better))
+        if better:
+            shape = candidate
+            axes, solution, best = found
+    return shape, axes, solution, best, tuple(tried)
+
+
+def _mode(
+    pieces: list[Piece], drives: list[Array], single: bool, shape: Shape, axes: Axes
+) -> tuple[list[Piece], Dynamics]:
+    """The same pieces with the undelayed drive and the answer to held demands, and its parameters."""
+    held = [replace(p, drive=drives[0 if single else i]) for i, p in enumerate(pieces)]
+    solution, _ = fit(pieces, shape, axes, [])
+    stack = stack_of(solution, shape, axes, 0.0)
+    levels = [simulate(stack, p.drive, 1.0 / p.dt, float(p.drive.max())) for p in held]
+    dt = pieces[0].dt
+    dynamics = fit_dynamics(levels, [p.z for p in held], dt, [p.rows for p in held])
+    return [replace(p, response=dynamics.response(dt)) for p in held], dynamics
+
+
+def _report(
+    given: list[Recording],
+    pieces: list[Piece],
+    shape: Shape,
+    axes: Axes,
+    solution: Solution,
+    unseen: Array,
+    dynamics: Dynamics,
+    parts: tuple[tuple[str, float, bool], ...],
+    notes: list[str],
+    partials: list[Solution],
+) -> PiezoFit:
+    raw = [residual(p, shape, axes, solution) for p in pieces]
+    errors = [e - e.mean() for e in raw]
+    zero = float(np.mean([e.mean() for e in raw]))
+    judged = [i for i in range(len(pieces)) if np.isfinite(unseen[i])]
+    lines = []
+    for p in pieces:
+        u, z = p.drive[p.rows], p.z[p.rows]
+        lines.append(np.mean((z - np.polyval(np.polyfit(u, z, 1), u)) ** 2))
+    names = [r.path.name if r.path.suffix == "" else r.path.stem for r in given]
+    if len(set(names)) < len(names):
+        names = [f"{name} {i + 1}" for i, name in enumerate(names)]
+    if len(given) == 1:
+        names = [f"{names[0]} (first {FIT_SHARE:.0%})", f"{names[0]} (rest)"]
     return PiezoFit(
-        stack=fits[best],
-        lag_s=lag_s,
-        rms_um=float(np.std(errors[best][rows])),
-        held_out_rms_um=float(np.sqrt(np.mean(held**2))),
-        held_out_max_um=float(np.max(np.abs(held))),
-        linear_rms_um=float(np.std(z[rows] - np.polyval(line, drive[rows]))),
-        range_um=float(np.ptp(z)),
-        warnings=tuple(_missing(drive, span)),
+        stack=stack_of(solution, shape, axes, zero),
+        others=tuple(stack_of(partial, shape, axes, zero) for partial in partials),
+        tick_hz=1.0 / given[0].dt,
+        low_V=min(float(r.inputs["command"].min()) for r in given),
+        high_V=max(float(r.inputs["command"].max()) for r in given),
+        span_um=(min(float(p.z[p.rows].min()) for p in pieces), max(float(p.z[p.rows].max()) for p in pieces)),
+        dynamics=dynamics,
+        lag_s=dynamics.sampled_delay_s(given[0].dt),
+        rms_um=float(np.sqrt(np.mean([np.mean(e**2) for e in errors]))),
+        held_out_rms_um=float(np.sqrt(np.mean(unseen[judged] ** 2))),
+        held_out_max_um=max(float(np.max(np.abs(errors[i]))) for i in judged),
+        linear_rms_um=float(np.sqrt(np.mean(lines))),
+        range_um=axes.span_um,
+        top_rate_um_s=axes.top_rate,
+        unseen_um={names[i]: float(unseen[i]) for i in judged},
+        parts=parts,
+        warnings=(
+            *notes,
+            *missing(
+                [r.inputs["command"] for r in given], [p.rate[p.rows] for p in pieces], [r.n * r.dt for r in given]
+            ),
+        ),
     )
 
 
-def _with_zones(drive: Array, z: Array, r: Array, d: Array, rows: slice) -> tuple[Array, Array, Array, float]:
-    w, s, z0 = _solve(drive, z, r, d, rows)
-    return w, d, s, z0
-
-
-def _missing(drive: Array, span: float) -> list[str]:
-    """What the excitation did not contain, in words."""
-    turns = drive[1:-1][np.diff(np.sign(np.diff(drive))) != 0]
-    swings = np.abs(np.diff(turns))
-    problems: list[str] = []
-    if span < 80.0:
-        problems.append(f"the drive covers {span:.0f} V; beyond that the model is a guess: record 0 to 100 V")
-    if len(swings) == 0 or np.min(swings) > 0.15 * span:
-        problems.append("no small loops: add sinusoids of a few volts, where a tremor is cancelled")
-    if len(swings) < 10:
-        problems.append(f"only {len(swings) + 1} reversals: record more cycles of different size")
-    return problems
-
-
-def excitation_V(rate_hz: float, seconds: float = 40.0, centre_V: float = 50.0, low_V: float = 0.0) -> Array:
-    """A drive that identifies all of the model: two full sweeps, then 10 Hz loops that shrink from full range to
-    2 V, with a slow wander of their centre."""
-    t = np.arange(round(seconds * rate_hz)) / rate_hz
-    half = centre_V - low_V
-    sweep_s = 0.1 * seconds
-    sweep = 0.5 * half * (1.0 - np.cos(2.0 * np.pi * t / (0.5 * sweep_s))) * 2.0
-    size = half * np.exp(-np.log(half) * (((t - sweep_s) * 4.0 / (seconds - sweep_s)) % 1.0))
-    room = half - size
-    loops = centre_V + size * np.sin(2.0 * np.pi * 10.0 * t) + 0.9 * room * np.sin(2.0 * np.pi * 0.31 * t)
-    return np.clip(np.where(t < sweep_s, low_V + sweep, loops), low_V, low_V + 2.0 * half)
-
-
-def piezo_calibration(fits: Sequence[PiezoFit], title: str) -> str:
+def piezo_calibration(fits: Sequence[PiezoFit], title: str, feedforward: Sequence[float] = ()) -> str:
     """Calibration file for the firmware: one fit for all three stacks, or one per stack in order 1, 2, 3."""
     if len(fits) not in (1, 3):
-        raise InputError(f"{len(fits)} recordings: give one (for all three stacks) or three (stacks 1, 2, 3)")
+        raise InputError(f"{len(fits)} stacks: give recordings of one (for all three stacks) or three (1, 2, 3)")
     stacks: list[dict[str, Any]] = [
         {key: list(v) if isinstance(v, tuple) else v for key, v in fit.stack.model_dump().items()} for fit in fits
     ]
-    return calibration_toml(title, "micron calibrate piezo", {"actuation": {"stacks": stacks * (3 // len(stacks))}})
+    table: dict[str, Any] = {"stacks": stacks * (3 // len(stacks))}
+    if feedforward:
+        table["feedforward"] = list(feedforward)
+    return calibration_toml(title, "micron calibrate piezo", {"actuation": table})

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli import calibrate_axes
+from tools.cli import calibrate_actuation, calibrate_axes
 from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json, write_text_atomic
 
@@ -16,6 +16,8 @@ calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks 
 
 calibrate.command("accelerometer")(calibrate_axes.accelerometer)
 calibrate.command("magnetometer")(calibrate_axes.magnetometer)
+calibrate.command("piezo")(calibrate_actuation.piezo)
+calibrate.command("manipulator")(calibrate_actuation.manipulator)
 
 Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration file (TOML) that a bench can name.")]
 
@@ -82,43 +84,3 @@ def sensors(
         console().print("missing poses: " + (", ".join(result.accelerometers.missing) or "none"))
         console().print(f"written: {out}")
         write_json({"format": 1, "out": str(out), **result.as_dict()}, json_file)
-
-
-@calibrate.command("piezo")
-def piezo(
-    recordings: Annotated[
-        list[Path], typer.Argument(metavar="RECORDING...", help="One recording, or one per stack in the order 1, 2, 3.")
-    ],
-    out: Out,
-    json_file: JsonOption = None,
-) -> None:
-    """Prandtl-Ishlinskii model of each stack from drive and displacement, checked on the part that no fit saw.
-
-    Example: micron calibrate piezo out/stack0 out/stack1 out/stack2 --out out/piezo.toml
-    """
-    from dataclasses import asdict
-
-    from tools.calibrate.piezo import identify_stack, piezo_calibration
-    from tools.mismatch.recording import load
-
-    with clear_errors():
-        check_writable(json_file, out)
-        fits = [identify_stack(load(path)) for path in recordings]
-        write_text_atomic(out, piezo_calibration(fits, "piezo stacks"))
-        table = Table(title="Piezo stacks, residuals on the held-out part", title_justify="left")
-        for column in ("recording", "range (um)", "line rms (um)", "model rms (um)", "model max (um)", "lag (ms)"):
-            table.add_column(column, justify="left" if column == "recording" else "right")
-        for path, fit in zip(recordings, fits, strict=True):
-            table.add_row(
-                path.name,
-                f"{fit.range_um:.2f}",
-                f"{fit.linear_rms_um:.3f}",
-                f"{fit.held_out_rms_um:.3f}",
-                f"{fit.held_out_max_um:.3f}",
-                f"{1e3 * fit.lag_s:.2f}",
-            )
-            for warning in fit.warnings:
-                console().print(f"{path.name}: {warning}", soft_wrap=True)
-        console().print(table)
-        console().print(f"written: {out}")
-        write_json({"format": 1, "out": str(out), "stacks": [asdict(fit) for fit in fits]}, json_file)

@@ -16,6 +16,7 @@ from tools.cli import (
     faults,
     hands,
     imu,
+    manipulator,
     mismatch,
     noise,
     placement,
@@ -73,6 +74,7 @@ app.add_typer(diagnose.log, name="log")
 app.add_typer(calibrate.calibrate, name="calibrate")
 app.add_typer(endoscope.endoscope, name="endoscope")
 app.add_typer(imu.imu, name="imu")
+app.add_typer(manipulator.app, name="manipulator")
 app.add_typer(mismatch.app, name="mismatch")
 app.add_typer(tremor.app, name="tremor")
 

@@ -12,6 +12,7 @@ MODULES: dict[str, str] = {
     "real-sensors": "tools.reproduce.real_sensors",
     "endoscope": "tools.reproduce.endoscope",
     "tremor": "tools.reproduce.tremor",
+    "actuation": "tools.reproduce.actuation",
 }
 
 

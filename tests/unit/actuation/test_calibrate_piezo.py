@@ -9,9 +9,13 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig, StackConfig
-from tools.calibrate.piezo import excitation_V, identify_stack, piezo_calibration, simulate
+from firmware_py.actuation.feedforward import design_feedforward, tracking_gain
+from tools.calibrate.piezo import identify_stack, piezo_calibration
+from tools.calibrate.piezo_dynamics import Dynamics, delayed
+from tools.calibrate.piezo_excitation import excitation_V
+from tools.calibrate.piezo_prediction import simulate
 from tools.cli.common import InputError
-from tools.mismatch.recording import Recording, Split, TwinText, load
+from tools.mismatch.recording import Recording, Split, TwinText
 
 RATE_HZ = 1000.0
 
@@ -54,7 +58,7 @@ def test_the_models_own_numbers_come_back() -> None:
     assert fit.held_out_rms_um < 0.03
     small = 50 + 5 * np.sin(np.linspace(0, 60, 3000))
     ours, theirs = simulate(fit.stack, small), simulate(truth, small)
-    assert np.std(ours - theirs) < 0.02  # of 0.37 um rms; the thresholds are not the same
+    assert np.std(ours - theirs) < 0.01  # of 0.37 um rms; the thresholds are not the same
 
 
 def test_an_unlike_stack_is_tracked_better_than_by_a_line() -> None:
@@ -62,7 +66,7 @@ def test_an_unlike_stack_is_tracked_better_than_by_a_line() -> None:
     noise = 0.01 * np.random.default_rng(1).standard_normal(len(drive))
     fit = identify_stack(recording(drive, bouc_wen(drive) + noise))
     assert fit.linear_rms_um > 0.01 * fit.range_um
-    assert fit.held_out_rms_um < 0.6 * fit.linear_rms_um
+    assert fit.held_out_rms_um < 0.3 * fit.linear_rms_um
     assert np.all(np.cumsum(fit.stack.play_weights_um_per_V) > 0.0)
     assert fit.warnings == ()
 
@@ -73,7 +77,7 @@ def test_a_lag_is_found_and_not_taken_for_hysteresis() -> None:
     late = np.interp(np.arange(len(drive)) - 1.4, np.arange(len(drive)), drive)
     fit = identify_stack(recording(drive, simulate(truth, late)))
     assert fit.lag_s == pytest.approx(1.4e-3, abs=1e-4)
-    assert fit.held_out_rms_um < 0.05
+    assert fit.held_out_rms_um < 0.01
 
 
 def test_the_firmware_loads_what_is_written() -> None:
@@ -96,10 +100,64 @@ def test_poor_excitation_is_named() -> None:
         identify_stack(recording(np.linspace(0, 100, 3000), np.linspace(0, 15, 3000)))
 
 
-def test_a_real_micromanipulator(shared_data: Path) -> None:
-    """Drive volts and displacement of the public recording: the published inverse model leaves 0.58 um."""
-    folder = shared_data / "piezo_micromanipulator_dbo"
-    if not folder.is_dir():
-        pytest.skip(f"the recording is not here: {folder}")
-    fit = identify_stack(load(folder / "test.toml"))
-    assert fit.held_out_rms_um < 0.58
+def test_a_real_micromanipulator_is_predicted_from_its_other_recording(shared_data: Path) -> None:
+    """Public recording: with the published inverse model 0.58 um are left, without one 1.68 um."""
+    from tools.reproduce.actuation_real import real_stack
+
+    rows = real_stack()
+    assert [row.published for row in rows] == [1.68, 0.58, 0.58]
+    assert all(row.meets for row in rows)
+
+
+def test_rates_and_creep_come_back() -> None:
+    """A stack of the model's own form: slopes that fall and rise with the rate, creep; several recordings."""
+    truth = StackConfig(
+        centre_V=50.0,
+        slope_per_rate_s_per_V=(-4e-5, -2e-5, *[0.0] * 6, 3e-5, 3e-5),
+        creep_times_s=(0.1, 1.0, 10.0),
+        creep_shares=(0.01, 0.015, 0.01),
+    )
+    t = np.arange(3000) / RATE_HZ
+    sweep = 50.0 + 50.0 * np.sin(2 * np.pi * t / 3.0)
+    given = []
+    for hz in (1.0, 5.0, 20.0, 38.0):
+        drive = np.concatenate([sweep, 50.0 + 48.0 * np.sin(2 * np.pi * hz * t)])
+        noise = 0.02 * np.random.default_rng(int(hz)).standard_normal(len(drive))
+        given.append(recording(drive, simulate(truth, drive) + noise))
+    fit = identify_stack(given)
+    assert fit.stack.slope_per_rate_s_per_V
+    assert fit.held_out_rms_um < 0.04
+    assert fit.singular_um_s == pytest.approx(0.105 / 4e-5, rel=0.35)
+    # a rate between those recorded
+    drive = np.concatenate([sweep, 50.0 + 48.0 * np.sin(2 * np.pi * 12.0 * t)])
+    # slopes that fall with the rate and a lag look much alike: together they must give the same displacement
+    apart = simulate(fit.stack, delayed(drive, fit.lag_s, 1.0 / RATE_HZ)) - simulate(truth, drive)
+    assert np.std(apart[3100:]) < 0.05  # of 5.5 um rms; unseen recordings leave 0.03
+
+
+def test_the_feedforward_inverse_undoes_a_resonance() -> None:
+    """A slow mechanism, 150 Hz and hardly damped: gain and phase of what comes out, exact sampled response."""
+    dynamics = Dynamics(lag_s=0.3e-3, resonance_hz=150.0, damping=0.05)
+    response = dynamics.response(1e-3)
+    hz = np.linspace(1.0, 40.0, 40)
+    preview_s = dynamics.sampled_delay_s(1e-3) + 1e-3
+    taps = design_feedforward(response, 1e-3, preview_s, taps=6)
+    assert taps.sum() == pytest.approx(1.0)
+    with_it = np.abs(tracking_gain(taps, response, 1e-3, preview_s, hz) - 1.0)
+    without = np.abs(tracking_gain(np.ones(1), response, 1e-3, dynamics.sampled_delay_s(1e-3), hz) - 1.0)
+    assert without[-1] > 0.05
+    assert with_it.max() < 0.2 * without.max()
+    assert np.abs(taps).sum() < 20.0  # stable, and no large gains
+
+
+def test_dynamics_step_against_the_differential_equation() -> None:
+    from scipy.signal import StateSpace, step
+
+    w, z, p = 2 * np.pi * 300.0, 0.07, 1 / 0.4e-3
+    system = StateSpace([[-p, 0, 0], [0, 0, 1], [w * w, -w * w, -2 * z * w]], [[p], [0], [0]], [[0, 1, 0]], [[0]])
+    t, y = step(system, T=np.linspace(0, 0.02, 400))
+    np.testing.assert_allclose(Dynamics(0.0, 0.4e-3, 300.0, 0.07).step(t), np.ravel(y), atol=1e-6)
+    slow = Dynamics(0.0, 0.4e-3, 0.0, 0.0, 0.5, 2e-3).step(t)
+    one = -np.expm1(-t * p)
+    two = 1 - (2e-3 * np.exp(-t / 2e-3) - 0.4e-3 * np.exp(-t * p)) / (2e-3 - 0.4e-3)
+    np.testing.assert_allclose(slow, 0.5 * one + 0.5 * two, atol=1e-9)

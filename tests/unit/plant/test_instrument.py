@@ -17,7 +17,9 @@ MS = 1_000_000
 LINEAR = EmulationConfig(
     sensors=SensorConfig(**PERFECT),
     stack=StackConfig(slip_sum=0.0, curvature=0.0, creep_per_decade=0.0, stroke_spread=0.0, expansion_um_per_K=0.0),
-    manipulator=ManipulatorConfig(lever_spread=0.0, mount_spread_deg=0.0),
+    manipulator=ManipulatorConfig(
+        lever_spread=0.0, mount_spread_deg=0.0, tilt_spread_deg=0.0, length_spread=0.0, rest_spread_um=0.0
+    ),
     amplifier=AmplifierConfig(bandwidth_hz=1e5, output_ohm=1e-3, slew_V_per_ms=1e6),
 )
 

@@ -9,7 +9,7 @@ from scipy.optimize import root
 from scipy.spatial.transform import Rotation
 
 from sim_devices.config import ManipulatorConfig
-from sim_devices.plant.manipulator import manipulator_unit, tip_displacement
+from sim_devices.plant.manipulator import manipulator_unit, rotation, tip_displacement
 
 R_MM, SHAFT_MM = 5.0, 40.0
 
@@ -68,3 +68,11 @@ def test_levers_differ_between_axes_and_not_between_calls():
     assert np.array_equal(unit.lever, manipulator_unit(ManipulatorConfig(), 5).lever)
     assert np.ptp(unit.lever) > 0.0
     assert np.abs(unit.lever / 8.0 - 1.0).max() < 0.1
+    assert np.ptp(unit.rest_m) > 0.0
+    assert np.allclose(unit.mount @ unit.mount.T, np.eye(3), atol=1e-15)
+
+
+def test_rotation_is_that_of_its_vector():
+    turn = np.array([0.01, -0.02, 0.03])
+    assert np.allclose(rotation(turn), Rotation.from_rotvec(turn).as_matrix(), atol=1e-15)
+    assert np.array_equal(rotation(np.zeros(3)), np.eye(3))

@@ -1,0 +1,117 @@
+"""The linear part behind the hysteresis: dead time, amplifier lag and resonance of one stack.
+
+A demand that is held for a tick moves the stack by a step through amplifier (first order) and mechanism (second
+order); what is read at the sampling instants is the extension's levels filtered with that step response. Recordings
+that do not say that their drive was held only give a delay.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from scipy.signal import lfilter
+
+Array = NDArray[np.float64]
+
+MAX_LAG_S = 0.02
+TAPS = 64
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """Dead time, first-order lag, resonance (0: none found) and its damping; ``slow_share`` of the extension follows
+    with ``slow_s`` more (domain walls do not jump with the field)."""
+
+    delay_s: float = 0.0
+    lag_s: float = 0.0
+    resonance_hz: float = 0.0
+    damping: float = 0.0
+    slow_share: float = 0.0
+    slow_s: float = 0.0
+
+    @property
+    def slow_delay_s(self) -> float:
+        """What a slow motion lags by."""
+        slow = self.delay_s + self.lag_s + self.slow_share * self.slow_s
+        return slow + (2.0 * self.damping / (2.0 * np.pi * self.resonance_hz) if self.resonance_hz else 0.0)
+
+    def sampled_delay_s(self, dt: float) -> float:
+        """What a slow motion lags by at the sampling instants, when the drive is held for ``dt``."""
+        if not self.resonance_hz:
+            return self.delay_s
+        weights = self.response(dt)
+        return dt * float(np.arange(len(weights)) @ weights) / float(weights.sum())
+
+    def step(self, t: Array) -> Array:
+        """Answer to a unit step at t = 0."""
+        t = np.maximum(t - self.delay_s, 0.0)
+        poles: list[complex] = [1.0 / max(self.lag_s, 1e-9)]
+        if self.resonance_hz:
+            w, z = 2.0 * np.pi * self.resonance_hz, self.damping
+            poles += [complex(z * w, w * np.sqrt(1.0 - z * z)), complex(z * w, -w * np.sqrt(1.0 - z * z))]
+        fast = _step_through(poles, t)
+        if not self.slow_share:
+            return fast
+        return (1.0 - self.slow_share) * fast + self.slow_share * _step_through([*poles, 1.0 / self.slow_s], t)
+
+    def response(self, dt: float, at_s: float | None = None) -> Array:
+        """(TAPS,) weights of the held levels at this tick, one, two, ... ticks ago, in what is read ``at_s`` after the
+        tick began (default: at its very beginning, when the new demand does not show yet)."""
+        edges = np.arange(TAPS + 1) * dt + (0.0 if at_s is None else at_s)
+        steps = self.step(np.asarray(edges, dtype=np.float64))
+        # the level of m ticks ago came m dt (+ at_s) ago and was replaced one dt later
+        return np.diff(steps, prepend=0.0)[:TAPS]
+
+
+def _step_through(poles: list[complex], t: Array) -> Array:
+    """Step response of the product of p / (s + p), all poles different."""
+    out = np.ones(len(t), dtype=np.complex128)
+    for i, p in enumerate(poles):
+        others = [q / (q - p) for j, q in enumerate(poles) if j != i]
+        out -= np.exp(-p * t) * np.prod(others)
+    return np.asarray(out.real, dtype=np.float64)
+
+
+def fit_dynamics(levels: Sequence[Array], measured: Sequence[Array], dt: float, rows: Sequence[slice]) -> Dynamics:
+    """Amplifier lag and resonance from the model's held extension ``levels`` and what was ``measured``, um."""
+
+    def misfit(p: Array) -> float:
+        dynamics = _from_logs(p)
+        # above the sampling rate a resonance is another one's alias
+        if not (dynamics.lag_s < 5.0 * dt and dynamics.damping < 0.9 and 50.0 < dynamics.resonance_hz < 0.95 / dt):
+            return 1e6
+        if not (dynamics.slow_share < 0.9 and 1.1 * dynamics.lag_s < dynamics.slow_s < 20.0 * dt):
+            return 1e6
+        return _misfit(dynamics.response(dt), levels, measured, rows)
+
+    best: Any = None
+    for share in (0.3, 0.65):
+        x0 = np.log([0.1 * dt, share / dt, 0.05, 0.3, 0.6 * dt])
+        found: Any = minimize(misfit, x0, method="Nelder-Mead", options={"maxfev": 400, "xatol": 1e-3, "fatol": 1e-9})
+        if best is None or found.fun < best.fun:
+            best = found
+    return _from_logs(best.x)
+
+
+def _from_logs(p: Array) -> Dynamics:
+    lag, hz, damping, share, slow = map(float, np.exp(np.minimum(p, 50.0)))
+    return Dynamics(0.0, lag, hz, damping, share, slow)
+
+
+def _misfit(response: Array, levels: Sequence[Array], measured: Sequence[Array], rows: Sequence[slice]) -> float:
+    total = 0.0
+    for x, z, use in zip(levels, measured, rows, strict=True):
+        e = (z - np.asarray(lfilter(response, [1.0], x - x[0]), dtype=np.float64))[use]
+        total += float(np.var(e))
+    return total / len(levels)
+
+
+def delayed(drive: Array, lag_s: float, dt: float) -> Array:
+    """``drive`` as it was ``lag_s`` ago, linear between samples."""
+    t = np.arange(len(drive)) * dt
+    return np.interp(t - lag_s, t, drive)

@@ -1,0 +1,1 @@
+"""Workspace of the manipulator: extents, largest spheres, conditioning, picture."""

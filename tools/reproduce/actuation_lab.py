@@ -1,0 +1,180 @@
+"""The emulated lab of chapter 7 of 000: stacks under an interferometer, paths to track, four ways to command.
+
+Identification uses the lab's calibration set, tracking its own runs: no path that is tracked has been fitted.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.actuation.config import StackConfig
+from sim_devices.config import EmulationConfig
+from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS
+from sim_devices.plant.lab import CALIBRATION_SET, INTERFEROMETER_RMS_UM, drive_stack, measure_piezo
+from sim_devices.plant.stack import drive_channel, stack_unit
+from tools.calibrate.piezo import identify_stack, rates_of
+from tools.calibrate.piezo_dynamics import delayed
+from tools.calibrate.piezo_excitation import determined_from
+from tools.calibrate.piezo_prediction import command
+from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual, stack_of
+from tools.mismatch.recording import Recording, Split, TwinText
+
+Array = NDArray[np.float64]
+
+DT_S = 1e-3
+NEUTRAL_V = 50.0
+SWING_V = 41.7  # half of peak to peak, about 12.5 um
+TEMPERATURE_C = 25.0
+APPROACH = 2000  # ticks from rest to the start of a path, not scored
+SCORED = 5000  # 5 s, as in 000
+LOW_UM = -5.0  # lowest point of a path of 12.5 um p-p, from rest at neutral: the middle of the range
+
+# 000, sec. 7.4: thresholds in V and dead zones of the published models (fractions of 41.7 V, of the displacement)
+INDEPENDENT = Shape(tuple(v / SWING_V for v in range(0, 41, 5)), zones=(0.633, 0.748, 0.873))
+DEPENDENT = Shape(
+    tuple(v / SWING_V for v in (0, 4, 8, 12, 16, 20, 25, 31, 38)),
+    zones=(0.633, 0.748, 0.873),
+    rate=True,
+    rate_high_um_per_s=200.0,
+)
+
+
+@dataclass(frozen=True)
+class Controller:
+    """A way to command one stack. ``stack`` None: a straight line, V from um, ``line`` = (V per um, V at zero).
+    ``preview_s``: how far ahead of the path it is driven."""
+
+    name: str
+    stack: StackConfig | None
+    preview_s: float
+    line: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """Error of one run, um, and how many of its commands were limited."""
+
+    rms_um: float
+    max_um: float
+    limited: int
+
+
+def recording(config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float) -> Recording:
+    """One recording of the lab, as ``micron calibrate piezo`` would load it."""
+    columns, _ = measure_piezo(config, axis, profile, rate_hz, seconds, SWING_V)
+    n = len(columns["command_V"])
+    return Recording(
+        path=Path(f"{profile}-{rate_hz:g}Hz"),
+        title=profile,
+        t=np.asarray(np.arange(n) * DT_S, dtype=np.float64),
+        dt=DT_S,
+        inputs={"command": columns["command_V"]},
+        outputs={"displacement": columns["displacement_um"]},
+        context={},
+        noise={"displacement": INTERFEROMETER_RMS_UM},
+        unit={"command": "V", "displacement": "um"},
+        column={"command": "command_V", "displacement": "displacement_um"},
+        twin=TwinText("piezo_stack", {"hold": "zero"}),
+        split=Split(),
+    )
+
+
+def published_model(recordings: Sequence[Recording], shape: Shape, lag_s: float) -> StackConfig:
+    """A model of the published form: given thresholds, and the lag that is taken for all."""
+    drives = [r.inputs["command"] for r in recordings]
+    pieces = [
+        Piece(
+            delayed(u, lag_s, DT_S), r.outputs["displacement"], np.zeros(len(u)),
+            slice(determined_from(u), len(u)), DT_S, np.ones(1),
+        )
+        for u, r in zip(drives, recordings, strict=True)
+    ]  # fmt: skip
+    pieces = rates_of(pieces, replace(shape, rate=False), NEUTRAL_V)
+    axes = axes_of(pieces, shape, NEUTRAL_V)
+    solution, _ = fit(pieces, shape, axes, [])
+    zero = float(np.mean([residual(p, shape, axes, solution).mean() for p in pieces]))
+    return stack_of(solution, shape, axes, zero)
+
+
+def rising_line(sine: Recording, lag_s: float) -> tuple[float, float]:
+    """V per um and V at rest of a straight line through the rising branch: control without a model."""
+    u, z = delayed(sine.inputs["command"], lag_s, DT_S), sine.outputs["displacement"]
+    last = slice(len(u) // 2, None)
+    up = (np.gradient(u) > 0.0)[last]
+    slope, zero = np.polyfit(z[last][up], u[last][up], 1)
+    return float(slope), float(zero)
+
+
+def controllers(config: EmulationConfig, axis: int) -> tuple[list[Controller], float]:
+    """Without a model, the two published ones and ours, each from recordings of this stack; the interferometer's
+    reading at rest, um."""
+    sine = recording(config, axis, "sine", 10.0, 4.0)
+    everything = [recording(config, axis, *one) for one in CALIBRATION_SET]
+    saw_teeth = [r for r in everything if r.path.name.startswith("sawtooth")]
+    ours = identify_stack(everything)
+    # the same preview for all, so that they differ by the hysteresis model alone
+    lag_s = ours.lag_s
+    rest_um = float(np.mean(run(config, axis, np.full(200, NEUTRAL_V))))
+    slope, zero = rising_line(sine, lag_s)
+    return [
+        Controller("without model", None, lag_s, (slope, zero + slope * rest_um)),
+        Controller("rate-independent", published_model([sine], INDEPENDENT, lag_s), lag_s),
+        Controller("rate-dependent", published_model(saw_teeth, DEPENDENT, lag_s), lag_s),
+        Controller("ours", ours.stack, lag_s),
+    ], rest_um
+
+
+def run(config: EmulationConfig, axis: int, volts: Array) -> Array:
+    """Extension um of a stack that was at rest at neutral, without noise."""
+    unit = stack_unit(config.stack, config.unit, axis)
+    params, state = drive_channel(unit, config.amplifier, STEP_S, TEMPERATURE_C)
+    extension, terminal = np.empty(len(volts)), np.empty(len(volts))
+    drive_stack(params, state, volts, TEMPERATURE_C, STEPS_PER_MS, extension, terminal)
+    return extension * 1e6
+
+
+def with_approach(path_um: Array, first_um: float) -> Array:
+    """The path with a smooth way to its first point and a pause there; rows from ``APPROACH`` on are the path."""
+    s = np.clip(np.arange(APPROACH) / (0.75 * APPROACH), 0.0, 1.0)
+    return np.concatenate([first_um * s**3 * (10.0 - 15.0 * s + 6.0 * s * s), path_um])
+
+
+def track(config: EmulationConfig, axis: int, controller: Controller, path_um: Array, seed: int) -> Tracking:
+    """Drive the stack along ``path_um`` (n,), um from rest, and read the interferometer (0.07 um rms)."""
+    wanted = with_approach(path_um, float(path_um[0]))
+    t = np.arange(len(wanted)) * DT_S
+    # linear between the path's samples, held at its end
+    ahead = np.interp(t + controller.preview_s, t, wanted)
+    limited = 0
+    if controller.stack is None:
+        slope, zero = controller.line
+        volts = np.clip(zero + slope * ahead, 0.0, 100.0)
+    else:
+        asked = command(controller.stack, ahead, NEUTRAL_V)
+        volts, limited = asked.drive_V, asked.singular + asked.voltage + asked.slew
+    z = run(config, axis, volts)
+    noise = INTERFEROMETER_RMS_UM * np.random.default_rng(seed).standard_normal(len(z))
+    e = (z - z[0] + noise - wanted)[APPROACH:]
+    return Tracking(float(np.sqrt(np.mean(e**2))), float(np.max(np.abs(e))), limited)
+
+
+def stationary(frequency_hz: float) -> Array:
+    """12.5 um p-p, from its lowest point."""
+    t = np.arange(SCORED) * DT_S
+    return LOW_UM + 6.25 * (1.0 - np.cos(2.0 * np.pi * frequency_hz * t))
+
+
+def multi_frequency(seed: int) -> Array:
+    """1, 10 and 19 Hz with amplitudes that vary in time, 12.5 um p-p together."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(SCORED) * DT_S
+    x = np.zeros(SCORED)
+    for hz, share in ((1.0, 0.5), (10.0, 0.3), (19.0, 0.2)):
+        slow, phase, turn = rng.uniform(0.1, 0.5), *rng.uniform(0.0, 2.0 * np.pi, 2)
+        x += share * (1.0 + 0.7 * np.sin(2.0 * np.pi * slow * t + phase)) * np.sin(2.0 * np.pi * hz * t + turn)
+    return LOW_UM + 12.5 * (x - x.min()) / np.ptp(x)
