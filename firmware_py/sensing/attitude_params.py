@@ -6,6 +6,7 @@ from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import iirnotch
 
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
@@ -20,36 +21,63 @@ METHODS = {
 }
 STANDARD_GRAVITY = 9.80665
 DRIFT_S = 100.0
+TREMOR_RAD_S2 = 0.5
 
 
 def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
-    """(6,) two-sided densities of (f, alpha) from the axes' noise: what a random walk grows by per second.
+    """(6, 6) two-sided densities of (f, alpha) from the axes' noise: what a random walk grows by per second.
 
     The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of ERRATA 21, 44.
     """
     sigma = np.array(config.noise_ug_per_rtHz) * 1e-6 * STANDARD_GRAVITY / np.sqrt(2.0)
-    solve = np.linalg.pinv(config.observation() / sigma[:, None]) / sigma
-    return np.sum((solve * sigma) ** 2, axis=1)
+    solve = np.linalg.pinv(config.observation() / sigma[:, None]) / sigma * sigma
+    return solve @ solve.T
+
+
+def quiet_point(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Where on the body (3,) m the solved specific force has the least noise, and its densities (3, 3) there.
+
+    At the origin the noise of alpha leans on f through its lever, and a filter that takes the two for independent would
+    believe it. With f(r) = f + alpha x r the trace of the covariance is quadratic in r.
+    """
+    p = motion_densities(config)
+    crosses = np.array([np.cross(axis, np.eye(3)).T for axis in np.eye(3)])  # crosses[i] @ v = e_i x v
+    a = np.array([[np.trace(u @ p[3:, 3:] @ w.T) for w in crosses] for u in crosses])
+    b = np.array([np.trace(u @ p[3:, :3]) for u in crosses])
+    r = np.linalg.lstsq(a, b, rcond=None)[0]
+    carry = np.hstack([np.eye(3), -np.einsum("i,ijk->jk", r, crosses)])
+    return r, carry @ p @ carry.T
+
+
+def tremor_notch(tick_hz: float, middle_hz: float, width_hz: float) -> NDArray[np.float64]:
+    """(5,) b0 b1 b2 a1 a2 of a band stop, -3 dB ``width_hz`` apart; none where the band is beyond the sampling."""
+    if width_hz == 0.0 or middle_hz >= 0.45 * tick_hz:
+        return np.array([1.0, 0.0, 0.0, 0.0, 0.0])
+    b, a = iirnotch(middle_hz, middle_hz / width_hz, tick_hz)
+    return np.array([*b, a[1], a[2]])
 
 
 def error_state_params(config: SensingConfig) -> Record:
     """Numbers of the error-state filter (dtype ``ERROR_STATE``) driven by accelerometers."""
-    density = motion_densities(config)
+    density = np.diag(motion_densities(config))
     return new_record(
         ERROR_STATE,
         turn_density=1e-12,
         lead=0.5,
+        velocity_gate=config.velocity_gate,
+        moving_s=0.5,
+        notch=tremor_notch(config.tick_hz, *config.tremor_notch_hz),
         rate_density=density[3:],
         bias_density=config.alpha_drift_rad_s2**2 / DRIFT_S,
-        force_density=float(density[:3].max()),
+        force_density=float(np.diag(quiet_point(config)[1]).max()),
         still_density=config.hand_velocity_m_s**2 * config.hand_velocity_s,
         heading_density=config.heading_noise_rad**2,
         held_density=0.01**2,
         disturbance_rad=radians(0.3),
         disturbance_s=3.0,
         start_variance=np.array([0.01**2, 0.02**2, 0.02**2, 0.002**2]),
-        # the bias is the mean over the alignment, the hand's own angular acceleration included
-        start_bias_variance=density[3:] / config.align_s + 0.05**2,
+        # the bias is the mean over the alignment, the tremor's own angular acceleration included
+        start_bias_variance=density[3:] / config.align_s + TREMOR_RAD_S2**2,
         field_tolerance=0.2,
         dip_tolerance_rad=radians(15.0),
         gravity=config.gravity_m_s2,
@@ -67,6 +95,7 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
         turn_density=(0.003 * deg) ** 2,
         lead=1.0,
         turn_per_rate=1e-7,
+        notch=np.array([1.0, 0.0, 0.0, 0.0, 0.0]),
         rate_density=(0.01 * deg) ** 2,
         force_density=0.01**2,
         still_density=0.1**2,
@@ -86,7 +115,7 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
 
 def quaternion_kalman_params(config: SensingConfig) -> Record:
     """Numbers of the quaternion filter (dtype ``QUATERNION_KALMAN``) driven by accelerometers."""
-    density = motion_densities(config)
+    density = np.diag(motion_densities(config))
     return new_record(
         QUATERNION_KALMAN,
         turn_density=1e-12,

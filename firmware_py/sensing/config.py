@@ -79,12 +79,16 @@ class SensingConfig(BaseModel):
     magnetometer_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     attitude_method: Literal["observer", "error-state", "quaternion-kalman"] = "error-state"
-    hand_velocity_m_s: Positive = 1e-3  # rms, with its correlation time: error-state filter
+    # the slow part of the hand's velocity, rms, with its correlation time: error-state filter
+    hand_velocity_m_s: Positive = 8e-5
     hand_velocity_s: Positive = 1.0
+    # middle and width of the band of tremor, which that velocity leaves out; width 0: none
+    tremor_notch_hz: tuple[Positive, Annotated[float, Field(ge=0.0)]] = (9.8, 4.0)
+    velocity_gate: Annotated[float, Field(ge=0.0)] = 4.0  # standard deviations; 0: no gate
     hand_acceleration_m_s2: Positive = 0.05  # rms below the tremor band: quaternion filter
     alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
-    heading_noise_rad: Positive = 0.01  # per square root of a second
-    align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.3
+    heading_noise_rad: Positive = 0.005  # per square root of a second
+    align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.08
     attitude_start_hz: Positive = 1.0
     attitude_hz: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.5)  # about the body axes
     attitude_lowpass_hz: Positive = 1.5

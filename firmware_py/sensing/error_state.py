@@ -8,11 +8,12 @@ bias of alpha (3, body), velocity (3,), heading of the magnetic disturbance m:
 
 Gravity is not measured as a direction: the specific force is integrated to a velocity, and what is known is that a hand
 does not travel, so v = 0 with a noise density. Accelerations of the hand thereby average out before they turn the
-attitude, where a direct comparison of f with gravity would follow each of them.
+attitude, where a direct comparison of f with gravity would follow each of them. The velocity of a tremor is far larger
+than that noise but in a known band: a notch takes it out of the comparison, which lets gravity be trusted much more.
 
 The magnetic field turns the heading only; its disturbance has a state of its own with time constant T. A field
 whose size or dip is off what was learned is not used. At rest (gyroscope only) the rate is measured as zero.
-Accelerometers without a magnetometer: the last field stays where it was in the body, which holds the heading on
+Accelerometers without a field to believe: the last one stays where it was in the body, which holds the heading on
 average and keeps the rate about the vertical bounded.
 Sequential scalar updates in Joseph form, each gated at ``gate`` standard deviations where that is said.
 """
@@ -40,6 +41,9 @@ ERROR_STATE = np.dtype(
         ("bias_density", "f8", (3,)),  # (rad/s^2)^2/s
         ("force_density", "f8"),  # (m/s)^2/s: white noise of the specific force
         ("still_density", "f8"),  # (m/s)^2 s: how far the velocity of a hand is from zero
+        ("velocity_gate", "f8"),  # standard deviations beyond which a velocity is a movement, not an error; 0: none
+        ("moving_s", "f8"),  # a movement that lasts longer is the filter's own error
+        ("notch", "f8", (5,)),  # biquad b0 b1 b2 a1 a2 through which the velocity is compared; 1 0 0 0 0: none
         ("rest_density", "f8"),  # (rad/s)^2 s: how far the rate is from zero at rest; 0: rest is not looked for
         ("heading_density", "f8"),  # rad^2 s of the magnetometer's heading
         ("held_density", "f8"),  # rad^2 s of the heading held without a magnetometer; 0: not held
@@ -60,6 +64,11 @@ ERROR_STATE_STATE = np.dtype(
         ("covariance", "f8", (ERRORS, ERRORS)),
         ("work", "f8", (ERRORS, ERRORS)),
         ("velocity", "f8", (3,)),
+        ("notch", "f8", (3, 2)),  # memory of the biquad
+        ("moving_s", "f8"),
+        ("trusted", "f8", (3,)),  # the last field that was believed, body frame
+        ("corrected", "f8", (3, 3)),  # body frame: turn and rate of this tick, bias since the start
+        ("gated", "i8"),  # ticks in which the hand moved too fast to say anything of gravity
         ("disturbance", "f8"),
         ("field_size", "f8"),
         ("field_dip", "f8"),
@@ -94,6 +103,11 @@ def start_errors(state: Record, params: Record, field_size: float, field_dip: fl
         p[BIAS + i, BIAS + i] = params.start_bias_variance[i]
         p[VELOCITY + i, VELOCITY + i] = variances[3]
         e.velocity[i] = 0.0
+        e.notch[i, 0] = 0.0
+        e.notch[i, 1] = 0.0
+        e.trusted[i] = state.field[i]
+        for j in range(3):
+            e.corrected[i, j] = 0.0
         e.slow_rate[i] = state.rate[i]
         e.slow_force[i] = 0.0
     p[DISTURBANCE, DISTURBANCE] = params.disturbance_rad**2
@@ -107,6 +121,8 @@ def start_errors(state: Record, params: Record, field_size: float, field_dip: fl
     e.candidate_s = 0.0
     e.still_s = 0.0
     e.rejected = 0
+    e.moving_s = 0.0
+    e.gated = 0
 
 
 @kernel
@@ -204,7 +220,10 @@ def apply_correction(state: Record, x: NDArray[np.float64]) -> None:
     rotate_by(state.quaternion, tx, ty, tz)
     to_matrix(state.quaternion, state.matrix)
     e = state.error_state
+    e.corrected[0, 0], e.corrected[0, 1], e.corrected[0, 2] = tx, ty, tz
     for i in range(3):
+        e.corrected[1, i] = x[RATE + i]
+        e.corrected[2, i] += x[BIAS + i]
         state.rate[i] += x[RATE + i]
         state.bias[i] += x[BIAS + i]
         e.velocity[i] += x[VELOCITY + i]
@@ -247,8 +266,20 @@ def error_state_step(
 
     x = np.zeros(ERRORS)
     resting = params.rest_density > 0.0 and _resting(state, params, force, dt)
+    gate = params.velocity_gate if params.velocity_gate > 0.0 else 1e9
+    moving = False
     for i in range(3):
-        correct(state, VELOCITY + i, -1, -e.velocity[i], params.still_density / dt, 1e9, x)
+        seen = params.notch[0] * e.velocity[i] + e.notch[i, 0]
+        e.notch[i, 0] = params.notch[1] * e.velocity[i] - params.notch[3] * seen + e.notch[i, 1]
+        e.notch[i, 1] = params.notch[2] * e.velocity[i] - params.notch[4] * seen
+        moving = not correct(state, VELOCITY + i, -1, -seen, params.still_density / dt, gate, x) or moving
+    if moving:
+        e.gated += 1
+        e.moving_s += dt
+        if e.moving_s > params.moving_s:
+            _forget_velocity(e)
+    else:
+        e.moving_s = 0.0
     if resting:
         for i in range(3):
             correct(state, RATE + i, -1, -state.rate[i], params.rest_density / dt, 1e9, x)
@@ -257,12 +288,28 @@ def error_state_step(
     if fresh:
         _heading(state, params, field, x)
         e.field_fresh_s = 0.0
-    elif params.held_density > 0.0 and e.field_fresh_s > HELD_AFTER_S:
-        b = state.field
+    if params.held_density > 0.0 and e.field_wait_s > HELD_AFTER_S:
+        b = e.trusted
         north = c[0, 0] * b[0] + c[0, 1] * b[1] + c[0, 2] * b[2]
         west = c[1, 0] * b[0] + c[1, 1] * b[1] + c[1, 2] * b[2]
         correct(state, TURN + 2, -1, -atan2(west, north), params.held_density / dt, 1e9, x)
     apply_correction(state, x)
+
+
+@kernel
+def _forget_velocity(e: Record) -> None:
+    """Start the velocity anew at zero, as uncertain as it was wrong, without correlation to the rest."""
+    p = e.covariance
+    for i in range(3):
+        k = VELOCITY + i
+        for j in range(ERRORS):
+            p[k, j] = 0.0
+            p[j, k] = 0.0
+        p[k, k] = e.velocity[i] ** 2 + 1e-6
+        e.velocity[i] = 0.0
+        e.notch[i, 0] = 0.0
+        e.notch[i, 1] = 0.0
+    e.moving_s = 0.0
 
 
 @kernel
@@ -292,6 +339,8 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
         e.field_dip += learn * (dip - e.field_dip)
         e.field_wait_s = 0.0
         e.candidate_s = 0.0
+        for i in range(3):
+            e.trusted[i] = field[i]
         correct(
             state, TURN + 2, DISTURBANCE, e.disturbance - atan2(west, north), params.heading_density / since, 1e9, x
         )

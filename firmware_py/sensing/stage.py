@@ -30,6 +30,7 @@ from firmware_py.sensing.attitude import (
     restart,
     step_attitude,
 )
+from firmware_py.sensing.attitude_params import quiet_point
 from firmware_py.sensing.calibration import (
     CALIBRATION,
     calibrate,
@@ -41,12 +42,16 @@ from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, s
 from firmware_py.sensing.translation import (
     TRANSLATION,
     integrate_band,
+    integrator_sections,
+    point_force,
     tip_acceleration,
     translation_params,
 )
 from hal.compiled import kernel
 
 MAX_RATE_RAD_S = 20.0
+LEAN_CORNER_HZ = 0.5
+"""Corrections of the attitude slower than this reach the tip's gravity."""
 
 SENSE = np.dtype(
     [
@@ -54,6 +59,8 @@ SENSE = np.dtype(
         ("kinematics", kinematics_dtype(6)),
         ("attitude", ATTITUDE),
         ("translation", TRANSLATION),
+        ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
+        ("lean_sections", "f8", (2, 5)),
         ("max_gap_ticks", "f8"),
     ]
 )
@@ -63,6 +70,8 @@ SENSE_STATE = np.dtype(
         ("smoothed", "f8", (2,)),  # supply V, temperature degC
         ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
         ("memory", "f8", (3, 2, 2)),  # band integrator
+        ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
+        ("turned", "f8", (3,)),  # correction of the last tick
         ("last_tick", "f8"),
     ]
 )
@@ -76,6 +85,8 @@ def sense_params(config: SensingConfig) -> Record:
         kinematics=kinematic_params(config.axis_positions(), np.array(config.axes), np.array(config.noise_ug_per_rtHz)),
         attitude=attitude_params(config),
         translation=translation_params(config),
+        quiet_point=quiet_point(config)[0],
+        lean_sections=integrator_sections(config.tick_hz, LEAN_CORNER_HZ),
         max_gap_ticks=float(config.max_gap_ticks),
     )
 
@@ -91,6 +102,27 @@ def sense_state() -> Record:
 def _plausible(rate: NDArray[np.float64]) -> bool:
     """No hand turns faster; written so that nan is not plausible either."""
     return rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2 < MAX_RATE_RAD_S**2
+
+
+@kernel
+def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
+    """``up`` (3,), body frame, without what corrections of the attitude do in the tremor band.
+
+    There the attitude shall be the double integral of alpha alone, which has the phase of the specific force. The
+    corrections are one more angular acceleration; its band integral is the turn to take back.
+    """
+    attitude = state.attitude
+    corrected = attitude.error_state.corrected
+    dt = param.attitude.dt_s
+    sudden, turn = np.empty(3), np.empty(3)
+    for i in range(3):
+        sudden[i] = (corrected[0, i] - state.turned[i]) / (dt * dt) + corrected[1, i] / dt - corrected[2, i]
+        state.turned[i] = corrected[0, i]
+    integrate_band(sudden, state.lean, param.lean_sections, turn)
+    z = attitude.matrix[2]
+    up[0] = z[0] + turn[1] * z[2] - turn[2] * z[1]
+    up[1] = z[1] + turn[2] * z[0] - turn[0] * z[2]
+    up[2] = z[2] + turn[0] * z[1] - turn[1] * z[0]
 
 
 @kernel
@@ -117,6 +149,8 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     if steps > param.max_gap_ticks or not _plausible(state.attitude.rate):
         restart(state.attitude)
         state.memory[:, :, :] = 0.0
+        state.lean[:, :, :] = 0.0
+        state.turned[:] = 0.0
         status |= RESTARTED
         steps = 1
     fresh = frame[MAGNETOMETER_FRESH] != 0.0 and calibrate_magnetometer(frame, param.calibration)
@@ -128,12 +162,17 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
         status |= ALIGNING
         align(attitude, param.attitude, motion, field, fresh)
     else:
-        step_attitude(attitude, param.attitude, motion, field, fresh, steps)
+        felt = np.empty(6)
+        point_force(motion, attitude.bias, attitude.rate, param.quiet_point, felt[:3])
+        felt[3:] = motion[3:]
+        step_attitude(attitude, param.attitude, felt, field, fresh, steps)
     tip = frame[TIP_ACCELERATION : TIP_ACCELERATION + 3]
     if status & ALIGNING:
         tip[:] = 0.0
     else:
-        tip_acceleration(motion, attitude.bias, attitude.rate, attitude.matrix[2], param.translation, tip)
+        up = np.empty(3)
+        _smooth_up(state, param, up)
+        tip_acceleration(motion, attitude.bias, attitude.rate, up, param.translation, tip)
     integrate_band(tip, state.memory, param.translation.sections, frame[TIP_DISPLACEMENT : TIP_DISPLACEMENT + 3])
     for i in range(3):
         frame[SPECIFIC_FORCE + i] = motion[i]

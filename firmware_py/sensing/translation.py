@@ -59,6 +59,28 @@ def displacement_response(
 
 
 @kernel
+def point_force(
+    motion: NDArray[np.float64],
+    bias: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    point: NDArray[np.float64],
+    out: NDArray[np.float64],
+) -> None:
+    """``out`` (3,) = specific force at a body point (3,) m: f + alpha x r + omega x (omega x r) (004 (31)).
+
+    ``motion`` is (f, alpha) of the origin, ``bias`` of alpha.
+    """
+    x, y, z = point[0], point[1], point[2]
+    ax, ay, az = motion[3] - bias[0], motion[4] - bias[1], motion[5] - bias[2]
+    wx, wy, wz = rate[0], rate[1], rate[2]
+    along = wx * x + wy * y + wz * z
+    square = wx * wx + wy * wy + wz * wz
+    out[0] = motion[0] + ay * z - az * y + wx * along - x * square
+    out[1] = motion[1] + az * x - ax * z + wy * along - y * square
+    out[2] = motion[2] + ax * y - ay * x + wz * along - z * square
+
+
+@kernel
 def tip_acceleration(
     motion: NDArray[np.float64],
     bias: NDArray[np.float64],
@@ -67,19 +89,10 @@ def tip_acceleration(
     params: Record,
     out: NDArray[np.float64],
 ) -> None:
-    """``out`` (3,) = acceleration of the tip, body frame: f + alpha x r + omega x (omega x r) - g up.
-
-    ``motion`` is (f, alpha) of the origin, ``bias`` of alpha, ``up`` the third row of C_WB.
-    """
-    x, y, z = params.tip_m[0], params.tip_m[1], params.tip_m[2]
-    ax, ay, az = motion[3] - bias[0], motion[4] - bias[1], motion[5] - bias[2]
-    wx, wy, wz = rate[0], rate[1], rate[2]
-    along = wx * x + wy * y + wz * z
-    square = wx * wx + wy * wy + wz * wz
-    g = params.gravity
-    out[0] = motion[0] + ay * z - az * y + wx * along - x * square - g * up[0]
-    out[1] = motion[1] + az * x - ax * z + wy * along - y * square - g * up[1]
-    out[2] = motion[2] + ax * y - ay * x + wz * along - z * square - g * up[2]
+    """``out`` (3,) = acceleration of the tip, body frame: its specific force minus g ``up``, the third row of C_WB."""
+    point_force(motion, bias, rate, params.tip_m, out)
+    for i in range(3):
+        out[i] -= params.gravity * up[i]
 
 
 @kernel
