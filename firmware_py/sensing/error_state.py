@@ -66,6 +66,7 @@ ERROR_STATE_STATE = np.dtype(
         ("velocity", "f8", (3,)),
         ("notch", "f8", (3, 2)),  # memory of the biquad
         ("moving_s", "f8"),
+        ("regained_s", "f8"),  # since a field was last refused
         ("trusted", "f8", (3,)),  # the last field that was believed, body frame
         ("corrected", "f8", (3, 3)),  # body frame: turn and rate of this tick, bias since the start
         ("gated", "i8"),  # ticks in which the hand moved too fast to say anything of gravity
@@ -86,6 +87,8 @@ ERROR_STATE_STATE = np.dtype(
 FIELD_LEARN_S = 5.0
 FIELD_ACCEPT_S = 10.0
 """A new field that stays this long is accepted as the environment."""
+FIELD_REGAIN_S = 0.5
+"""After a refused field: a body that turns near a magnet passes through attitudes where all looks well."""
 REST_SMOOTHING_S = 0.5
 HELD_AFTER_S = 0.2
 
@@ -123,6 +126,7 @@ def start_errors(state: Record, params: Record, field_size: float, field_dip: fl
     e.rejected = 0
     e.moving_s = 0.0
     e.gated = 0
+    e.regained_s = FIELD_REGAIN_S
 
 
 @kernel
@@ -262,6 +266,7 @@ def error_state_step(
         up[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
         e.velocity[i] += up[i] * dt
     e.velocity[2] -= params.gravity * dt
+    e.disturbance *= exp(-dt / params.disturbance_s)
     propagate_errors(e, params, c, up, state.rate, dt)
 
     x = np.zeros(ERRORS)
@@ -333,6 +338,9 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
         abs(size - e.field_size) < params.field_tolerance * e.field_size
         and abs(dip - e.field_dip) < params.dip_tolerance_rad
     )
+    e.regained_s = e.regained_s + since if known else 0.0
+    if known and e.regained_s < FIELD_REGAIN_S:
+        return
     if known:
         learn = min(1.0, since / FIELD_LEARN_S)
         e.field_size += learn * (size - e.field_size)
