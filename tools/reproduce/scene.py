@@ -139,7 +139,7 @@ def run_scene(
         n = min(BLOCK, total - first)
         hand.fill(nodes[:n], parts[:n])
         noise, slow = rng.standard_normal((n, NOISES)), rng.standard_normal((n, SLOW_NOISES))
-        t_s = (first + np.arange(n)) * NODE_S
+        t_s: Array = np.arange(first, first + n, dtype=np.float64) * NODE_S
         magnet = no_magnet[:n] if magnet_uT is None else np.ascontiguousarray(magnet_uT(t_s))
         scene_kernel(
             plant, state, nodes[:n], noise, slow, magnet, first, firmware.state, firmware.params, frame, out[:n]
