@@ -103,7 +103,8 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
         heading_density=(3.0 * deg) ** 2,
         disturbance_rad=deg,
         disturbance_s=10.0,
-        start_variance=np.array([deg**2, (2.0 * deg) ** 2, (0.5 * deg) ** 2, 0.1**2]),
+        # TRIAD on a body that may be moving: 1 m/s^2 is 6 degrees
+        start_variance=np.array([(5.0 * deg) ** 2, (10.0 * deg) ** 2, (0.5 * deg) ** 2, 0.1**2]),
         field_tolerance=0.1,
         dip_tolerance_rad=10.0 * deg,
         rest_rate_rad_s=2.0 * deg,

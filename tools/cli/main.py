@@ -24,6 +24,7 @@ from tools.cli import (
     replay,
     reproduce,
     run,
+    sensing,
     tremor,
 )
 
@@ -76,6 +77,7 @@ app.add_typer(endoscope.endoscope, name="endoscope")
 app.add_typer(imu.imu, name="imu")
 app.add_typer(manipulator.app, name="manipulator")
 app.add_typer(mismatch.app, name="mismatch")
+app.add_typer(sensing.app, name="sensing")
 app.add_typer(tremor.app, name="tremor")
 
 

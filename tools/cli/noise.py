@@ -20,7 +20,10 @@ from tools.cli.common import (
 
 
 def noise(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Folder or .npz of a sensor at rest.")],
+    recording: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING", help="Recording of a sensor at rest: folder, .toml, .csv, .npz, .mcap."),
+    ],
     column: Annotated[list[str] | None, typer.Option(help="Column to analyse; default all.")] = None,
     rate_hz: Annotated[float | None, typer.Option(min=1e-6, help="Sampling rate, if the file does not say.")] = None,
     scale: Annotated[float, typer.Option(help="Factor from counts to a unit.")] = 1.0,
@@ -45,7 +48,9 @@ def noise(
     with clear_errors():
         check_writable(json_file)
         log = load_log(recording, rate_hz)
-        names = column or [name for name in log.columns if name not in ("t_s", "t_ns")]
+        names = column or [name for name in log.columns if name not in (log.time_column, "t_ns")]
+        if log.gaps:
+            console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")
         rate = log.need_rate()
         found: dict[str, tuple[AllanCurve, NoiseModel]] = {}
         for name in names:

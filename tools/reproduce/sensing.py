@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from tools.reproduce import sensing_drift, sensing_dynamic, sensing_noise, sensing_static, sensing_variance
+from tools.reproduce import (
+    sensing_budget,
+    sensing_drift,
+    sensing_dynamic,
+    sensing_noise,
+    sensing_static,
+    sensing_variance,
+)
 from tools.reproduce.rows import Table, build
 
 NOTES = (
@@ -24,5 +31,6 @@ def table() -> Table:
         sensing_dynamic.translation_rows,
         sensing_dynamic.arm_rows,
         sensing_dynamic.orientation_rows,
+        sensing_budget.rows,
     )
     return build("sensing", sections, NOTES)
