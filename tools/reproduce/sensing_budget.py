@@ -71,7 +71,7 @@ class Share:
 
 @dataclass(frozen=True)
 class Budget:
-    """``total_um`` and ``floor_um``: all sources, none. ``axes_um``: the total by body axis, ``tremor_um`` the truth's."""
+    """``total_um`` and ``floor_um``: all sources, none. ``axes_um``: total by body axis, ``tremor_um``: the truth."""
 
     total_um: float
     floor_um: float
@@ -148,12 +148,21 @@ def rows() -> list[Row]:
     found = budget()
     condition = f"8 to 12 Hz, default hand, {SECONDS - SETTLE_S:g} s, all sensor errors on, after calibration"
     worst = max(found.axes_um)
+    tremor = ", ".join(f"{v:.1f}" for v in found.tremor_um)
     out = [
-        Row("000, sec. 2.1.1 (ii)", "rms error of tip displacement, worst axis", "um", condition, GOAL_UM, worst,
-            "lower", "emulated", why="tremor in the band: " + ", ".join(f"{v:.1f}" for v in found.tremor_um) + " um rms"),
-        Row("000, sec. 2.1.1 (ii)", "rms error of tip displacement, vector", "um", condition, GOAL_UM, found.total_um,
-            "lower", "emulated"),
-    ]  # fmt: skip
+        Row(
+            "000, sec. 2.1.1 (ii)",
+            f"rms error of tip displacement, {what}",
+            "um",
+            condition,
+            GOAL_UM,
+            value,
+            "lower",
+            "emulated",
+            why=f"tremor in the band: {tremor} um rms",
+        )
+        for what, value in (("worst axis", worst), ("vector", found.total_um))
+    ]
     for share in found.shares:
         out.append(
             Row(
