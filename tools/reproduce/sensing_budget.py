@@ -101,7 +101,7 @@ def calibrated_config(config: EmulationConfig) -> SensingConfig:
 def _band(signal: Array, cutoff_rad_s: float | None = None) -> Array:
     """(n, 3) cut to the band; with ``cutoff_rad_s`` also divided by the displacement's known response."""
     spectrum = np.fft.rfft(signal - signal.mean(axis=0), axis=0)
-    f = np.fft.rfftfreq(len(signal), 1e-3)
+    f: Array = np.fft.rfftfreq(len(signal), 1e-3).astype(np.float64)
     inside = (f >= BAND_HZ[0]) & (f <= BAND_HZ[1])
     spectrum[~inside] = 0.0
     if cutoff_rad_s is not None:
