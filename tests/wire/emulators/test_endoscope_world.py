@@ -106,6 +106,7 @@ def test_card_on_a_pty_in_real_time(tmp_path: Path) -> None:
     assert isinstance(world, ProcessWorld)
     try:
         with serial.Serial(world.endpoint("card0").removeprefix("serial://"), 115_200, timeout=2.0) as port:
+            port.read_until(b"\r\n")  # opening flushes the line: the first one may be a rest
             lines = [port.read_until(b"\r\n") for _ in range(21)]
     finally:
         world.stop()
