@@ -43,7 +43,7 @@ def evaluate(
 ) -> None:
     """Tables 5.4 to 5.8 of document 002 for a sensor: from recordings, or measured now on a bench (auto-calibrated).
 
-    Example: micron imu evaluate --bench benches/endoscope.toml --virtual --seconds 60
+    Example: micron imu evaluate --bench benches/imus.toml --virtual --seconds 60
     """
     from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_turned
     from tools.imu.picture import save_imu_picture
