@@ -130,11 +130,10 @@ def test_half_a_sphere_is_said_to_be_half() -> None:
     assert result.missing == ("z down",)
 
 
-@pytest.mark.skipif(not Path("/work/shared/data/imu_tk_xsens").is_dir(), reason="the shared recordings are not here")
-def test_the_xsens_log_reaches_its_reference() -> None:
+def test_the_xsens_log_reaches_its_reference(shared_data: Path) -> None:
     from tools.calibrate.logs import load_log
 
-    log = load_log(Path("/work/shared/data/imu_tk_xsens"))
+    log = load_log(shared_data / "imu_tk_xsens")
     result = identify_poses(log.matrix(("acc_x_raw", "acc_y_raw", "acc_z_raw")), log.need_rate(), 9.81744)
     assert result.residual_m_s2 <= 0.0135
     scale = [1.0 / result.parameters[f"scale_{a}"].value for a in "xyz"]
