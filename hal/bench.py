@@ -286,6 +286,7 @@ def open_bench(
     try:
         if emulated:
             table = description.model_dump()
+            table["folder"] = str(bench.path.parent)  # what the emulation names is relative to the bench file
             if seed is not None:
                 table["emulation"]["seed"] = seed
             if truth_s is not None:

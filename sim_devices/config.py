@@ -289,3 +289,5 @@ class EmulationConfig(_Table):
     environment: EnvironmentConfig = EnvironmentConfig()
     endoscope: EndoscopeConfig | None = None
     imu: dict[str, ImuConfig] = Field(default_factory=dict)
+    twin: str | tuple[str, str, str] | None = None
+    """Corrected twin (``micron mismatch apply``) in place of the stacks, or one for each; relative to the bench."""

@@ -55,13 +55,14 @@ class FileTwin:
         prefix = KINDS[self.kind][2]
         return f"{prefix}_{output[-1]}" if prefix else "command"
 
-    def run(self, dt: float, signals: Mapping[str, Array]) -> dict[str, Array]:
+    def run(self, dt: float, signals: Mapping[str, Array], begin_s: float = 0.0) -> dict[str, Array]:
         """Outputs (n,) in the contract's units for inputs and context signals (n,), from rest at the first sample.
 
-        BenchError names a signal that an effect needs and ``signals`` does not have.
+        ``begin_s``: time of the first sample, for what ages (warm-up). BenchError names a signal that an effect needs
+        and ``signals`` does not have.
         """
         n = next(iter(signals.values())).size
-        t = np.asarray(np.arange(n) * dt, np.float64)
+        t = np.asarray(begin_s + np.arange(n) * dt, np.float64)
         inputs = dict(signals)
         for output in self.base:
             self._present(signals, self.drive(output), "the twin")

@@ -24,6 +24,7 @@ from sim_devices.plant.kernel import (
     outputs_later,
     truth_row,
 )
+from sim_devices.plant.stack_twin import StackTwins, move_tips
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
 
@@ -38,17 +39,25 @@ class Instrument:
     """One instrument, one hand, one run.
 
     ``unit`` (default ``seed``) draws the physical instrument, ``seed`` its noise; ``hand`` must be fresh.
-    ``quiet`` leaves all sensor, DAQ and room noise out (a twin for arrays). Steps are 1/8 ms: between steps demands
+    ``quiet`` leaves all sensor, DAQ and room noise out (a twin for arrays); ``twins`` move in place of the stacks (in
+    ``truth``, not in ``truth_row``). Steps are 1/8 ms: between steps demands
     count from their own instant on, and outputs follow their RC filters. Truth is recorded each millisecond, the
     first row at 0.
     """
 
     def __init__(
-        self, config: EmulationConfig, seed: int, hand: Hand, *, unit: int | None = None, quiet: bool = False
+        self,
+        config: EmulationConfig,
+        seed: int,
+        hand: Hand,
+        *,
+        unit: int | None = None,
+        quiet: bool = False,
+        twins: StackTwins | None = None,
     ) -> None:
         self.unit = build_unit(config, seed if unit is None else unit)
         self._plant, self._state = plant_arrays(config, self.unit, hand.frame)
-        self._hand, self._quiet = hand, quiet
+        self._hand, self._quiet, self._twins = hand, quiet, twins
         self._supply_V = float(self._plant[0]["supply_V"])
         self._tip_m = np.array(config.instrument.tip_mm) * 1e-3
         self._rng = stream(seed, "instrument.noise")
@@ -108,6 +117,8 @@ class Instrument:
         # the running step sees the mean of its demands
         self._demand_fix_V[channel] += (1.0 - left) * (self._demand_V[channel] - volts)
         self._demand_V[channel] = volts
+        if self._twins is not None:
+            self._twins.demand(channel, volts, max(t_ns, self._steps * STEP_NS))
 
     @property
     def analog_V(self) -> Array:
@@ -164,6 +175,12 @@ class Instrument:
         columns: dict[str, NDArray] = {"t_ns": numbers * 1_000_000}
         for name, at, n in TRUTH:
             columns[name] = rows[:, at] if n == 1 else rows[:, at : at + n]
+        if self._twins is not None:
+            strokes = self._twins.strokes_m(columns["t_ns"], columns["temperature_C"])
+            columns["tip_m"] = np.empty((len(rows), 3))
+            attitude, rigid = (np.ascontiguousarray(columns[k]) for k in ("quaternion", "tip_rigid_m"))
+            move_tips(self._plant, strokes, attitude, rigid, columns["tip_m"])
+            columns["stroke_m"] = strokes + self._plant[0]["channel"]["reference_m"]
         return columns
 
     def _now(self) -> None:
@@ -176,6 +193,8 @@ class Instrument:
         if self._row + BLOCK_MS > _CHUNK_ROWS:
             if len(self._chunks) == self._chunks.maxlen:
                 self._forgotten += len(self._chunks[0])
+                if self._twins is not None:
+                    self._twins.forget(self._forgotten * 1_000_000)
             self._chunks.append(self._chunk[: self._row])
             self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 0
         self._nodes[0] = self._nodes[-1]

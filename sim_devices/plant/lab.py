@@ -4,7 +4,7 @@
 [--twin FILE]``
 drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
 contract; ``set`` writes a folder of them, saw-teeth and sines of 0.1 to 40 Hz and loops, all that a calibration needs.
-With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place.
+With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place, as with a bench that names it.
 ``... manipulator --out FOLDER`` moves all three stacks through a grid and tracks the tip.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
@@ -255,6 +255,14 @@ def load_config(bench: Path | None, unit: int | None) -> EmulationConfig:
         raise LabError(f"{bench or '--unit'}: [emulation] {where}: {first['msg']}") from error
 
 
+def in_place(config: EmulationConfig, bench: Path | None, axis: int, given: Path | None) -> FileTwin | None:
+    """The corrected twin that stands in for a stack: the one ``given``, else what the bench names, else none."""
+    named = config.twin if config.twin is None or isinstance(config.twin, str) else config.twin[axis % 3]
+    if given is not None or named is None:
+        return None if given is None else load_twin(given)
+    return load_twin((bench.parent if bench is not None else Path()) / named)
+
+
 def write_recording(folder: Path, columns: dict[str, Array], descriptor: str) -> None:
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -286,9 +294,12 @@ def main(arguments: list[str] | None = None) -> int:
     given = parser.parse_args(arguments)
     try:
         config = load_config(given.bench, given.unit)
+        twin = in_place(config, given.bench, given.axis, given.twin) if given.what == "piezo" else None
         if given.what == "piezo" and given.profile == "set":
             for profile, rate_hz, seconds in CALIBRATION_SET:
-                columns, descriptor = measure_piezo(config, given.axis, profile, rate_hz, seconds, given.amplitude_V)
+                columns, descriptor = measure_piezo(
+                    config, given.axis, profile, rate_hz, seconds, given.amplitude_V, twin
+                )
                 write_recording(given.out / f"{profile}-{rate_hz:g}Hz", columns, descriptor)
             sys.stderr.write(f"{given.out}: {len(CALIBRATION_SET)} recordings\n")
             return 0
@@ -298,9 +309,8 @@ def main(arguments: list[str] | None = None) -> int:
             columns, descriptor = measure_scan(config, given.per_axis, stream(config.seed, "lab.manipulator"))
         elif given.what == "piezo":
             columns, descriptor = measure_piezo(
-                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V,
-                None if given.twin is None else load_twin(given.twin),
-            )  # fmt: skip
+                config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V, twin
+            )
         else:
             columns, descriptor = measure_tumble(config, given.positions, given.seconds)
         write_recording(given.out, columns, descriptor)

@@ -1,4 +1,4 @@
-"""A bench file with another calibration laid over it: a copy, the original stays as it is."""
+"""A bench file with another calibration, or a corrected twin in it: a copy, the original stays as it is."""
 
 from __future__ import annotations
 
@@ -8,17 +8,62 @@ import tomllib
 from pathlib import Path
 
 from hal.bench import BenchFile, load_bench
+from hal.errors import BenchError
+from sim_devices.plant_factory import emulation_config, stack_twins
 from tools.cli.common import write_text_atomic
 
 _LIST = re.compile(r"^calibration\s*=\s*\[.*?\][^\n]*$", re.MULTILINE | re.DOTALL)
 _TABLE = re.compile(r"^\[firmware\][^\n]*$", re.MULTILINE)
+_EMULATION = re.compile(r"^\[emulation\][^\n]*$", re.MULTILINE)
+_TWIN = re.compile(r"^twin\s*=\s*(\[.*?\]|[^\n]*)[^\n]*\n", re.MULTILINE | re.DOTALL)
 
 
 def with_calibration(bench: BenchFile, calibration: Path, out: Path) -> Path:
     """Write ``out``: the bench with ``calibration`` as its last calibration file, paths made absolute."""
+    wanted = [name for name in _calibrations(bench) if name != str(calibration)] + [str(calibration)]
+    write_text_atomic(out, _calibrated(bench, wanted))
+    load_bench(out)
+    return out
+
+
+def with_twin(bench: BenchFile, twin: Path, out: Path) -> Path:
+    """Write ``out``: the bench with a corrected twin (``micron mismatch apply``) in its stacks' place, paths absolute.
+
+    BenchError for a bench without emulation, or a twin that its emulated world cannot run; nothing is written then.
+    """
+    description = bench.description.model_dump()
+    if "provider" not in description["emulation"]:
+        raise BenchError(f"{bench.path}: nothing is emulated there; a corrected twin runs on an emulated bench")
+    file = str(twin.resolve())
+    description["emulation"]["twin"] = file
+    stack_twins(emulation_config(description), description)
+    text = _calibrated(bench, _calibrations(bench))
+    begin, end = _table_span(text)
+    body = _TWIN.sub("", text[begin:end])
+    text = f"{text[:begin]}\ntwin = {json.dumps(file)}{body}{text[end:]}"
+    assert tomllib.loads(text)["emulation"]["twin"] == file
+    write_text_atomic(out, text)
+    return out
+
+
+def _table_span(text: str) -> tuple[int, int]:
+    """Where the keys of ``[emulation]`` stand, from the end of its own line to the next table."""
+    found = _EMULATION.search(text)
+    if found is None:
+        raise BenchError("[emulation] must be a table of its own line to take a twin")
+    after = re.search(r"^\[", text[found.end() :], re.MULTILINE)
+    return found.end(), len(text) if after is None else found.end() + after.start()
+
+
+def _calibrations(bench: BenchFile) -> list[str]:
+    return [str(bench.resolve(name)) for name in bench.description.firmware.get("calibration", ())]
+
+
+def _calibrated(bench: BenchFile, wanted: list[str]) -> str:
+    """The bench's text with these calibration files."""
     firmware = bench.description.firmware
-    files = [str(bench.resolve(name)) for name in firmware.get("calibration", ())]
-    wanted = [name for name in files if name != str(calibration)] + [str(calibration)]
+    if not wanted:
+        return bench.text
     line = f"calibration = {json.dumps(wanted)}"
     text = bench.text
     if "calibration" in firmware:
@@ -28,6 +73,4 @@ def with_calibration(bench: BenchFile, calibration: Path, out: Path) -> Path:
     else:
         text = f"{text.rstrip()}\n\n[firmware]\n{line}\n"
     assert tomllib.loads(text)["firmware"]["calibration"] == wanted
-    write_text_atomic(out, text)
-    load_bench(out)
-    return out
+    return text

@@ -259,13 +259,30 @@ def apply(
     recording: RecordingArgument,
     report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],
     out: Annotated[Path, typer.Option("--out", metavar="TWIN.toml", help="The corrected twin.")],
+    bench: Annotated[
+        Path | None, typer.Option(metavar="BENCH.toml", help="Put a piezo_stack twin on this emulated bench, too.")
+    ] = None,
+    bench_out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The bench with the twin; default: bench.toml beside the twin.")
+    ] = None,
 ) -> None:
     """Write the corrected twin: base parameters re-fitted beside the effects, and the effects themselves.
 
-    A recording refers to it by [twin] file = "TWIN.toml". Example: micron mismatch apply rec rec.json --out twin.toml
+    A recording refers to it by file = "TWIN.toml" in its twin table, a bench by twin = "TWIN.toml" in emulation.
+    Example: micron mismatch apply rec rec.json --out twin.toml --bench benches/micron.toml
     """
     with _clear_errors():
-        _check_targets(out)
+        if bench_out is not None and bench is None:
+            raise InputError("--bench-out names a copy of a bench; name the bench with --bench")
+        copy = bench_out or out.with_name("bench.toml")
+        _check_targets(out, *([] if bench is None else [copy]))
+        original = None
+        if bench is not None:
+            from hal.bench import load_bench
+
+            original = load_bench(bench)
+            if copy.exists() and copy.samefile(bench):
+                raise InputError(f"{copy}: is the bench itself; name another file with --bench-out")
         from tools.mismatch.apply import corrected_twin
 
         twin = corrected_twin(recording, _report(report))
@@ -274,6 +291,11 @@ def apply(
             console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
         carried = ", ".join(twin.effects) or "no effects"
         console().print(f"{out}: {twin.kind} with {carried}")
+        if original is not None:
+            from tools.bench.bench_copy import with_twin
+
+            with_twin(original, out, copy)
+            console().print(f"{copy}: {original.path} with it; try: micron run --bench {copy}", soft_wrap=True)
 
 
 def _report(path: Path) -> dict[str, Any]:
