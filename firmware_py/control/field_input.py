@@ -1,0 +1,52 @@
+"""The magnetometer beside the scans: polled a channel at a time, handed to sensing when three fresh volts are there."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.hmc2003 import Hmc2003
+from firmware_py.control.incidents import Incidents, LoopCounts
+from firmware_py.frame import MAGNETOMETER_FRESH, MAGNETOMETER_RAW
+from firmware_py.scheduler.task import TickInfo
+from hal.errors import HalError
+
+
+class FieldInput:
+    """``limit_ms``: how long the field may be missing or stand still before the run ends."""
+
+    def __init__(self, magnetometer: Hmc2003, incidents: Incidents, counts: LoopCounts, limit_ms: float) -> None:
+        self._magnetometer = magnetometer
+        self._incidents = incidents
+        self._counts = counts
+        self._limit_ms = limit_ms
+        self._volts = np.zeros(3)
+        self._fresh = False
+        self._hangs = False
+
+    def fill(self, frame: NDArray[np.float64]) -> None:
+        """Into the frame's columns, once per reading."""
+        frame[MAGNETOMETER_FRESH] = float(self._fresh)
+        if self._fresh:
+            frame[MAGNETOMETER_RAW : MAGNETOMETER_RAW + 3] = self._volts
+            self._fresh = False
+
+    def poll(self, info: TickInfo) -> None:
+        """Task: one transfer on the bus."""
+        magnetometer, incidents = self._magnetometer, self._incidents
+        try:
+            if magnetometer.poll():
+                volts = magnetometer.volts
+                # three axes never read the same twice; one converter that hangs gives its last word for all
+                hangs = bool(volts[0] == volts[1] == volts[2])
+                if hangs and self._hangs:
+                    incidents.notice("magnetometer's converter hangs")
+                self._hangs = hangs
+                self._volts[:] = volts
+                self._fresh = not hangs
+            reason = f"{magnetometer.name}: its converter gives one reading for all axes; it hangs"
+            incidents.bad_for("magnetometer", self._hangs, info.due_ns, self._limit_ms, reason)
+        except HalError as error:
+            self._counts.magnetometer_errors += 1
+            incidents.notice("magnetometer does not answer")
+            incidents.bad_for("magnetometer", True, info.due_ns, self._limit_ms, str(error))

@@ -1,0 +1,105 @@
+"""The watch over a run: the self-test before arming, and at 100 Hz everything that no task sees by itself."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.incidents import Incidents
+from firmware_py.control.plausibility import ScanCheck
+from firmware_py.control.safety import Supervisor
+from firmware_py.control.wiring import Devices
+from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
+from firmware_py.scheduler.task import TickInfo
+from hal.errors import HalError
+
+WATCH_TICKS = 10
+
+
+class Watch:
+    """Reads the frame and the devices; its only consequence is a trip."""
+
+    def __init__(
+        self,
+        devices: Devices,
+        config: FirmwareConfig,
+        frame: NDArray[np.float64],
+        check: ScanCheck,
+        supervisor: Supervisor,
+        incidents: Incidents,
+        period_ns: int,
+    ) -> None:
+        self._devices = devices
+        self._config = config
+        self._frame = frame
+        self._check = check
+        self._supervisor = supervisor
+        self._incidents = incidents
+        self._elapsed_s = WATCH_TICKS * period_ns * 1e-9
+
+    def supervise(self, info: TickInfo) -> None:
+        """Task: readings that are impossible for a while, the room, the stop button."""
+        frame, limits, incidents = self._frame, self._config.safety, self._incidents
+        status = int(frame[STATUS])
+        t_ns = info.due_ns
+        if status & FrameStatus.INVALID:
+            incidents.trip("a reading or estimate is not a number; see the recording")
+        incidents.bad_for(
+            "saturation",
+            bool(status & FrameStatus.SATURATED),
+            t_ns,
+            limits.saturated_ms,
+            f"an accelerometer has been beyond its range for {limits.saturated_ms:g} ms; is the instrument falling?",
+        )
+        for name, value, unit, (lo, hi) in (
+            ("temperature", frame[TEMPERATURE], "degC", limits.temperature_C),
+            ("supply", frame[SUPPLY], "V", limits.supply_V),
+        ):
+            outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
+            reason = f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}"
+            incidents.bad_for(name, outside, t_ns, 100.0, reason)
+        if not status & FrameStatus.INVALID and (apart := self._check.pairs(frame, self._elapsed_s)):
+            incidents.trip(apart)
+        telemetry = self._devices.telemetry
+        if telemetry is not None:
+            if telemetry.poll():
+                incidents.trip("stop button pressed")
+            elif telemetry.button_silent() and self._supervisor.may_move:
+                incidents.trip(
+                    f"{telemetry.name}: the stop button is not heard any more; check the CAN bus and the button"
+                )
+
+    def verify_output(self, info: TickInfo) -> None:
+        """Task, 300 Hz: the amplifier must hold what it was told; a DAC that restarted or misheard does not."""
+        assert self._devices.verify_output is not None
+        if not self._supervisor.may_move:
+            return
+        name = self._devices.amplifier.name
+        try:
+            if wrong := self._devices.verify_output():
+                self._incidents.trip(f"{name}: {wrong}; check its supply and the bus")
+        except HalError as error:
+            self._incidents.error = error
+            self._incidents.trip_for(name, error)
+
+    def self_test_passed(self, watched_ms: float) -> bool:
+        """Sensors have been watched long enough and are sane; trips when that takes too long."""
+        limits = self._config.self_test
+        status = int(self._frame[STATUS])
+        telemetry = self._devices.telemetry
+        waiting = [
+            name
+            for name, wrong in (
+                ("attitude is not aligned", status & FrameStatus.ALIGNING),
+                ("an accelerometer is out of range", status & FrameStatus.SATURATED),
+                ("a reading is not a number", status & FrameStatus.INVALID),
+                ("the stop button has not been heard", telemetry is not None and telemetry.button_silent()),
+            )
+            if wrong
+        ]
+        if not waiting:
+            return watched_ms >= limits.watch_ms
+        if watched_ms > limits.limit_ms:
+            self._incidents.trip(f"self-test: {', '.join(waiting)} after {limits.limit_ms:g} ms")
+        return False
