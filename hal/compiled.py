@@ -3,7 +3,8 @@
 Numba's own cache looks only at the file that a function is written in; a kernel that calls another file's
 kernel, or folds in its constants, would be served stale after an edit there. The fingerprint here covers the
 module and all of our modules that it imports, directly or not: an edit compiles anew what it can reach and
-nothing else. Import this module only where kernels are: it pulls in numba.
+nothing else. The cache knows no path: every clone and work tree of a user shares it. Import this module only
+where kernels are: it pulls in numba.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core import config as numba_config
+from numba.core.caching import UserProvidedCacheLocator
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -71,13 +73,27 @@ def cache_folder(file: Path) -> Path:
     return cache / "micron-bench" / f"kernels-{source_fingerprint(file)}"
 
 
+class AnyClone(UserProvidedCacheLocator):
+    """Names a cached file by its place in this tree, not by where the tree lies; its content is in the folder."""
+
+    @classmethod
+    def get_suitable_cache_subpath(cls, py_file: str) -> str:
+        return ".".join(Path(py_file).resolve().relative_to(ROOT).parent.parts)
+
+
 def kernel(function: _Function) -> _Function:
     """Compile ``function``; the pure-Python twin stays reachable as ``.py_func``.
 
     Division by zero gives inf or nan as in numpy instead of raising, so that a bad sample becomes a
     flagged sample and not an exception in the middle of a tick.
     """
-    if "NUMBA_CACHE_DIR" not in os.environ:
-        folder = cache_folder(Path(function.__code__.co_filename).resolve())
-        numba_config.CACHE_DIR = str(folder)  # pyright: ignore[reportAttributeAccessIssue]
-    return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+    file = Path(function.__code__.co_filename).resolve()
+    if "NUMBA_CACHE_DIR" in os.environ or not file.is_relative_to(ROOT):
+        return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+    config = cast(Any, numba_config)
+    theirs = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+    config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = str(cache_folder(file)), f"{__name__}.AnyClone"
+    try:
+        return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+    finally:
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = theirs

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from hal.compiled import imported_sources, kernel, source_fingerprint
+from hal.compiled import ROOT, AnyClone, cache_folder, imported_sources, kernel, source_fingerprint
 
 
 def tree(root: Path, inner: str = "X = 1\n", other: str = "Y = 1\n") -> Path:
@@ -37,3 +37,18 @@ def test_division_by_zero_is_a_number_and_not_an_exception():
         return a / b
 
     assert ratio(1.0, 0.0) == float("inf")
+
+
+def test_the_cache_has_no_clone_in_its_path_and_numbas_own_settings_are_left_alone():
+    from numba.core import config
+
+    theirs = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+
+    @kernel
+    def twice(a: float) -> float:
+        return 2.0 * a
+
+    assert theirs == (config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES)
+    here = Path(__file__).resolve()
+    assert Path(twice._cache.cache_path) == cache_folder(here) / "tests.unit.hal"
+    assert AnyClone.get_suitable_cache_subpath(str(ROOT / "firmware_py" / "frame.py")) == "firmware_py"
