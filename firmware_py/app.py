@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from drivers.specs import check_devices
 from firmware_py.control.config import FirmwareConfig, load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.stages import StageConfigs, Stages
@@ -134,7 +135,11 @@ def open_requested(
     runtime_dir: Path | None,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> Iterator[OpenBench]:
-    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own."""
+    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own.
+
+    ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
+    """
+    check_devices(bench.description, str(bench.path))
     with contextlib.ExitStack() as stack:
         folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
         yield stack.enter_context(

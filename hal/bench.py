@@ -123,6 +123,8 @@ def describe_validation_error(error: ValidationError, where: str) -> str:
             message = "unknown key; check the spelling"
         elif item["type"] == "missing":
             message = "this key is missing"
+        elif item["type"] == "value_error":
+            message = message.removeprefix("Value error, ")
         lines.append(f"{where}: [{key}] {message}")
     return "\n".join(lines)
 

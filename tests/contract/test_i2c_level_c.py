@@ -10,28 +10,18 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 import smbus2
 
 from hal.backends.open import open_i2c
+from hal.clock import MonotonicClock
 from hal.errors import I2cNack
 from hal.types import I2cRead, I2cWrite
 from sim_devices.register import ProcessWorld, provider
+from tests.contract.imu_contract import CHIPS, DESCRIPTION, check_imu
 
 ROOT = Path(__file__).resolve().parents[2]
-DESCRIPTION: dict[str, Any] = {
-    "format": 1,
-    "name": "endoscope",
-    "emulation": {
-        "endoscope": {"scenario": "rest", "attitude_deg": [0.0, 30.0, 0.0]},
-        "imu": {"imu": {"errors": 0.0, "noise": 0.0}},
-    },
-    "bus": {"i2c0": {"kind": "i2c", "uri": "sim://i2c0", "speed_hz": 400_000}},
-    "device": {"imu": {"driver": "mpu6050", "bus": "i2c0", "address": 0x69}},
-}
-
 pytestmark = [
     pytest.mark.skipif(os.geteuid() != 0, reason="level C needs root (it mounts a file system)"),
     pytest.mark.skipif(not os.access("/dev/fuse", os.R_OK | os.W_OK), reason="level C needs /dev/fuse"),
@@ -93,6 +83,15 @@ def test_our_own_linux_backend(device_file: str) -> None:
         assert bus.transfer(0x69, [I2cWrite(b"\x75"), I2cRead(1)]) == b"\x68"
         with pytest.raises(I2cNack):
             bus.transfer(0x50, [I2cRead(1)])
+    finally:
+        bus.close()
+
+
+@pytest.mark.parametrize("name", CHIPS)
+def test_our_drivers_are_the_same_here(device_file: str, name: str) -> None:
+    bus = open_i2c(f"linux-i2c://{device_file}")
+    try:
+        check_imu(name, bus, MonotonicClock())
     finally:
         bus.close()
 

@@ -96,13 +96,17 @@ def play_command(
             console().print(f"report: {report}")
         write_json(result, json_file)
         if not done["done"]:
+            ended = result.get("safe_state", {"normal": True})
+            why = f"gave up after {limit:g} s (--limit)" if ended["normal"] else f"ended: {ended['reason']}"
+            console().print(f"[yellow]{why}[/]", soft_wrap=True)
             raise typer.Exit(Exit.FAILED)
         if not healthy:
             raise typer.Exit(Exit.DATA_LOST)
 
 
 def _show(user: str, result: dict[str, Any]) -> None:
-    title = f"{user}: {result['reached']} of {result['targets']} targets in {result['elapsed_s']:.1f} s, "
+    time = f" in {result['elapsed_s']:.1f} s" if result["reached"] else ""
+    title = f"{user}: {result['reached']} of {result['targets']} targets{time}, "
     table = Table(title=title + f"{result['clicks']} clicks, {result['mapping']} mapping", title_justify="left")
     for column in ("target", "time (s)", "clicks", "psi (deg)", "theta (deg)"):
         table.add_column(column, justify="right")

@@ -26,7 +26,9 @@ def evaluate(
     turned: Annotated[
         Path | None, typer.Option("--turned", metavar="RECORDING", help="Turned slowly through all six directions.")
     ] = None,
-    rate: Annotated[float | None, typer.Option("--rate-hz", min=0.1, help="When the recording does not say.")] = None,
+    rate: Annotated[
+        float | None, typer.Option("--rate-hz", min=0.1, help="Of recordings without a time column.")
+    ] = None,
     accel_lsb: Annotated[float | None, typer.Option("--accel-lsb-per-g", min=1e-9, help="Of raw counts.")] = None,
     gyro_lsb: Annotated[float | None, typer.Option("--gyro-lsb-per-dps", min=1e-9, help="Of raw counts.")] = None,
     accel_factor: Annotated[float, typer.Option(min=1e-9, help="Repairs a range error of the logger.")] = 1.0,
@@ -50,9 +52,11 @@ def evaluate(
     from tools.imu.series import Scales, load_series
 
     with clear_errors():
-        check_writable(json_file)
+        check_writable(json_file, picture)
         if (bench is None) == (not recording and not fall and turned is None):
-            raise InputError("give recordings, or --bench FILE to measure")
+            raise InputError("give recordings, or --bench FILE to measure: one of the two")
+        if picture is not None and bench is None and not recording:
+            raise InputError("--picture shows a motionless recording; give one, or leave --picture out")
         result: dict[str, Any] = {"format": 1, "sensors": [], "falls": [], "turned": None}
         shown: Series | None = None
         ok = True
@@ -84,6 +88,7 @@ def evaluate(
 
 def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tuple[list[Series], list[dict[str, Any]]]:
     """Each sensor in turn: uncalibrated head, auto-calibration in the chip, ``seconds`` of watching."""
+    from drivers.specs import check_devices
     from firmware_py.endoscope.wiring import open_sensors
     from hal.bench import load_bench, open_bench
     from tools.imu.evaluate import evaluate_still
@@ -91,10 +96,12 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
 
     series: list[Series] = []
     found: list[dict[str, Any]] = []
+    described = load_bench(bench)
+    check_devices(described.description, str(described.path))
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
-        open_bench(load_bench(bench), virtual=virtual, runtime_dir=Path(folder)) as opened,
+        open_bench(described, virtual=virtual, runtime_dir=Path(folder)) as opened,
         Progress(*columns, console=console(), transient=True) as bar,
     ):
         sensors = open_sensors(opened, only)

@@ -14,6 +14,7 @@ from firmware_py.endoscope.app import run_endoscope
 from firmware_py.endoscope.config import EndoscopeConfig, load_endoscope_config
 from firmware_py.endoscope.report import experiment
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
+from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
 from tools.endoscope.user import SyntheticUser, Task, UserConfig
@@ -57,6 +58,8 @@ def play_on_bench(
     ``InputError`` for a bench that has no emulated motion card.
     """
     bench = load_bench(bench_file)
+    if not is_endoscope(bench.description):
+        raise InputError(f"{bench_file}: no endoscope bench (a motion card, and no DAQ or amplifier)")
     config = load_endoscope_config(bench)
     config = EndoscopeConfig(**{**config.model_dump(), "game": (game or config.game).model_dump()})
     request = RunRequest(bench_file, limit_s, virtual=True, record=record, seed=seed)

@@ -7,7 +7,8 @@ speed mapping, K / (s (T s + 1)), the operator is proportional and leads with T.
 so from there on they become slower and ring. Where the hand's place is the view's place (position mapping), the first
 movement is an aimed one that needs no eyes (Woodworth's two components, 1899): it goes where the goal is, misses by
 some percent (Schmidt 1979), and correcting begins once the view has had its response time. The rest (time to decide, to
-press, noise, reach of the wrist) is ordinary and not fitted to the document's tables.
+press, noise, reach of the wrist) is ordinary and not fitted to the document's tables; the aimed movement was added
+after a comparison with them, see docs/endoscope.md.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ Accelerations in g (specific force, +1 g on an axis that points up), rates in de
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -63,9 +63,12 @@ class Scales:
 def load_series(path: Path, scales: Scales | None = None, rate_hz: float | None = None) -> Series:
     """A recording as folder or .npz with columns ``acc_x_UNIT``, ``gyro_x_UNIT``, ``temperature_C``.
 
-    Units: raw (counts), g, mg, m_s2; raw, deg_s, dps, rad_s. ``InputError`` says what is missing.
+    Units: raw (counts), g, mg, m_s2; raw, deg_s, dps, rad_s. ``InputError`` says what is missing. ``rate_hz`` is
+    for recordings without a time column: several recordings share it.
     """
-    log = load_log(path, rate_hz)
+    log = load_log(path)
+    if log.time_column is None and rate_hz is not None:
+        log = replace(log, rate_hz=rate_hz)
     scales = scales or Scales()
     accel = _triad(log, "acc", {**ACCEL_UNITS, "raw": _per(scales.accel_lsb_per_g)}, "--accel-lsb-per-g")
     if accel is None:

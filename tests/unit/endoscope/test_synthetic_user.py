@@ -108,3 +108,7 @@ def test_command(tmp_path: Path) -> None:
     assert "position or speed" in wrong.output
     late = runner.invoke(app, ["endoscope", "play", "--direct", "--limit", "2"])
     assert late.exit_code == 1
+    assert "gave up after 2 s" in late.output
+    other = runner.invoke(app, ["endoscope", "play", "--bench", str(Path(benches.__file__).with_name("micron.toml"))])
+    assert other.exit_code == 2
+    assert "no endoscope bench" in other.output

@@ -174,6 +174,14 @@ def test_drops_of_an_impactor(shared_data: Path, name: str, fall_s: float) -> No
     assert list(found["offset_g"].values()) == pytest.approx([0.005, 0.009, 0.013], abs=0.0015)
 
 
+def test_a_time_column_goes_before_the_rate_asked_for(tmp_path: Path) -> None:
+    columns = {f"acc_{a}_g": np.full(50, float(a == "z")) for a in "xyz"}
+    np.savez(tmp_path / "timed.npz", t_s=np.arange(50) / 200.0, **columns)
+    np.savez(tmp_path / "plain.npz", **columns)
+    assert load_series(tmp_path / "timed.npz", rate_hz=50.0).rate_hz == pytest.approx(200.0)
+    assert load_series(tmp_path / "plain.npz", rate_hz=50.0).rate_hz == 50.0
+
+
 def test_joining_needs_one_rate() -> None:
     other = Series("other", 50.0, np.zeros((10, 3)), None)
     with pytest.raises(InputError, match="50 Hz"):
@@ -249,3 +257,14 @@ def test_command(tmp_path: Path) -> None:
     assert (
         runner.invoke(app, ["imu", "evaluate", "--fall", str(tmp_path / "rest.npz"), "--rate-hz", "100"]).exit_code == 2
     )
+
+
+@pytest.mark.parametrize("command", [["imu", "evaluate", "--seconds", "5"], ["run", "--seconds", "1"]])
+def test_clashing_addresses_are_refused_with_the_strap_that_frees_one(command: list[str], tmp_path: Path) -> None:
+    path = tmp_path / "bench.toml"
+    other = '[device.other]\ndriver = "mpu6050"\nbus = "i2c0"\naddress = 0x68\n'
+    path.write_text(BENCH.format(driver="bmx055", address=CHIPS["bmx055"]) + other)
+    done = CliRunner().invoke(app, [*command, "--bench", str(path), "--virtual"])
+    assert done.exit_code == 2
+    assert "0x68 on 'i2c0' is claimed by the gyro of 'chip' (BMX055) and 'other' (MPU6050)" in done.stderr
+    assert "tie AD0 of 'other' high" in done.stderr
