@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 
-.PHONY: run test test-all lint bench setup clean
+.PHONY: run test test-all lint bench docs wheel coverage setup clean
 
 run: setup
 	$(BIN)/micron run
@@ -26,6 +26,24 @@ lint: setup
 
 bench: setup
 	$(BIN)/python -m benchmarks
+
+# the site in out/site; strict: a broken link or an undocumented name in the reference fails
+docs: setup
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[docs]'
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+# the built package in an empty environment, away from the sources
+wheel: setup
+	rm -rf out/wheel
+	$(BIN)/uv build --quiet --wheel --out-dir out/wheel
+	$(BIN)/uv venv --quiet --python $(BIN)/python out/wheel/venv
+	VIRTUAL_ENV=out/wheel/venv $(BIN)/uv pip install --quiet -c constraints.txt out/wheel/*.whl
+	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
+
+# by branch, without kernels: compiled code cannot be traced, their pure-Python twins are tested instead
+coverage: setup
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[quality]'
+	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --cov --cov-report=term --cov-report=html:out/coverage
 
 setup: $(VENV)/.ready
 

@@ -1,0 +1,6 @@
+"""From the acceleration of the tip to its tremor now and over the delay of the loop.
+
+What lives here: estimators behind one interface (``estimator``), their prefilters and designs, detectors of what is
+not tremor, the compiled ``stage``.
+What must not: sensors (``sensing``), actuators, figures of merit (``tools.tremor``).
+"""

@@ -1,1 +1,5 @@
-"""Identification: from calibration recordings to the tables that the firmware loads."""
+"""Identification: from calibration recordings to the tables that the firmware loads.
+
+What lives here: fits with intervals, conditions and what is missing. What must not: the models themselves, which are
+the firmware's (``firmware_py``), so that what is identified is what runs.
+"""
