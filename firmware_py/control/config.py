@@ -11,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from firmware_py.control.plausibility import PlausibilityLimits
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.stages import StageConfigs
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.noise_file import noise_table
 from hal.bench import BenchFile, validate_table
 from hal.errors import BenchError
 
@@ -36,13 +38,15 @@ class FirmwareConfig(BaseModel):
     plausibility: PlausibilityLimits = PlausibilityLimits()
     budget_us: dict[str, float] = Field(default_factory=dict[str, float])
     calibration: tuple[str, ...] = ()
+    noise: str | None = None
+    """JSON of ``micron noise`` for the filters' covariances."""
     sensing: dict[str, Any] = Field(default_factory=dict[str, Any])
     tremor: dict[str, Any] = Field(default_factory=dict[str, Any])
     actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
 
 
 def load_firmware_config(bench: BenchFile, wired: Mapping[str, Any]) -> tuple[FirmwareConfig, StageConfigs]:
-    """Bench table, then calibration files over it (in order), then what the wiring decides.
+    """Bench table, then calibration files over it (in order), then what the wiring decides, then measured noise.
 
     Raises ``BenchError`` naming file and key.
     """
@@ -53,6 +57,9 @@ def load_firmware_config(bench: BenchFile, wired: Mapping[str, Any]) -> tuple[Fi
         for stage, table in _calibration(bench, name).items():
             tables[stage].update(table)
     tables["sensing"].update(wired)
+    if config.noise is not None:
+        sensing = SensingConfig.from_dict(tables["sensing"], f"{where}: firmware.sensing")
+        tables["sensing"].update(noise_table(bench.resolve(config.noise), sensing))
     return config, StageConfigs.from_dict(tables, where)
 
 

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.signal import iirnotch
 
 from firmware_py.records import Record, new_record
-from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.config import DRIFT_S, STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.error_state import ERROR_STATE
 from firmware_py.sensing.quaternion_kalman import QUATERNION_KALMAN
 
@@ -19,8 +19,6 @@ METHODS = {
     "error-state": ERROR_STATE_METHOD,
     "quaternion-kalman": QUATERNION_KALMAN_METHOD,
 }
-STANDARD_GRAVITY = 9.80665
-DRIFT_S = 100.0
 TREMOR_RAD_S2 = 0.5
 
 
@@ -30,8 +28,23 @@ def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
     The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of ERRATA 21, 44.
     """
     sigma = np.array(config.noise_ug_per_rtHz) * 1e-6 * STANDARD_GRAVITY / np.sqrt(2.0)
-    solve = np.linalg.pinv(config.observation() / sigma[:, None]) / sigma * sigma
+    solve = np.linalg.pinv(config.observation() / sigma[:, None])
     return solve @ solve.T
+
+
+def alpha_drift_densities(config: SensingConfig) -> NDArray[np.float64]:
+    """(3,) (rad/s^2)^2/s: random walk of the solved angular acceleration's bias.
+
+    The drift of the axes at rest, carried through the geometry, and what moves with the hand (``alpha_drift_rad_s2``).
+    """
+    sigma = np.array(config.noise_ug_per_rtHz)
+    solve = (np.linalg.pinv(config.observation() / sigma[:, None]) / sigma)[3:]
+    return (solve**2 @ np.array(config.axis_drift_m_s2) ** 2 + config.alpha_drift_rad_s2**2) / DRIFT_S
+
+
+def heading_density(config: SensingConfig) -> float:
+    """rad^2 s of the magnetometer's heading: its surroundings and its own noise."""
+    return config.heading_noise_rad**2 + (config.magnetometer_noise_uT / config.horizontal_field_uT) ** 2
 
 
 def quiet_point(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -68,10 +81,10 @@ def error_state_params(config: SensingConfig) -> Record:
         moving_s=0.5,
         notch=tremor_notch(config.tick_hz, *config.tremor_notch_hz),
         rate_density=density[3:],
-        bias_density=config.alpha_drift_rad_s2**2 / DRIFT_S,
+        bias_density=alpha_drift_densities(config),
         force_density=float(np.diag(quiet_point(config)[1]).max()),
         still_density=config.hand_velocity_m_s**2 * config.hand_velocity_s,
-        heading_density=config.heading_noise_rad**2,
+        heading_density=heading_density(config),
         held_density=0.01**2,
         disturbance_rad=radians(0.3),
         disturbance_s=3.0,
@@ -121,10 +134,10 @@ def quaternion_kalman_params(config: SensingConfig) -> Record:
         QUATERNION_KALMAN,
         turn_density=1e-12,
         # no state for the bias of alpha here: its drift is rate drift
-        rate_density=density[3:] + config.alpha_drift_rad_s2**2,
+        rate_density=density[3:] + DRIFT_S * alpha_drift_densities(config),
         lead=0.5,
         up_density=(config.hand_acceleration_m_s2 / config.gravity_m_s2) ** 2,
-        field_density=config.heading_noise_rad**2,
+        field_density=heading_density(config),
         start_variance=np.array([0.01**2, 0.02**2, 0.02**2]),
         gravity=config.gravity_m_s2,
         force_gate_m_s2=3.0,

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from firmware_py.frame import (
     ACCELEROMETER,
+    AXES,
     COUNTS,
     MAGNETOMETER,
     MAGNETOMETER_RAW,
@@ -59,6 +60,11 @@ CALIBRATION = np.dtype(
         ("magnetometer_uT_per_V", "f8", (3, 3)),  # misalignment included
     ]
 )
+
+
+def reading_names(axes: int) -> tuple[str, ...]:
+    """Names of the calibrated readings, as recordings have them."""
+    return tuple(f"accelerometer_{AXES[i] if i < len(AXES) else i + 1}" for i in range(axes))
 
 
 def calibration_params(config: SensingConfig) -> Record:

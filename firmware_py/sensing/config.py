@@ -14,12 +14,17 @@ from hal.bench import validate_table
 
 Vector = tuple[float, float, float]
 Six = tuple[float, float, float, float, float, float]
+NotNegative = Annotated[float, Field(ge=0.0)]
+SixNotNegative = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 Pair = tuple[float, float]
 SixPairs = tuple[Pair, Pair, Pair, Pair, Pair, Pair]
 Places = tuple[Vector, Vector, Vector] | tuple[Vector, Vector, Vector, Vector, Vector, Vector]
 Axis = Annotated[int, Field(ge=0, le=5)]
 SixAxes = tuple[Axis, Axis, Axis, Axis, Axis, Axis]
 Positive = Annotated[float, Field(gt=0.0)]
+STANDARD_GRAVITY = 9.80665
+DRIFT_S = 100.0
+"""Over which a slow drift is stated."""
 UNIT_AXES: tuple[Vector, ...] = (
     (1.0, 0.0, 0.0),
     (0.0, 0.0, 1.0),
@@ -52,6 +57,8 @@ class SensingConfig(BaseModel):
     tip_m: Vector = (0.0, 0.0, 0.155)
     gravity_m_s2: Positive = 9.80131
     noise_ug_per_rtHz: Six = (110.0,) * 6  # pyright: ignore[reportAssignmentType]
+    # rms of an axis' slow drift over 100 s, beside alpha_drift_rad_s2; both keys as `micron noise` measures them
+    axis_drift_m_s2: SixNotNegative = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
     filter_ohm: Positive = 32_000.0  # ADXL-203 output resistance with the external capacitor, 000 sec. 3.2.1.7
     filter_farad: Positive = 0.33e-6
 
@@ -87,7 +94,9 @@ class SensingConfig(BaseModel):
     velocity_gate: Annotated[float, Field(ge=0.0)] = 4.0  # standard deviations; 0: no gate
     hand_acceleration_m_s2: Positive = 0.05  # rms below the tremor band: quaternion filter
     alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
-    heading_noise_rad: Positive = 0.005  # per square root of a second
+    heading_noise_rad: Positive = 0.005  # per square root of a second: the surroundings' own fluctuation
+    magnetometer_noise_uT: NotNegative = 0.0  # white, per square root of a second
+    horizontal_field_uT: Positive = 20.0
     align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.08
     attitude_start_hz: Positive = 1.0
     attitude_hz: tuple[Positive, Positive, Positive] = (0.3, 0.3, 0.5)  # about the body axes

@@ -8,6 +8,7 @@ With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack
 ``... manipulator --out FOLDER`` moves all three stacks through a grid and tracks the tip.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
+``... rest --out FOLDER`` and ``... pivot --out FOLDER`` log the same at 1 kHz, lying still or swung about the tip.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin, outputs
+from sim_devices.plant.lab_motion import measure_motion
 from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
 from sim_devices.plant.streams import stream
@@ -287,7 +289,11 @@ def main(arguments: list[str] | None = None) -> int:
     tumble.add_argument("--seconds", type=float, default=5.0, help="averaging at each position")
     scan = what.add_parser("manipulator", help="the tip over a grid of voltages")
     scan.add_argument("--per-axis", type=int, default=5, help="voltages per stack")
-    for command in (piezo, tumble, scan):
+    rest = what.add_parser("rest", help="the instrument lying still, at 1 kHz")
+    pivot = what.add_parser("pivot", help="the instrument swung about its tip, at 1 kHz")
+    rest.add_argument("--seconds", type=float, default=600.0)
+    pivot.add_argument("--seconds", type=float, default=60.0)
+    for command in (piezo, tumble, scan, rest, pivot):
         command.add_argument("--out", type=Path, required=True, help="folder to write to")
         command.add_argument("--bench", type=Path, help="bench file whose [emulation] table describes the unit")
         command.add_argument("--unit", type=int, help="the unit, if not the bench's")
@@ -307,6 +313,8 @@ def main(arguments: list[str] | None = None) -> int:
             if not 3 <= given.per_axis <= 12:
                 raise LabError(f"{given.per_axis} voltages per axis: give 3 to 12")
             columns, descriptor = measure_scan(config, given.per_axis, stream(config.seed, "lab.manipulator"))
+        elif given.what in ("rest", "pivot"):
+            columns, descriptor = measure_motion(config, given.what, given.seconds)
         elif given.what == "piezo":
             columns, descriptor = measure_piezo(
                 config, given.axis, given.profile, given.rate_hz, given.seconds, given.amplitude_V, twin

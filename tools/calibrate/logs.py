@@ -126,9 +126,9 @@ def _npz(file: Path) -> dict[str, Array]:
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
         raise InputError(f"{file}: cannot be read as .npz ({error})") from error
     arrays = {name: a for name, a in arrays.items() if a.dtype.kind in "fiub"}
-    lengths = {len(array) for array in arrays.values() if array.ndim == 1}
+    lengths = {len(a) for a in arrays.values() if a.ndim == 1 or (a.ndim == 2 and a.shape[1] <= 16)}
     if not lengths:
-        raise InputError(f"{file}: holds no columns (one-dimensional arrays)")
+        raise InputError(f"{file}: holds no columns (arrays of one dimension, or two with up to 16 columns)")
     length = max(lengths)
     columns = {
         name: array.astype(np.float64) for name, array in arrays.items() if array.ndim == 1 and len(array) == length

@@ -30,6 +30,9 @@ def noise(
     shortest_s: Annotated[
         float, typer.Option(min=0.0, help="Shortest averaging time of the fit: above a filter's time constant.")
     ] = 0.0,
+    bench: Annotated[
+        Path | None, typer.Option(metavar="BENCH", help="The log is of this instrument: its calibrated axes instead.")
+    ] = None,
     image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the deviation.")] = Path(
         "out/noise.png"
     ),
@@ -37,10 +40,15 @@ def noise(
 ) -> None:
     """Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.
 
+    The JSON is what a bench names as [firmware] noise = "FILE": the attitude filters then use these figures.
+
     Example: micron noise rest.npz --rate-hz 100 --picture out/noise.png
+
+    For a bench: micron noise out/rest --bench benches/micron.toml --shortest-s 0.1 --json out/noise.json
     """
     from dataclasses import asdict
 
+    from tools.calibrate.instrument_log import calibrated_log
     from tools.calibrate.logs import load_log
     from tools.noise.allan import TERMS, AllanCurve, NoiseModel, allan_curve, identify
     from tools.noise.picture import save_allan_picture
@@ -48,6 +56,8 @@ def noise(
     with clear_errors():
         check_writable(json_file)
         log = load_log(recording, rate_hz)
+        if bench is not None:
+            log = calibrated_log(log, bench)
         names = column or [name for name in log.columns if name not in (log.time_column, "t_ns")]
         if log.gaps:
             console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")
@@ -63,7 +73,7 @@ def noise(
                 raise InputError(f"{log.path}: '{name}': {error}") from error
         table = Table(title=f"{log.path}, {rate:g} Hz", title_justify="left")
         for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)"):
-            table.add_column(heading)
+            table.add_column(heading, no_wrap=heading == "column")
         for name, (_, model) in found.items():
             cells = []
             for term in TERMS:
@@ -78,6 +88,8 @@ def noise(
             {
                 "format": 1,
                 "rate_hz": rate,
+                "scale": scale,
+                "shortest_s": shortest_s,
                 "columns": {n: {"curve": asdict(c), "model": asdict(m)} for n, (c, m) in found.items()},
             },
             json_file,
