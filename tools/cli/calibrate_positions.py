@@ -1,0 +1,88 @@
+"""``micron calibrate positions``: where the accelerometers sit, from a swing about the tip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from tools.cli.common import (
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+    write_text_atomic,
+)
+
+
+def positions(
+    recording: Annotated[
+        Path,
+        typer.Argument(metavar="RECORDING", help="Swung for a minute about the tip, which stands in a dimple."),
+    ],
+    bench: Annotated[Path, typer.Option(metavar="BENCH", help="The instrument, calibrated otherwise.")],
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Calibration file for the bench.")] = None,
+    rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Positions of the accelerometers with 95 % intervals; name the file under [firmware] calibration of the bench.
+
+    Put the tip into a dimple, switch the manipulator to neutral, swing the handle by 20 degrees and more about all
+    axes, slowly and at 1 to 2 Hz mixed, for a minute.
+
+    Example: python -m sim_devices.plant.lab pivot --bench benches/micron.toml --out out/pivot;
+    micron calibrate positions out/pivot --bench benches/micron.toml --out out/positions.toml
+    """
+    from tools.calibrate.calibration_file import calibration_toml
+    from tools.calibrate.instrument_log import bench_sensing, instrument_readings
+    from tools.calibrate.logs import load_log
+    from tools.calibrate.positions import fit_positions
+
+    with clear_errors():
+        check_writable(json_file, out)
+        config = bench_sensing(bench)
+        log = load_log(recording, rate_hz)
+        readings, field = instrument_readings(log, config)
+        with console().status("fitting the swing"):
+            fit = fit_positions(readings, field, log.need_rate(), config)
+        table = Table(
+            title=f"{fit.seconds:.0f} s, {fit.turning_rad_s:.2f} rad/s rms, condition {fit.condition:.0f}, residual "
+            f"{1e3 * fit.residual_m_s2:.2f} mm/s^2; intervals of 95 %",
+            title_justify="left",
+        )
+        for heading in ("place", "believed (mm)", "found (mm)", "moved by (mm)"):
+            table.add_column(heading, justify="left" if heading == "place" else "right")
+        for name, before, place, reach in zip(fit.names, fit.believed, fit.places, fit.reach, strict=True):
+            table.add_row(
+                name,
+                ", ".join(f"{1e3 * v:.2f}" for v in before),
+                ", ".join(f"{1e3 * v:.3f} +- {1e3 * r:.3f}" for v, r in zip(place, reach, strict=True)),
+                ", ".join(f"{1e3 * (v - b):+.3f}" for v, b in zip(place, before, strict=True)),
+            )
+        data_console().print(table)
+        if out is not None:
+            made_by = f"micron calibrate positions {recording} --bench {bench}"
+            write_text_atomic(
+                out,
+                calibration_toml("sensor positions", made_by, {"sensing": {"positions_m": fit.places.tolist()}}),
+            )
+            console().print(f"written: {out}")
+        write_json(
+            {
+                "format": 1,
+                "positions_m": fit.places,
+                "believed_m": fit.believed,
+                "parameters": {
+                    name: {"value": e.value, "low": e.low, "high": e.high} for name, e in fit.parameters.items()
+                },
+                "residual_m_s2": fit.residual_m_s2,
+                "condition": fit.condition,
+                "seconds": fit.seconds,
+                "turning_rad_s": fit.turning_rad_s,
+            },
+            json_file,
+        )
