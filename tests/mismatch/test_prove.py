@@ -129,14 +129,17 @@ def test_null_harness_counts_and_bounds(tmp_path: Path) -> None:
     assert clopper_pearson(0, 300)[1] == pytest.approx(0.0122, abs=1e-4)  # 1 - 0.025**(1/300)
 
 
-def test_null_run_continues_where_it_was_interrupted(tmp_path: Path) -> None:
+def test_an_interrupted_null_run_ends_as_an_uninterrupted_one(tmp_path: Path) -> None:
     rows = tmp_path / "rows.json"
-    more = {"doc": None, "rows_file": rows, "max_samples": 1500, "diagnose": silent, "say": lambda text: None}
-    nulls(2, 3, 1, **more)
-    first = json.loads(rows.read_text())["rows"]
-    r = nulls(4, 9, 1, **more)
-    assert list(r.rows[:2]) == first
-    assert [x["seed"] for x in r.rows] == [3, 3, 11, 11]
+    more = {"doc": None, "max_samples": 1500, "diagnose": silent, "say": lambda text: None}
+    nulls(2, 3, 1, rows_file=rows, **more)
+    continued = nulls(4, None, 1, rows_file=rows, **more)
+    whole = nulls(4, 3, 1, **more)
+    drawn = [[{k: v for k, v in row.items() if k != "seconds"} for row in r.rows] for r in (continued, whole)]
+    assert drawn[0] == drawn[1]
+    assert [row["index"] for row in continued.rows] == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="made with seed 3, not 9"):
+        nulls(4, 9, 1, rows_file=rows, **more)
 
 
 def test_sealed_answers_come_back(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import statistics
 import sys
 import tempfile
 import time
@@ -13,11 +14,12 @@ from typing import Any
 
 from scipy.stats import beta
 
+from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.catalog import TWINS
 from tools.mismatch.prove.noise import KINDS
-from tools.mismatch.prove.proof import generate
-from tools.mismatch.prove.runner import Diagnose, diagnose_all, tool
+from tools.mismatch.prove.proof import draw_one
+from tools.mismatch.prove.runner import Diagnose, in_processes, timed, tool
 from tools.mismatch.prove.score import FALSE_ALARM, names_of
 
 DOC = Path("docs/mismatch-false-alarms.md")
@@ -25,11 +27,13 @@ DOC = Path("docs/mismatch-false-alarms.md")
 
 @dataclass(frozen=True)
 class NullResult:
-    """``rows``: one per recording (twin, noise, kind, verdict, said, alarm)."""
+    """``rows``: one per recording (twin, noise, kind, verdict, said, alarm); ``seconds`` of wall time."""
 
     seed: int
     rows: tuple[dict[str, Any], ...]
     seconds: float
+    max_samples: int = 12_000
+    revision: str = "unknown"
 
     def count(self, **where: str) -> tuple[int, int]:
         """(false alarms, recordings) among the rows that match."""
@@ -59,38 +63,45 @@ def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
     return plans, kinds
 
 
-BATCH = 4
+@dataclass(frozen=True)
+class _Null:
+    """One null recording to draw and diagnose."""
+
+    seed: int
+    index: int
+    plan: draw.Plan
+    noise: str
+    max_samples: int
+    diagnose: Diagnose
 
 
-def _batch(
-    seed: int, plans: Sequence[draw.Plan], kinds: Sequence[str], jobs: int, max_samples: int, diagnose: Diagnose
-) -> list[dict[str, Any]]:
+def _one(job: _Null) -> dict[str, Any] | None:
+    """Draw, seal, diagnose, open; the row. None when the plan cannot be drawn. What it draws depends on seed and index
+    alone, so that an interrupted run ends as an uninterrupted one."""
     with tempfile.TemporaryDirectory(prefix="micron-nulls-") as tmp:
-        paths, answers = generate(
-            seed, plans, Path(tmp) / "recordings", jobs=jobs, max_samples=max_samples, each_noise=kinds
-        )
-        digest = seal.close(answers, Path(tmp) / "sealed")
-        reports = {name: report for name, report, _ in diagnose_all(paths, jobs, diagnose)}
-        rows: list[dict[str, Any]] = []
-        for name, answer in sorted(seal.opened(Path(tmp) / "sealed", digest).items()):
-            verdict = str(reports[name]["verdict"])
-            rows.append(
-                {
-                    "seed": seed,
-                    "case": name,
-                    "twin": answer["twin"],
-                    "noise": answer["noise_kind"],
-                    "kind": answer["kind"],
-                    "declared": answer["noise_declared"],
-                    "excitation": answer["excitation"],
-                    "verdict": verdict,
-                    "said": names_of(reports[name]),
-                    "error": reports[name].get("error"),
-                    "alarm": verdict in FALSE_ALARM,
-                    "failed": verdict == "error",
-                }
-            )
-    return rows
+        drawn = draw_one((job.seed, job.index, job.plan, Path(tmp) / "recordings", job.max_samples, job.noise))
+        if drawn is None:
+            return None
+        name, answer, path = drawn
+        digest = seal.close({name: answer}, Path(tmp) / "sealed")
+        _, report, seconds = timed((name, Path(path), job.diagnose))
+        answer = seal.opened(Path(tmp) / "sealed", digest)[name]
+    verdict = str(report["verdict"])
+    return {
+        "index": job.index,
+        "twin": answer["twin"],
+        "noise": answer["noise_kind"],
+        "kind": answer["kind"],
+        "declared": answer["noise_declared"],
+        "excitation": answer["excitation"],
+        "samples": answer["samples"],
+        "verdict": verdict,
+        "said": names_of(report),
+        "error": report.get("error"),
+        "alarm": verdict in FALSE_ALARM,
+        "failed": verdict == "error",
+        "seconds": round(seconds, 2),
+    }
 
 
 def nulls(
@@ -106,27 +117,46 @@ def nulls(
 ) -> NullResult:
     """Run ``n`` null recordings; write ``doc`` unless None.
 
-    ``rows_file`` (JSON) keeps the rows after every batch; what it already holds counts, so that a run of hours may be
-    interrupted and continued. It must come from the same state of the tool: remove it when the tool changes.
+    ``rows_file`` (JSON) keeps every row as soon as it is there; what it already holds counts, so that a run of hours
+    may be interrupted and continued with the same answer. Its seed stands when none is given. ValueError when it comes
+    from another seed, record length or state of the tool.
     """
     start = time.perf_counter()
     tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
-    seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
+    revision = git_revision() or "unknown"
     rows: list[dict[str, Any]] = []
     before = 0.0
     if rows_file is not None and rows_file.exists():
         kept = json.loads(rows_file.read_text())
+        seed = int(kept["seed"]) if seed is None else seed
+        for key, mine in (("seed", seed), ("max_samples", max_samples), ("revision", revision)):
+            if kept[key] != mine:
+                raise ValueError(f"{rows_file}: made with {key} {kept[key]}, not {mine}; remove it to begin anew")
         rows, before = kept["rows"], float(kept["seconds"])
+    seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
     plans, kinds = null_plans(n)
-    tell(f"seed {seed}, {n} null recordings, {len(rows)} of them done before")
-    for first in range(len(rows), n, BATCH):
-        part = slice(first, min(first + BATCH, n))
-        rows += _batch(seed + first, plans[part], kinds[part], jobs, max_samples, diagnose)
+    done = {r["index"] for r in rows}
+    todo = [_Null(seed, i, plans[i], kinds[i], max_samples, diagnose) for i in range(n) if i not in done]
+    tell(f"seed {seed}, {n} null recordings, {n - len(todo)} of them done before")
+    missed = 0
+    for row in in_processes(_one, todo, jobs):
+        if row is None:
+            missed += 1
+            continue
+        rows.append(row)
         seconds = before + time.perf_counter() - start
         if rows_file is not None:
-            rows_file.write_text(json.dumps({"seconds": seconds, "rows": rows}, indent=1))
-        tell(f"{len(rows)}/{n}, {sum(r['alarm'] for r in rows)} false alarms, {seconds:.0f} s")
-    result = NullResult(seed, tuple(rows), before + time.perf_counter() - start)
+            head = {"seed": seed, "max_samples": max_samples, "revision": revision, "seconds": seconds}
+            partial = rows_file.with_suffix(".part")
+            partial.write_text(json.dumps({**head, "rows": rows}, indent=1))
+            partial.replace(rows_file)
+        alarm = f"  FALSE ALARM {row['verdict']} {','.join(row['said'])}" if row["alarm"] else ""
+        tell(
+            f"{len(rows)}/{n - missed}, {sum(r['alarm'] for r in rows)} false alarms, {seconds:.0f} s  "
+            f"#{row['index']} {row['twin']} {row['noise']} {row['seconds']:.1f} s{alarm}"
+        )
+    rows = sorted((r for r in rows if r["index"] < n), key=lambda r: r["index"])
+    result = NullResult(seed, tuple(rows), before + time.perf_counter() - start, max_samples, revision)
     if doc is not None:
         doc.parent.mkdir(parents=True, exist_ok=True)
         doc.write_text(document(result))
@@ -147,8 +177,8 @@ def _by(result: NullResult, key: str, values: Sequence[str]) -> list[str]:
     return lines
 
 
-def document(result: NullResult, note: str = "") -> str:
-    """The text of docs/mismatch-false-alarms.md. ``note`` on the state of the tool and what was not run."""
+def document(result: NullResult) -> str:
+    """The text of docs/mismatch-false-alarms.md."""
     k, n = result.count()
     failed = sum(r["failed"] for r in result.rows)
     named: dict[str, int] = {}
@@ -158,6 +188,7 @@ def document(result: NullResult, note: str = "") -> str:
             named[word] = named.get(word, 0) + 1
     false_names = sum(bool(r["said"]) and r["alarm"] for r in result.rows)
     exact = sum(r["verdict"] == r["kind"] for r in result.rows)
+    seconds = statistics.median(r["seconds"] for r in result.rows)
     lines = [
         "# False alarms of the mismatch tool",
         "",
@@ -167,8 +198,9 @@ def document(result: NullResult, note: str = "") -> str:
         "one third needs recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
         "Intervals are Clopper-Pearson, 95 %.",
         "",
-        *([note, ""] if note else []),
-        f"{n} recordings, {result.seconds:.0f} s; seeds {', '.join(sorted({str(r['seed']) for r in result.rows}))}.",
+        f"{n} recordings of at most {result.max_samples} samples, seed {result.seed}, tool {result.revision[:12]}, "
+        f"{time.strftime('%Y-%m-%d', time.gmtime())}; {result.seconds:.0f} s, median {seconds:.1f} s a recording. "
+        f"`--seed {result.seed} --n {n} --max-samples {result.max_samples}` makes them again.",
         "",
         f"- false alarms: {_cell(k, n)}",
         f"- of these with a false name: {_cell(false_names, n)}",
@@ -199,9 +231,12 @@ def main() -> None:
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--max-samples", type=int, default=12_000)
     p.add_argument("--doc", type=Path, default=DOC)
-    p.add_argument("--rows", type=Path, default=None, help="JSON kept after every batch, and continued from")
+    p.add_argument("--rows", type=Path, default=None, help="JSON kept after every recording, and continued from")
     a = p.parse_args()
-    print(document(nulls(a.n, a.seed, a.jobs, doc=a.doc, rows_file=a.rows, max_samples=a.max_samples)))
+    try:
+        print(document(nulls(a.n, a.seed, a.jobs, doc=a.doc, rows_file=a.rows, max_samples=a.max_samples)))
+    except (ValueError, OSError) as error:  # rows of another run, a file that cannot be written
+        p.error(str(error))
 
 
 if __name__ == "__main__":

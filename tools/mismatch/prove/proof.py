@@ -45,7 +45,9 @@ class ProofResult:
         }
 
 
-def _generate(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[str, dict[str, Any], str] | None:
+def draw_one(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[str, dict[str, Any], str] | None:
+    """(name, answer, path) of one recording written below a folder; its noise is kept beside that folder. None when no
+    scene shows the effect. ``job``: seed, index, plan, folder, most samples, kind of noise (None: drawn)."""
     seed, index, plan, folder, max_samples, noise_kind = job
     case = None
     # where no scene shows the effect at this severity, a larger one takes its place
@@ -79,9 +81,9 @@ def generate(
     work = [(seed, i, p, folder, max_samples, each_noise[i] if each_noise else None) for i, p in enumerate(plans)]
     if jobs > 1:
         with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-            done = list(pool.map(_generate, work))
+            done = list(pool.map(draw_one, work))
     else:
-        done = [_generate(w) for w in work]
+        done = [draw_one(w) for w in work]
     kept = [d for d in done if d is not None]
     return {n: Path(p) for n, _, p in kept}, {n: a for n, a, _ in kept}
 

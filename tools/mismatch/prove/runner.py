@@ -10,9 +10,11 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 Diagnose = Callable[[Path], dict[str, Any]]
+A = TypeVar("A")
+B = TypeVar("B")
 
 
 def tool(path: Path) -> dict[str, Any]:
@@ -54,12 +56,16 @@ def diagnose_all(
     paths: dict[str, Path], jobs: int, diagnose: Diagnose = tool
 ) -> Iterator[tuple[str, dict[str, Any], float]]:
     """(name, report, seconds) as they finish; ``jobs`` processes, in this one if 1."""
-    work: Sequence[tuple[str, Path, Diagnose]] = [(k, p, diagnose) for k, p in paths.items()]
-    if jobs <= 1:
-        yield from map(timed, work)
+    yield from in_processes(timed, [(k, p, diagnose) for k, p in paths.items()], jobs)
+
+
+def in_processes(function: Callable[[A], B], items: Sequence[A], jobs: int) -> Iterator[B]:
+    """Results as they finish, from ``jobs`` processes with one thread each; in this process if 1."""
+    if jobs <= 1 or len(items) < 2:
+        yield from map(function, items)
         return
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(key, "1")
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
-        for done in as_completed([pool.submit(timed, w) for w in work]):
+    with ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context("spawn")) as pool:
+        for done in as_completed([pool.submit(function, item) for item in items]):
             yield done.result()
