@@ -84,9 +84,9 @@ def _one(job: _Null) -> dict[str, Any] | None:
             return None
         name, answer, path = drawn
         digest = seal.close({name: answer}, Path(tmp) / "sealed")
-        _, report, seconds = timed((name, Path(path), job.diagnose))
+        done = timed((name, Path(path), job.diagnose))
         answer = seal.opened(Path(tmp) / "sealed", digest)[name]
-    verdict = str(report["verdict"])
+    verdict = str(done.report["verdict"])
     return {
         "index": job.index,
         "twin": answer["twin"],
@@ -96,11 +96,11 @@ def _one(job: _Null) -> dict[str, Any] | None:
         "excitation": answer["excitation"],
         "samples": answer["samples"],
         "verdict": verdict,
-        "said": names_of(report),
-        "error": report.get("error"),
+        "said": names_of(done.report),
+        "error": done.report.get("error"),
         "alarm": verdict in FALSE_ALARM,
         "failed": verdict == "error",
-        "seconds": round(seconds, 2),
+        "cpu_s": round(done.cpu_s, 2),
     }
 
 
@@ -153,7 +153,7 @@ def nulls(
         alarm = f"  FALSE ALARM {row['verdict']} {','.join(row['said'])}" if row["alarm"] else ""
         tell(
             f"{len(rows)}/{n - missed}, {sum(r['alarm'] for r in rows)} false alarms, {seconds:.0f} s  "
-            f"#{row['index']} {row['twin']} {row['noise']} {row['seconds']:.1f} s{alarm}"
+            f"#{row['index']} {row['twin']} {row['noise']} {row['cpu_s']:.1f} s of CPU{alarm}"
         )
     rows = sorted((r for r in rows if r["index"] < n), key=lambda r: r["index"])
     result = NullResult(seed, tuple(rows), before + time.perf_counter() - start, max_samples, revision)
@@ -188,7 +188,7 @@ def document(result: NullResult) -> str:
             named[word] = named.get(word, 0) + 1
     false_names = sum(bool(r["said"]) and r["alarm"] for r in result.rows)
     exact = sum(r["verdict"] == r["kind"] for r in result.rows)
-    seconds = statistics.median(r["seconds"] for r in result.rows)
+    cpu_s = statistics.median(r["cpu_s"] for r in result.rows)
     lines = [
         "# False alarms of the mismatch tool",
         "",
@@ -199,7 +199,7 @@ def document(result: NullResult) -> str:
         "Intervals are Clopper-Pearson, 95 %.",
         "",
         f"{n} recordings of at most {result.max_samples} samples, seed {result.seed}, tool {result.revision[:12]}, "
-        f"{time.strftime('%Y-%m-%d', time.gmtime())}; {result.seconds:.0f} s, median {seconds:.1f} s a recording. "
+        f"{time.strftime('%Y-%m-%d', time.gmtime())}; {result.seconds:.0f} s, median {cpu_s:.1f} s of CPU a recording. "
         f"`--seed {result.seed} --n {n} --max-samples {result.max_samples}` makes them again.",
         "",
         f"- false alarms: {_cell(k, n)}",

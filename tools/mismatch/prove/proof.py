@@ -17,7 +17,7 @@ import numpy as np
 
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.disk import write
-from tools.mismatch.prove.runner import Diagnose, diagnose_all, tool
+from tools.mismatch.prove.runner import Diagnose, Done, diagnose_all, tool
 from tools.mismatch.prove.score import score, summary
 
 
@@ -117,19 +117,26 @@ def prove(
     missing = "" if len(answers) == cases else f" ({cases - len(answers)} could not be drawn)"
     say(f"{len(answers)} recordings written{missing}; answers sealed, sha256 {digest}")
     del answers
-    reports: dict[str, tuple[dict[str, Any], float]] = {}
+    reports: dict[str, Done] = {}
     (folder / "reports").mkdir(exist_ok=True)
-    for name, report, seconds in diagnose_all(paths, jobs, diagnose):
-        reports[name] = (report, seconds)
-        (folder / "reports" / f"{name}.json").write_text(json.dumps(report, indent=1))
-        say(f"{len(reports)}/{len(paths)}  {name}  {seconds:.1f} s")
+    for done in diagnose_all(paths, jobs, diagnose):
+        reports[done.name] = done
+        (folder / "reports" / f"{done.name}.json").write_text(json.dumps(done.report, indent=1))
+        say(f"{len(reports)}/{len(paths)}  {done.name}  {done.wall_s:.1f} s, {done.cpu_s:.1f} s of CPU")
     opened = seal.opened(folder / "sealed", digest)
     rows: list[dict[str, Any]] = []
     for name in sorted(reports):
-        report, seconds = reports[name]
+        done = reports[name]
+        report = done.report
         spans = (report.get("fit") or {}).get("held_out_spans")
         oracle = seal.noise_on(folder / "sealed", name, spans) if spans else None
         rows.append(
-            {"case": name, "path": str(paths[name]), "wall_s": round(seconds, 2), **score(opened[name], report, oracle)}
+            {
+                "case": name,
+                "path": str(paths[name]),
+                "wall_s": round(done.wall_s, 2),
+                "cpu_s": round(done.cpu_s, 2),
+                **score(opened[name], report, oracle),
+            }
         )
     return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder)

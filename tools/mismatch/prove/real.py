@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove.disk import toml_text
-from tools.mismatch.prove.runner import Diagnose, diagnose_all, tool
+from tools.mismatch.prove.runner import Diagnose, as_plain, diagnose_all
 
 DOC = Path("docs/mismatch-on-real-data.md")
 DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
@@ -187,7 +188,7 @@ def joined(real: RealSet, data: Path, folder: Path) -> Path:
 class RealRow:
     real: RealSet
     report: dict[str, Any]
-    seconds: float
+    cpu_s: float
 
     def rms(self, key: str) -> float | None:
         value = ((self.report.get("fit") or {}).get(key) or {}).get(self.real.output)
@@ -198,12 +199,29 @@ class RealRow:
         return f"{self.report['verdict']}: {', '.join(names)}" if names else str(self.report["verdict"])
 
 
+def tool_aloud(path: Path) -> dict[str, Any]:
+    """As ``tool``; says on standard error every few seconds how far it is."""
+    from tools.mismatch.engine.diagnose import diagnose
+    from tools.mismatch.recording import load
+
+    began = last = time.monotonic()
+
+    def say(what: str, done: int, total: int) -> None:
+        nonlocal last
+        now = time.monotonic()
+        if now - last > 5.0:
+            last = now
+            print(f"  {path.parent.name}: {what} {done}/{total}, {now - began:.0f} s", file=sys.stderr, flush=True)
+
+    return as_plain(diagnose(load(path), jobs=1, seed=0, progress=say))
+
+
 def run(
     data: Path = DATA,
     *,
     only: Sequence[str] = (),
     jobs: int = 1,
-    diagnose: Diagnose = tool,
+    diagnose: Diagnose = tool_aloud,
     say: Callable[[str], None] | None = None,
     rows_file: Path | None = None,
 ) -> list[RealRow]:
@@ -222,12 +240,13 @@ def run(
         paths = {
             name: joined(s, data, Path(tmp) / name.replace(" ", "_")) for name, s in chosen.items() if name not in kept
         }
-        rows = {name: RealRow(wanted[name], k["report"], k["seconds"]) for name, k in kept.items() if name in wanted}
-        for name, report, seconds in diagnose_all(paths, jobs, diagnose):
-            rows[name] = RealRow(chosen[name], report, seconds)
-            tell(f"{name}: {rows[name].said()} ({seconds:.0f} s)")
+        rows = {name: RealRow(wanted[name], k["report"], k["cpu_s"]) for name, k in kept.items() if name in wanted}
+        for done in diagnose_all(paths, jobs, diagnose):
+            name = done.name
+            rows[name] = RealRow(chosen[name], done.report, done.cpu_s)
+            tell(f"{name}: {rows[name].said()} ({done.wall_s:.0f} s, {done.cpu_s:.0f} s of CPU)")
             if rows_file is not None:
-                kept[name] = {"report": report, "seconds": seconds}
+                kept[name] = {"report": done.report, "cpu_s": done.cpu_s}
                 rows_file.write_text(json.dumps(kept))
     return [rows[name] for name in wanted]
 
@@ -266,9 +285,10 @@ def _figure(value: float | None) -> str:
     return "" if value is None else f"{value:.3g}"
 
 
-def document(rows: Sequence[RealRow], note: str = "") -> str:
-    """The text of docs/mismatch-on-real-data.md. ``note``: state of the tool; sets that were not run are named."""
+def document(rows: Sequence[RealRow]) -> str:
+    """The text of docs/mismatch-on-real-data.md; sets that were not run are named."""
     absent = [s.name for s in SETS if s.name not in {r.real.name for r in rows}]
+    date = time.strftime("%Y-%m-%d", time.gmtime())
     lines = [
         "# The mismatch tool on measured recordings",
         "",
@@ -277,16 +297,17 @@ def document(rows: Sequence[RealRow], note: str = "") -> str:
         "test sweep, since the lag differs from run to run). Errors are rms on data that no fit has seen. The data "
         "are not part of the repository.",
         "",
-        *([note, ""] if note else []),
+        f"Tool {git_revision()[:12]}, {date}. The seconds are CPU time of one process.",
+        "",
         *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
-        "| set | unit | naive | re-calibrated | with physics | noise floor (tool's) | published | what it said | s |",
+        "| set | unit | naive | re-calibrated | with physics | noise (tool's) | published | what it said | CPU s |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         published = "; ".join(f"{p.figure:g} ({p.what})" for p in r.real.published)
         cells = [_figure(r.rms(k)) for k in ("base_rms", "recalibrated_rms", "fitted_rms", "noise_floor_rms")]
         lines.append(
-            f"| {r.real.name} | {r.real.unit} | {' | '.join(cells)} | {published} | {r.said()} | {r.seconds:.0f} |"
+            f"| {r.real.name} | {r.real.unit} | {' | '.join(cells)} | {published} | {r.said()} | {r.cpu_s:.0f} |"
         )
     lines.append("")
     for r in rows:
@@ -321,14 +342,13 @@ def reproduce(
     jobs: int = 1,
     doc: Path | None = DOC,
     rows_file: Path | None = None,
-    note: str = "",
 ) -> dict[str, Any]:
     """Run all sets, write the page, return the JSON of `micron reproduce mismatch-real`."""
     start = time.perf_counter()
     rows = run(data, only=only, jobs=jobs, rows_file=rows_file)
     if doc is not None:
         doc.parent.mkdir(parents=True, exist_ok=True)
-        doc.write_text(document(rows, note))
+        doc.write_text(document(rows))
     return rows_json(rows, time.perf_counter() - start)
 
 
@@ -344,10 +364,9 @@ def main() -> None:
     p.add_argument("--jobs", type=int, default=1)
     p.add_argument("--doc", type=Path, default=DOC)
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every set, and continued from")
-    p.add_argument("--note", default="", help="a line on the state of the tool, for the page")
     p.add_argument("--json", type=Path, default=None)
     a = p.parse_args()
-    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows, note=a.note)
+    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows)
     text = json.dumps(result, indent=1)
     if a.json:
         a.json.write_text(text)

@@ -8,6 +8,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,10 +38,20 @@ def as_plain(report: Any) -> dict[str, Any]:
     raise TypeError(f"cannot read a report of type {type(report).__name__}")
 
 
-def timed(job: tuple[str, Path, Diagnose]) -> tuple[str, dict[str, Any], float]:
+@dataclass(frozen=True)
+class Done:
+    """One diagnosis: its JSON report, wall time, and CPU time of the process that made it."""
+
+    name: str
+    report: dict[str, Any]
+    wall_s: float
+    cpu_s: float
+
+
+def timed(job: tuple[str, Path, Diagnose]) -> Done:
     """One diagnosis; an exception becomes a report with the verdict 'error'."""
     name, path, diagnose = job
-    start = time.perf_counter()
+    wall, cpu = time.perf_counter(), time.process_time()
     try:
         report = diagnose(path)
     except Exception as e:  # a crash of the tool is a result to be counted, not ours to raise
@@ -49,13 +60,11 @@ def timed(job: tuple[str, Path, Diagnose]) -> tuple[str, dict[str, Any], float]:
             "verdict": "error",
             "error": f"{type(e).__name__}: {e} ({Path(last.filename).name}:{last.lineno})",
         }
-    return name, report, time.perf_counter() - start
+    return Done(name, report, time.perf_counter() - wall, time.process_time() - cpu)
 
 
-def diagnose_all(
-    paths: dict[str, Path], jobs: int, diagnose: Diagnose = tool
-) -> Iterator[tuple[str, dict[str, Any], float]]:
-    """(name, report, seconds) as they finish; ``jobs`` processes, in this one if 1."""
+def diagnose_all(paths: dict[str, Path], jobs: int, diagnose: Diagnose = tool) -> Iterator[Done]:
+    """Diagnoses as they finish; ``jobs`` processes, in this one if 1."""
     yield from in_processes(timed, [(k, p, diagnose) for k, p in paths.items()], jobs)
 
 

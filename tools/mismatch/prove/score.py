@@ -193,7 +193,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     }
     foreseeable = [r for r in named if r.get("predictable") and r["explained"] is not None]
     cover = [c for r in single + pairs for c in r.get("coverage") or []]
-    seconds = sorted(r["wall_s"] for r in rows if r.get("wall_s") is not None)
+    cpu_s = sorted(r["cpu_s"] for r in rows if r.get("cpu_s") is not None)
     return {
         "cases": len(rows),
         "named_severity_4_up": _share([r for r in single if r["severity"] >= 4], "ok"),
@@ -212,8 +212,9 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "below_noise": _share([r for r in rows if r["ratio"] is not None], "below_noise"),
         "ci_coverage": [sum(c["covered"] for c in cover), len(cover)],
         "errors": [sum(bool(r.get("error")) for r in rows), len(rows)],
-        "seconds_median": seconds[len(seconds) // 2] if seconds else None,
-        "seconds_max": seconds[-1] if seconds else None,
+        "cpu_s_median": cpu_s[len(cpu_s) // 2] if cpu_s else None,
+        "cpu_s_max": cpu_s[-1] if cpu_s else None,
+        "cpu_s_total": round(sum(cpu_s), 1),
         "by_class": by_class,
         "confusion": confusion,
         "weak_classes": weak,

@@ -64,8 +64,8 @@ def render(result: ProofResult) -> RenderableType:
     s = result.summary
     weak = ", ".join(f"{k} {v[0]}/{v[1]}" for k, v in sorted(s["weak_classes"].items())) or "none"
     foot = (
-        f"seed {result.seed}, {s['cases']} cases, {result.seconds:.0f} s; per case median "
-        f"{s['seconds_median'] or 0:.1f} s, longest {s['seconds_max'] or 0:.1f} s\nweak classes: {weak}"
+        f"seed {result.seed}, {s['cases']} cases, {result.seconds:.0f} s; CPU of diagnoses {s['cpu_s_total']:.0f} s "
+        f"(median {s['cpu_s_median'] or 0:.1f} s, longest {s['cpu_s_max'] or 0:.1f} s)\nweak classes: {weak}"
     )
     return Group(_totals(s), _confusion(s), foot)
 
