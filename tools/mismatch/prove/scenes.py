@@ -57,8 +57,9 @@ def _timing(rng: Rng, wish: Wish) -> tuple[float, int]:
     """(rate_hz, samples)."""
     if wish.excitation.startswith("slow"):
         return 1.0, int(min(rng.uniform(1.0, 8.0) * 3600.0, wish.max_samples))
-    rate = float(rng.choice([200.0, 250.0, 400.0, 500.0, 1000.0]))
     low = max(10.0, wish.least_s)
+    rates = (200.0, 250.0, 400.0, 500.0, 1000.0)
+    rate = float(rng.choice([r for r in rates if r * low <= wish.max_samples] or rates[:1]))
     longest = max(min(120.0, wish.max_samples / rate), low * 1.05)
     return rate, int(rate * np.exp(rng.uniform(np.log(low), np.log(longest))))
 
