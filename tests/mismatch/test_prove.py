@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from tools.mismatch.prove import prove, real, seal
+from tools.mismatch.prove import draw, page, prove, real, seal
 from tools.mismatch.prove.nulls import clopper_pearson, document, nulls
 from tools.mismatch.prove.score import coverage, score
 from tools.mismatch.prove.table import failures, show
@@ -58,7 +58,7 @@ def test_a_perfect_tool_scores_full_marks_and_a_silent_one_none(tmp_path: Path) 
     for key in ("named_severity_4_up", "named_severity_2", "pairs_both_named", "unknown_with_right_signal"):
         assert s[key][0] == s[key][1]
     assert s["false_alarms"][0] == s["below_noise"][0] == s["errors"][0] == 0
-    assert failures(good) == []
+    assert failures(good.rows) == []
     bad = prove(12, 21, 1, tmp_path / "bad", diagnose=silent, **QUIET)
     assert bad.summary["named_severity_4_up"][0] == 0
     assert bad.summary["false_alarms"][0] == 0
@@ -66,7 +66,15 @@ def test_a_perfect_tool_scores_full_marks_and_a_silent_one_none(tmp_path: Path) 
     text = io.StringIO()
     show(bad, Console(file=text, width=140))
     assert "weak classes" in text.getvalue()
-    json.dumps(bad.to_json())
+    proofs = [tmp_path / "good.json", tmp_path / "bad.json"]
+    for file, result in zip(proofs, (good, bad), strict=True):
+        file.write_text(json.dumps(result.to_json()))
+    text = page.document([page.read(file) for file in proofs])
+    assert "24 cases" in text
+    assert text.count(good.digest) == 2
+    n = good.summary["named_severity_4_up"][1]
+    assert f"severity 4 and above | {n} of {2 * n} | 50 %" in text
+    assert text.count("- WRONG") == len(failures(bad.rows))
 
 
 def test_the_hash_is_said_before_any_diagnosis_and_a_broken_seal_is_noticed(tmp_path: Path) -> None:
@@ -165,7 +173,17 @@ def test_real_sets_carry_their_official_split(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_small_real_proof(tmp_path: Path) -> None:
-    """Six cases through the real tool: it runs, names most, and raises no alarm on the controls."""
-    r = prove(6, 1, 1, tmp_path, max_samples=6000, progress=lambda text: None)
-    assert r.summary["errors"][0] == 0
-    assert r.summary["false_alarms"][0] == 0
+    """One case of each kind through the real tool: what is plain is named, controls raise no alarm."""
+    plans = (
+        draw.Plan("single", "piezo_stack", ("backlash",), 10.0),
+        draw.Plan("single", "mechanical_axis", ("coulomb_friction",), 10.0),
+        draw.Plan("pair", "magnetometer", ("current_coupling", "thermal_drift"), 10.0),
+        draw.Plan("agrees", "accelerometer_cluster", (), 4.0),
+        draw.Plan("recalibrate", "state_space", (), 10.0),
+        draw.Plan("unknown", "accelerometer", (), 30.0),
+    )
+    s = prove(seed=1, jobs=1, folder=tmp_path, plans=plans, max_samples=2500, progress=lambda text: None).summary
+    assert s["cases"] == 6
+    assert s["errors"][0] == s["false_alarms"][0] == s["below_noise"][0] == 0
+    for measure in ("named_severity_4_up", "pairs_both_named", "controls_verdict_right", "unknown_unexplained"):
+        assert s[measure][0] == s[measure][1] > 0, measure

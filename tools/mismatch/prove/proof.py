@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.disk import write
 from tools.mismatch.prove.runner import Diagnose, Done, diagnose_all, tool
@@ -31,6 +32,7 @@ class ProofResult:
     summary: dict[str, Any]
     seconds: float
     folder: Path
+    max_samples: int = 24_000
 
     def to_json(self) -> dict[str, Any]:
         """What `micron mismatch prove --json` writes."""
@@ -38,6 +40,9 @@ class ProofResult:
             "format": 1,
             "seed": self.seed,
             "answers_sha256": self.digest,
+            "revision": git_revision(),
+            "date": time.strftime("%Y-%m-%d", time.gmtime()),
+            "max_samples": self.max_samples,
             "seconds": round(self.seconds, 1),
             "folder": str(self.folder),
             "summary": self.summary,
@@ -95,6 +100,7 @@ def prove(
     folder: Path | None = None,
     *,
     only: tuple[str, str, float] | None = None,
+    plans: Sequence[draw.Plan] | None = None,
     max_samples: int = 24_000,
     diagnose: Diagnose = tool,
     progress: Any = None,
@@ -102,19 +108,18 @@ def prove(
     """Draw ``cases`` cases, seal the answers, run the tool on each, open the seal, score.
 
     ``seed`` None draws a fresh one from the clock; it is printed. ``folder`` keeps everything (a temporary
-    folder otherwise). ``only`` = (twin, effect, severity) restricts the single effects. ``progress`` is called
-    with one line of text per event; standard error by default.
+    folder otherwise). ``only`` = (twin, effect, severity) restricts the single effects; ``plans`` takes the place of
+    what would be drawn. ``progress`` is called with one line of text per event; standard error by default.
     """
     start = time.perf_counter()
     say = progress or (lambda text: print(text, file=sys.stderr, flush=True))
     seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
     folder = Path(tempfile.mkdtemp(prefix="micron-prove-")) if folder is None else folder
-    say(f"seed {seed}, {cases} cases, folder {folder}")
-    paths, answers = generate(
-        seed, draw.plans(seed, cases, only), folder / "recordings", jobs=jobs, max_samples=max_samples
-    )
+    asked = draw.plans(seed, cases, only) if plans is None else plans
+    say(f"seed {seed}, {len(asked)} cases, folder {folder}")
+    paths, answers = generate(seed, asked, folder / "recordings", jobs=jobs, max_samples=max_samples)
     digest = seal.close(answers, folder / "sealed")
-    missing = "" if len(answers) == cases else f" ({cases - len(answers)} could not be drawn)"
+    missing = "" if len(answers) == len(asked) else f" ({len(asked) - len(answers)} could not be drawn)"
     say(f"{len(answers)} recordings written{missing}; answers sealed, sha256 {digest}")
     del answers
     reports: dict[str, Done] = {}
@@ -139,4 +144,4 @@ def prove(
                 **score(opened[name], report, oracle),
             }
         )
-    return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder)
+    return ProofResult(seed, digest, tuple(rows), summary(rows), time.perf_counter() - start, folder, max_samples)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rich.console import Console, Group, RenderableType
@@ -65,15 +66,16 @@ def render(result: ProofResult) -> RenderableType:
     weak = ", ".join(f"{k} {v[0]}/{v[1]}" for k, v in sorted(s["weak_classes"].items())) or "none"
     foot = (
         f"seed {result.seed}, {s['cases']} cases, {result.seconds:.0f} s; CPU of diagnoses {s['cpu_s_total']:.0f} s "
-        f"(median {s['cpu_s_median'] or 0:.1f} s, longest {s['cpu_s_max'] or 0:.1f} s)\nweak classes: {weak}"
+        f"(median {s['cpu_s_median'] or 0:.1f} s, longest {s['cpu_s_max'] or 0:.1f} s)\nweak classes: {weak}\n"
+        f"recordings and reports: {result.folder}"
     )
     return Group(_totals(s), _confusion(s), foot)
 
 
-def failures(result: ProofResult) -> list[str]:
-    """One line per case that went wrong: path, what was true, what was said."""
+def failures(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """One line per case that went wrong: what was true, what was said."""
     out: list[str] = []
-    for r in result.rows:
+    for r in rows:
         if r["ok"] and not r.get("extra"):
             continue
         if r["kind"] in ("agrees", "recalibrate") and not r["false_alarm"]:
@@ -85,13 +87,13 @@ def failures(result: ProofResult) -> list[str]:
         error = f" {r['error']}" if r["error"] else ""
         follows = f" follows {','.join(r['follows'])}" if r["kind"] == "unknown" else ""
         out.append(
-            f"{word} {r['twin']} {true} ({'+'.join(r['form']) or '-'}) severity {r['severity']:g} "
-            f"{r['excitation']} noise {r['noise_kind']}: {r['verdict']} {said}{follows}{ratio}{error}  {r['path']}"
+            f"{word} {r['case']} {r['twin']} {true} ({'+'.join(r['form']) or '-'}) severity {r['severity']:g} "
+            f"{r['excitation']} noise {r['noise_kind']}: {r['verdict']} {said}{follows}{ratio}{error}"
         )
     return out
 
 
 def show(result: ProofResult, console: Console) -> None:
     console.print(render(result))
-    for line in failures(result):
+    for line in failures(result.rows):
         console.print(line, soft_wrap=True, markup=False, highlight=False)
