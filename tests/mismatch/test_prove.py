@@ -176,14 +176,14 @@ def test_small_real_proof(tmp_path: Path) -> None:
     """One case of each kind through the real tool: what is plain is named, controls raise no alarm."""
     plans = (
         draw.Plan("single", "piezo_stack", ("backlash",), 10.0),
-        draw.Plan("single", "mechanical_axis", ("coulomb_friction",), 10.0),
-        draw.Plan("pair", "magnetometer", ("current_coupling", "thermal_drift"), 10.0),
+        draw.Plan("single", "accelerometer", ("misalignment",), 10.0),
+        draw.Plan("pair", "piezo_stack", ("saturation", "mains_interference"), 10.0),
         draw.Plan("agrees", "accelerometer_cluster", (), 4.0),
         draw.Plan("recalibrate", "state_space", (), 10.0),
-        draw.Plan("unknown", "accelerometer", (), 30.0),
+        draw.Plan("unknown", "piezo_stack", (), 30.0),
     )
     s = prove(seed=1, jobs=1, folder=tmp_path, plans=plans, max_samples=2500, progress=lambda text: None).summary
     assert s["cases"] == 6
     assert s["errors"][0] == s["false_alarms"][0] == s["below_noise"][0] == 0
-    for measure in ("named_severity_4_up", "pairs_both_named", "controls_verdict_right", "unknown_unexplained"):
+    for measure in ("named_severity_4_up", "pairs_both_named", "controls_verdict_right", "unknown_with_right_signal"):
         assert s[measure][0] == s[measure][1] > 0, measure
