@@ -8,6 +8,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import FRICTION
+from sim_devices.physics.hysteresis import stops
 from sim_devices.physics.statistics import least_squares, smooth, thin
 
 
@@ -70,7 +71,56 @@ def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Huma
     )
 
 
+PRESLIDING = (0.001, 0.004, 0.015)
+"""Distances over which bristles yield, relative to half the travel: LuGre and Dahl friction before it slides."""
+
+
+def _presliding_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    half = 0.5 * float(np.ptp(x)) or 1.0
+    return {"presliding": tuple(float(half * f) for f in PRESLIDING)}
+
+
+def _presliding_parts(settings: Settings) -> Parts:
+    n = len(settings.get("presliding", PRESLIDING))
+    return Parts((), tuple(Parameter(f"bristle{i + 1}", "{out}/s^2/{out}") for i in range(n)), 0.05 * np.eye(n))
+
+
+def _presliding_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    r = np.array(settings.get("presliding", PRESLIDING))
+    return -stops(x, r, float(x[0]), np.array(ctx.starts, np.int64))
+
+
+def _presliding_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    return {"thresholds": np.array(settings["presliding"]), "memory": np.asarray(w)}
+
+
+def _presliding_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    level = float(p @ np.array(settings["presliding"]))
+    stiffness = float(p.sum())
+    return (
+        Human("coulomb_forward", level / g, "{in}"),
+        Human("coulomb_backward", level / g, "{in}"),
+        Human("presliding_distance", level / stiffness if stiffness else 0.0, "{out}"),
+    )
+
+
 _FRICTION_SOURCE = "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, eqs. 1-3"
+
+_BRISTLES = Effect(
+    name="coulomb_friction",
+    summary="constant force against the motion, behind bristles that give way over a small distance",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_presliding_parts,
+    equation=r"m\ddot x = F - \sum_i \sigma_i\,(x - P_{r_i}[x]),\; r_i \ll \text{travel}",
+    source="P. R. Dahl, AIAA J. 14 (1976) 1675; F. Al-Bender et al., IEEE Trans. AC 50 (2005) 1883, eq. 3",
+    excitation="reversals of motion, at speeds that differ",
+    prepare=_presliding_settings,
+    basis=_presliding_basis,
+    fill=_presliding_fill,
+    report=_presliding_report,
+)
 
 COULOMB_FRICTION = Effect(
     name="coulomb_friction",
@@ -86,6 +136,7 @@ COULOMB_FRICTION = Effect(
     basis=_coulomb_basis,
     fill=_coulomb_fill,
     report=_coulomb_report,
+    variants=(_BRISTLES,),
 )
 
 

@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import least_squares, thin
+from sim_devices.physics.statistics import least_squares, runs, thin
 
 N_PLAYS = 10
 FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays")
@@ -119,6 +120,42 @@ def relays(x, lo, hi, count, starts):
 
 N_DAHL = 7
 N_GRID = 8
+MASING = ("stops", "dahl", "dahl_stops")
+"""Forms in which one outer loop says what every minor loop is (Masing's rule)."""
+
+
+def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
+    """Whether x (n,) turns at two levels only where it may be looked at: then minor loops are nowhere to be seen."""
+    span = float(np.ptp(x[keep])) if keep.any() else 0.0
+    if span == 0.0:
+        return False
+    turns: list[float] = []
+    for a, b in runs(keep):
+        v = turning_points(x[a:b], 0.02 * span)
+        turns += v
+    high = np.array([v for v in turns if v > np.median(x[keep])])
+    low = np.array([v for v in turns if v <= np.median(x[keep])])
+    if min(high.size, low.size) < 3:
+        return False
+    return all(float(np.quantile(v, 0.9) - np.quantile(v, 0.1)) < 0.05 * span for v in (high, low))
+
+
+def turning_points(x: Array, least: float) -> list[float]:
+    """Values at which x (n,) turns by more than ``least``, without the ends."""
+    out: list[float] = []
+    top = bottom = float(x[0])
+    going = 0
+    for v in x.tolist():
+        top, bottom = max(top, v), min(bottom, v)
+        if going >= 0 and top - v > least:
+            if going:
+                out.append(top)
+            going, bottom = -1, v
+        elif going <= 0 and v - bottom > least:
+            if going:
+                out.append(bottom)
+            going, top = 1, v
+    return out
 
 
 def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tuple[int, ...]) -> Array:
@@ -183,7 +220,7 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     lo, hi = float(x.min()), float(x.max())
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
-    form = choose_form(x, residual, ctx, lo, hi)
+    form = choose_form(x, residual, ctx, lo, hi, MASING if one_loop(x, ctx.keep) else FORMS)
     return {"range": (lo, hi), "rest": (float(x[0]),), "form": (float(FORMS.index(form)),)}
 
 

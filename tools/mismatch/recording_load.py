@@ -97,7 +97,7 @@ def load_recording(path: Path) -> Recording:
             notes.append(f"column '{c.column}' ({c.role} '{c.signal}') never changes")
         parts[c.role][c.signal] = values
     _same_data(data_path, channels, columns, notes)
-    return Recording(
+    recording = Recording(
         path=path,
         title=str(text.get("title", path.stem)),
         t=np.asarray(np.arange(n) * dt, np.float64),
@@ -119,6 +119,11 @@ def load_recording(path: Path) -> Recording:
         },
         warnings=tuple(notes),
     )
+    if twin.kind == "state_space":
+        from tools.mismatch.recording_units import in_twin_units
+
+        return in_twin_units(recording)
+    return recording
 
 
 def _toml(path: Path) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from tools.mismatch.engine.unexplained import about, lead, leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make
 
 Progress = Callable[[str, int, int], None]
@@ -61,13 +60,14 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
 
     Only a plant that truly integrates is started afresh: a spring or drag forgets its start within the record.
     """
-    if not isinstance(twin, DynamicTwin):
+    fastest_per_s = getattr(twin, "fastest_per_s", None)  # a corrected axis has it, too
+    if fastest_per_s is None:
         return twin, 0
     if twin.restart and any(p.name == "stiffness_per_mass" for p in twin.parameters):
         twin = replace(twin, restart=False)
     if "x0" in recording.twin.parameters and not twin.restart:
         return twin, 0
-    period = 4.0 / max(twin.fastest_per_s * recording.dt, 1e-9)
+    period = 4.0 / max(fastest_per_s * recording.dt, 1e-9)
     most = recording.n // (150 if twin.restart else 25)
     return twin, int(np.clip(period, 40, max(most, 40)))
 
@@ -173,7 +173,7 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     if own:
         twin, init = free_run(recording, twin)
     split = make_split(recording, held_out, seed, twin.restart)
-    if not own and was_joined and isinstance(twin, DynamicTwin):
+    if not own and was_joined and hasattr(twin, "fastest_per_s"):
         # the second recording has a start of its own
         twin = replace(twin, restart=True)
     if not own and twin.restart:

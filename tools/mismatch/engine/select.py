@@ -17,6 +17,9 @@ from tools.mismatch.engine.trial import Progress, Trial, try_all
 from tools.mismatch.engine.unexplained import Stranger, about, stranger
 from tools.mismatch.simulate import Model, Placed
 
+FAR = 100.0  # noise variances above which the best is a poor model: then blocks say nothing about which is simpler
+MOST_TIE = 0.3  # noise variances, besides what the form of a model may cost
+MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
 
 
@@ -72,6 +75,11 @@ class Selection:
     """A context signal whose free curve does better than the next effect would have done: the search ended there."""
 
 
+def moved_by(placed: Placed, problem: Problem) -> tuple[str, ...]:
+    """Outputs that an effect moves: a force moves every output of its equation of motion."""
+    return problem.twin.outputs if placed.site == "feedback" else placed.outputs
+
+
 def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
     """May this effect be named at all: better on held-out data by more than chance and by more than a trifle.
 
@@ -82,6 +90,10 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
         return False
     if trial.placed.effect.claims is not None:
         p, share = trial.candidate.p_value, trial.candidate.share
+        settings = trial.placed.settings
+        taken = sum(settings.get("stops", ())) - sum(settings.get("starts", ()))
+        if taken > MOST_EXCUSED * trial.fitted.residual[trial.placed.outputs[0]].size:
+            return False
         return (p < rule.p_tested and share > 0.2) or (share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
@@ -116,7 +128,7 @@ def search(
     while len(steps) < rule.most * len(problem.twin.outputs):
         now = misfits(problem, current)
         form = {
-            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in p.outputs)
+            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in moved_by(p, problem))
             * max(start[o] - now[o], 0.0)
             for o in now
         }  # fmt: skip
@@ -137,7 +149,7 @@ def search(
         trials = [known[_key(p)] for p in pool]
         if not steps:
             first = tuple(trials)
-        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in t.placed.outputs))]
+        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in moved_by(t.placed, problem)))]
         if not good and not steps and max(now.values()) > WORTH_A_PAIR:
             pair = pair_search(problem, current, trials, z=rule.z + 1, gain=rule.gain)
             if pair is None:
@@ -269,7 +281,7 @@ def _left(rival: Trial, best: Trial) -> float:
 
 
 def _key(p: Placed) -> tuple[str, ...]:
-    return (p.effect.name, p.effect.kind, p.site, p.target)
+    return (p.effect.name, p.effect.kind, p.site, p.target, p.effect.equation)
 
 
 def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: frozenset[str]) -> Trial:
@@ -325,9 +337,11 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
     form = 0.02 + rule.shape * max(before - best.misfits[output], 0.0)
     shapeless = best.placed.effect.stochastic
-    if b <= (1.0 if shapeless else rule.tie) * a + form:
+    # far above the noise a share of the excess is no trifle
+    slack = form if shapeless else form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
+    if b <= a + slack:
         return True
-    if shapeless or b > 2.0 * a + 0.1 + 5.0 * form:
+    if shapeless or a > FAR or b > 2.0 * a + 0.1 + 5.0 * form:
         return False
     column = best.outputs.index(output)
     mine, his = best.energy[:, column], rival.energy[:, column]
@@ -335,7 +349,7 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
         return True
     usual = np.argsort(his - mine)[: his.size - his.size // 10]
     a, b = max(float(mine[usual].mean()) - 1.0, 0.0), max(float(his[usual].mean()) - 1.0, 0.0)
-    return b <= rule.tie * a + form
+    return b <= a + form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
 
 
 def complexity(trial: Trial) -> float:

@@ -220,9 +220,15 @@ class DynamicTwin:
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
         return start_state(ad, rows, run.measured, run.starts, run.t.size, window, run.memo)
 
-    def _substeps(self, run: Run, packed: Rows) -> int:
-        """Steps per sample: four to a radian of the fastest mode, eight to a period of cogging."""
+    def _substeps(self, run: Run, packed: Rows, push: float) -> int:
+        """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (powers of two, so
+        that they seldom change while a fit moves; ``push``: acceleration per unit of force), eight to a period of
+        cogging.
+        """
         sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
+        stiff = run.dt * np.sqrt(abs(push) * float(np.sum(np.abs(packed.memory)))) / 0.5
+        if stiff > sub:
+            sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
         if packed.cogging[0] > 0:
             course = run.measured[self.feedback_on]
             travel = float(np.quantile(np.abs(np.diff(course)), 0.99))
@@ -237,8 +243,6 @@ class DynamicTwin:
         source = self.inputs[0]
         plant = self.plant_of(theta)
         packed = pack(forces)
-        sub = 1 if self.hold == "discrete" or not forces else self._substeps(run, packed)
-        d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
         g = self.input_gain(source, theta)
         drive = inputs[source]
         u = g * drive.value
@@ -264,7 +268,11 @@ class DynamicTwin:
         token: tuple[object, ...] = ("forced", theta[: len(self.parameters)].tobytes(), run.starts, run.window)
         token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
         token = (*token, *((f.effect.name, _key(f)) for f in forces))
-        cp = rows[self.feedback_on]
+        cp = rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
+        sub = 1
+        if forces and self.hold != "discrete":
+            sub = self._substeps(run, packed, float(cp @ plant.a @ plant.b))
+        d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
         if self.hold == "discrete":
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
         else:
@@ -276,27 +284,33 @@ class DynamicTwin:
         held = self.hold != "linear"
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0
 
-        def go(x0: Array, stop: NDArray[np.int64]) -> Array:
-            some = u[: int(stop.max())]
+        def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
             return run_feedback(
-                d.ad, d.g0, d.g1, cp, cv, some, held, sub, x0, starts, stop,
+                d.ad, d.g0, d.g1, cp, cv, drive, held, sub, x0, first, stop,
                 packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,
             )  # fmt: skip
 
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
         if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
             free = self.fixed_free(run.t.size)
-            x = go(np.zeros((1, plant.a.shape[0])), ends)
+            x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
         full = np.linalg.matrix_power(d.ad, sub)
         ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
+        # what sets the state is simulated alone, one window after the other
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)
-        m = int(stop.max())
+        seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
+        after = np.cumsum(stop - starts)
+        before = after - (stop - starts)
+        part = np.ascontiguousarray(u[seen])
+        need = {o: np.zeros(int(stop.max())) for o in self.outputs}
         for _ in range(3 if forces else 1):
-            x = go(x0, stop)
-            x0 = x0 + ss.states({o: run.measured[o][:m] - extra[o][:m] - x @ rows[o] for o in self.outputs})
-        x = go(x0, ends)
+            x = go(x0, part, before, after)
+            for o in self.outputs:
+                need[o][seen] = run.measured[o][seen] - extra[o][seen] - x @ rows[o]
+            x0 = x0 + ss.states(need)
+        x = go(x0, u, starts, ends)
         return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
 
 

@@ -65,11 +65,11 @@ def run_feedback(
 ):
     """States (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
 
-    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces run linearly over the step,
-    predicted and corrected once (second order). Dry friction is set-valued and implicit: it takes from the velocity
-    what its limit allows, and no more than brings it to rest (time stepping; Acary, Brogliato, Numerical Methods for
-    Nonsmooth Dynamical Systems, 2008, section 1.4). ``cp``, ``cv``: rows of position and velocity. ``stop`` (starts,)
-    ends each stretch early (the rest keeps the last state).
+    The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces and memory run linearly over
+    the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it takes from the
+    velocity what its limit allows, and no more than brings it to rest (time stepping; Acary, Brogliato, Numerical
+    Methods for Nonsmooth Dynamical Systems, 2008, section 1.4). ``cp``, ``cv``: rows of position and velocity.
+    ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
     """
     n, s = u.size, ad.shape[0]
     out = np.zeros((n, s))
@@ -114,24 +114,25 @@ def run_feedback(
                         e[j] = p + r
                     f0 -= memory[j] * (p - e[j])
                 f1 = f0
-                passes = 2 if any_smooth else 1
+                passes = 2 if any_smooth or e.size > 0 else 1
                 for turn in range(passes):
                     for i in range(s):
                         a = g0[i] * (w0 + f0) + g1[i] * (w1 + f1)
                         for j in range(s):
                             a += ad[i, j] * x[j]
                         z[i] = a
-                    if turn == 0 and any_smooth:
+                    if turn + 1 < passes:
                         pn = 0.0
                         vn = 0.0
                         for i in range(s):
                             pn += cp[i] * z[i]
                             vn += cv[i] * z[i]
-                        f1 = (
-                            smooth_force(pn, vn, spring, cogging, friction)
-                            + f0
-                            - smooth_force(p, v, spring, cogging, friction)
-                        )
+                        f1 = 0.0
+                        if any_smooth:
+                            f1 = smooth_force(pn, vn, spring, cogging, friction)
+                        for j in range(e.size):
+                            r = thresholds[j]
+                            f1 -= memory[j] * min(max(pn - e[j], -r), r)
                 if dry:
                     vn = 0.0
                     for i in range(s):
