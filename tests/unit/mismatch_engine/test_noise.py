@@ -73,3 +73,13 @@ def test_steep_signal_is_not_a_spike() -> None:
 
 def test_silence_has_no_noise() -> None:
     assert spectral_floor(np.zeros(1000), RATE)[0] == 0.0
+
+
+def test_repeats_under_a_warm_up() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(N) / RATE
+    u = np.sin(2 * np.pi * 4 * t)
+    drift = 5 * (1 - np.exp(-t / (0.2 * t[-1])))
+    found = repeat_floor(u + drift + rng.standard_normal(N), u[:, None])
+    assert found is not None
+    assert found[0] == pytest.approx(1.0, rel=0.05)

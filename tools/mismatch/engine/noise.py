@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.signal import welch
 
 from tools.mismatch.engine.colour import autocovariance
@@ -114,7 +114,7 @@ def spectral_floor(e: Array, rate_hz: float) -> tuple[float, float, bool]:
 def repeat_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
     """Noise from exact repetitions of the excitation: (rms, standard error); None when nothing repeats.
 
-    ``inputs`` (n, k). Slow drift is taken off the differences (a running mean over a fifth of the record),
+    ``inputs`` (n, k). Slow drift is taken off the differences (a running mean over a twentieth of them),
     so that warm-up is not booked as noise.
     """
     n = y.size
@@ -136,7 +136,7 @@ def repeat_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
         change = inputs[candidate:] - inputs[:-candidate]
         if float(np.max(np.abs(change))) <= 1e-6 * float(np.max(np.abs(inputs))):
             d = y[candidate:] - y[:-candidate]
-            d = clip_spikes(d - d.mean())
+            d = clip_spikes(d - uniform_filter1d(d, max(51, d.size // 20), mode="nearest"))
             rms = float(np.std(d)) / np.sqrt(2)
             return rms, rms / np.sqrt(max(d.size / 4, 2))
     return None

@@ -296,9 +296,15 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
     best = here[0]
     near = [t for t in here if t is best or as_good(t, best, rule, output, now[output])]
     names = {t.name for t in near}
+    # as good here within a trifle: then what it does for the other outputs counts
+    close = best.misfits[output] + 0.05 + 0.001 * max(now[output] - best.misfits[output], 0.0)
     return min(
-        near, key=lambda t: (t.name not in named, complexity(t), less_plain(t.name, names), -t.improvement, t.label)
-    )
+        near,
+        key=lambda t: (
+            t.name not in named, complexity(t), less_plain(t.name, names), t.misfits[output] > close, -t.improvement,
+            t.label,
+        ),
+    )  # fmt: skip
 
 
 ORDER = (
@@ -353,9 +359,11 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
 
 
 def complexity(trial: Trial) -> float:
-    """How much freedom an effect has, per output that it serves; events read off the data count as parameters."""
+    """How much freedom an effect has, per output that it serves but at least one; events read off the data count as
+    parameters.
+    """
     most = FREEDOM.get(trial.name, np.inf)
-    return min(size(trial.placed), most) / max(len(trial.placed.outputs), 1)
+    return max(min(size(trial.placed), most) / max(len(trial.placed.outputs), 1), 1.0)
 
 
 def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:

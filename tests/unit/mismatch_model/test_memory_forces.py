@@ -1,0 +1,48 @@
+"""Elastic-plastic forces inside an equation of motion: a spring while they stick, dry friction when they slide."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tools.mismatch.twins.feedback import run_feedback
+
+NONE2, NONE5, NONE6 = np.zeros(2), np.zeros(5), np.zeros(6)
+
+
+def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, stiffness: float) -> np.ndarray:
+    """Position of a unit mass with one stop operator under the force u."""
+    ad = np.array([[1.0, dt], [0.0, 1.0]])
+    # linear input over a step: exact weights of the values before and after
+    g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
+    x = run_feedback(
+        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, np.array([x0]),
+        np.zeros(1, np.int64), np.array([u.size]), NONE6, NONE2, NONE5, np.array([radius]), np.array([stiffness]),
+        False,
+    )  # fmt: skip
+    return x[:, 0]
+
+
+def test_a_bristle_that_sticks_is_a_spring_that_never_gains_energy() -> None:
+    w, dt = 2.0, 0.1  # a fifth of a radian a step
+    x = free_mass(np.zeros(2000), dt, (0.0, 1e-3), 1.0, w * w)
+    t = np.arange(2000) * dt
+    assert x[:200] == pytest.approx(0.5e-3 * np.sin(w * t[:200]), abs=0.05e-3)
+    assert 0.85e-3 < np.ptp(x[-200:]) < 1e-3  # after 64 periods
+
+
+def test_a_bristle_that_slides_is_a_constant_force() -> None:
+    radius, level, dt = 1e-4, 0.3, 1e-3
+    x = free_mass(np.full(1000, 1.0), dt, (0.0, 0.0), radius, level / radius)
+    v = np.diff(x)[-100:] / dt
+    assert np.diff(v) / dt == pytest.approx(np.full(99, 1.0 - level), rel=1e-6)
+
+
+def test_presliding_friction_reports_level_and_distance() -> None:
+    bristles = EFFECTS["coulomb_friction"].variants[0]
+    settings = {"presliding": (1e-5, 4e-5)}
+    assert bristles.report is not None
+    found = {h.name: h.value for h in bristles.report(np.array([2e4, 1e4]), settings, 2.0)}
+    assert found["coulomb_forward"] == pytest.approx((0.2 + 0.4) / 2.0)
+    assert found["presliding_distance"] == pytest.approx(0.6 / 3e4)
