@@ -25,6 +25,8 @@ from tools.mismatch.engine.unexplained import about, lead, leftover, stranger
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.corrected import CorrectedTwin
+from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make
 
 Progress = Callable[[str, int, int], None]
@@ -64,12 +66,18 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
     if fastest_per_s is None:
         return twin, 0
     if twin.restart and any(p.name == "stiffness_per_mass" for p in twin.parameters):
-        twin = replace(twin, restart=False)
+        twin = restarting(twin, False)
     if "x0" in recording.twin.parameters and not twin.restart:
         return twin, 0
     period = 4.0 / max(fastest_per_s * recording.dt, 1e-9)
     most = recording.n // (150 if twin.restart else 25)
     return twin, int(np.clip(period, 40, max(most, 40)))
+
+
+def restarting(twin: Twin, restart: bool) -> Twin:
+    """A dynamic twin, plain or corrected, that starts every range afresh or does not."""
+    assert isinstance(twin, DynamicTwin | CorrectedTwin)
+    return replace(twin, restart=restart)
 
 
 def gross(recording: Recording, twin: Twin, raw: Fit) -> list[str]:
@@ -175,7 +183,7 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     split = make_split(recording, held_out, seed, twin.restart)
     if not own and was_joined and hasattr(twin, "fastest_per_s"):
         # the second recording has a start of its own
-        twin = replace(twin, restart=True)
+        twin = restarting(twin, True)
     if not own and twin.restart:
         init = max(init, 20)
         split = shot(split, init)
