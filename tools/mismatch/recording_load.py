@@ -18,6 +18,8 @@ from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds,
 
 MIN_SAMPLES = 50
 MIN_SPAN = 30  # samples of a [split] range
+LONGEST_GAP = 20.0  # usual steps of a time column
+MOST_MISSING = 0.02  # of the time
 MOST_SIZE = 1e100  # of any value: squares must stay finite
 _TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
 _CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution"}
@@ -76,7 +78,11 @@ def load_recording(path: Path) -> Recording:
                 f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; fill the gap or cut the recording there"
             )
     if time_column is not None:
-        dt = _step(data_path, time_column, columns[time_column], rate, notes)
+        stamps = columns[time_column]
+        dt, grid = _step(data_path, time_column, stamps, rate, notes)
+        if grid is not None:
+            columns = {name: on_grid(grid, dt, stamps, x) for name, x in columns.items()}
+            n = grid.size
     else:
         assert rate is not None
         dt = 1.0 / rate
@@ -268,8 +274,10 @@ def _together(where: str, kind: str, channels: list[_Channel]) -> None:
                 raise RecordingError(f"{where}: {o} in {c.to} does not go with the input {', '.join(inputs)}")
 
 
-def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[str]) -> float:
-    """The step of a time column that must run forwards and be uniform to half a sample."""
+def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[str]) -> tuple[float, Array | None]:
+    """The step of a time column that must run forwards, and a uniform grid to bring it to where it is not uniform to
+    half a sample: few short gaps, or a clock that wanders.
+    """
     d = np.diff(stamps)
     back = d <= 0
     if back.any():
@@ -278,29 +286,40 @@ def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[
         raise RecordingError(
             f"{path}: time column '{name}' {what} at sample {i} ({stamps[i - 1]:g} then {stamps[i]:g} s); sort it"
         )
-    dt = float(stamps[-1] - stamps[0]) / d.size
-    median = float(np.median(d))
+    dt, median = float(stamps[-1] - stamps[0]) / d.size, float(np.median(d))
     gap = d > 1.5 * median
-    if gap.any():
-        i = int(np.argmax(gap)) + 1
+    missing = float(np.sum(d[gap] - median))
+    if gap.any() and (d.max() > LONGEST_GAP * median or missing > MOST_MISSING * (stamps[-1] - stamps[0])):
+        i = int(np.argmax(d)) + 1
         raise RecordingError(
             f"{path}: time column '{name}' jumps by {d[i - 1]:g} s at sample {i}, the usual step is {median:g} s;"
             " resample to uniform steps or cut the recording there"
         )
+    grid: Array | None = None
     off = np.abs(stamps - (stamps[0] + dt * np.arange(stamps.size)))
-    if off.max() > 0.5 * dt:
-        i = int(np.argmax(off))
-        raise RecordingError(
-            f"{path}: time column '{name}' is not uniform: sample {i} is {off[i]:.3g} s off a grid of {dt:.6g} s;"
-            " resample to uniform steps"
-        )
+    if gap.any() or off.max() > 0.5 * dt:
+        # the mean step between the gaps: the median is quantised like the stamps
+        dt = float(np.mean(d[~gap]))
+        count = round(float(stamps[-1] - stamps[0]) / dt)
+        dt = float(stamps[-1] - stamps[0]) / count
+        grid = stamps[0] + dt * np.arange(count + 1)
+        lost = f"{int(gap.sum())} gaps, {missing:.3g} s in all, filled by straight lines" if gap.any() else "no gaps"
+        notes.append(f"time column '{name}' is not uniform: brought to a grid of {dt:.6g} s ({lost})")
+    elif off.max() > 0.01 * dt:
+        notes.append(f"time stamps scatter by up to {off.max() / dt:.2g} of a step; taken as uniform")
     if rate is not None and abs(rate * dt - 1) > 0.2:
         raise RecordingError(f"{path}: rate_hz {rate:g} contradicts the time column '{name}' ({1 / dt:g} Hz)")
     if rate is not None and abs(rate * dt - 1) > 1e-3:
         notes.append(f"rate_hz {rate:g} differs from the time column ({1 / dt:.6g} Hz); the time column is used")
-    if off.max() > 0.01 * dt:
-        notes.append(f"time stamps scatter by up to {off.max() / dt:.2g} of a step; taken as uniform")
-    return dt
+    return dt, grid
+
+
+def on_grid(grid: Array, dt: float, stamps: Array, x: Array) -> Array:
+    """Per point of the grid the nearest sample (interpolation would smooth the noise); a straight line in gaps."""
+    after = np.clip(np.searchsorted(stamps, grid), 1, stamps.size - 1)
+    nearest = np.where(grid - stamps[after - 1] < stamps[after] - grid, after - 1, after)
+    near = np.abs(stamps[nearest] - grid) <= 0.75 * dt
+    return np.where(near, x[nearest], np.interp(grid, stamps, x))
 
 
 def _same_data(path: Path, channels: list[_Channel], columns: dict[str, Array], notes: list[str]) -> None:
