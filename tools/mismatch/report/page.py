@@ -52,6 +52,7 @@ def html_page(report: Report) -> str:
         split=_split(report),
         cautions=wording.cautions(report),
         number=number,
+        chance=wording.chance,
         percent=percent,
         words=words,
         scaled=wording.scaled,

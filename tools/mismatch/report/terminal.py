@@ -14,7 +14,7 @@ from tools.mismatch.engine.report import PhysicsFound, Report
 from tools.mismatch.report import wording
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.next_experiment import next_experiments
-from tools.mismatch.report.wording import number, percent, words
+from tools.mismatch.report.wording import chance, number, percent, words
 
 _COLOUR = {"agrees": "green", "recalibrate": "cyan", "missing_physics": "yellow", "unexplained": "magenta"}
 
@@ -123,12 +123,10 @@ def _checks(report: Report) -> Table:
     white = {True: "white", False: "not white"}
     rows = [
         ("residual", f"{white[c.residual_white_before]} before, {white[c.residual_white_after]} after"),
-        ("by chance", f"p = {number(c.false_alarm_p_value)}"),
+        ("by chance", chance(c.false_alarm_p_value)),
     ]
     if c.memory_p_value < 1e-3:
-        rows.append(
-            ("memory", f"history helps beyond the present (p = {number(c.memory_p_value)}): a state is missing")
-        )
+        rows.append(("memory", f"history helps beyond the present ({chance(c.memory_p_value)}): a state is missing"))
     rows += [("look at", m) for m in wording.cautions(report)]
     return _pairs(rows)
 

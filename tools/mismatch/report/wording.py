@@ -23,6 +23,11 @@ def number(value: float | None) -> str:
     return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
 
 
+def chance(p: float) -> str:
+    """A p-value as one may believe it: no tail of a distribution is known beyond one in a million million."""
+    return "p < 1e-12" if p < 1e-12 else f"p = {number(p)}"
+
+
 _PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n"))
 _SCALABLE = {"V", "A", "N", "m", "g", "rad", "m/s", "m/s^2", "rad/s"}
 
