@@ -33,6 +33,7 @@ def test_base_equations_are_type(tex: str):
         (r"a\,\Delta T \text{ behind a lag}", "a ΔT  behind a lag"),
         (r"y = a\,e^{-t/\tau} \sin 2\pi f t", "y = a e^(-t/τ) sin 2π f t"),
         (r"\sum_{j \ne i} m_{ij} f_j", "Σ_(j≠i) mᵢⱼ fⱼ"),
+        (r"\sigma_i\,x,\; r_i \ll 1", "σᵢ x,  rᵢ ≪ 1"),
         (r"\Delta\,\mathrm{round}(x/\Delta)", "Δ round(x/Δ)"),
         (r"\sum_{d \ge 2} c \quad\text{or}\quad 1", "Σ_(d≥2) c   or   1"),
     ],

@@ -92,3 +92,8 @@ def test_a_residual_far_above_the_noise_is_said_whatever_the_verdict():
     left = replace(agrees().fit, fitted_rms={"displacement": 0.2})
     assert wording.cautions(replace(agrees(), fit=left)) == ["what is left in displacement is 10 times the noise floor"]
     assert wording.cautions(replace(agrees(), verdict="unexplained", fit=left)) == []
+
+
+def test_no_probability_is_believed_beyond_what_a_tail_can_say():
+    assert wording.chance(8e-207) == "p < 1e-12"
+    assert wording.chance(1e-9) == "p = 1e-09"

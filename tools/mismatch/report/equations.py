@@ -7,7 +7,7 @@ import re
 _WORDS = {
     "tau": "τ", "omega": "ω", "alpha": "α", "lambda": "λ", "epsilon": "ε", "varphi": "φ", "theta": "θ", "pi": "π",
     "delta": "δ", "Delta": "Δ", "ell": "ℓ", "sum": "Σ", "times": "×", "cdot": "·", "ge": "≥", "le": "≤", "ne": "≠",
-    "sim": "~", "ln": "ln", "sin": "sin", "cos": "cos", "sgn": "sgn", "left": "", "right": "",
+    "ll": "≪", "sigma": "σ", "sim": "~", "ln": "ln", "sin": "sin", "cos": "cos", "sgn": "sgn", "left": "", "right": "",
 }  # fmt: skip
 _ACCENTS = {"dot": "\u0307", "ddot": "\u0308", "tilde": "\u0303"}
 _SUPERSCRIPT = str.maketrans("0123456789", "⁰¹²³⁴⁵⁶⁷⁸⁹")
