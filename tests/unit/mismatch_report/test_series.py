@@ -127,3 +127,14 @@ def test_a_close_up_shows_a_few_cycles_whatever_the_noise():
     p = replace(pictures(), t=t, held_out=np.ones(6000, bool), measured={"y": noisy}, recalibrated={"y": 0 * t})
     a, b = series.zoom(p, "y")
     assert b - a == pytest.approx(series.CYCLES * 500, rel=0.02)
+
+
+@pytest.mark.parametrize(
+    ("feature", "label"),
+    [("value", "command (V)"), ("rate", "rate of command (V/s)"), ("frequency", "frequency of command (Hz)")],
+)
+def test_an_axis_has_its_unit(feature: str, label: str):
+    p = replace(pictures(), units={"command": "V"})
+    found = series.axis_of(p, DependsOn("command", feature, 0.5))
+    assert found is not None
+    assert found[0] == label

@@ -299,7 +299,7 @@ def assemble(
         location=Location(
             tuple(guilty),
             stage,
-            tuple(Window(a, b) for a, b in span),
+            tuple(Window(round(a, 9), round(b, 9)) for a, b in span),
             regime(problem, looked, guilty[0]) if guilty else "nowhere",
             tuple(depends[:6]),
         ),
@@ -351,6 +351,7 @@ def assemble(
             simulated(base),
             simulated(fitted),
             {s: x[problem.index] for s, x in rec.signals.items()},
+            rec.unit,
         ),
     )
 

@@ -121,7 +121,7 @@ class Checks:
 @dataclass(frozen=True)
 class Pictures:
     """Arrays for the report: time (m,), inputs and, per output, measured, as given, recalibrated, fitted (m,);
-    ``held_out`` (m,) bool. Not part of the JSON."""
+    ``held_out`` (m,) bool; ``units`` of the signals. Not part of the JSON."""
 
     t: Array
     held_out: NDArray[np.bool_]
@@ -130,6 +130,7 @@ class Pictures:
     recalibrated: Mapping[str, Array]
     fitted: Mapping[str, Array]
     signals: Mapping[str, Array]
+    units: Mapping[str, str] = field(default_factory=dict[str, str])
 
 
 @dataclass(frozen=True)

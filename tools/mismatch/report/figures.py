@@ -124,7 +124,7 @@ def follows(report: Report, p: Pictures, output: str, name: str) -> str:
                 ax.plot(x_mid, e_mid * factor, "-", color=colour, lw=2, label=f"{tag}, mean")
             ax.axhline(0, color=INK, lw=0.6)
             ax.set_xlabel(label)
-            ax.set_title(f"against {label.removesuffix(' (s)')}{strength}")
+            ax.set_title(f"against {label.split(' (')[0]}{strength}")
         panels[0].legend(loc="best", fontsize=9)
         panels[0].set_ylabel(f"residual ({unit})")
     return out[0]

@@ -128,7 +128,10 @@ def axis_of(p: Pictures, d: DependsOn) -> tuple[str, Array] | None:
         "frequency": ("frequency of {} (Hz)", lambda v: local_frequency(v, seconds, dt)),
     }
     label, make = makers.get(d.feature, ("{}", lambda v: v))
-    return label.format(d.signal), make(x)
+    unit = p.units.get(d.signal, "")
+    over = {"rate": "/s", "sign of rate": "/s", "acceleration": "/s²"}.get(d.feature, "")
+    shown = "" if unit in ("", "1") or "(" in label else f" ({unit}{over})"
+    return label.format(d.signal) + shown, make(x)
 
 
 def binned(x: Array, y: Array, bins: int = 24) -> tuple[Array, Array]:

@@ -65,7 +65,7 @@ def figure(name: str, size_in: tuple[float, float], **kwargs: Any) -> Iterator[t
         drawn = Figure(figsize=size_in)
         wide, tall = size_in
         # fixed margins: axes of all figures stand under one another, and no layout has to be solved
-        drawn.subplots_adjust(0.72 / wide, 0.5 / tall, 1 - 0.08 / wide, 1 - 0.3 / tall, 0.13, 0.36)
+        drawn.subplots_adjust(0.72 / wide, 0.5 / tall, 1 - 0.22 / wide, 1 - 0.3 / tall, 0.13, 0.36)
         yield drawn, out
         FigureCanvasSVG(drawn)
         buffer = io.StringIO()
