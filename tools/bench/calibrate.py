@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +11,7 @@ from starlette.requests import Request
 from starlette.routing import BaseRoute, Route
 
 from firmware_py.frame import LAYOUT
-from hal.bench import load_bench
-from tools.bench.bench_copy import with_calibration
+from tools.bench.applied import Applied
 from tools.bench.history import BLOCK
 from tools.bench.jobs import Jobs
 from tools.bench.poses import identify
@@ -30,13 +28,13 @@ STANDARD_GRAVITY = 9.80665
 
 
 class Calibration:
-    """What was found and not yet applied, and the bench to go back to."""
+    """What was found and not yet applied."""
 
-    def __init__(self, session: Session, jobs: Jobs) -> None:
+    def __init__(self, session: Session, jobs: Jobs, applied: Applied) -> None:
         self._session = session
         self._jobs = jobs
+        self._applied = applied
         self._folder = session.recorder.folder / "calibrations"
-        self._original: Path | None = None
         self.found: dict[str, Any] | None = None
         self._file: Path | None = None
 
@@ -111,21 +109,12 @@ class Calibration:
         else:
             name = "piezo.toml" if kind == "piezo" else "sensors.toml"
             source = self._jobs.file("calibrate", name)
-        self._folder.mkdir(parents=True, exist_ok=True)
-        kept = self._folder / f"{kind}.toml"
-        write_text_atomic(kept, source.read_text(encoding="utf-8"))
-        choice = self._session.choice
-        self._original = self._original or choice.bench
-        out = with_calibration(load_bench(choice.bench), kept, self._folder / f"{self._original.stem}.toml")
-        await self._session.start(replace(choice, bench=out))
-        return {"bench": str(out), "calibration": str(kept)}
+        return {"bench": str(await self._applied.calibration(kind, source))}
 
     async def discard(self, _: Request) -> Any:
         """Forget what was found; back to the original bench if something was applied."""
         self.found, self._file = None, None
-        if self._original is not None:
-            original, self._original = self._original, None
-            await self._session.start(replace(self._session.choice, bench=original))
+        await self._applied.discard()
 
     def _keep(self, kind: str, toml: str, result: dict[str, Any]) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
@@ -134,11 +123,11 @@ class Calibration:
         self.found = result
 
     async def state(self, _: Request) -> Any:
-        return {"job": self._jobs.state("calibrate"), "applied": self._original is not None, "found": self.found}
+        return {"job": self._jobs.state("calibrate"), "applied": self._applied.what, "found": self.found}
 
 
-def calibrate_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
-    c = Calibration(session, jobs)
+def calibrate_routes(session: Session, jobs: Jobs, applied: Applied) -> list[BaseRoute]:
+    c = Calibration(session, jobs, applied)
     return [
         Route("/api/calibrate", clear(c.state)),
         Route("/api/calibrate/warmth", clear(c.warmth)),

@@ -113,14 +113,18 @@ class Jobs:
 
     def start(self, kind: str, title: str, steps: Sequence[Sequence[str]], folder: Path) -> Job:
         """Replace the last job of ``kind``. ``InputError`` while another one runs."""
-        for job in self._jobs.values():
-            if job.state == "running":
-                raise InputError(f"'{job.title}' is still running; wait for it or cancel it")
+        self.must_be_idle()
         old = self._jobs.get(kind)
         if old is not None:
             shutil.rmtree(old.folder, ignore_errors=True)
         self._jobs[kind] = Job(kind, title, steps, folder)
         return self._jobs[kind]
+
+    def must_be_idle(self) -> None:
+        """``InputError`` while a job runs."""
+        for job in self._jobs.values():
+            if job.state == "running":
+                raise InputError(f"'{job.title}' is still running; wait for it or cancel it")
 
     def get(self, kind: str) -> Job:
         """The newest of that kind. ``InputError`` when there is none."""

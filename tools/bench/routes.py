@@ -13,6 +13,7 @@ from starlette.routing import BaseRoute, Route
 
 from hal.bench import load_bench
 from hal.errors import HalError
+from tools.bench.applied import Applied
 from tools.bench.calibrate import calibrate_routes
 from tools.bench.collect import collect_routes
 from tools.bench.jobs import Jobs
@@ -25,12 +26,13 @@ from tools.errors import InputError
 
 def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     """Everything besides the core."""
+    applied = Applied(session)
     return [
         *_attitude(session),
         *_targets(session),
         *collect_routes(session, jobs),
-        *mismatch_routes(session, jobs),
-        *calibrate_routes(session, jobs),
+        *mismatch_routes(session, jobs, applied),
+        *calibrate_routes(session, jobs, applied),
     ]
 
 

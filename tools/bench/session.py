@@ -154,6 +154,7 @@ class Session:
             run.reason = outcome["safe_state"]["reason"]
             run.phase = "safe" if outcome["safe_state"]["reached"] else "ended"
             run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
+            run.status = {**run.status, "lost": outcome["samples"]["lost"]}  # what was lost at the very end, too
         else:
             run.phase, run.reason = "failed", failure
             self.note("error", f"the firmware failed: {failure}")

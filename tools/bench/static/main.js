@@ -58,10 +58,13 @@ function buildNav() {
 function showVitals(state) {
   const s = state.status;
   const timing = state.timing["sample to command"];
+  const outputs = s.tasks?.actuate; // rate, budget, runs, overruns, late, skipped
+  const share = outputs ? (100 * outputs[5]) / Math.max(1, outputs[2] + outputs[5]) : 0;
   const items = [
     ["run time", s.t_s === undefined ? "–" : duration(s.t_s)],
     ["sample to command p50", timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–"],
-    ["lost / skipped", s.lost === undefined ? "–" : `${s.lost} / ${s.skipped}`],
+    ["lost scans", s.lost ?? "–"],
+    ["outputs skipped", outputs ? `${share === 0 ? 0 : share < 0.1 ? "<0.1" : share.toFixed(1)} %` : "–"],
     ["tremor", s.amplitude_um ? `${Math.hypot(...s.amplitude_um).toFixed(0)} µm` : "–"],
   ];
   byId("vitals").replaceChildren(...items.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));

@@ -91,7 +91,7 @@ export function mount(root, { link }) {
     if (!q) return;
     const [roll, pitch, yaw] = euler(q);
     const rows = [["roll (x)", `${roll.toFixed(2)}°`], ["pitch (y)", `${pitch.toFixed(2)}°`], ["yaw (z)", `${yaw.toFixed(2)}°`],
-      ...["w", "x", "y", "z"].map((n, i) => [`q ${n}`, q[i].toFixed(5)]),
+      ["q w, x", `${q[0].toFixed(5)}  ${q[1].toFixed(5)}`], ["q y, z", `${q[2].toFixed(5)}  ${q[3].toFixed(5)}`],
       ["turned since zero", `${((angleBetween(reference, q) * 180) / Math.PI).toFixed(3)}°`]];
     numbers.replaceChildren(...rows.map(([name, value]) => h("tr", {}, h("td", { style: "color:var(--soft)" }, name), h("td.num", {}, value))));
   }, 100);

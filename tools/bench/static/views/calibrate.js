@@ -50,8 +50,8 @@ export function mount(root, { link }) {
     try {
       const state = await get("/api/calibrate");
       showLab(state.job);
-      applied.textContent = state.applied ? "A new calibration is applied; the firmware was started again with it." : "The bench runs with the calibration of its file.";
-      discard.hidden = !state.applied;
+      applied.textContent = state.applied.length ? `Applied over the bench file: ${state.applied.join(", ")}; the firmware was started again with it.` : "The bench runs with the calibration of its file.";
+      discard.hidden = !state.applied.length;
       const warm = await get("/api/calibrate/warmth");
       warmth.textContent = warm.text;
       warmth.style.color = warm.steady === undefined ? css("--soft") : css(warm.steady ? "--good" : "--warn");

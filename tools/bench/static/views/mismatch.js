@@ -7,18 +7,23 @@ const STEPS = { 2: ["locate and fit", "corrected twin"], 3: ["prepare", "locate 
 export function mount(root, { link }) {
   let shown = "";
   let timer = 0;
+  let compareTimer = 0;
+  let inUse = false;
   const select = h("select", { "aria-label": "Recording", style: "min-width:320px" });
   const run = h("button.primary", { onclick: start }, "Diagnose");
   const cancel = h("button", { onclick: () => post("/api/jobs/mismatch/cancel").then(poll).catch(fail) }, "Cancel");
   const problem = h("span.bad", { role: "alert" });
   const files = h("span.row");
+  const apply = h("button", { hidden: true, title: "Start the emulated bench again with the corrected twin in its stacks' place", onclick: applyTwin }, "Apply to the emulated bench");
+  const back = h("button", { hidden: true, onclick: goBack }, "Back to the original bench");
+  const applied = h("div.row", { hidden: true, style: "margin-top:8px" });
   const status = h("span.soft.num");
   const lines = h("pre.num", { style: "margin:8px 0 0;font-size:11.5px;line-height:1.5;max-height:130px;overflow:auto;white-space:pre-wrap" });
   const report = h("div", { style: "min-height:0;height:100%" }, h("div.empty", {},
     h("p", {}, "Pick a recording. The engine compares it with its twin, names the physics that is missing and fits it on data that it then checks on the part it has not seen."),
     h("p", {}, "A run takes from half a minute to several, in a process of its own; the firmware does not notice.")));
   root.append(h("div.cols", { style: "grid-template-rows:auto minmax(0,1fr)" },
-    h("section.panel", {}, h("div.row", {}, select, run, cancel, status, h("span.grow"), files), problem, lines), report));
+    h("section.panel", {}, h("div.row", {}, select, run, cancel, status, h("span.grow"), files, apply, back), problem, applied, lines), report));
 
   const fail = (error) => { problem.textContent = error.message; };
 
@@ -26,7 +31,43 @@ export function mount(root, { link }) {
     const state = await get("/api/mismatch");
     select.replaceChildren(...state.recordings.map((name) => h("option", { value: name }, name)));
     if (!state.recordings.length) select.replaceChildren(h("option", { value: "" }, `no recording in ${state.folder}`));
+    showApplied(state.applied);
     show(state.job);
+    if (state.difference.state !== "none") compare();
+  }
+
+  function showApplied(what) {
+    inUse = what.includes("corrected twin");
+    back.hidden = !inUse;
+    if (!inUse) applied.hidden = true;
+  }
+
+  async function applyTwin() {
+    problem.textContent = "";
+    try { await post("/api/mismatch/apply"); await refresh(); } catch (error) { fail(error); }
+  }
+
+  async function goBack() {
+    problem.textContent = "";
+    try { await post("/api/calibrate/discard"); await refresh(); } catch (error) { fail(error); }
+  }
+
+  /** The same hand on both benches, on the emulated truth: what the twin changes at the tip. */
+  async function compare() {
+    clearTimeout(compareTimer);
+    let found;
+    try { found = await get("/api/mismatch/difference"); } catch (error) { fail(error); return; }
+    const { job, before, after } = found;
+    if (!inUse) return;
+    applied.hidden = false;
+    const um = (v) => (v === null || v === undefined ? "–" : `${v.toFixed(2)} µm`);
+    const row = (name, r) => h("tr", {}, h("td", {}, name), ...(r ? [um(r.band[0]), um(r.band[1]), `${r.band[2].toFixed(1)} %`, um(r.all[1])] : ["…", "…", "…", "…"]).map((v) => h("td.num", {}, v)));
+    const waiting = job.state === "running" ? `step ${job.step + 1} of ${job.steps}, ${duration(job.seconds)}` : job.state === "done" ? "" : `${job.state}: ${job.lines.at(-1) || ""}`;
+    applied.replaceChildren(h("table", { id: "difference", style: "width:auto;min-width:560px" },
+      h("tr", {}, h("th", {}, "same hand, 10 s of virtual time, truth at the tip"), ["tremor 8–12 Hz", "left of it", "less", "error, all bands"].map((t) => h("th.num", {}, t))),
+      row("bench as it was", before), row("with the corrected twin", after)),
+    h("span.soft", {}, waiting || "The page runs the bench with the corrected twin now."));
+    if (job.state === "running") compareTimer = setTimeout(compare, 700);
   }
 
   async function start() {
@@ -56,9 +97,11 @@ export function mount(root, { link }) {
     }
     files.replaceChildren(...["report.html", "report.json", "twin.toml"].filter((f) => job.files.includes(f))
       .map((f) => h("button", { onclick: () => download(`/api/jobs/mismatch/files/${f}`, f) }, f === "twin.toml" ? "Corrected twin" : f)));
+    apply.hidden = !job.files.includes("twin.toml") || running || inUse || !link.state?.emulated;
+    apply.disabled = !link.mayOrder;
     if (running) timer = setTimeout(poll, 700);
   }
 
   refresh().catch(fail);
-  return () => clearTimeout(timer);
+  return () => { clearTimeout(timer); clearTimeout(compareTimer); };
 }

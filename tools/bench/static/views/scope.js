@@ -211,11 +211,13 @@ export function mount(root, { link, catalogue }) {
   document.addEventListener("keydown", onKey);
   const offData = link.on("data", (s) => { if (s === subscription && !paused) dirty = true; });
   const offRun = link.on("run", () => { if (paused) resume(); strips.forEach(({ strip }) => strip.range.reset()); });
-  let frames = 0;
+  let frames = link.frames;
+  let countedAt = performance.now();
   const timer = setInterval(() => {
-    const got = link.frames - frames;
-    frames = link.frames;
-    rate.textContent = `${settings.channels.length} channels · ${got} frames/s`;
+    const now = performance.now();
+    const got = (1000 * (link.frames - frames)) / (now - countedAt);
+    [frames, countedAt] = [link.frames, now];
+    rate.textContent = `${settings.channels.length} channels · ${got.toFixed(0)} frames/s`;
   }, 1000);
   const retheme = () => { strips.forEach(({ strip }) => strip.build()); dirty = true; };
   window.addEventListener("themechange", retheme);

@@ -40,9 +40,9 @@ export function mount(root, { link }) {
       h("div", { style: "flex:1;min-height:0" }, path)),
     h("section.panel", { style: "display:flex;flex-direction:column" }, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div", { style: "flex:1;min-height:0" }, spectra)),
     h("div.stack", { style: "overflow:auto" },
+      h("section.panel", {}, h("h2", {}, "Compensation ", gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
       h("section.panel", {}, h("h2", {}, "Reduction, 4 s"), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
-        h("p.note", {}, "Estimated: tremor now against its prediction one loop delay ago. Errors of the stacks are not in it; micron run measures those on the emulated bench.")),
-      h("section.panel", {}, h("h2", {}, "Compensation"), h("div.row", {}, onOff, gainText), h("div.row", { style: "margin-top:8px" }, h("span.soft", {}, "gain"), gain))),
+        h("p.note", {}, "The firmware's estimate against its own prediction; errors of the stacks are not in it (micron run has them)."))),
     h("div", { style: "grid-column:1/4;display:flex;flex-direction:column;gap:6px;min-height:0" }, amplitude.element, frequency.element)));
 
   /** Tremor now and what is left of it: what was commanded acts `delay` later. */
