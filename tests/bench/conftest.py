@@ -17,7 +17,8 @@ import threading
 import time
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,25 +58,31 @@ class Server:
     def live(self) -> str:
         return self.base.replace("http", "ws") + "/live"
 
-    def state(self) -> dict[str, Any]:
-        """The next status message, as a page gets it."""
+    def states(self) -> Generator[dict[str, Any], None, None]:
+        """Status messages as a page gets them, ten a second."""
         from websockets.sync.client import connect
 
         with connect(self.live, open_timeout=30) as ws:
             while True:
                 message = ws.recv(30)
                 if isinstance(message, str) and (table := json.loads(message))["type"] == "state":
-                    return table
+                    yield table
+
+    def state(self) -> dict[str, Any]:
+        """The next status message."""
+        with closing(self.states()) as states:
+            return next(states)
 
     def wait_for(self, good: Callable[[dict[str, Any]], bool], what: str, limit_s: float = 60.0) -> dict[str, Any]:
         """The first status for which ``good`` holds."""
         deadline_s = time.monotonic() + limit_s
-        while time.monotonic() < deadline_s:
-            state = self.state()
-            if good(state):
-                return state
-            time.sleep(0.1)
-        pytest.fail(f"{what} did not come within {limit_s:.0f} s: {state['phase']}: {state['reason']}")
+        with closing(self.states()) as states:
+            for state in states:
+                if good(state):
+                    return state
+                if time.monotonic() > deadline_s:
+                    pytest.fail(f"{what} did not come within {limit_s:.0f} s: {state['phase']}: {state['reason']}")
+        raise AssertionError("status messages end with the connection, by an error")
 
     def wait_running(self) -> dict[str, Any]:
         """Start the firmware unless it runs; wait until it is armed."""
@@ -109,6 +116,7 @@ def server() -> Iterator[Server]:
     bench = folder / "bench.toml"
     text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')
     bench.write_text(text + "\n[firmware.plausibility]\njump_V = 2.0\n")
+    shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)  # has the motion card
     command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
     command += ["--bench", str(bench)]
     process = subprocess.Popen(
@@ -140,12 +148,19 @@ def server() -> Iterator[Server]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def go(page: Any, view: str) -> None:
+    """To a view of the page; returns when it is there."""
+    page.evaluate(f"location.hash = '/{view}'")
+    page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
+
+
 def find_chromium() -> str | None:
     """Path of Debian's Chromium, installed if need be."""
     found = shutil.which("chromium")
     if found is None and shutil.which("apt-get") and os.geteuid() == 0:
-        for command in (["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]):
-            subprocess.run(command, capture_output=True, timeout=200, check=False)
+        with suppress(subprocess.TimeoutExpired):  # no network: skipped, and said so
+            for command in (["apt-get", "update"], ["apt-get", "install", "-y", "--no-install-recommends", "chromium"]):
+                subprocess.run(command, capture_output=True, timeout=200, check=False)
         found = shutil.which("chromium")
     return found
 
@@ -153,10 +168,12 @@ def find_chromium() -> str | None:
 @pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     """Chromium without a window."""
-    sync_api = pytest.importorskip("playwright.sync_api", reason="the python package playwright is not installed")
+    sync_api = pytest.importorskip(
+        "playwright.sync_api", reason="the package playwright is not installed; 'make setup' does it"
+    )
     path = find_chromium()
     if path is None:
-        pytest.skip("no Chromium: install Debian's package 'chromium' to run the browser tests")
+        pytest.skip("no Chromium and none to be had: run 'apt-get install chromium' as root for the browser tests")
     with sync_api.sync_playwright() as playwright:
         chromium = playwright.chromium.launch(
             executable_path=path, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]

@@ -8,16 +8,11 @@ from typing import Any
 
 import pytest
 
-from tests.bench.conftest import Server
+from tests.bench.conftest import Server, go
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
-
-
-def go(page: Any, view: str) -> None:
-    page.evaluate(f"location.hash = '/{view}'")
-    page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])

@@ -47,8 +47,7 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
         return {"channels": catalogue()}
 
     async def benches(_: Request) -> Any:
-        folder = session.choice.bench.parent
-        return {"benches": sorted(str(p) for p in folder.glob("*.toml")), "now": str(session.choice.bench)}
+        return {"benches": sorted(str(p) for p in session.home.glob("*.toml")), "now": str(session.choice.bench)}
 
     async def safe(_: Request) -> Any:
         return {"ok": session.order("safe")}
@@ -56,8 +55,8 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
     async def start(request: Request) -> Any:
         table = await body(request)
         bench = text(table, "bench")
-        if bench and Path(bench) not in session.choice.bench.parent.glob("*.toml"):
-            raise InputError(f"{bench} is not one of the benches beside {session.choice.bench}")
+        if bench and Path(bench) not in session.home.glob("*.toml"):
+            raise InputError(f"{bench} is not one of the benches in {session.home}")
         await session.start(replace(session.choice, bench=Path(bench)) if bench else None)
 
     async def stop(_: Request) -> Any:

@@ -43,9 +43,11 @@ class Job:
             for step, arguments in enumerate(self.steps):
                 self.step = step
                 self.code = await self._one(arguments)
-                if self.code not in (0, 3):  # 3: done, but data were lost; the output says so
+                # 3: done, but data were lost; the output says so
+                if self.code not in (0, 3) or self.state != "running":
                     break
-            self.state = "done" if self.code in (0, 3) else "failed" if self.state == "running" else self.state
+            if self.state == "running":
+                self.state = "done" if self.code in (0, 3) else "failed"
         except OSError as error:
             self.state, self.code = "failed", -1
             self.lines.append(str(error))
@@ -64,6 +66,8 @@ class Job:
             env={**os.environ, "COLUMNS": "110", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             preexec_fn=lambda: os.nice(10),
         )
+        if self.state != "running":  # cancelled while it was being started
+            self._end()
         assert self._process.stdout is not None
         rest = ""
         while chunk := await self._process.stdout.read(4096):
@@ -76,10 +80,13 @@ class Job:
         """End it with everything that it started."""
         if self.state == "running":
             self.state = "cancelled"
-            if self._process is not None and self._process.returncode is None:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(self._process.pid, signal.SIGTERM)
+            self._end()
         await asyncio.gather(self.task, return_exceptions=True)
+
+    def _end(self) -> None:
+        if self._process is not None and self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self._process.pid, signal.SIGTERM)
 
     def as_dict(self) -> dict[str, Any]:
         """For the page."""

@@ -41,7 +41,7 @@ def _targets(session: Session) -> list[BaseRoute]:
 
     def benches() -> dict[str, Path]:
         with_card: dict[str, Path] = {}
-        for path in sorted(session.choice.bench.parent.glob("*.toml")):
+        for path in sorted(session.home.glob("*.toml")):
             with suppress(HalError):
                 if load_bench(path).description.devices_with("motion_card"):
                     with_card[str(path)] = path

@@ -28,13 +28,15 @@ def bind(address: str, port: int) -> socket.socket:
     """A listening socket, ``port`` 0 for any. ``InputError`` when that cannot be."""
     try:
         family = socket.AF_INET6 if ipaddress.ip_address(address).version == 6 else socket.AF_INET
-        sock = socket.socket(family)
+    except ValueError:
+        raise InputError(f"--listen {address}: not an IP address") from None
+    sock = socket.socket(family)
+    try:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind((address, port))
         sock.listen(128)  # who comes before the server is ready waits instead of being refused
-    except ValueError:
-        raise InputError(f"--listen {address}: not an IP address") from None
     except OSError as error:
+        sock.close()
         raise InputError(f"cannot listen on {address}, port {port}: {error.strerror}; choose another --port") from error
     return sock
 

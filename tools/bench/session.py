@@ -71,6 +71,7 @@ class Session:
 
     def __init__(self, choice: Choice, recordings: Path) -> None:
         self.choice = choice
+        self.home = choice.bench.parent  # where benches to choose from are; copies run from elsewhere
         self.bench = instrument_bench(choice.bench)
         self.firmware: Firmware | None = None
         self.run = Run()
