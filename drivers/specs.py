@@ -63,6 +63,15 @@ class Hmc2003Options(Options):
     strap_daq: str = "daq"
 
 
+class AmplifierMonitorOptions(Options):
+    """Monitor voltages of the amplifier's three outputs on an ADC: output volts = ADC volts x ``ratio``."""
+
+    channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
+    ratio: float = Field(default=20.0, gt=0, le=1000)
+    tolerance_V: float = Field(default=0.5, gt=0)
+    settle_ms: float = Field(default=0.3, ge=0, le=10.0)
+
+
 class DacAmplifierOptions(Options):
     """AD5696R and an amplifier: output volts = DAC volts x ``gain``."""
 
@@ -131,6 +140,7 @@ OPTIONS: dict[str, type[Options]] = {
     "analog": AnalogOptions,
     "ads1115": Ads1115Options,
     "hmc2003": Hmc2003Options,
+    "amplifier_monitor": AmplifierMonitorOptions,
     "dac_amplifier": DacAmplifierOptions,
     "e727": E727Options,
     "nidaqmx_ao": NiOutputOptions,
@@ -142,12 +152,16 @@ OPTIONS: dict[str, type[Options]] = {
 }
 """Drivers by the name used in a bench file. Adding a driver adds one line here."""
 
+MONITOR_LOOKS = 0.4
+"""Conversions per tick that an amplifier monitor makes, whatever its ADC's ``rate_hz``: a fault must be seen soon."""
+
 NEEDS = {
     "di4108": "bus",
     "adxl203": "daq",
     "analog": "daq",
     "ads1115": "bus",
     "hmc2003": "adc",
+    "amplifier_monitor": "adc",
     "dac_amplifier": "bus",
     "e727": "bus",
     "can_amplifier": "bus",
@@ -197,7 +211,7 @@ def _channel_claims(description: BenchDescription, options: dict[str, Any]) -> l
                 claims = tuple(channels.values())
             case AnalogOptions(channel=channel):
                 claims = (channel,)
-            case Hmc2003Options(channels=adc_channels):
+            case Hmc2003Options(channels=adc_channels) | AmplifierMonitorOptions(channels=adc_channels):
                 claims = adc_channels
             case _:
                 continue
@@ -250,6 +264,7 @@ def _bus_time(description: BenchDescription, options: dict[str, Any]) -> list[st
 def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[BusLoad]:
     """Share of its bus that each device takes. I2C: 9 bits a byte plus start and stop; CAN: worst stuffing."""
     tick_hz = description.clock.tick_hz
+    monitors = {spec.adc for spec in description.devices_with("amplifier_monitor").values()}
     loads: list[BusLoad] = []
     for name, spec in description.device.items():
         bus = description.bus.get(spec.bus or "")
@@ -260,7 +275,9 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
                 loads.append(bus_load(options[name], spec.bus or "", bus.speed_hz, name))
             transfers = {
                 "dac_amplifier": (tick_hz, 16, 4),
-                "ads1115": (3 * getattr(options[name], "rate_hz", 0), 9, 2),
+                "ads1115": (
+                    MONITOR_LOOKS * tick_hz if name in monitors else 3 * getattr(options[name], "rate_hz", 0), 9, 2,
+                ),
             }.get(spec.driver)
             if transfers:
                 rate_hz, n_bytes, n_starts = transfers

@@ -6,14 +6,17 @@ Plain arithmetic on a few floats: a numpy expression on three values costs more 
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Sequence
 
 from hal.contracts import Clock, Float64Array
 from hal.errors import ErrorKind, SafetyTrip
 from hal.types import OutputLimit
 
-LONGEST_RAMP_STEP = 3
-"""Steps of the ramp at once after a delay: still slower than any slew limit that a healthy command has."""
+RAMP_STEPS = 16
+"""Of a millisecond each; four of the twenty until neutral are left for transfers that have to be tried again."""
+
+TOLD = 16
 
 
 class OutputGuard:
@@ -29,7 +32,7 @@ class OutputGuard:
         limits: Sequence[OutputLimit],
         clock: Clock,
         *,
-        ramp_steps: int = 20,
+        ramp_steps: int = RAMP_STEPS,
         ramp_step_s: float = 0.001,
         longest_gap_s: float = 0.005,
     ) -> None:
@@ -38,6 +41,8 @@ class OutputGuard:
         self.last_V = [limit.safe_V for limit in limits]
         self.next_V = list(self.last_V)
         self.armed = False
+        self.told: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=TOLD)
+        """When what was sent (bench ns, V), the newest last: for who compares outputs with commands."""
         self.writes = 0
         self.clipped = 0
         self.slew_limited = 0
@@ -50,6 +55,7 @@ class OutputGuard:
         self._ramp_next = 0
         self._ramp_start_ns = 0
         self._ramp_from = list(self.last_V)
+        self._ramp_longest = 1
         self._bounds = [(limit.lo_V, limit.hi_V, limit.slew_V_per_s) for limit in limits]
 
     def admit(self, values_V: Float64Array) -> int:
@@ -102,7 +108,8 @@ class OutputGuard:
         """Disarm and fill ``next_V`` with the next step of a straight ramp to the safe state.
 
         True when that step is the safe state itself. Call again only after ``sent()``: a step that failed on
-        the bus is offered once more. Time that was lost is made up for, by at most three steps at once.
+        the bus is offered once more. Time that was lost is made up for, by as many steps at once as the slew limit
+        allows in the time of one.
         """
         self.armed = False
         now_ns = self._clock.now_ns()
@@ -110,18 +117,28 @@ class OutputGuard:
             self._ramp_from = list(self.last_V)
             self._ramp_done = 0
             self._ramp_start_ns = now_ns
+            self._ramp_longest = self._steps_within_slew()
         due = 1 + round((now_ns - self._ramp_start_ns) / self._ramp_step_ns)
-        self._ramp_next = min(max(due, self._ramp_done + 1), self._ramp_done + LONGEST_RAMP_STEP)
+        self._ramp_next = min(max(due, self._ramp_done + 1), self._ramp_done + self._ramp_longest)
         part = self._ramp_next / self._ramp_steps
         for i, limit in enumerate(self.limits):
             start = self._ramp_from[i]
             self.next_V[i] = limit.safe_V if part >= 1.0 else start + (limit.safe_V - start) * part
         return part >= 1.0 or all(v == limit.safe_V for v, limit in zip(self._ramp_from, self.limits, strict=True))
 
+    def _steps_within_slew(self) -> int:
+        fewest = self._ramp_steps
+        for start, limit in zip(self._ramp_from, self.limits, strict=True):
+            step_V = abs(start - limit.safe_V) / self._ramp_steps
+            if step_V > 0.0:
+                fewest = min(fewest, int(limit.slew_V_per_s * self._ramp_step_ns * 1e-9 / step_V))
+        return max(1, fewest)
+
     def sent(self) -> None:
         """The device has been told ``next_V``."""
         self.last_V[:] = self.next_V
         self._sent_ns = self._clock.now_ns()
+        self.told.append((self._sent_ns, tuple(self.next_V)))
         if self._ramp_done >= 0:
             self._ramp_done = self._ramp_next
         else:

@@ -25,7 +25,7 @@ from sim_devices.devices.can_stop_button import CanStopButton
 from sim_devices.devices.can_telemetry_listener import CanTelemetryListener
 from sim_devices.devices.di4108 import Di4108
 from sim_devices.devices.e727 import E727
-from sim_devices.devices.faces import ByteFace, TimedFace, Volts
+from sim_devices.devices.faces import ByteFace, TimedFace, VoltageSource, Volts
 from sim_devices.devices.lsm6ds3 import Lsm6ds3
 from sim_devices.devices.motion_card import MotionCard
 from sim_devices.devices.mpu6050 import Mpu6050
@@ -36,6 +36,7 @@ from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.wiring_faults import WiringFaults
 
 SIM_SCHEME = "sim://"
+MONITOR_RATIO = 20.0  # the divider between a stack and the input of an amplifier monitor
 AMPLIFIER_GAIN = 20.0  # the emulated amplifier's own; what the firmware believes is in its device table
 SPIKE_V, SPIKE_NS = 0.5, 2_000_000
 STRAP_SET, STRAP_RESET = 1, 2  # digital outputs 0 and 1 of the DAQ
@@ -49,6 +50,8 @@ class Plant(Protocol):
     def analog_V(self) -> Volts: ...
     @property
     def magnetometer_V(self) -> Volts: ...
+    @property
+    def stack_V(self) -> Volts: ...
     def advance_to(self, t_ns: int) -> None: ...
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None: ...
     def strap(self, pulse: Literal["set", "reset"]) -> None: ...
@@ -157,6 +160,18 @@ class World:
         self._adc_volts[self._adc_wiring[:3]] = self.plant.magnetometer_V
         return self._adc_volts
 
+    def _stack_monitor(self, channels: Sequence[int]) -> VoltageSource:
+        """Inputs of an ADC whose ``channels`` hang behind dividers on the terminals of the three stacks."""
+        volts = np.zeros(4)
+
+        def at(t_ns: int) -> Volts:
+            self.plant.advance_to(t_ns - self.epoch_ns)
+            for channel, stack_V in zip(channels, self.plant.stack_V, strict=True):
+                volts[channel] = stack_V / MONITOR_RATIO
+            return volts
+
+        return at
+
     def _amplifier_input(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
             self._piezo_demand(channel, volts * AMPLIFIER_GAIN, t_ns)
@@ -197,6 +212,11 @@ class World:
             "motion_card": self._add_motion_card,
         }
         emulation = description.get("emulation", {})
+        self._monitors = {
+            device.get("adc"): device.get("channels", (0, 1, 2))
+            for device in description["device"].values()
+            if device["driver"] == "amplifier_monitor"
+        }
         self._seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
         self._presses = (emulation.get("endoscope") or {}).get("presses", ())
         self._baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
@@ -247,7 +267,8 @@ class World:
         self.devices[name] = face
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
-        adc = Ads1115(self._magnetometer_V)
+        monitored = self._monitors.get(name)
+        adc = Ads1115(self._magnetometer_V if monitored is None else self._stack_monitor(monitored))
         self._add_i2c(name, device, adc)
         self._timed.append(adc)
 

@@ -1,7 +1,7 @@
 """The supervisor: one state machine that decides whether the actuators may move.
 
 Outputs are armed only after the self-test. Whatever goes wrong, the first reason wins, the amplifier ramps to
-neutral, one step a tick, within ``RAMP_TICKS``, and stays there: there is no way back to RUNNING in one run.
+neutral within ``RAMP_TICKS``, and stays there: there is no way back to RUNNING in one run.
 """
 
 from __future__ import annotations
@@ -12,10 +12,12 @@ from enum import IntEnum
 from pydantic import BaseModel, ConfigDict
 
 from hal.contracts import AnalogOutput
-from hal.errors import HalError
+from hal.errors import HalError, I2cNack
 
 RAMP_TICKS = 20
-"""Neutral within 20 ms of the decision, at one step a millisecond."""
+"""Neutral within 20 ms of the decision; the amplifier's ramp is shorter, so that steps can be tried again."""
+ATTEMPTS = 3
+"""Of a step that nobody acknowledged, within its tick: a refusal takes a tenth of the time of a transfer."""
 
 
 class State(IntEnum):
@@ -97,17 +99,21 @@ class Supervisor:
     def step(self) -> bool:
         """One tick of the ramp; True once neutral is reached or has to be given up.
 
-        A transfer that fails is tried again on the next tick until the ramp's time is over; then the report
-        says that neutral could not be confirmed, and why.
+        A transfer that is refused is tried again at once, one that fails otherwise on the next tick, until twice the
+        ramp's time is over; then the report says that neutral could not be confirmed, and why.
         """
         if self.state is not State.SAFE_RAMP:
             return self.state is State.SAFE
         self._ramp_ticks += 1
-        try:
-            if self._amplifier.safe_step():
-                self.state, self.safe_reached, self.ramp_failure = State.SAFE, True, ""
-        except HalError as error:
-            self.ramp_failure = str(error)
+        for _ in range(ATTEMPTS):
+            try:
+                if self._amplifier.safe_step():
+                    self.state, self.safe_reached, self.ramp_failure = State.SAFE, True, ""
+            except HalError as error:
+                self.ramp_failure = str(error)
+                if isinstance(error, I2cNack):
+                    continue
+            break
         if self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS:
             self.state = State.SAFE
             self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"

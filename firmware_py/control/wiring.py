@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from drivers.adc.ads1115 import Ads1115
+from drivers.amplifier_monitor import AmplifierMonitor
 from drivers.base import wait_s
 from drivers.can_frames import HostHeartbeat
 from drivers.can_telemetry import CanTelemetry
@@ -18,6 +19,7 @@ from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
 from drivers.specs import (
     Ads1115Options,
+    AmplifierMonitorOptions,
     CanAmplifierOptions,
     DacAmplifierOptions,
     Di4108Options,
@@ -31,6 +33,7 @@ from hal.bench import DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.middleware.share import SharedCan
+from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
 
 ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))
@@ -51,6 +54,7 @@ class Devices:
 
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
+    ``monitor`` measures what arrives at the stacks, where the bench has wires for it.
     """
 
     daq: Daq
@@ -61,6 +65,7 @@ class Devices:
     sensing_table: dict[str, Any]
     scan_labels: tuple[str, ...]
     verify_output: Callable[[], str] | None = None
+    monitor: AmplifierMonitor | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
 
 
@@ -94,18 +99,18 @@ def open_devices(bench: OpenBench) -> Devices:
     magnetometer = None
     for name, spec in description.devices_with("hmc2003").items():
         magnetometer_options: Hmc2003Options = options[name]
-        adc_name = spec.adc or ""
-        adc_options: Ads1115Options = options[adc_name]
-        adc_spec = description.device[adc_name]
-        adc = Ads1115(
-            bench.i2c(_bus(adc_spec)),
-            bench.clock,
-            adc_spec.address or 0x48,
-            full_scale_V=adc_options.full_scale_V,
-            name=adc_name,
-        )
-        probe(adc_name, adc.probe)
+        adc = _adc(bench, spec.adc or "", options)
+        probe(adc.name, adc.probe)
         magnetometer = Hmc2003(adc, daq, bench.clock, magnetometer_options.channels, name=name)
+    monitor = None
+    for name, spec in description.devices_with("amplifier_monitor").items():
+        monitor_options: AmplifierMonitorOptions = options[name]
+        adc = _adc(bench, spec.adc or "", options)
+        probe(adc.name, adc.probe)
+        monitor = AmplifierMonitor(
+            adc, _guard_of(amplifier, where, name), bench.clock, monitor_options.channels, ratio=monitor_options.ratio,
+            tolerance_V=monitor_options.tolerance_V, settle_s=monitor_options.settle_ms * 1e-3, name=name,
+        )  # fmt: skip
     telemetry = None
     for name, spec in description.devices_with("can_telemetry").items():
         bus = _bus(spec)
@@ -127,13 +132,29 @@ def open_devices(bench: OpenBench) -> Devices:
     labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in ACCELEROMETERS)
     labels += tuple(f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature"))
     verify = amplifier.verify if isinstance(amplifier, DacAmplifier) else None
-    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, identities)
+    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities)
 
 
 def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:
     if len(found) != 1:
         raise BenchError(f"{where}: [device] the instrument needs exactly one {what}, this bench has {len(found)}")
     return next(iter(found))
+
+
+def _adc(bench: OpenBench, name: str, options: Mapping[str, Any]) -> Ads1115:
+    adc_options: Ads1115Options = options[name]
+    spec = bench.file.description.device[name]
+    full_scale_V = adc_options.full_scale_V
+    return Ads1115(bench.i2c(_bus(spec)), bench.clock, spec.address or 0x48, full_scale_V=full_scale_V, name=name)
+
+
+def _guard_of(amplifier: AnalogOutput, where: str, name: str) -> OutputGuard:
+    if not isinstance(amplifier, DacAmplifier):
+        raise BenchError(
+            f"{where}: [device.{name}] compares commands of a dac_amplifier; '{amplifier.name}' measures its outputs "
+            "itself or cannot be compared; remove the monitor"
+        )
+    return amplifier.guard
 
 
 def _bus(spec: DeviceSpec) -> str:

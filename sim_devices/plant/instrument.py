@@ -75,6 +75,7 @@ class Instrument:
         s = self._state[0]
         self._demand_V, self._demand_fix_V = s["demand_V"], s["demand_fix_V"]
         self._daq_V, self._magnetometer_V = s["daq_V"], s["magnetometer_V"]
+        self._stack_V = s["channel"]["stack_V"]
 
     @property
     def now_ns(self) -> int:
@@ -131,6 +132,11 @@ class Instrument:
         """(3,) HMC-2003 outputs now. Changes as time goes on."""
         self._now()
         return self._magnetometer_V
+
+    @property
+    def stack_V(self) -> Array:
+        """(3,) at the terminals of the stacks at the last step."""
+        return self._stack_V
 
     def strap(self, pulse: Literal["set", "reset"]) -> None:
         """A pulse on the magnetometer's set/reset strap: ``reset`` turns the sign of its sensitivity."""

@@ -52,7 +52,7 @@ class Scanner:
         self._led_states: list[tuple[Array, Array, Array]] = [(self._level, np.zeros(3), np.zeros(3))]
         self._waves = _waves(self._config, config.seed)
         self.now_ns = 0
-        self.analog_V, self.magnetometer_V = np.zeros(8), np.full(3, 2.5)
+        self.analog_V, self.magnetometer_V, self.stack_V = np.zeros(8), np.full(3, 2.5), np.zeros(3)
 
     # ------------------------------------------------------------------ what the world needs
 

@@ -20,6 +20,7 @@ from hal.backends.nidaqmx_ai import NidaqmxScan
 from hal.backends.nidaqmx_ao import NidaqmxOutput
 from hal.clock import VirtualClock
 from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, HalError, Overrun, SafetyTrip
+from hal.output_guard import RAMP_STEPS
 from hal.types import ScanConfig, Status
 
 MS = 1_000_000
@@ -189,7 +190,7 @@ def test_output_divides_by_the_gain_and_clips(package: Package):
     assert device.readback_V().tolist() == [50.0, 50.0, 50.0]
     sent.clear()
     device.close()
-    assert len(sent) == 20
+    assert len(sent) == RAMP_STEPS
     assert sent[-1] == [2.5, 2.5, 2.5]
     device.close()
     for task in package.tasks:

@@ -10,6 +10,7 @@ import pytest
 from drivers.piezo.dac_amplifier import DacAmplifier
 from hal.clock import VirtualClock
 from hal.errors import BenchError, I2cNack, SafetyTrip, WrongDevice
+from hal.output_guard import RAMP_STEPS
 from tests.wire.drivers.scripted_ports import ScriptedI2c
 
 MS = 1_000_000
@@ -71,10 +72,10 @@ def test_probe_refuses_a_12_bit_part():
 
 
 def test_arm_ramps_from_where_the_dac_is():
-    steps = [update(*([round(0x8000 * k / 20)] * 3)) for k in range(1, 21)]
+    steps = [update(*([round(0x8000 * k / RAMP_STEPS)] * 3)) for k in range(1, RAMP_STEPS + 1)]
     amplifier, bus, clock = make(*PROBE, readback(bytes(6)), *steps, readback(NEUTRAL))
     amplifier.arm()
-    assert clock.now_ns() == 19 * MS
+    assert clock.now_ns() == (RAMP_STEPS - 1) * MS
     bus.done()
 
 
@@ -127,22 +128,22 @@ def test_a_value_that_is_not_finite_trips(bad: float):
     bus.done()
 
 
-def test_safe_ramp_takes_twenty_steps_and_disarms():
+def test_safe_ramp_takes_its_steps_and_disarms():
     far = update(0xFFFF, 0x0000, 0x8000)
     ramp = [
-        update(*(round((v + (50.0 - v) * k / 20) * 655.36) for v in (100.0 - 100.0 / 65536, 0.0, 50.0)))
-        for k in range(1, 21)
+        update(*(round((v + (50.0 - v) * k / RAMP_STEPS) * 655.36) for v in (100.0 - 100.0 / 65536, 0.0, 50.0)))
+        for k in range(1, RAMP_STEPS + 1)
     ]
     amplifier, bus, _ = armed(far, *ramp, readback(NEUTRAL), slew_V_per_s=1e9)
     amplifier.write(np.array([100.0, 0.0, 50.0]))
-    assert [amplifier.safe_step() for _ in range(20)] == [False] * 19 + [True]
+    assert [amplifier.safe_step() for _ in range(RAMP_STEPS)] == [False] * (RAMP_STEPS - 1) + [True]
     bus.done()
     with pytest.raises(SafetyTrip):
         amplifier.write(np.full(3, 50.0))
 
 
 def test_a_failed_step_is_offered_again():
-    first = update(0x8000 + 6226, 0x8000, 0x8000)  # 59.5 V
+    first = update(0x8000 + 6144, 0x8000, 0x8000)  # 59.375 V
     amplifier, bus, _ = armed(update(0x8000 + 6554, 0x8000, 0x8000), (A, I2cNack("busy")), first, slew_V_per_s=1e9)
     amplifier.write(np.array([60.0, 50.0, 50.0]))
     with pytest.raises(I2cNack):
@@ -152,7 +153,7 @@ def test_a_failed_step_is_offered_again():
 
 
 def test_close_goes_to_neutral_first():
-    ramp = [update(0x8000 + round(655.36 * (20 - k) / 2), 0x8000, 0x8000) for k in range(1, 21)]
+    ramp = [update(0x8000 + round(6553.6 * (1.0 - k / RAMP_STEPS)), 0x8000, 0x8000) for k in range(1, RAMP_STEPS + 1)]
     amplifier, bus, clock = armed(update(0x8000 + 6554, 0x8000, 0x8000), *ramp, readback(NEUTRAL), slew_V_per_s=1e9)
     amplifier.write(np.array([60.0, 50.0, 50.0]))
     t0 = clock.now_ns()

