@@ -276,7 +276,9 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
             transfers = {
                 "dac_amplifier": (tick_hz, 16, 4),
                 "ads1115": (
-                    MONITOR_LOOKS * tick_hz if name in monitors else 3 * getattr(options[name], "rate_hz", 0), 9, 2,
+                    MONITOR_LOOKS * tick_hz if name in monitors else 3 * getattr(options[name], "rate_hz", 0),
+                    9,
+                    2,
                 ),
             }.get(spec.driver)
             if transfers:

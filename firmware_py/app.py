@@ -28,6 +28,7 @@ from firmware_py.control.wiring import Devices, open_devices
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.exit_codes import exit_code_of
 from firmware_py.frame import LAYOUT
+from firmware_py.guardian.start import guarded
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
@@ -97,6 +98,7 @@ def run_in_process(
             stalled_ms = max(request.stale_ms, config.safety.stalled_ms)
             safety = config.safety.model_copy(update={"stale_ms": request.stale_ms, "stalled_ms": stalled_ms})
             config = config.model_copy(update={"safety": safety})
+        heart = stack.enter_context(guarded(opened, devices, config.safety, opened.runtime_dir))
         stages = Stages(configs)
         recorder = _recorder(request, bench, configs, opened)
         live = None
@@ -124,6 +126,8 @@ def run_in_process(
         finally:
             if recorder is not None:
                 summary = recorder.stop(loop.scheduler.snapshot().as_dict())
+        if heart is not None and heart.noticed_ns:
+            loop.counts.noticed.setdefault("no command for a while (guardian)", heart.noticed_ns)
         outcome = make_outcome(request, bench, devices, loop, config, report, summary)
         return outcome, truth_of(opened)
 

@@ -41,6 +41,7 @@ from sim_devices.world import Plant, World
 POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
+LINGER_NS = 1_000_000_000  # after the death of the firmware
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
 
@@ -75,12 +76,18 @@ class WorldProcess:
         self._control.bind(str(sockets / "control.sock"))
         self._control.setblocking(False)
         self._stop = False
+        self._ends_ns: int | None = None
         self._worst_late_ns = 0
         self._turns = 0
         self._now_ns = self.world.epoch_ns
 
     def request_stop(self, *_: object) -> None:
         self._stop = True
+
+    def outlive_parent(self, *_: object) -> None:
+        """The firmware is gone; a device does not end with it, and a guardian may still want it."""
+        if self._ends_ns is None:
+            self._ends_ns = self._clock.now_ns() + LINGER_NS
 
     def endpoints(self) -> dict[str, str]:
         """URI of each bus for the ordinary adapters of hal."""
@@ -102,6 +109,8 @@ class WorldProcess:
             if self._now_ns >= check_ns:
                 check_ns = self._now_ns + PARENT_CHECK_NS
                 if os.getppid() != self._parent:
+                    self.outlive_parent()
+                if self._ends_ns is not None and self._now_ns >= self._ends_ns:
                     break
         self._finish()
 
@@ -215,7 +224,7 @@ def prefer_real_time() -> str:
 def main(argv: list[str]) -> int:
     job_path = Path(argv[0])
     job = json.loads(job_path.read_text(encoding="utf-8"))
-    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGHUP)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the firmware; it ends us when it is done
     try:
         process = WorldProcess(job)
@@ -223,6 +232,7 @@ def main(argv: list[str]) -> int:
         job_path.with_name("error.txt").write_text(str(error), encoding="utf-8")
         return 2
     signal.signal(signal.SIGTERM, process.request_stop)
+    signal.signal(signal.SIGHUP, process.outlive_parent)
     gc.collect()
     gc.freeze()
     gc.disable()

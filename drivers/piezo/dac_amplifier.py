@@ -121,6 +121,10 @@ class DacAmplifier:
             self.guard.require(found == wanted, f"neutral codes {wanted} read back as {found}")
         return done
 
+    def lose_position(self) -> None:
+        """Somebody else has moved the outputs: the next ramp begins where they are found."""
+        self._position_known = False
+
     def verify(self) -> str:
         """Read all four input registers back, 0.26 ms at 400 kHz: empty, or what is not as it was told.
 

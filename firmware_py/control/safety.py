@@ -36,6 +36,8 @@ class SafetyLimits(BaseModel):
     ``stalled_ms``: scans that come in one piece after so long say that the host stood still, uncontrolled.
     ``magnetometer_ms``: how long the heading may coast; a rate that is integrated from accelerations does not keep it
     for longer.
+    ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
+    ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -46,6 +48,9 @@ class SafetyLimits(BaseModel):
     saturated_ms: float = 50.0
     stalled_ms: float = 100.0
     magnetometer_ms: float = 150.0
+    guardian: bool = True
+    guardian_notice_ms: float = 8.0
+    guardian_ms: float = 40.0
 
 
 @dataclass(frozen=True)

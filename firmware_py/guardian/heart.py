@@ -1,0 +1,93 @@
+"""Heartbeat of the firmware in shared memory: a few aligned 64-bit words, each with one writer."""
+
+from __future__ import annotations
+
+import mmap
+import os
+from enum import IntEnum
+
+_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY = range(6)
+_BYTES = 64
+
+
+class Phase(IntEnum):
+    """What the firmware says of the outputs: at rest, being armed (only a death counts), or moving with every beat."""
+
+    IDLE = 0
+    ARMING = 1
+    RUNNING = 2
+
+
+class Why(IntEnum):
+    """Why the guardian took the outputs."""
+
+    NOTHING = 0
+    DIED = 1
+    SILENT = 2
+
+
+class Heart:
+    """``phase`` and ``beat`` are the firmware's words, the others the guardian's. Times on the bench clock, ns; 0: never.
+
+    Without ``fd`` in private memory, for a guardian in the same process.
+    """
+
+    def __init__(self, fd: int | None = None) -> None:
+        self.fd = fd
+        self._words = memoryview(bytearray(_BYTES) if fd is None else mmap.mmap(fd, _BYTES)).cast("q")
+
+    @classmethod
+    def shared(cls) -> Heart:
+        """In memory that a child process can open by ``fd``."""
+        fd = os.memfd_create("micron-heart")
+        os.ftruncate(fd, _BYTES)
+        return cls(fd)
+
+    # -- the firmware's side
+
+    def beat(self, t_ns: int) -> None:
+        self._words[_BEAT] = t_ns
+
+    def say(self, phase: Phase) -> None:
+        self._words[_PHASE] = phase
+
+    # -- the guardian's side
+
+    def notice(self, t_ns: int) -> None:
+        """The beat is late; the first time is kept."""
+        if not self._words[_NOTICED]:
+            self._words[_NOTICED] = t_ns
+
+    def take(self, why: Why, t_ns: int) -> None:
+        self._words[_WHY] = why
+        self._words[_TAKEN] = t_ns
+
+    def reach(self, t_ns: int) -> None:
+        """Neutral, read back."""
+        self._words[_REACHED] = t_ns
+
+    # -- for both
+
+    @property
+    def phase(self) -> Phase:
+        return Phase(self._words[_PHASE])
+
+    @property
+    def beat_ns(self) -> int:
+        return self._words[_BEAT]
+
+    @property
+    def noticed_ns(self) -> int:
+        return self._words[_NOTICED]
+
+    @property
+    def taken_ns(self) -> int:
+        return self._words[_TAKEN]
+
+    @property
+    def reached_ns(self) -> int:
+        return self._words[_REACHED]
+
+    @property
+    def why(self) -> Why:
+        return Why(self._words[_WHY])

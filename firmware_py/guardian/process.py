@@ -1,0 +1,145 @@
+"""The guardian's process and its handle in the firmware.
+
+The firmware holds the writing end of a pipe: when it dies, by whatever cause, the kernel closes it and the guardian
+wakes at once. That it stands still is seen in the heartbeat. The guardian has its own connection to the amplifier's
+bus, opened at the start; it outlives the firmware, and ends when the outputs are neutral and stay so.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.guardian import STEP_NS, Guardian, State
+from firmware_py.guardian.heart import Heart, Why
+from firmware_py.scheduler.realtime import RealtimeConfig, realtime
+from hal.backends import open_i2c
+from hal.clock import MonotonicClock
+from hal.errors import HalError, OpenFailed
+
+PRIORITY = 85  # above the loop: it does almost nothing, but must do it while the loop is stuck
+START_S = 30.0
+REPORT = "guardian.json"
+_ROOT = Path(__file__).resolve().parents[2]
+
+
+class GuardianProcess:
+    """Handle of a running guardian. Start it before real-time settings are made."""
+
+    def __init__(self, process: subprocess.Popen[bytes], heart: Heart, pipe: int, report: Path) -> None:
+        """Use ``start``."""
+        self.heart = heart
+        self._process = process
+        self._pipe = pipe
+        self._report = report
+
+    @classmethod
+    def start(cls, order: dict[str, Any], runtime_dir: Path) -> GuardianProcess:
+        """``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``.
+
+        Returns at once; ``await_ready`` says whether it came up.
+        """
+        heart = Heart.shared()
+        assert heart.fd is not None
+        theirs, ours = os.pipe()
+        report = runtime_dir / REPORT
+        order = {**order, "heart": heart.fd, "pipe": theirs, "report": str(report)}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "firmware_py.guardian.process", json.dumps(order)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            pass_fds=(heart.fd, theirs),
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])},
+            start_new_session=True,  # Ctrl-C is for the firmware
+        )
+        os.close(theirs)
+        return cls(process, heart, ours, report)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    def await_ready(self) -> None:
+        """Raises ``OpenFailed`` when the guardian has no way to the amplifier."""
+        assert self._process.stdout is not None
+        ready, _, _ = select.select([self._process.stdout], (), (), START_S)
+        line = self._process.stdout.readline().decode() if ready else ""
+        if line.strip() != "ready":
+            self.stop()
+            why = line.strip() or f"no word from it within {START_S:g} s"
+            raise OpenFailed([HalError(f"the guardian of the outputs did not start: {why}", device="guardian")])
+
+    def stop(self) -> dict[str, Any] | None:
+        """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent."""
+        if self._pipe >= 0:
+            os.close(self._pipe)
+            self._pipe = -1
+            try:
+                self._process.communicate(timeout=10.0)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.communicate()
+        with suppress(OSError, ValueError):
+            return json.loads(self._report.read_text(encoding="utf-8"))
+        return None
+
+
+def serve(guardian: Guardian, pipe: int) -> None:
+    """Until the outputs need no guardian any more."""
+    alive = True
+    while guardian.state is not State.DONE:
+        readable, _, _ = select.select([pipe] if alive else [], (), (), STEP_NS * 1e-9)
+        if readable:
+            alive = bool(os.read(pipe, 64))
+        guardian.step(alive)
+
+
+def main(arguments: list[str]) -> int:
+    """``python -m firmware_py.guardian.process ORDER`` (JSON)."""
+    order = json.loads(arguments[0])
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # it ends with the firmware, not with its terminal
+    clock = MonotonicClock()
+    try:
+        bus = open_i2c(order["uri"], speed_hz=order["speed_hz"])
+        amplifier = DacAmplifier(bus, clock, **order["options"])
+        amplifier.readback_V()
+    except HalError as error:
+        sys.stdout.write(f"{error}\n")
+        return 1
+    guardian = Guardian(
+        Heart(order["heart"]), amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"]
+    )
+    sys.stdout.write("ready\n")
+    sys.stdout.flush()
+    with realtime(RealtimeConfig(priority=PRIORITY)):
+        serve(guardian, order["pipe"])
+    report = guardian.report()
+    partial = Path(order["report"] + ".partial")
+    with suppress(OSError):  # whoever wanted it may have cleaned up
+        partial.write_text(json.dumps(report), encoding="utf-8")
+        partial.rename(order["report"])
+    if report["why"] != Why.NOTHING.name.lower():
+        sys.stderr.write(f"micron guardian: {describe(report)}\n")
+    return 0
+
+
+def describe(report: dict[str, Any]) -> str:
+    """A report in words."""
+    why = {"died": "the firmware died", "silent": "the loop stood still"}.get(report["why"], "nothing to do")
+    if report["neutral_ns"] and report["last_beat_ns"]:
+        after_ms = (report["neutral_ns"] - report["last_beat_ns"]) * 1e-6
+        return f"{why}; outputs neutral and read back {after_ms:.1f} ms after the last command"
+    return f"{why}; neutral NOT confirmed ({report['problem'] or 'no answer'}): switch the amplifier off"
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

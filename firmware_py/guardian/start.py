@@ -1,0 +1,89 @@
+"""Which bench gets a guardian, and how: a process in real time, callbacks of the clock in virtual time."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from drivers.piezo.dac_amplifier import DacAmplifier
+from drivers.specs import DacAmplifierOptions, device_options
+from firmware_py.control.safety import SafetyLimits
+from firmware_py.control.wiring import Devices
+from firmware_py.guardian.amplifier import GuardedAmplifier
+from firmware_py.guardian.guardian import STEP_NS, Guardian, State
+from firmware_py.guardian.heart import Heart
+from firmware_py.guardian.process import GuardianProcess
+from hal.bench import I2cSpec, OpenBench
+from hal.clock import VirtualClock
+
+
+@contextlib.contextmanager
+def guarded(opened: OpenBench, devices: Devices, limits: SafetyLimits, runtime_dir: Path) -> Iterator[Heart | None]:
+    """Puts a guardian beside ``devices.amplifier`` where that is a DAC without a watchdog; yields its heartbeat.
+
+    Raises ``OpenFailed`` when it has no way to the amplifier.
+    """
+    amplifier = devices.amplifier
+    if not limits.guardian or not isinstance(amplifier, DacAmplifier):
+        yield None
+        return
+    # without scans there are no commands: the loop's own limit for those comes first
+    limit_ms = max(limits.guardian_ms, 2.0 * limits.stale_ms)
+    if isinstance(opened.clock, VirtualClock):
+        heart = Heart()
+        own = DacAmplifier(_bus_of(opened, amplifier.name), opened.clock, **_options(opened, amplifier.name))
+        guardian = Guardian(heart, own, opened.clock, notice_ms=limits.guardian_notice_ms, limit_ms=limits.guardian_ms)
+        _step_in_virtual_time(guardian, opened.clock)
+        devices.amplifier = GuardedAmplifier(amplifier, heart, opened.clock)
+        try:
+            yield heart
+        finally:
+            guardian.state = State.DONE
+        return
+    process = GuardianProcess.start(
+        {
+            **_uri(opened, amplifier.name),
+            "options": _options(opened, amplifier.name),
+            "notice_ms": limits.guardian_notice_ms,
+            "limit_ms": limit_ms,
+        },
+        runtime_dir,
+    )
+    try:
+        process.await_ready()
+        devices.amplifier = GuardedAmplifier(amplifier, process.heart, opened.clock)
+        yield process.heart
+    finally:
+        process.stop()
+
+
+def _step_in_virtual_time(guardian: Guardian, clock: VirtualClock) -> None:
+    """Half a step beside the firmware's ticks; its transfers take their time on the bus as the firmware's do."""
+
+    def step(t_ns: int) -> None:
+        guardian.step(alive=True)
+        if guardian.state is not State.DONE:
+            clock.at(t_ns + STEP_NS, step)
+
+    clock.at(clock.now_ns() + STEP_NS // 2, step)
+
+
+def _bus_of(opened: OpenBench, name: str) -> Any:
+    return opened.i2c(opened.file.description.device[name].bus or "")
+
+
+def _uri(opened: OpenBench, name: str) -> dict[str, Any]:
+    bus = opened.file.description.device[name].bus or ""
+    spec = opened.file.description.bus[bus]
+    assert isinstance(spec, I2cSpec)
+    emulated = opened.world is not None and bus in opened.file.description.emulated_buses()
+    uri = opened.world.endpoint(bus) if emulated and opened.world is not None else spec.uri
+    return {"uri": uri, "speed_hz": spec.speed_hz}
+
+
+def _options(opened: OpenBench, name: str) -> dict[str, Any]:
+    spec = opened.file.description.device[name]
+    options: DacAmplifierOptions = device_options(opened.file.description, name, str(opened.file.path))
+    return {"address": spec.address or 0x0C, "name": name, **options.model_dump()}
