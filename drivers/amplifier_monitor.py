@@ -2,8 +2,8 @@
 
 What is measured must lie between the lowest and the highest voltage that was commanded during the conversion and
 the amplifier's settling time before it, give or take a tolerance: no model of the amplifier is needed. A reading
-outside is looked at once more, on the same channel, before anything is said. Wired to the stack's terminals it sees
-a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
+a little outside is looked at once more, on the same channel, before anything is said. Wired to the stack's terminals
+it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
 """
 
 from __future__ import annotations
@@ -15,6 +15,9 @@ import numpy as np
 from drivers.adc.ads1115 import Ads1115
 from hal.contracts import Clock, Float64Array
 from hal.output_guard import OutputGuard
+
+GROSS = 8.0
+"""Times the tolerance: no noise and no mistake of a model, believed at once."""
 
 
 class AmplifierMonitor:
@@ -96,11 +99,12 @@ class AmplifierMonitor:
             self._output = (output + 1) % len(self._channels)
             return ""
         self.suspicions += 1
-        if not self._suspected:
+        beyond_V = max(span[0] - measured_V, measured_V - span[1])
+        if not self._suspected and beyond_V < GROSS * self._tolerance_V:
             self._suspected = True  # and the same output is converted again
             return ""
         told = f"{span[0]:.2f} V" if span[1] - span[0] < 0.005 else f"{span[0]:.2f} to {span[1]:.2f} V"
         return (
-            f"output {output + 1} is at {measured_V:.2f} V and was told {told}: the amplifier, its supply, a cable or a "
-            f"stack is broken (or {self.name} is); switch the amplifier off"
+            f"output {output + 1} is at {measured_V:.2f} V and was told {told}: the amplifier, its supply, a cable or "
+            f"a stack is broken (or {self.name} is); switch the amplifier off"
         )

@@ -18,7 +18,7 @@ from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
 from firmware_py.control.plausibility import ScanCheck
-from firmware_py.control.safety import State, Supervisor
+from firmware_py.control.safety import FINISHED, State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.tasks import Works, task_table
 from firmware_py.control.watch import Watch
@@ -96,7 +96,7 @@ class InstrumentLoop:
         wired = devices.sensing_table
         watched = (*wired["channels"], wired["supply_channel"], wired["temperature_channel"])
         self._check = ScanCheck(config.plausibility, wired["lsb_V"], watched, devices.scan_labels)
-        self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents, self._period_ns)
+        self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
         if live is not None:
             background.append(BackgroundSpec("histograms", lambda: live.show(self.histograms), 30.0))
@@ -108,6 +108,7 @@ class InstrumentLoop:
             supervise=self._supervise,
             magnetometer=self._field.poll if self._field is not None else None,
             verify=self._watch.verify_output if devices.verify_output is not None else None,
+            monitor=self._watch.monitor_output if devices.monitor is not None else None,
             telemetry=self._send_telemetry if devices.telemetry is not None else None,
         )
         tasks = task_table(works, tick_hz, config.budget_us)
@@ -172,7 +173,7 @@ class InstrumentLoop:
             silent_after_ns=round(limits.stale_ms * 1e6),
         )
         end_ns: int | None = None
-        while self.supervisor.state is not State.SAFE:
+        while self.supervisor.state is not State.SAFE and not self.supervisor.must_not_wait:
             ticks = ticker.wait()
             self._ticks = ticks
             self.incidents.tick = ticks.k0
@@ -188,7 +189,7 @@ class InstrumentLoop:
             elif self._interrupted:
                 self.incidents.trip(f"stopped by the operator ({self._interrupted})", normal=True)
             elif end_ns is not None and newest_ns >= end_ns:
-                self.incidents.trip("run finished", normal=True)
+                self.incidents.trip(FINISHED, normal=True)
             self.scheduler.run(ticks)
             if self.supervisor.state is State.SELF_TEST and self._watch.self_test_passed(
                 (newest_ns - self._started_ns) * 1e-6

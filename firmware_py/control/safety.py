@@ -18,6 +18,7 @@ RAMP_TICKS = 20
 """Neutral within 20 ms of the decision; the amplifier's ramp is shorter, so that steps can be tried again."""
 ATTEMPTS = 3
 """Of a step that nobody acknowledged, within its tick: a refusal takes a tenth of the time of a transfer."""
+FINISHED = "run finished"
 
 
 class State(IntEnum):
@@ -36,6 +37,7 @@ class SafetyLimits(BaseModel):
     ``stalled_ms``: scans that come in one piece after so long say that the host stood still, uncontrolled.
     ``magnetometer_ms``: how long the heading may coast; a rate that is integrated from accelerations does not keep it
     for longer.
+    ``monitor_ms``: how long the amplifier's monitor may be deaf.
     ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
     ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
     """
@@ -48,6 +50,7 @@ class SafetyLimits(BaseModel):
     saturated_ms: float = 50.0
     stalled_ms: float = 100.0
     magnetometer_ms: float = 150.0
+    monitor_ms: float = 100.0
     guardian: bool = True
     guardian_notice_ms: float = 8.0
     guardian_ms: float = 40.0
@@ -80,6 +83,12 @@ class Supervisor:
     def may_move(self) -> bool:
         """Only this lets a command through."""
         return self.state is State.RUNNING
+
+    @property
+    def must_not_wait(self) -> bool:
+        """A ramp that somebody or something asked for runs on the host clock: the loop would wait for scans, and they
+        may be what broke. Only the planned end of a run is recorded to its last step."""
+        return self.state is State.SAFE_RAMP and self.trip_cause is not None and self.trip_cause.reason != FINISHED
 
     def begin_self_test(self) -> None:
         if self.state is State.BOOT:

@@ -16,9 +16,12 @@ BUDGETS_US: Mapping[str, float] = {
     "supervise": 300.0,
     "telemetry": 300.0,
     "verify": 340.0,  # 260 us of bus time
+    "monitor": 350.0,  # 220 us of bus time
 }
 MAGNETOMETER_PHASES = (0, 3, 6)
 VERIFY_PHASES = (1, 4, 8)  # in ticks that leave the bus free for it
+MONITOR_PHASES = (1, 4, 7, 9)
+VERIFY_BESIDE_MONITOR = ((10, 8), (20, 15))  # divider, phase
 
 Work = Callable[[TickInfo], object]
 
@@ -34,6 +37,7 @@ class Works:
     supervise: Work
     magnetometer: Work | None
     verify: Work | None
+    monitor: Work | None
     telemetry: Work | None
 
 
@@ -58,7 +62,11 @@ def task_table(works: Works, tick_hz: int, budget_us: Mapping[str, float]) -> li
     task("publish", works.publish, 3, catch_up=True)
     task("supervise", works.supervise, 5, 10, 2)
     in_turn([f"magnetometer_{axis}" for axis in "xyz"], works.magnetometer, MAGNETOMETER_PHASES)
-    in_turn([f"verify_{phase}" for phase in VERIFY_PHASES], works.verify, VERIFY_PHASES)
+    verify = [(10, phase) for phase in VERIFY_PHASES] if works.monitor is None else VERIFY_BESIDE_MONITOR
+    for divider, phase in verify:
+        if works.verify is not None:
+            task(f"verify_{phase}", works.verify, 4, divider, phase)
+    in_turn([f"monitor_{phase}" for phase in MONITOR_PHASES], works.monitor, MONITOR_PHASES)
     if works.telemetry is not None:
         task("telemetry", works.telemetry, 6, 20, 5)
     return table

@@ -14,8 +14,6 @@ from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
-WATCH_TICKS = 10
-
 
 class Watch:
     """Reads the frame and the devices; its only consequence is a trip."""
@@ -28,7 +26,6 @@ class Watch:
         check: ScanCheck,
         supervisor: Supervisor,
         incidents: Incidents,
-        period_ns: int,
     ) -> None:
         self._devices = devices
         self._config = config
@@ -36,7 +33,6 @@ class Watch:
         self._check = check
         self._supervisor = supervisor
         self._incidents = incidents
-        self._elapsed_s = WATCH_TICKS * period_ns * 1e-9
 
     def supervise(self, info: TickInfo) -> None:
         """Task: readings that are impossible for a while, the room, the stop button."""
@@ -59,8 +55,10 @@ class Watch:
             outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
             reason = f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}"
             incidents.bad_for(name, outside, t_ns, 100.0, reason)
-        if not status & FrameStatus.INVALID and (apart := self._check.pairs(frame, self._elapsed_s)):
+        if not status & FrameStatus.INVALID and (apart := self._check.pairs(frame)):
             incidents.trip(apart)
+        if odd := self._check.odd():
+            incidents.notice(odd)
         telemetry = self._devices.telemetry
         if telemetry is not None:
             if telemetry.poll():
@@ -71,7 +69,7 @@ class Watch:
                 )
 
     def verify_output(self, info: TickInfo) -> None:
-        """Task, 300 Hz: the amplifier must hold what it was told; a DAC that restarted or misheard does not."""
+        """Task, 150 or 300 Hz: the amplifier must hold what it was told; a DAC that restarted or misheard does not."""
         assert self._devices.verify_output is not None
         if not self._supervisor.may_move:
             return
@@ -82,6 +80,24 @@ class Watch:
         except HalError as error:
             self._incidents.error = error
             self._incidents.trip_for(name, error)
+
+    def monitor_output(self, info: TickInfo) -> None:
+        """Task, 400 Hz: what arrives at the stacks must be what was told."""
+        monitor = self._devices.monitor
+        assert monitor is not None
+        if not self._supervisor.may_move:
+            monitor.forget()
+            return
+        name, limit_ms = self._devices.amplifier.name, self._config.safety.monitor_ms
+        deaf, reason = False, ""
+        try:
+            if wrong := monitor.poll():
+                self._incidents.trip(f"{name}: {wrong}")
+        except HalError as error:
+            deaf, reason = True, f"{monitor.name}: {error}"
+            monitor.forget()
+            self._incidents.notice("amplifier monitor does not answer")
+        self._incidents.bad_for("monitor", deaf, info.due_ns, limit_ms, reason)
 
     def self_test_passed(self, watched_ms: float) -> bool:
         """Sensors have been watched long enough and are sane; trips when that takes too long."""

@@ -27,7 +27,7 @@ class Why(IntEnum):
 
 
 class Heart:
-    """``phase`` and ``beat`` are the firmware's words, the others the guardian's. Times on the bench clock, ns; 0: never.
+    """``phase`` and ``beat`` are the firmware's words, the others the guardian's. Times: bench clock, ns; 0: never.
 
     Without ``fd`` in private memory, for a guardian in the same process.
     """

@@ -7,11 +7,8 @@ from tools.faults.fault import Fault, InWorld, OnBus, OnHost
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
-NO_FEEDBACK = "nothing on this bench measures the amplifier's output or the stack's stroke; fit a monitor input"
-ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 300 Hz only"
-
-
-NOBODY = "while the host stands still only a watchdog at the amplifier could act; the CAN node has one (10 ms)"
+ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 150 Hz only"
+GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
 
 def faults() -> tuple[Fault, ...]:
@@ -33,7 +30,7 @@ def serial_line() -> tuple[Fault, ...]:
         line("neighbouring bytes exchanged", "safe state", reorder=0.05),
         line("reads cut short", "safe state", truncation=0.02),
         line("every tenth read 2 ms late", "noticed", delay=0.1, delay_s=0.002),
-        line("a read 20 ms late now and then", "noticed", delay=0.02, delay_s=0.020, why=NOBODY),
+        line("a read 20 ms late now and then", "noticed", delay=0.02, delay_s=0.020, why=GUARDED),
         line("silence of 3 ms", "noticed", silent_after_s=0.0, silent_for_s=0.003),
         line("silence of 50 ms", "safe state", silent_after_s=0.0, silent_for_s=0.05),
         line("silence", "safe state", silent_after_s=0.0),
@@ -60,8 +57,11 @@ def sensors() -> tuple[Fault, ...]:
         words = ("acc", "DAQ input")
         return Fault(f"sensor: {name}", InWorld(fault, str(channel)), expected, words, watch_s, why=why)  # type: ignore[arg-type]
 
-    slow = "50 mV/s is within what motion can do for seconds; parallel axes disagree after some seconds"
-    fast = "1 mV/ms is as fast as tremor; only the slow disagreement of parallel axes shows it"
+    noise = (
+        "six axes have no parity in motion (ERRATA 15): a few mV move the tip as far as they would if they were true; "
+    )
+    slow = noise + "parallel axes disagree after 0.4 s, longer than this run"
+    fast = noise + "parallel axes disagree after 0.05 to 0.08 s, by more than tremor spreads them"
     return (
         one("stuck", "sensor_stuck", "safe state"),
         one("wire broken", "sensor_open", "safe state"),
@@ -75,7 +75,12 @@ def sensors() -> tuple[Fault, ...]:
         one("sign turned round", "sensor_sign", "safe state"),
         one("exchanged with its neighbour", "sensor_swap", "safe state", 2),
         Fault("sensor: supply sags to 4.25 V", InWorld("supply=0.85", ""), "safe state", ("supply",), 0.3),
-        Fault("sensor: supply sags by 1 %", InWorld("supply=0.99", ""), "harmless", why="ratiometric: it cancels"),
+        Fault(
+            "sensor: supply sags by 1 %",
+            InWorld("supply=0.99", ""),
+            "noticed",
+            why="ratiometric: it cancels but for the spread of the sensors' filters",
+        ),
         Fault("sensor: temperature wire broken", InWorld("sensor_open", "7"), "safe state", ("temperature",)),
         Fault("sensor: supply wire broken", InWorld("sensor_open", "6"), "safe state", ("supply",)),
         Fault("sensor: supply reading stuck", InWorld("sensor_stuck", "6"), "harmless", why="the supply moves slowly"),
@@ -149,8 +154,7 @@ def can_bus() -> tuple[Fault, ...]:
 
 def actuators() -> tuple[Fault, ...]:
     def one(name: str, fault: str) -> Fault:
-        how = InWorld(f"actuator_{fault}", "1")
-        return Fault(f"actuator: {name}", how, "cannot be seen", ("piezo", "output"), why=NO_FEEDBACK)
+        return Fault(f"actuator: {name}", InWorld(f"actuator_{fault}", "1"), "safe state", ("output 2 is at",))
 
     return (
         one("open", "open"),
@@ -165,6 +169,6 @@ def host() -> tuple[Fault, ...]:
     return (
         Fault("host: stalls for 3 ms", OnHost(3.0), "noticed", ("daq",), effect=0),
         Fault("host: stalls for 5 ms", OnHost(5.0), "noticed", ("daq",), effect=0),
-        Fault("host: stalls for 50 ms", OnHost(50.0), "noticed", ("daq",), effect=0, why=NOBODY),
-        Fault("host: stalls for 500 ms", OnHost(500.0), "safe state", ("daq",), effect=0, why=NOBODY),
+        Fault("host: stalls for 50 ms", OnHost(50.0), "safe state", ("guardian",), effect=0, why=GUARDED),
+        Fault("host: stalls for 500 ms", OnHost(500.0), "safe state", ("daq", "host"), effect=0, why=GUARDED),
     )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck, check_counts
+from firmware_py.control.plausibility import NO_SLOPE, PlausibilityLimits, ScanCheck, check_counts
 from firmware_py.frame import ACCELEROMETER, LAYOUT
 
 LSB_V = 5.0 / 32768.0
@@ -84,21 +84,62 @@ def test_parallel_axes_must_agree_slowly_and_may_differ_in_tremor():
     made, frame = check(), LAYOUT.new_frame()
     for k in range(1000):
         frame[ACCELEROMETER + 4] = 1.0 * np.sin(2 * np.pi * 9.7 * t[k])
-        assert made.pairs(frame, 0.01) == ""
+        assert made.pairs(frame) == ""
     frame[ACCELEROMETER + 4] = 1.0
-    texts = [made.pairs(frame, 0.01) for _ in range(30)]
-    # a low-pass of 0.1 s passes 0.6 of a step of 1 m/s^2 after 0.92 time constants
+    texts = [made.pairs(frame) for _ in range(30)]
+    # the spread of that tremor is 0.64 m/s^2: the mean over ten looks passes 0.15 + 0.64 at the eighth
     assert 5 <= next(k for k, text in enumerate(texts) if text) <= 13
     assert "1x and 3x disagree" in texts[-1]
+
+
+def test_a_value_out_of_line_is_noticed_and_noise_and_motion_are_not():
+    t = np.arange(3000) * 0.001
+    rng = np.random.default_rng(3)
+    volts = np.tile(LEVEL_V, (3000, 1)) + 0.00015 * rng.standard_normal((3000, 8))
+    volts[:, :6] += 0.1 * np.sin(2 * np.pi * 10.0 * t)[:, None]  # 0.1 g at 10 Hz: 0.4 mV of second difference
+    rows = np.round(volts / LSB_V).astype(np.int16)
+    made = check()
+    assert findings(made, rows) == []
+    assert made.odd() == ""
+    rows[1500, 3] ^= 1 << 6  # 9.8 mV in one reading
+    made = check()
+    assert findings(made, rows) == []
+    assert "2z read a value out of line" in made.odd()
+    assert made.odd() == ""  # told once
+
+
+def test_a_step_of_the_supply_by_one_percent_is_noticed():
+    rows = scans(200, seed=2)
+    rows[:, 6] = round(2.5 / LSB_V)
+    rows[100:, 6] -= round(0.0125 / LSB_V)
+    made = check(outlier_V=1.0)
+    assert findings(made, rows) == []
+    assert made.odd() == "supply stepped"
+
+
+def test_a_new_difference_of_parallel_axes_is_a_drift_and_an_old_one_is_not():
+    made, frame = check(), LAYOUT.new_frame()
+    frame[ACCELEROMETER] = 0.4
+    assert [made.pairs(frame) for _ in range(300)] == [""] * 300
+    texts = []
+    for k in range(20):  # 5 m/s^3
+        frame[ACCELEROMETER] = 0.4 + 0.05 * k
+        texts.append(made.pairs(frame))
+    # mean of a ramp over 0.1 s: 5 * 0.01 * k (k + 1) / 20 passes 0.15 at k = 8, a little later with its own spread
+    assert 8 <= next(k for k, text in enumerate(texts) if text) <= 11
+    assert "lately" in texts[-1]
 
 
 def test_kernel_and_python_agree():
     rows = scans(300)
     rows[50, 2] += 2000
     rows[200:, 5] = rows[200, 5]
-    results = []
+    results, counted = [], []
     for function in (check_counts, check_counts.py_func):  # type: ignore[attr-defined]
         last, same = np.zeros(8, dtype=np.int64), np.full(8, -1, dtype=np.int64)
-        results.append([function(row, 6, last, same, 1, 197, 2621, 30147, 20) for row in rows])
+        slope, odd = np.full(8, NO_SLOPE), np.zeros(8, dtype=np.int64)
+        results.append([function(row, 6, last, same, slope, odd, 1, 197, 33, 26, 2621, 30147, 20) for row in rows])
+        counted.append(odd.tolist())
     assert results[0] == results[1]
+    assert counted[0] == counted[1]
     assert {value for value in results[0] if value} == {16 * 2 + 2, 16 * 5 + 3}
