@@ -8,6 +8,7 @@ it sees a broken cable too; wired to the amplifier's monitor socket it sees the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -52,7 +53,7 @@ class AmplifierMonitor:
         self._tolerance_V = tolerance_V
         self._settle_ns = round(settle_s * 1e9)
         self._output = 0
-        self._started_ns = 0
+        self._asked_ns = self._started_ns = 0  # the conversion under way began in between
         self._suspected = False
 
     def poll(self) -> str:
@@ -66,8 +67,9 @@ class AmplifierMonitor:
             if value_V is None:
                 return ""
             wrong = self._judge(value_V * self._ratio)
-        self._started_ns = self._clock.now_ns()
+        self._asked_ns = self._clock.now_ns()
         self._adc.start_conversion(self._channels[self._output])
+        self._started_ns = self._clock.now_ns()
         return wrong
 
     def forget(self) -> None:
@@ -76,24 +78,21 @@ class AmplifierMonitor:
         self._suspected = False
 
     def expected_V(self, output: int, from_ns: int, to_ns: int) -> tuple[float, float] | None:
-        """Lowest and highest command of ``output`` that was in force between two bench times, ``None`` if unknown."""
-        lowest = highest = None
-        until_ns = to_ns
-        for sent_ns, volts in reversed(self._guard.told):
-            if sent_ns < until_ns:
-                v = volts[output]
-                lowest, highest = (v, v) if lowest is None or highest is None else (min(lowest, v), max(highest, v))
-                until_ns = sent_ns
-            if sent_ns <= from_ns:
-                return None if lowest is None or highest is None else (lowest, highest)
+        """Lowest and highest command that may have been in force between two times; ``None``: not known any more."""
+        lowest, highest = math.inf, -math.inf
+        for told in reversed(self._guard.told):
+            if told.offered_ns < to_ns:
+                v = told.volts[output]
+                lowest, highest = min(lowest, v), max(highest, v)
+            if told.sent_ns <= from_ns:  # all that came before had been replaced by this one
+                return lowest, highest
         return None  # commands older than those that are kept
 
     def _judge(self, measured_V: float) -> str:
         output = self._output
         self.volts[output] = measured_V
         self.readings += 1
-        # the conversion may begin at once and take its longest
-        span = self.expected_V(output, self._started_ns - self._settle_ns, self._started_ns + self._adc.conversion_ns)
+        span = self.expected_V(output, self._asked_ns - self._settle_ns, self._started_ns + self._adc.conversion_ns)
         if span is None or span[0] - self._tolerance_V <= measured_V <= span[1] + self._tolerance_V:
             self._suspected = False
             self._output = (output + 1) % len(self._channels)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from hal.contracts import Clock, Float64Array
 from hal.errors import ErrorKind, SafetyTrip
@@ -17,6 +18,14 @@ RAMP_STEPS = 16
 """Of a millisecond each; four of the twenty until neutral are left for transfers that have to be tried again."""
 
 TOLD = 16
+
+
+class Told(NamedTuple):
+    """One command: it took force between the two times (bench clock, ns)."""
+
+    offered_ns: int
+    sent_ns: int
+    volts: tuple[float, ...]
 
 
 class OutputGuard:
@@ -41,8 +50,8 @@ class OutputGuard:
         self.last_V = [limit.safe_V for limit in limits]
         self.next_V = list(self.last_V)
         self.armed = False
-        self.told: deque[tuple[int, tuple[float, ...]]] = deque(maxlen=TOLD)
-        """When what was sent (bench ns, V), the newest last: for who compares outputs with commands."""
+        self.told: deque[Told] = deque(maxlen=TOLD)
+        """What was sent, the newest last: for who compares outputs with commands."""
         self.writes = 0
         self.clipped = 0
         self.slew_limited = 0
@@ -50,7 +59,7 @@ class OutputGuard:
         self._ramp_steps = ramp_steps
         self._ramp_step_ns = ramp_step_s * 1e9
         self._longest_gap_s = longest_gap_s
-        self._sent_ns = clock.now_ns()
+        self._sent_ns = self._offered_ns = clock.now_ns()
         self._ramp_done = -1  # steps of the ramp that the device has been told; -1: no ramp
         self._ramp_next = 0
         self._ramp_start_ns = 0
@@ -67,7 +76,8 @@ class OutputGuard:
             raise SafetyTrip("outputs are not armed: call arm() first", device=self.device)
         if len(values_V) != len(self.limits):
             raise SafetyTrip(f"{len(values_V)} values for {len(self.limits)} output channels", device=self.device)
-        gap_s = (self._clock.now_ns() - self._sent_ns) * 1e-9
+        self._offered_ns = self._clock.now_ns()
+        gap_s = (self._offered_ns - self._sent_ns) * 1e-9
         if gap_s > self._longest_gap_s:
             gap_s = self._longest_gap_s
         mask = 0
@@ -112,7 +122,7 @@ class OutputGuard:
         allows in the time of one.
         """
         self.armed = False
-        now_ns = self._clock.now_ns()
+        self._offered_ns = now_ns = self._clock.now_ns()
         if self._ramp_done < 0:
             self._ramp_from = list(self.last_V)
             self._ramp_done = 0
@@ -138,7 +148,7 @@ class OutputGuard:
         """The device has been told ``next_V``."""
         self.last_V[:] = self.next_V
         self._sent_ns = self._clock.now_ns()
-        self.told.append((self._sent_ns, tuple(self.next_V)))
+        self.told.append(Told(self._offered_ns, self._sent_ns, tuple(self.next_V)))
         if self._ramp_done >= 0:
             self._ramp_done = self._ramp_next
         else:

@@ -274,6 +274,8 @@ class InstrumentLoop:
         if self._field is not None:
             self._field.fill(frame)
         self.stages.sense()
+        if not int(frame[STATUS]) & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(frame)):
+            self.incidents.trip(apart)
 
     def _estimate(self, info: TickInfo) -> None:
         self.stages.estimate()

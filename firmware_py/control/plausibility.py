@@ -3,14 +3,15 @@
 Six axes and six unknowns leave no parity while the instrument moves (ERRATA no. 15). What is left: a sensor behind
 its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails; and of axes that point the
 same way at two places the slow parts must agree, because turning hands do not accelerate for long. Natural figures
-(three hands, nine runs of 15 s): second differences up to 2.8 mV, slow differences of parallel axes within 0.08 m/s^2
-of their own mean.
+(three hands, nine runs of 15 s): second differences up to 2.8 mV; parallel axes never beyond 5 times their spread plus
+0.07 m/s^2 (z: 0.016).
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +29,9 @@ class PlausibilityLimits(BaseModel):
     """What no healthy sensor does. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter.
 
     ``outlier_V``: second difference of an accelerometer's readings, ``supply_step_V``: of the supply's from tick to
-    tick; both are noticed only. ``pair_drift_m_s2``: parallel axes against what they were over the last
-    ``pair_memory_s``, on top of how far tremor spreads them.
+    tick; both are noticed only. ``pair_m_s2``: parallel axes may not differ by more on average over ``pair_s``. What
+    they differ by at once, against their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` (of x, z, y:
+    1.3 rad/s^2 over the distance of the two) plus PAIR_SPREADS times their usual spread.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,13 +43,15 @@ class PlausibilityLimits(BaseModel):
     pair_s: float = Field(default=0.1, ge=0.02)
     outlier_V: float = Field(default=0.005, gt=0.0)
     supply_step_V: float = Field(default=0.004, gt=0.0)
-    pair_drift_m_s2: float = Field(default=0.15, gt=0.0)
+    pair_step_m_s2: tuple[float, float, float] = (0.15, 0.05, 0.15)
     pair_memory_s: float = Field(default=5.0, gt=0.0)
 
 
 NO_SLOPE = 1 << 40
-PAIR_RATE_HZ = 100
+TICK_S = 0.001
 SPREAD_S = 1.0
+PAIR_SPREADS = 6.0
+PAIR_PLACES = np.array([(i, j) for i, j, _ in PAIRS])
 
 
 class Finding(IntEnum):
@@ -118,6 +122,51 @@ def check_counts(
     return found
 
 
+@kernel
+def check_pairs(
+    frame: NDArray[np.float64],
+    places: NDArray[np.int64],
+    looks: int,
+    window: NDArray[np.float64],
+    sums: NDArray[np.float64],
+    usual: NDArray[np.float64],
+    spread: NDArray[np.float64],
+    step: NDArray[np.float64],
+    limit: float,
+    memory: float,
+    spread_memory: float,
+) -> int:
+    """Number (from 1) of a pair that disagrees for good, minus the number of one that has come apart, else 0."""
+    n = window.shape[0]
+    row = looks % n
+    found = 0
+    for k in range(len(places)):
+        apart = frame[ACCELEROMETER + places[k, 0]] - frame[ACCELEROMETER + places[k, 1]]
+        sums[k] += apart - window[row, k]
+        window[row, k] = apart
+        if looks < n:
+            usual[k] = sums[k] / (looks + 1)
+            continue
+        off = abs(apart - usual[k])
+        if abs(sums[k]) > limit * n:
+            if found <= 0:
+                found = k + 1
+        elif found == 0 and looks > 4 * n and off > step[k] + PAIR_SPREADS * spread[k]:
+            found = -(k + 1)
+        usual[k] += (apart - usual[k]) * memory
+        spread[k] += (off - spread[k]) * spread_memory
+    return found
+
+
+class PairState(NamedTuple):
+    """``window`` (n, 3): the last differences, in a ring; over them ``sums``, ``usual`` and ``spread`` (3,)."""
+
+    window: NDArray[np.float64]
+    sums: NDArray[np.float64]
+    usual: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+
 class ScanCheck:
     """Looks at every scan, before it is believed.
 
@@ -136,9 +185,12 @@ class ScanCheck:
         self._told = 0
         self._outlier, self._supply_step = round(limits.outlier_V / lsb_V), round(limits.supply_step_V / lsb_V)
         self._jump, self._lo, self._hi = round(limits.jump_V / lsb_V), *(round(v / lsb_V) for v in limits.rail_V)
-        self._window = np.zeros((max(2, round(limits.pair_s * PAIR_RATE_HZ)), len(PAIRS)))
+        self._pairs = PairState(
+            np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3))
+        )
         self._looks = 0
-        self._usual, self._spread = np.zeros(len(PAIRS)), np.zeros(len(PAIRS))
+        self._pair_step = np.array(limits.pair_step_m_s2)
+        self._pair_told = 0
         self._tick = -1
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
@@ -161,6 +213,10 @@ class ScanCheck:
 
     def odd(self) -> str:
         """Which input has been out of line since the last call: nothing that ends a run, but somebody should know."""
+        if self._pair_told:
+            i, j, axis = PAIRS[self._pair_told - 1]
+            self._pair_told = 0
+            return f"{self._labels[i]} and {self._labels[j]} came apart along {axis}"
         total = int(self._odd.sum())
         if total == self._told:
             return ""
@@ -171,30 +227,25 @@ class ScanCheck:
         return f"{self._labels[worst]} read a value out of line with its neighbours"
 
     def pairs(self, frame: NDArray[np.float64]) -> str:
-        """Slow difference of parallel axes, at ``PAIR_RATE_HZ``: empty, or which two disagree.
+        """Difference of parallel axes, every tick: empty, or which two disagree for good; see also ``odd``.
 
-        The mean over 0.1 s leaves out most of a tremor, down to 0.64 of it at 5 Hz: hence the spread in the limit. What
-        they have differed by for seconds is calibration, or was there before; a new difference is a drift.
+        The mean over 0.1 s leaves out most of a tremor. What they have differed by for seconds is calibration, or was
+        there before; a new difference is a drift or a blow.
         """
-        limits, window = self.limits, self._window
-        n = len(window)
-        row = window[self._looks % n]
-        for k, (i, j, _) in enumerate(PAIRS):
-            row[k] = frame[ACCELEROMETER + i] - frame[ACCELEROMETER + j]
+        state, limits = self._pairs, self.limits
+        found = check_pairs(
+            frame, PAIR_PLACES, self._looks, state.window, state.sums, state.usual, state.spread, self._pair_step,
+            limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
+        )  # fmt: skip
         self._looks += 1
-        if self._looks < n:
+        if found == 0:
             return ""
-        apart = window.mean(axis=0)
-        if self._looks == n:
-            self._usual[:] = apart
-        drift = apart - self._usual
-        self._usual += drift / (limits.pair_memory_s * PAIR_RATE_HZ)
-        allowed = limits.pair_drift_m_s2 + self._spread
-        self._spread += (np.abs(row - self._usual) - self._spread) / (SPREAD_S * PAIR_RATE_HZ)
-        for k, (i, j, axis) in enumerate(PAIRS):
-            if abs(apart[k]) > limits.pair_m_s2 or abs(drift[k]) > allowed[k]:
-                return (
-                    f"{self._labels[i]} and {self._labels[j]} disagree by {apart[k]:.2f} m/s^2 along {axis} "
-                    f"({drift[k]:+.2f} lately): one of them has drifted or is calibrated wrongly"
-                )
-        return ""
+        if found < 0:
+            self._pair_told = -found
+            return ""
+        i, j, axis = PAIRS[found - 1]
+        apart = state.sums[found - 1] / len(state.window)
+        return (
+            f"{self._labels[i]} and {self._labels[j]} disagree by {apart:.2f} m/s^2 along {axis}: "
+            "one of them has drifted or is calibrated wrongly"
+        )

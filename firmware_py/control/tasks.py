@@ -21,7 +21,7 @@ BUDGETS_US: Mapping[str, float] = {
 MAGNETOMETER_PHASES = (0, 3, 6)
 VERIFY_PHASES = (1, 4, 8)  # in ticks that leave the bus free for it
 MONITOR_PHASES = (1, 4, 7, 9)
-VERIFY_BESIDE_MONITOR = ((10, 8), (20, 15))  # divider, phase
+VERIFY_BESIDE_MONITOR = (8,)  # tick 15 of 20 stays free for background work
 
 Work = Callable[[TickInfo], object]
 
@@ -62,10 +62,8 @@ def task_table(works: Works, tick_hz: int, budget_us: Mapping[str, float]) -> li
     task("publish", works.publish, 3, catch_up=True)
     task("supervise", works.supervise, 5, 10, 2)
     in_turn([f"magnetometer_{axis}" for axis in "xyz"], works.magnetometer, MAGNETOMETER_PHASES)
-    verify = [(10, phase) for phase in VERIFY_PHASES] if works.monitor is None else VERIFY_BESIDE_MONITOR
-    for divider, phase in verify:
-        if works.verify is not None:
-            task(f"verify_{phase}", works.verify, 4, divider, phase)
+    phases = VERIFY_PHASES if works.monitor is None else VERIFY_BESIDE_MONITOR
+    in_turn([f"verify_{phase}" for phase in phases], works.verify, phases)
     in_turn([f"monitor_{phase}" for phase in MONITOR_PHASES], works.monitor, MONITOR_PHASES)
     if works.telemetry is not None:
         task("telemetry", works.telemetry, 6, 20, 5)

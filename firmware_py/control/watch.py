@@ -55,8 +55,6 @@ class Watch:
             outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
             reason = f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}"
             incidents.bad_for(name, outside, t_ns, 100.0, reason)
-        if not status & FrameStatus.INVALID and (apart := self._check.pairs(frame)):
-            incidents.trip(apart)
         if odd := self._check.odd():
             incidents.notice(odd)
         telemetry = self._devices.telemetry
@@ -69,7 +67,8 @@ class Watch:
                 )
 
     def verify_output(self, info: TickInfo) -> None:
-        """Task, 150 or 300 Hz: the amplifier must hold what it was told; a DAC that restarted or misheard does not."""
+        """Task, 100 Hz, or 300 without a monitor: the amplifier must hold what it was told. A DAC that restarted or
+        misheard does not."""
         assert self._devices.verify_output is not None
         if not self._supervisor.may_move:
             return

@@ -7,7 +7,7 @@ from tools.faults.fault import Fault, InWorld, OnBus, OnHost
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
-ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 150 Hz only"
+ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 100 Hz only"
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
 

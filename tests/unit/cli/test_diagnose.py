@@ -31,6 +31,7 @@ def test_scan_finds_the_declared_devices_and_the_button(tmp_path: Path):
     assert {(a["address"], a["declared"], a["answered"]) for a in found["i2c"]} == {
         (0x0C, "piezo", True),
         (0x48, "mag_adc", True),
+        (0x49, "monitor_adc", True),
     }
     assert [(c["can_id"], c["name"]) for c in found["can"]] == [(0x080, "STOP_BUTTON")]
     assert found["can"][0]["rate_hz"] == pytest.approx(2.0, abs=0.5)
@@ -155,7 +156,9 @@ def test_a_declared_device_that_is_silent_is_exit_4(monkeypatch: pytest.MonkeyPa
     from sim_devices.transports.i2c_line import I2cLine
 
     attach = I2cLine.attach
-    monkeypatch.setattr(I2cLine, "attach", lambda self, address, face: attach(self, address ^ (address == 0x48), face))
+    monkeypatch.setattr(
+        I2cLine, "attach", lambda self, address, face: attach(self, address ^ (2 * (address == 0x48)), face)
+    )
     done = run("scan", "--virtual", "--seconds", "0")
     assert done.exit_code == 4
     assert "mag_adc" in done.output

@@ -1,0 +1,183 @@
+"""The guardian against the emulated amplifier, in virtual time: who dies or stands still is brought to neutral."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.amplifier import GuardedAmplifier
+from firmware_py.guardian.guardian import STEP_NS, Guardian, State
+from firmware_py.guardian.heart import Heart, Phase, Why
+from hal.clock import VirtualClock
+from hal.errors import I2cNack, SafetyTrip
+from hal.middleware.faults import FaultI2c, FaultPlan
+from sim_devices.devices.ad5696r import Ad5696r
+from sim_devices.transports.i2c_line import I2cLine
+from sim_devices.transports.lockstep import LockstepI2cBus
+
+MS = 1_000_000
+FAR = np.array([90.0, 10.0, 60.0])
+
+
+class Rig:
+    """One DAC, two masters: the firmware's guarded amplifier and the guardian with an amplifier of its own."""
+
+    def __init__(self, *, loss: float = 0.0) -> None:
+        self.clock = VirtualClock()
+        line = I2cLine(400_000)
+        self.dac = Ad5696r(on_output=lambda channel, volts, t_ns: self.path.append((t_ns, channel, 20.0 * volts)))
+        self.path: list[tuple[int, int, float]] = []
+        line.attach(0x0C, self.dac)
+        bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
+        lossy = FaultI2c(bus, self.clock, FaultPlan(loss=loss, seed=3))
+        self.heart = Heart()
+        self.amplifier = GuardedAmplifier(DacAmplifier(bus, self.clock), self.heart, self.clock)
+        self.guardian = Guardian(self.heart, DacAmplifier(lossy, self.clock), self.clock, notice_ms=8.0, limit_ms=40.0)
+
+    def moving(self) -> None:
+        """Armed and out at ``FAR``."""
+        self.amplifier.arm()
+        for _ in range(5):
+            self.tick()
+            self.amplifier.write(FAR)
+
+    def tick(self, *, alive: bool = True) -> None:
+        self.guardian.step(alive)
+        self.clock.advance_to((self.clock.now_ns() // STEP_NS + 1) * STEP_NS)
+
+    def volts(self) -> list[float]:
+        return [20.0 * v for v in self.dac.output_V[:3]]
+
+
+def test_a_beating_firmware_is_left_alone():
+    rig = Rig()
+    rig.moving()
+    before = len(rig.path)
+    for _ in range(200):
+        rig.amplifier.write(FAR)
+        rig.tick()
+    assert len(rig.path) == before
+    assert rig.guardian.report()["why"] == "nothing"
+    assert rig.heart.noticed_ns == 0
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.5])
+def test_a_dead_firmware_is_brought_to_neutral_within_twenty_ms(loss: float):
+    rig = Rig(loss=loss)
+    rig.moving()
+    died_ns = rig.clock.now_ns()
+    while rig.guardian.state is not State.DONE:
+        rig.tick(alive=False)
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert max(t_ns for t_ns, _, _ in rig.path) - died_ns <= 20 * MS
+    report = rig.guardian.report()
+    assert report["why"] == "died"
+    assert report["problem"] == ""
+    assert report["neutral_ns"] - died_ns <= 25 * MS
+    steps = np.diff([v for t_ns, channel, v in rig.path if channel == 0 and t_ns >= died_ns])
+    assert np.abs(steps).max() <= 20.0  # the slew limit, per ms
+
+
+def test_a_firmware_that_dies_at_rest_needs_nothing():
+    rig = Rig()
+    rig.tick(alive=False)
+    assert rig.guardian.state is State.DONE
+    assert rig.path == []
+
+
+def test_a_pause_is_noticed_and_a_long_one_taken_over_and_the_firmware_gives_in():
+    rig = Rig()
+    rig.moving()
+    beat_ns = rig.heart.beat_ns
+    for _ in range(30):
+        rig.tick()
+    assert 8 * MS < rig.heart.noticed_ns - beat_ns <= 10 * MS
+    assert not rig.heart.taken_ns
+    for _ in range(40):
+        rig.tick()
+    assert rig.heart.why is Why.SILENT
+    assert 40 * MS < rig.heart.taken_ns - beat_ns <= 42 * MS
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    with pytest.raises(SafetyTrip, match=r"stood still for 4[01] ms"):
+        rig.amplifier.write(FAR)
+    assert rig.amplifier.safe_step()
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    for _ in range(60):
+        rig.tick()
+    assert rig.guardian.state is State.DONE
+
+
+def test_a_firmware_that_wakes_during_the_ramp_waits_for_its_end():
+    rig = Rig()
+    rig.moving()
+    while not rig.heart.taken_ns:
+        rig.tick()
+    rig.tick()
+    written = len(rig.path)
+    assert not rig.amplifier.safe_step()
+    assert len(rig.path) == written
+    while not rig.heart.reached_ns:
+        rig.tick()
+    assert rig.amplifier.safe_step()
+
+
+def test_a_command_that_was_under_way_is_undone():
+    rig = Rig()
+    rig.moving()
+    while not rig.heart.reached_ns:
+        rig.tick(alive=False)
+    late = DacAmplifier(rig.guardian._output._bus, rig.clock)  # type: ignore[attr-defined]
+    late.arm()
+    rig.clock.burn_ns(5 * MS)
+    late.write(np.array([60.0, 50.0, 50.0]))
+    while rig.guardian.state is not State.DONE:
+        rig.tick(alive=False)
+    assert rig.volts() == pytest.approx([50.0] * 3)
+
+
+def test_a_dead_bus_ends_in_a_report():
+    rig = Rig()
+    rig.moving()
+    rig.dac.nack_address = True
+    while rig.guardian.state is not State.DONE:
+        rig.tick(alive=False)
+    report = rig.guardian.report()
+    assert report["neutral_ns"] is None
+    assert "0x0c" in report["problem"].lower()
+
+
+def test_arming_is_not_silence_and_rest_after_the_ramp_is_not_either():
+    rig = Rig()
+    rig.heart.say(Phase.ARMING)
+    for _ in range(100):
+        rig.tick()
+    assert rig.heart.why is Why.NOTHING
+    rig.moving()
+    while not rig.amplifier.safe_step():
+        rig.tick()
+    assert rig.heart.phase is Phase.IDLE
+    for _ in range(100):
+        rig.tick()
+    assert rig.heart.why is Why.NOTHING
+
+
+def test_a_refused_command_is_a_beat_too():
+    rig = Rig()
+    rig.moving()
+    rig.dac.nack_address = True
+    with pytest.raises(I2cNack):
+        rig.amplifier.write(FAR)
+    assert rig.heart.beat_ns <= rig.clock.now_ns()
+    assert rig.clock.now_ns() - rig.heart.beat_ns < MS
+
+
+def test_shared_memory_is_seen_through_its_descriptor():
+    ours = Heart.shared()
+    assert ours.fd is not None
+    theirs = Heart(ours.fd)
+    ours.beat(12345678901234567)
+    ours.say(Phase.RUNNING)
+    assert (theirs.beat_ns, theirs.phase) == (12345678901234567, Phase.RUNNING)
+    theirs.take(Why.SILENT, 7)
+    assert (ours.taken_ns, ours.why) == (7, Why.SILENT)
