@@ -294,8 +294,9 @@ def document(rows: Sequence[RealRow]) -> str:
         "",
         "Made by `python -m tools.mismatch.prove.real`; do not edit. Each set starts from the naive twin that its own "
         "papers give; fit and test parts are the official ones (the accelerometer package: held-out blocks of its "
-        "test sweep, since the lag differs from run to run). Errors are rms on data that no fit has seen. The data "
-        "are not part of the repository.",
+        "test sweep, since the lag differs from run to run). Errors are rms on data that no fit has seen; "
+        "which effects to name is decided on that part, too, so a figure is a little kinder than one of a third part "
+        "would be. The data are not part of the repository.",
         "",
         f"Tool {git_revision()[:12]}, {date}. The seconds are CPU time of one process.",
         "",
