@@ -90,6 +90,23 @@ def test_the_hash_is_said_before_any_diagnosis_and_a_broken_seal_is_noticed(tmp_
         prove(2, 5, 1, tmp_path, diagnose=tamper, max_samples=2500, progress=said.append)
 
 
+def test_an_interrupted_proof_goes_on_in_its_folder(tmp_path: Path) -> None:
+    asked: list[str] = []
+
+    def second_breaks(path: Path) -> dict[str, Any]:
+        asked.append(path.parent.name)
+        if len(asked) == 2:
+            raise KeyboardInterrupt
+        return silent(path)
+
+    plans = [draw.Plan("agrees", "piezo_stack", (), 2.0)] * 3
+    more = {"plans": plans, "seed": 4, "jobs": 1, "diagnose": second_breaks, **QUIET}
+    with pytest.raises(KeyboardInterrupt):
+        prove(folder=tmp_path, **more)
+    assert len(prove(folder=tmp_path, **more).rows) == 3
+    assert asked == ["r000", "r001", "r001", "r002"]
+
+
 def test_a_crash_of_the_tool_is_counted(tmp_path: Path) -> None:
     def broken(path: Path) -> dict[str, Any]:
         raise RuntimeError(str(path))

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -107,9 +107,10 @@ def prove(
 ) -> ProofResult:
     """Draw ``cases`` cases, seal the answers, run the tool on each, open the seal, score.
 
-    ``seed`` None draws a fresh one from the clock; it is printed. ``folder`` keeps everything (a temporary
-    folder otherwise). ``only`` = (twin, effect, severity) restricts the single effects; ``plans`` takes the place of
-    what would be drawn. ``progress`` is called with one line of text per event; standard error by default.
+    ``seed`` None draws a fresh one from the clock; it is printed. ``folder`` keeps everything (a temporary folder
+    otherwise); the same tool on the same answers goes on there where it was interrupted. ``only`` = (twin, effect,
+    severity) restricts the single effects; ``plans`` takes the place of what would be drawn. ``progress`` is called
+    with one line of text per event; standard error by default.
     """
     start = time.perf_counter()
     say = progress or (lambda text: print(text, file=sys.stderr, flush=True))
@@ -122,11 +123,15 @@ def prove(
     missing = "" if len(answers) == len(asked) else f" ({len(asked) - len(answers)} could not be drawn)"
     say(f"{len(answers)} recordings written{missing}; answers sealed, sha256 {digest}")
     del answers
-    reports: dict[str, Done] = {}
-    (folder / "reports").mkdir(exist_ok=True)
-    for done in diagnose_all(paths, jobs, diagnose):
+    kept = folder / "reports" / f"{digest[:16]}-{git_revision()[:16]}"
+    kept.mkdir(parents=True, exist_ok=True)
+    reports = {file.stem: Done(**json.loads(file.read_text())) for file in sorted(kept.glob("*.json"))}
+    if reports:
+        say(f"{len(reports)} of them diagnosed before")
+    for done in diagnose_all({k: p for k, p in paths.items() if k not in reports}, jobs, diagnose):
         reports[done.name] = done
-        (folder / "reports" / f"{done.name}.json").write_text(json.dumps(done.report, indent=1))
+        (kept / "unfinished").write_text(json.dumps(asdict(done), indent=1))
+        (kept / "unfinished").replace(kept / f"{done.name}.json")
         say(f"{len(reports)}/{len(paths)}  {done.name}  {done.wall_s:.1f} s, {done.cpu_s:.1f} s of CPU")
     opened = seal.opened(folder / "sealed", digest)
     rows: list[dict[str, Any]] = []

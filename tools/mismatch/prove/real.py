@@ -189,6 +189,7 @@ class RealRow:
     real: RealSet
     report: dict[str, Any]
     cpu_s: float
+    revision: str
 
     def rms(self, key: str) -> float | None:
         value = ((self.report.get("fit") or {}).get(key) or {}).get(self.real.output)
@@ -228,11 +229,12 @@ def run(
     """Diagnose every set on its official split. FileNotFoundError when the data are not beside the project.
 
     ``rows_file`` (JSON) keeps each set as soon as it is done; what it already holds counts and is returned, so that
-    the sets may be run one by one. It must come from the same state of the tool: remove it when the tool changes.
+    the sets may be run one by one. Remove it when the tool changes; the page names the state that made each.
     """
     tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
     if not data.is_dir():
         raise FileNotFoundError(f"{data}: the measured recordings are not here; they are not part of the repository")
+    revision = git_revision()
     chosen = {s.name: s for s in SETS if not only or any(o in s.name for o in only)}
     kept: dict[str, Any] = json.loads(rows_file.read_text()) if rows_file is not None and rows_file.exists() else {}
     wanted = {s.name: s for s in SETS if s.name in chosen or s.name in kept}
@@ -240,13 +242,17 @@ def run(
         paths = {
             name: joined(s, data, Path(tmp) / name.replace(" ", "_")) for name, s in chosen.items() if name not in kept
         }
-        rows = {name: RealRow(wanted[name], k["report"], k["cpu_s"]) for name, k in kept.items() if name in wanted}
+        rows = {
+            name: RealRow(wanted[name], k["report"], k["cpu_s"], k["revision"])
+            for name, k in kept.items()
+            if name in wanted
+        }
         for done in diagnose_all(paths, jobs, diagnose):
             name = done.name
-            rows[name] = RealRow(chosen[name], done.report, done.cpu_s)
+            rows[name] = RealRow(chosen[name], done.report, done.cpu_s, revision)
             tell(f"{name}: {rows[name].said()} ({done.wall_s:.0f} s, {done.cpu_s:.0f} s of CPU)")
             if rows_file is not None:
-                kept[name] = {"report": done.report, "cpu_s": done.cpu_s}
+                kept[name] = {"report": done.report, "cpu_s": done.cpu_s, "revision": revision}
                 rows_file.write_text(json.dumps(kept))
     return [rows[name] for name in wanted]
 
@@ -298,7 +304,7 @@ def document(rows: Sequence[RealRow]) -> str:
         "which effects to name is decided on that part, too, so a figure is a little kinder than one of a third part "
         "would be. The data are not part of the repository.",
         "",
-        f"Tool {git_revision()[:12]}, {date}. The seconds are CPU time of one process.",
+        f"Tool {', '.join(sorted({r.revision[:12] for r in rows}))}, {date}. The seconds are CPU time of one process.",
         "",
         *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
         "| set | unit | naive | re-calibrated | with physics | noise (tool's) | published | what it said | CPU s |",
