@@ -133,8 +133,9 @@ def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
     for a, b in runs(keep):
         v = turning_points(x[a:b], 0.02 * span)
         turns += v
-    high = np.array([v for v in turns if v > np.median(x[keep])])
-    low = np.array([v for v in turns if v <= np.median(x[keep])])
+    middle = float(np.median(x[keep]))
+    high = np.array([v for v in turns if v > middle])
+    low = np.array([v for v in turns if v <= middle])
     if min(high.size, low.size) < 3:
         return False
     return all(float(np.quantile(v, 0.9) - np.quantile(v, 0.1)) < 0.05 * span for v in (high, low))
