@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli import calibrate_actuation, calibrate_axes, calibrate_positions
+from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
 from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json, write_text_atomic
 
@@ -16,6 +16,7 @@ calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks 
 
 calibrate.command("accelerometer")(calibrate_axes.accelerometer)
 calibrate.command("magnetometer")(calibrate_axes.magnetometer)
+calibrate.command("gyroscope")(calibrate_gyroscope.gyroscope)
 calibrate.command("positions")(calibrate_positions.positions)
 calibrate.command("piezo")(calibrate_actuation.piezo)
 calibrate.command("manipulator")(calibrate_actuation.manipulator)

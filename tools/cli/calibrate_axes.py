@@ -50,14 +50,16 @@ class Model(StrEnum):
 Columns = Annotated[str, typer.Option(help="The three columns, with commas.")]
 
 
-def _three(columns: str) -> tuple[str, str, str]:
+def three(columns: str) -> tuple[str, str, str]:
+    """Three names from one option."""
     names = tuple(name.strip() for name in columns.split(","))
     if len(names) != 3:
         raise InputError(f"--columns {columns}: three names are needed")
     return names  # pyright: ignore[reportReturnType]
 
 
-def _print(title: str, parameters: dict, notes: list[str]) -> None:
+def print_parameters(title: str, parameters: dict, notes: list[str]) -> None:
+    """A table of estimates with their intervals, and lines below it."""
     table = Table(title=title, title_justify="left")
     for heading in ("parameter", "value", "95 % interval"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
@@ -99,10 +101,10 @@ def accelerometer(
     with clear_errors():
         check_writable(json_file, out)
         if method is Method.STAGE:
-            _stage(recording, _three(columns), model, drift, rate_hz, out, json_file)
+            _stage(recording, three(columns), model, drift, rate_hz, out, json_file)
             return
         log = load_log(recording, rate_hz)
-        raw, rate = log.matrix(_three(columns)), log.need_rate()
+        raw, rate = log.matrix(three(columns)), log.need_rate()
         raw, warm = remove_drift(raw, rate, allowed=drift is OnDrift.FIT)
         notes = [warm.text()]
         if method is Method.POSES:
@@ -118,7 +120,7 @@ def accelerometer(
         else:
             result = flat(raw, counts_per_g, up)
         notes.append("missing: " + (", ".join(result.missing) or "nothing"))
-        _print(f"accelerometer, {method.value}", result.parameters, notes)
+        print_parameters(f"accelerometer, {method.value}", result.parameters, notes)
         if out is not None:
             values = {name: e.value for name, e in result.parameters.items()}
             write_text_atomic(
@@ -164,7 +166,7 @@ def _stage(
     ]
     notes.append("missing: " + (", ".join(fit.missing) or "nothing"))
     named = {f"{n}.{k}": e for n, axis in zip("xyz", fit.axes, strict=True) for k, e in axis.parameters.items()}
-    _print(f"accelerometer, stage, {fit.poses} poses", named, notes)
+    print_parameters(f"accelerometer, stage, {fit.poses} poses", named, notes)
     if out is not None:
         tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
         made_by = f"micron calibrate accelerometer {recording} --method stage"
@@ -175,33 +177,61 @@ def _stage(
 def magnetometer(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording, turned through all directions.")],
     columns: Columns = "mag_x_raw,mag_y_raw,mag_z_raw",
+    reset_columns: Annotated[
+        str | None, typer.Option(help="The same after a reset pulse: takes the bridge's offset off.")
+    ] = None,
+    accelerometer_columns: Annotated[
+        str | None, typer.Option(help="Calibrated accelerometer beside it: gives the turn to the body.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1.
+    """Hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1; turn to the body, offset.
 
     Example: micron calibrate magnetometer turned.npz
+
+    With all: micron calibrate magnetometer log.npz --accelerometer-columns ax,ay,az --reset-columns rx,ry,rz
     """
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.ellipsoid import fit_ellipsoid
+    from tools.calibrate.field_axes import fit_turn, strap
     from tools.calibrate.logs import load_log
 
     with clear_errors():
         check_writable(json_file, out)
-        result = fit_ellipsoid(load_log(recording, 1.0).matrix(_three(columns)))
-        _print(
-            "magnetometer",
-            result.intervals,
-            [
-                f"norm {result.norm_mean:.4f} +/- {result.norm_spread:.4f} over {result.samples} samples, "
-                f"{result.outliers} outliers ({result.kept_spread:.4f} without), condition {result.condition:.1f}",
-                "missing: " + (", ".join(result.missing) or "nothing"),
-            ],
-        )
-        if out is not None:
-            table = {"matrix": result.matrix.tolist(), "bias": result.bias.tolist()}
-            write_text_atomic(
-                out,
-                calibration_toml("magnetometer", f"micron calibrate magnetometer {recording}", {"magnetometer": table}),
+        log = load_log(recording, 1.0)
+        raw, offset = log.matrix(three(columns)), None
+        if reset_columns is not None:
+            raw, offset = strap(raw, log.matrix(three(reset_columns)))
+        result = fit_ellipsoid(raw)
+        parameters, matrix, turn = dict(result.intervals), result.matrix, None
+        notes = [
+            f"norm {result.norm_mean:.4f} +/- {result.norm_spread:.4f} over {result.samples} samples, "
+            f"{result.outliers} outliers ({result.kept_spread:.4f} without), condition {result.condition:.1f}",
+            "missing: " + (", ".join(result.missing) or "nothing"),
+        ]
+        if offset is not None:
+            parameters |= {f"bridge_offset_{axis}": e for axis, e in zip("xyz", offset, strict=True)}
+            notes.append("b is hard iron alone: the bridge's offset is taken off")
+        if accelerometer_columns is not None:
+            turn = fit_turn(result.apply(raw), log.matrix(three(accelerometer_columns)))
+            parameters |= turn.parameters
+            matrix = turn.turn @ matrix
+            notes.append(
+                f"turn to the body from {turn.samples} samples at rest, residual {turn.residual:.4f}, "
+                f"condition {turn.condition:.1f}; the matrix in --out holds it"
             )
-        write_json({"format": 1, **asdict(result)}, json_file)
+        else:
+            notes.append("the turn between magnetometer and body is not in these data: give --accelerometer-columns")
+        print_parameters("magnetometer", parameters, notes)
+        if out is not None:
+            table = {"matrix": matrix.tolist(), "bias": result.bias.tolist()}
+            if offset is not None:
+                table["bridge_offset"] = [e.value for e in offset]
+            made_by = f"micron calibrate magnetometer {recording}"
+            write_text_atomic(out, calibration_toml("magnetometer", made_by, {"magnetometer": table}))
+        body = None if turn is None else asdict(turn)
+        write_json(
+            {"format": 1, **asdict(result), "bridge_offset": offset and [asdict(e) for e in offset], "body": body},
+            json_file,
+        )

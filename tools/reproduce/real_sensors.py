@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from tools.calibrate.ellipsoid import fit_ellipsoid
+from tools.calibrate.gyroscope import fit_gyroscope
 from tools.calibrate.logs import load_log
 from tools.calibrate.multi_position import identify_poses
 from tools.noise.allan import allan_curve
@@ -21,6 +22,7 @@ from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
 from tools.reproduce.rows import Row, Table, build
 
 ACCELEROMETER = ("acc_x_raw", "acc_y_raw", "acc_z_raw")
+GYROSCOPE = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw")
 BROAD_HZ = 1.0 / 0.0035
 
 
@@ -122,6 +124,40 @@ def mpu6050() -> list[Row]:
                 why="nine parameters from ten poses, three of them shorter than 0.15 s in the published fit",
             ),
         ]
+    return rows
+
+
+def gyroscopes() -> list[Row]:
+    """Scale of two gyroscopes from still poses and the turns between them (Tedaldi sec. V)."""
+    rows = []
+    xsens_factory = [1.0 / v for v in _meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]]
+    mpu = _meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
+    for source, file, rate_hz, gravity, published in (
+        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory),
+        ("tomisuarez2/ImuCalibration, MPU-6050", "mpu6050_tomisuarez/calibration.npz", 100.0, 9.80665, mpu),
+    ):
+        log = load_log(data_folder() / file, rate_hz)
+        fit = fit_gyroscope(log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE), log.need_rate(), gravity)
+        condition = (
+            f"{fit.turns} turns between poses, {fit.saturated} saturated ones left out; gravity after a turn "
+            f"off by {np.degrees(fit.residual_rad):.2f} deg rms"
+        )
+        for i, axis in enumerate("xyz"):
+            scale = fit.parameters[f"scale_{axis}"]
+            rows.append(
+                Row(
+                    source,
+                    f"scale of gyroscope {axis}",
+                    "rad/s per count",
+                    condition,
+                    published[i],
+                    scale.value,
+                    "equal",
+                    "recording",
+                    tolerance=scale.high - scale.value,
+                    why=f"our 95 % interval is +-{100.0 * (scale.high / scale.value - 1.0):.2f} %",
+                )
+            )
     return rows
 
 
@@ -275,4 +311,6 @@ def table() -> Table:
     """All sets that are there."""
     there = {name: section for name, section in SETS.items() if (data_folder() / name).is_dir()}
     notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in there]
+    if all(name in there for name in ("imu_tk_xsens", "mpu6050_tomisuarez")):
+        there["gyroscopes"] = gyroscopes
     return build("real-sensors", list(there.values()), notes)
