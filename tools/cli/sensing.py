@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from tools.cli.common import JsonOption, check_writable, clear_errors, console, data_console, write_json
+from tools.cli.common import InputError, JsonOption, check_writable, clear_errors, console, data_console, write_json
 
 app = typer.Typer(no_args_is_help=True, help="Error budgets of the sensing stage on emulated sensors.")
 
@@ -45,3 +46,101 @@ def budget(
             + " um rms (goal: 5)"
         )
         write_json({"format": 1, "seconds": seconds, **asdict(found)}, json_file)
+
+
+@app.command("variance")
+def variance(
+    configurations: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="CONFIGURATION...",
+            help="micron-000, micron-004, micron-004-turned, cube-004, proposed-004, a bench, a TOML file with "
+            "format = 1, positions_mm and axes, or the JSON of `micron placement`.",
+        ),
+    ],
+    noise_mg: Annotated[float, typer.Option(min=1e-6, help="Rms of an axis behind its 15 Hz filter.")] = 0.535,
+    gyroscope_deg_s: Annotated[
+        float, typer.Option(min=1e-9, help="Rms of a gyroscope behind the same filter (ADXRS150: 0.75).")
+    ] = 0.75,
+    tip_mm: Annotated[str, typer.Option(help="Tip in the body frame.")] = "0,0,155",
+    turning_deg_s: Annotated[str, typer.Option(help="Body rate at which the solver is examined.")] = "0,0,0",
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the comparison.")] = Path(
+        "out/variance.png"
+    ),
+    json_file: JsonOption = None,
+) -> None:
+    """Error variance of accelerometer configurations, linear and unscented, beside a conventional 3G-3A.
+
+    Example: micron sensing variance micron-000 proposed-004 --noise-mg 2.25 --json out/variance.json
+    """
+    from dataclasses import asdict
+
+    import numpy as np
+
+    from tools.placement.analysis import BAND_HZ, DOWN_40, Analysis, Conditions, all_accelerometers, conventional
+    from tools.placement.analysis_picture import save_analysis_picture
+    from tools.placement.configuration_file import STANDARD_GRAVITY, load_configuration
+
+    def cells(values: object, factor: float) -> str:
+        return "-" if values is None else ", ".join(f"{factor * v:.3g}" for v in np.asarray(values)[:3])
+
+    with clear_errors():
+        check_writable(json_file)
+        conditions = Conditions(
+            _vector(tip_mm, "--tip-mm") * 1e-3,
+            np.array(DOWN_40),
+            float(np.radians(gyroscope_deg_s)),
+            np.radians(_vector(turning_deg_s, "--turning-deg-s")),
+        )
+        found: list[Analysis] = []
+        for given in configurations:
+            placement, noise = load_configuration(given, noise_mg)
+            try:
+                found.append(all_accelerometers(placement, noise, conditions))
+            except ValueError as error:
+                raise error if isinstance(error, InputError) else InputError(f"{given}: {error}") from error
+        found.append(conventional(np.zeros(3), noise_mg * 1e-3 * STANDARD_GRAVITY, conditions))
+        band = f"{BAND_HZ[0]:g}-{BAND_HZ[1]:g} Hz"
+        table = Table(title="Rms error by body axis x, y, z, from sensor noise alone", title_justify="left")
+        for heading in ("quantity", *(a.name for a in found)):
+            table.add_column(heading, overflow="fold")
+        rows = (
+            ("axes", [str(a.axes) for a in found]),
+            ("angular acceleration (rad/s^2)", [cells(a.alpha, 1.0) for a in found]),
+            ("rate, one increment, linear (deg/s)", [cells(a.rate_linear, 180.0 / np.pi) for a in found]),
+            ("rate, one increment, unscented (deg/s)", [cells(a.rate_unscented, 180.0 / np.pi) for a in found]),
+            (f"rate, {band} (deg/s)", [cells(a.rate_band, 180.0 / np.pi) for a in found]),
+            ("acceleration at the sensors' centroid (mm/s^2)", [cells(a.force_centre, 1e3) for a in found]),
+            ("acceleration of the tip (mm/s^2)", [cells(a.force_tip, 1e3) for a in found]),
+            (f"tip displacement, {band} (um)", [cells(a.tip_band_m, 1e6) for a in found]),
+        )
+        for name, values in rows:
+            table.add_row(name, *values)
+        data_console().print(table)
+        console().print(
+            "an increment of the rate is not its error: that is a random walk (ERRATA 20), compare the bands"
+        )
+        save_analysis_picture(found, image)
+        console().print(f"picture: {image}")
+        write_json(
+            {
+                "format": 1,
+                "band_hz": BAND_HZ,
+                "noise_mg": noise_mg,
+                "gyroscope_deg_s": gyroscope_deg_s,
+                "configurations": [asdict(a) for a in found],
+            },
+            json_file,
+        )
+
+
+def _vector(text: str, option: str):
+    import numpy as np
+
+    try:
+        values = np.array([float(part) for part in text.split(",")])
+    except ValueError as error:
+        raise InputError(f"{option} {text}: three numbers with commas are needed") from error
+    if values.shape != (3,) or not np.all(np.isfinite(values)):
+        raise InputError(f"{option} {text}: three numbers with commas are needed")
+    return values
