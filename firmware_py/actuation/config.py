@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from hal.bench import validate_table
 
 Positive = Annotated[float, Field(gt=0.0)]
+Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=16)]
 
 
 class StackConfig(BaseModel):
@@ -96,17 +97,30 @@ class ActuationConfig(BaseModel):
     neutral_V: float = 50.0
     slew_V_per_s: Positive = 20_000.0
     stacks: tuple[StackConfig, StackConfig, StackConfig] = (StackConfig(), StackConfig(), StackConfig())
-    feedforward: Annotated[tuple[float, ...], Field(min_length=1, max_length=16)] = (1.0,)
-    """Taps on the wanted strokes, newest first: inverse of amplifier lag and resonance. What they need to see of the
-    future is part of the predictor's horizon ([firmware.tremor] loop_delay_s)."""
+    feedforward: tuple[Taps, Taps, Taps] = ((1.0,), (1.0,), (1.0,))
+    """Taps on the wanted stroke of each stack, newest first: inverse of its lag and resonance; one list for all or
+    three. ``micron calibrate piezo`` writes them."""
+    preview_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0
+    """From a demand to the extension that it is for; part of the predictor's horizon ([firmware.tremor]
+    loop_delay_s), which must reach at least this far."""
 
     @field_validator("lever_gain", mode="before")
     @classmethod
     def _one_for_all(cls, value: Any) -> Any:
         return (value,) * 3 if isinstance(value, int | float) else value
 
+    @field_validator("feedforward", mode="before")
+    @classmethod
+    def _same_taps(cls, value: Any) -> Any:
+        alike = isinstance(value, list | tuple) and all(isinstance(v, int | float) for v in value)
+        return (value,) * 3 if alike else value
+
     @model_validator(mode="after")
     def _check(self) -> ActuationConfig:
+        for taps in self.feedforward:
+            # what is not one at rest would drive every stroke too far or not far enough
+            if not abs(sum(taps) - 1.0) < 1e-3:
+                raise ValueError(f"feedforward: taps must sum to 1, not {sum(taps):g}")
         if not self.low_V < self.neutral_V < self.high_V:
             raise ValueError("low_V < neutral_V < high_V is needed")
         rotation = np.array(self.mounting)

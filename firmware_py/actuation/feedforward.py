@@ -1,45 +1,50 @@
 """A stable inverse of what follows the hysteresis (amplifier lag, resonance), with preview: 000 sec. 7.5, 5.1.
 
 The exact inverse of a sampled resonance is not stable (zeros outside the unit circle). A short FIR filter that may look
-a little ahead is, always: its taps are the least squares that make taps x response = 1 over the tremor's band, with a
+a little ahead is, always: its taps are the least squares that make taps x answer = 1 over the tremor's band, with a
 penalty on gain beyond it. How far it looks ahead is a number of seconds that the tremor predictor must reach.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+Answer = Callable[[Array], Complex]
+"""(n,) complex gain from demands that are held for a tick to the extension, at (n,) Hz; 1 at rest."""
 
 
 def design_feedforward(
-    response: Array, dt: float, preview_s: float, taps: int = 6, band_hz: float = 60.0, penalty: float = 0.03
+    answer: Answer, dt: float, preview_s: float, taps: int = 6, band_hz: float = 40.0, penalty: float = 1e-3
 ) -> Array:
     """(taps,) weights on the wanted extension at ``preview_s`` from now, one tick earlier, ...
 
-    ``response``: (n,) weights of the levels held m ticks ago in what counts now. Every frequency up to ``band_hz``
-    weighs the same; ``penalty`` keeps the gain above ``band_hz`` near one. The gain at rest is exactly one.
+    Every frequency up to ``band_hz`` weighs the same. ``penalty`` weighs the taps' own gain beyond: they must not raise
+    the noise of what is wanted. The gain at rest is exactly one.
     """
-    inside = np.linspace(0.0, band_hz, 61)
-    outside = np.linspace(band_hz, 0.5 / dt, 61)
-    hz = np.concatenate([inside, outside])
-    weight = np.concatenate([np.ones(61), np.full(61, penalty)])
-    z = np.exp(-2j * np.pi * hz * dt)
-    plant = np.polynomial.polynomial.polyval(z, response / response.sum())
-    # taps on x(t + preview - k dt); the plant adds its own lag; wanted: x(t)
-    matrix = (plant * np.exp(2j * np.pi * hz * preview_s))[:, None] * z[:, None] ** np.arange(taps)
+    inside: Array = np.linspace(0.0, band_hz, 61)
+    outside: Array = np.linspace(band_hz, 0.5 / dt, 61)
+    k = np.arange(taps)
+    # taps on x(t + preview - k dt); what follows adds its own lag; wanted: x(t)
+    track = (answer(inside) * np.exp(2j * np.pi * inside * preview_s))[:, None]
+    track = track * np.exp(-2j * np.pi * inside[:, None] * k * dt)
+    noise = penalty * np.exp(-2j * np.pi * outside[:, None] * k * dt)
+    matrix = np.concatenate([track, noise])
+    wanted = np.concatenate([np.ones(61), np.zeros(61)])
     # the last tap is one minus the others
     free = matrix[:, :-1] - matrix[:, -1:]
-    target = 1.0 - matrix[:, -1]
-    a = np.concatenate([free.real, free.imag]) * np.tile(weight, 2)[:, None]
-    b = np.concatenate([target.real, target.imag]) * np.tile(weight, 2)
+    target = wanted - matrix[:, -1]
+    a = np.concatenate([free.real, free.imag])
+    b = np.concatenate([target.real, target.imag])
     found = np.linalg.lstsq(a, b, rcond=None)[0]
     return np.concatenate([found, [1.0 - found.sum()]])
 
 
-def tracking_gain(taps: Array, response: Array, dt: float, preview_s: float, hz: Array) -> NDArray[np.complex128]:
+def tracking_gain(taps: Array, answer: Answer, dt: float, preview_s: float, hz: Array) -> Complex:
     """(n,) complex ratio of what comes out to what was wanted at ``hz``: 1 is perfect."""
     z = np.exp(-2j * np.pi * hz * dt)
-    plant = np.polynomial.polynomial.polyval(z, response / response.sum())
-    return np.polynomial.polynomial.polyval(z, taps) * plant * np.exp(2j * np.pi * hz * preview_s)
+    return np.polynomial.polynomial.polyval(z, taps) * answer(hz) * np.exp(2j * np.pi * hz * preview_s)

@@ -60,7 +60,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("stroke_low", "f8", (3,)),  # m from neutral
             ("stroke_high", "f8", (3,)),
             ("neutral_extension", "f8", (3,)),  # m
-            ("taps", "f8", (TAPS,)),
+            ("taps", "f8", (3, TAPS)),
             ("stacks", operator_dtype(n_plays, n_zones, n_creep), (3,)),
         ]
     )
@@ -109,7 +109,7 @@ def actuate_params(config: ActuationConfig) -> Record:
         high_V=config.high_V,
         neutral_V=config.neutral_V,
         slew_step_V=config.slew_V_per_s / config.tick_hz,
-        taps=np.array(config.feedforward + (0.0,) * (TAPS - len(config.feedforward))),
+        taps=np.array([taps + (0.0,) * (TAPS - len(taps)) for taps in config.feedforward]),
     )
     param = attributes(params)[0]
     slopes = np.empty(sizes[0])
@@ -197,7 +197,7 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
         past[0] = stroke[i]
         target = 0.0
         for k in range(len(past)):
-            target += param.taps[k] * past[k]
+            target += param.taps[i, k] * past[k]
         command, limited = command_stack(
             target, state.plays[i], state.creep[i], state.slopes, state.target[i], state.command_V[i], i, param
         )

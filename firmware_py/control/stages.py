@@ -22,6 +22,7 @@ from firmware_py.sensing.stage import Sensing
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.detectors import Detectors
 from firmware_py.tremor.stage import Tremor
+from hal.errors import BenchError
 
 Frame = NDArray[np.float64]
 
@@ -41,10 +42,16 @@ class StageConfigs:
     @classmethod
     def from_dict(cls, tables: Mapping[str, Mapping[str, Any]], where: str) -> StageConfigs:
         """From the tables of a bench or the metadata of a recording. ``BenchError`` names the wrong key."""
+        tremor = TremorConfig.from_dict(tables.get("tremor", {}), where=f"{where}: firmware.tremor")
+        actuation = ActuationConfig.from_dict(tables.get("actuation", {}), where=f"{where}: firmware.actuation")
+        if tremor.loop_delay_s < actuation.preview_s:
+            raise BenchError(
+                f"{where}: firmware.tremor: loop_delay_s = {tremor.loop_delay_s:g} predicts less far ahead than the "
+                f"stacks' feedforward needs (actuation preview_s = {actuation.preview_s:g}): add the time from sample "
+                "to command to it"
+            )
         return cls(
-            SensingConfig.from_dict(tables.get("sensing", {}), where=f"{where}: firmware.sensing"),
-            TremorConfig.from_dict(tables.get("tremor", {}), where=f"{where}: firmware.tremor"),
-            ActuationConfig.from_dict(tables.get("actuation", {}), where=f"{where}: firmware.actuation"),
+            SensingConfig.from_dict(tables.get("sensing", {}), where=f"{where}: firmware.sensing"), tremor, actuation
         )
 
 

@@ -1,10 +1,12 @@
 """The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
 
-``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops|set]
+``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops|steps|set]
 [--twin FILE]``
 drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
-contract; ``set`` writes a folder of them, saw-teeth and sines of 0.1 to 40 Hz and loops, all that a calibration needs.
-With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place, as with a bench that names it.
+contract; ``steps``: small ones, read at 8 kHz so that a resonance shows; ``set`` writes a folder of them, saw-teeth and
+sines of 0.1 to 40 Hz, loops and steps, all that a calibration needs.
+With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place, as with a bench that
+names it.
 ``... manipulator --out FOLDER`` moves all three stacks through a grid and tracks the tip.
 ``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
 and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
@@ -27,7 +29,7 @@ from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
-from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, TRUTH_COLUMNS, begin, outputs
+from sim_devices.plant.kernel import STEP_S, TRUTH_COLUMNS, begin, outputs
 from sim_devices.plant.lab_motion import measure_motion
 from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.stack import drive_channel, drive_step, stack_unit
@@ -39,6 +41,9 @@ Array = NDArray[np.float64]
 
 INTERFEROMETER_RMS_UM = 0.07
 RATE_HZ = 1000.0
+STEPS_HZ = 8000.0
+STEPS_SHARE = 0.05
+"""Of the amplitude: small steps, which the amplifier's slew limit does not slow down."""
 
 
 class LabError(BenchError):
@@ -59,9 +64,16 @@ def drive_stack(params, state, volts, temperature_C, steps_per_sample, extension
             drive_step(p, s, volts[i], temperature_C)
 
 
+def sample_rate_hz(profile: str) -> float:
+    """Of the demand and of the interferometer."""
+    return STEPS_HZ if profile == "steps" else RATE_HZ
+
+
 def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: float, seed: int) -> Array:
-    """Demand in volts about 50 V at 1 kHz: triangle (``sawtooth``), sine of growing amplitude, or a tremor."""
-    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    """Demand in volts about 50 V at ``sample_rate_hz``: triangle (``sawtooth``), sine of growing amplitude, or a tremor."""
+    t = np.arange(round(seconds * sample_rate_hz(profile))) / sample_rate_hz(profile)
+    if profile == "steps":
+        return 50.0 + STEPS_SHARE * amplitude_V * np.where((rate_hz * t) % 1.0 < 0.5, 1.0, -1.0)
     grow = np.minimum(1.0, t / max(0.2 * seconds, 1.0 / rate_hz))
     phase = rate_hz * t
     if profile == "sawtooth":
@@ -81,7 +93,7 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
         wander = (amplitude_V - size) * np.sin(2.0 * math.pi * 0.031 * rate_hz * t)
         loops = 50.0 + size * np.sin(2.0 * math.pi * phase) + 0.9 * wander
         return np.where(rest > 0.0, loops, 50.0 - amplitude_V * np.cos(4.0 * math.pi * t / (0.1 * seconds)))
-    raise LabError(f"profile '{profile}': it is sawtooth, sine, tremor or loops")
+    raise LabError(f"profile '{profile}': it is sawtooth, sine, tremor, loops or steps")
 
 
 CALIBRATION_SET = (
@@ -89,8 +101,9 @@ CALIBRATION_SET = (
     *(("sawtooth", hz, 4.0) for hz in (10.0, 15.0, 20.0, 30.0, 40.0)),
     *(("sine", hz, 4.0) for hz in (2.0, 10.0, 25.0)),
     ("loops", 10.0, 20.0),
+    ("steps", 10.0, 4.0),
 )
-"""Profile, Hz, seconds: rates as in 000, sec. 7.4, and minor loops."""
+"""Profile, Hz, seconds: rates as in 000, sec. 7.4, minor loops, and steps for lag and resonance."""
 
 
 def measure_piezo(
@@ -114,17 +127,18 @@ def measure_piezo(
     if not 0.0 < amplitude_V <= 50.0:
         raise LabError(f"amplitude {amplitude_V:g} V about 50 V: give 0 < amplitude <= 50 V")
     temperature_C = start_temperature_C(config)
+    read_hz = sample_rate_hz(profile)
     volts = drive_profile(profile, rate_hz, seconds, amplitude_V, config.seed)
     room_C = np.full(len(volts), temperature_C)
     if twin is not None:
         if twin.kind != "piezo_stack":
             raise LabError(f"{twin.path}: a twin of kind {twin.kind}; the interferometer measures a piezo_stack")
-        extension = 1e-6 * twin.run(1.0 / RATE_HZ, {"command": volts, "temperature": room_C})["displacement"]
+        extension = 1e-6 * twin.run(1.0 / read_hz, {"command": volts, "temperature": room_C})["displacement"]
     else:
         unit = stack_unit(config.stack, config.unit, axis)
         params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
         extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
-        drive_stack(params, state, volts, temperature_C, STEPS_PER_MS, extension, terminal_V)
+        drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), extension, terminal_V)
     hiss = stream(config.seed, f"lab.piezo.{axis}.{profile}.{rate_hz:g}").standard_normal(len(volts))
     noise = INTERFEROMETER_RMS_UM * hiss
     columns = {
@@ -135,7 +149,7 @@ def measure_piezo(
     descriptor = f"""format = 1
 title = "piezo stack {axis} of unit {config.unit}, {profile} {rate_hz:g} Hz, {amplitude_V:g} V about 50 V"
 data = "data.npz"
-rate_hz = {RATE_HZ}
+rate_hz = {read_hz}
 
 [twin]
 kind = "piezo_stack"
@@ -279,7 +293,7 @@ def main(arguments: list[str] | None = None) -> int:
     what = parser.add_subparsers(dest="what", required=True)
     piezo = what.add_parser("piezo", help="one stack under the interferometer")
     piezo.add_argument("--axis", type=int, default=0)
-    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor", "loops", "set"), default="sine")
+    piezo.add_argument("--profile", choices=("sawtooth", "sine", "tremor", "loops", "steps", "set"), default="sine")
     piezo.add_argument("--rate-hz", type=float, default=10.0)
     piezo.add_argument("--seconds", type=float, default=10.0)
     piezo.add_argument("--amplitude-V", type=float, default=41.7, help="half of peak to peak, about 50 V")

@@ -19,8 +19,10 @@ from firmware_py.actuation.config import StackConfig
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.piezo_dynamics import MAX_LAG_S, Dynamics, delayed, fit_dynamics
 from tools.calibrate.piezo_excitation import determined_from, missing, one_loop
+from tools.calibrate.piezo_feedforward import Answers, Feedforward, for_tip
 from tools.calibrate.piezo_prediction import simulate
 from tools.calibrate.piezo_regression import Axes, Piece, Shape, Solution, axes_of, fit, play_states, residual, stack_of
+from tools.calibrate.piezo_steps import fit_steps, is_steps
 from tools.cli.common import InputError
 from tools.mismatch.recording import Recording
 
@@ -62,6 +64,8 @@ class PiezoFit:
     low_V: float
     high_V: float
     span_um: tuple[float, float]
+    answer: Answers
+    """What the taps undo: lag and resonance, from steps when there were any, and as late as the model says."""
 
     @property
     def neutral_V(self) -> float:
@@ -85,6 +89,10 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
     given = [recordings] if isinstance(recordings, Recording) else list(recordings)
     if not given:
         raise InputError("no recording was given")
+    steps = [r for r in given if is_steps(r)]
+    given = [r for r in given if not is_steps(r)]
+    if not given:
+        raise InputError(f"{steps[0].path}: steps show lag and resonance only; add saw-teeth and sinusoids")
     dt = given[0].dt
     notes: list[str] = []
     for recording in given:
@@ -121,7 +129,13 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
             parts = (*parts, *again)
     partials: list[Solution] = []
     solution, unseen = fit(pieces, shape, axes, folds, partials)
-    return _report(given, pieces, shape, axes, solution, unseen, dynamics, parts, notes, partials)
+    if steps:
+        mechanism = fit_steps(steps[0])
+        more_s = dynamics.sampled_delay_s(dt) - mechanism.sampled_delay_s(dt)
+        answer = Answers(mechanism, mechanism, more_s, dt)
+    else:
+        answer = Answers(dynamics.mechanism(dt, held), dynamics, 0.0, dt)
+    return _report(given, pieces, shape, axes, solution, unseen, dynamics, parts, notes, partials, answer)
 
 
 def _check(recording: Recording, dt: float) -> None:
@@ -253,6 +267,7 @@ def _report(
     parts: tuple[tuple[str, float, bool], ...],
     notes: list[str],
     partials: list[Solution],
+    answer: Answers,
 ) -> PiezoFit:
     raw = [residual(p, shape, axes, solution) for p in pieces]
     errors = [e - e.mean() for e in raw]
@@ -274,6 +289,7 @@ def _report(
         low_V=min(float(r.inputs["command"].min()) for r in given),
         high_V=max(float(r.inputs["command"].max()) for r in given),
         span_um=(min(float(p.z[p.rows].min()) for p in pieces), max(float(p.z[p.rows].max()) for p in pieces)),
+        answer=answer,
         dynamics=dynamics,
         lag_s=dynamics.sampled_delay_s(given[0].dt),
         rms_um=float(np.sqrt(np.mean([np.mean(e**2) for e in errors]))),
@@ -293,14 +309,23 @@ def _report(
     )
 
 
-def piezo_calibration(fits: Sequence[PiezoFit], title: str, feedforward: Sequence[float] = ()) -> str:
+def feedforward_of(fits: Sequence[PiezoFit], tick_hz: float = 1000.0) -> Feedforward:
+    """Taps and preview of these stacks for a firmware of ``tick_hz``."""
+    return for_tip([fit.answer for fit in fits], 1.0 / tick_hz)
+
+
+def piezo_calibration(fits: Sequence[PiezoFit], title: str, tick_hz: float = 1000.0) -> str:
     """Calibration file for the firmware: one fit for all three stacks, or one per stack in order 1, 2, 3."""
     if len(fits) not in (1, 3):
         raise InputError(f"{len(fits)} stacks: give recordings of one (for all three stacks) or three (1, 2, 3)")
     stacks: list[dict[str, Any]] = [
         {key: list(v) if isinstance(v, tuple) else v for key, v in fit.stack.model_dump().items()} for fit in fits
     ]
-    table: dict[str, Any] = {"stacks": stacks * (3 // len(stacks))}
-    if feedforward:
-        table["feedforward"] = list(feedforward)
+    inverse = feedforward_of(fits, tick_hz)
+    times = 3 // len(stacks)
+    table: dict[str, Any] = {
+        "preview_s": inverse.preview_s,
+        "feedforward": [[round(v, 6) for v in taps] for taps in inverse.taps] * times,
+        "stacks": stacks * times,
+    }
     return calibration_toml(title, "micron calibrate piezo", {"actuation": table})

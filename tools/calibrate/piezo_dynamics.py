@@ -17,9 +17,12 @@ from scipy.optimize import minimize
 from scipy.signal import lfilter
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 MAX_LAG_S = 0.02
 TAPS = 64
+TREMOR_HZ = 10.0
+LONG = 2048
 
 
 @dataclass(frozen=True)
@@ -34,18 +37,40 @@ class Dynamics:
     slow_share: float = 0.0
     slow_s: float = 0.0
 
-    @property
-    def slow_delay_s(self) -> float:
-        """What a slow motion lags by."""
-        slow = self.delay_s + self.lag_s + self.slow_share * self.slow_s
-        return slow + (2.0 * self.damping / (2.0 * np.pi * self.resonance_hz) if self.resonance_hz else 0.0)
+    def delay_at(self, hz: float = TREMOR_HZ) -> float:
+        """What a sinusoid of ``hz`` lags by, s."""
+        return -float(np.angle(self.gain(np.array([hz]))[0])) / (2.0 * np.pi * hz)
 
-    def sampled_delay_s(self, dt: float) -> float:
-        """What a slow motion lags by at the sampling instants, when the drive is held for ``dt``."""
-        if not self.resonance_hz:
-            return self.delay_s
-        weights = self.response(dt)
-        return dt * float(np.arange(len(weights)) @ weights) / float(weights.sum())
+    def mechanism(self, dt: float, held: bool) -> Dynamics:
+        """The same without what sampling at ``dt`` and holding the drive as long adds to a delay."""
+        if self.resonance_hz or not held:
+            return self
+        return Dynamics(delay_s=max(0.0, self.delay_s - 0.5 * dt))
+
+    def gain(self, hz: Array) -> Complex:
+        """(n,) complex gain of the mechanism at ``hz``, 1 at rest."""
+        s = 2j * np.pi * hz
+        fast = np.exp(-s * self.delay_s) / (1.0 + s * self.lag_s)
+        if self.resonance_hz:
+            w = 2.0 * np.pi * self.resonance_hz
+            fast = fast * (w * w / (s * s + 2.0 * self.damping * w * s + w * w))
+        return fast * (1.0 - self.slow_share + self.slow_share / (1.0 + s * self.slow_s))
+
+    def held_gain(self, hz: Array, tick_s: float) -> Complex:
+        """(n,) complex gain from demands held for ``tick_s`` to the extension: what moves the tip."""
+        x = hz * tick_s
+        return self.gain(hz) * np.sinc(x) * np.exp(-1j * np.pi * x)
+
+    def sampled_gain(self, hz: Array, dt: float) -> Complex:
+        """(n,) the same as an instrument sees it that reads when a demand begins, at the same rate."""
+        if not (self.resonance_hz or self.lag_s):
+            return np.exp(-2j * np.pi * hz * self.delay_s)
+        weights = np.diff(self.step(np.arange(LONG) * dt), prepend=0.0)
+        return np.polynomial.polynomial.polyval(np.exp(-2j * np.pi * hz * dt), weights)
+
+    def sampled_delay_s(self, dt: float, hz: float = TREMOR_HZ) -> float:
+        """What a sinusoid of ``hz`` lags by at the sampling instants, when the drive is held for ``dt``."""
+        return -float(np.angle(self.sampled_gain(np.array([hz]), dt)[0])) / (2.0 * np.pi * hz)
 
     def step(self, t: Array) -> Array:
         """Answer to a unit step at t = 0."""

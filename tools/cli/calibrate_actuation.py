@@ -21,6 +21,7 @@ from tools.cli.common import (
 
 if TYPE_CHECKING:
     from tools.calibrate.piezo import PiezoFit
+    from tools.calibrate.piezo_feedforward import Feedforward
     from tools.calibrate.piezo_prediction import Prediction
 
 Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration file (TOML) that a bench can name.")]
@@ -51,9 +52,11 @@ def piezo(
 
     Example: micron calibrate piezo out/stack0 out/stack1 out/stack2 --out out/piezo.toml
     """
+    from dataclasses import asdict
+
     from rich.progress import track
 
-    from tools.calibrate.piezo import identify_stack, piezo_calibration
+    from tools.calibrate.piezo import feedforward_of, identify_stack, piezo_calibration
     from tools.calibrate.piezo_prediction import predict
     from tools.mismatch.recording import load
 
@@ -73,11 +76,17 @@ def piezo(
             identify_stack(group) for _, group in track(named, description="fit", console=console(), transient=True)
         ]
         predictions = [predict(fit) for fit in fits]
+        inverse = feedforward_of(fits)
         write_text_atomic(out, piezo_calibration(fits, "piezo stacks"))
-        _show(fits, predictions)
+        _show(fits, predictions, inverse)
         console().print(f"written: {out}")
         write_json(
-            {"format": 1, "out": str(out), "stacks": [_json(f, p) for f, p in zip(fits, predictions, strict=True)]},
+            {
+                "format": 1,
+                "out": str(out),
+                "stacks": [_json(f, p) for f, p in zip(fits, predictions, strict=True)],
+                "feedforward": asdict(inverse),
+            },
             json_file,
         )
 
@@ -90,7 +99,7 @@ def _json(fit: PiezoFit, prediction: Prediction) -> dict[str, object]:
     return {**plain, "prediction": asdict(prediction)}
 
 
-def _show(fits: list[PiezoFit], predictions: list[Prediction]) -> None:
+def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforward) -> None:
     import numpy as np
 
     table = Table(title="Piezo stacks; errors on recordings that the fit had not seen", title_justify="left")
@@ -108,6 +117,15 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction]) -> None:
     row("slopes by rate", *("yes" if f.stack.slope_per_rate_s_per_V else "no" for f in fits))
     row("creep, sum of shares (%)", *(f"{100 * sum(f.stack.creep_shares):.1f}" for f in fits))
     row("lag (ms)", *(f"{1e3 * f.lag_s:.2f}" for f in fits))
+    found = [f.answer.mechanism for f in fits]
+    row(
+        "resonance (Hz), damping",
+        *(f"{d.resonance_hz:.0f}, {d.damping:.3f}" if d.resonance_hz else "not found" for d in found),
+    )
+    row(
+        "error at 1 to 40 Hz by lag (%)",
+        *(f"{100 * a:.2f} -> {100 * b:.2f}" for a, b in zip(inverse.without, inverse.left, strict=True)),
+    )
     row("fastest motion seen (um/s)", *(f"{f.top_rate_um_s:.0f}" for f in fits))
     singular = [f.singular_um_s for f in fits]
     row("singular rate (um/s)", *(f"{v:.0f}" if np.isfinite(v) else "none" for v in singular))
@@ -117,6 +135,11 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction]) -> None:
     row("  rms error (um, % of p-p)", *(f"{p.rms_um:.3f}, {100 * p.rms_um / p.wanted_um:.2f}" for p in predictions))
     row("  largest (um, % of p-p)", *(f"{p.max_um:.3f}, {100 * p.max_um / p.wanted_um:.2f}" for p in predictions))
     data_console().print(table)
+    data_console().print(
+        f"preview: {1e3 * inverse.preview_s:.2f} ms from demand to extension (error by lag: with it alone -> with the "
+        "taps); loop_delay_s of [firmware.tremor] is this and the time from sample to command",
+        soft_wrap=True,
+    )
     for i, fit in enumerate(fits):
         for warning in fit.warnings:
             data_console().print(f"stack {i + 1}, missing: {warning}", soft_wrap=True)

@@ -11,15 +11,23 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import lfilter
 
 from firmware_py.actuation.config import StackConfig
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS
-from sim_devices.plant.lab import CALIBRATION_SET, INTERFEROMETER_RMS_UM, drive_stack, measure_piezo
+from sim_devices.plant.lab import (
+    CALIBRATION_SET,
+    INTERFEROMETER_RMS_UM,
+    drive_stack,
+    measure_piezo,
+    sample_rate_hz,
+)
 from sim_devices.plant.stack import drive_channel, stack_unit
-from tools.calibrate.piezo import identify_stack, rates_of
+from tools.calibrate.piezo import PiezoFit, identify_stack, rates_of
 from tools.calibrate.piezo_dynamics import delayed
 from tools.calibrate.piezo_excitation import determined_from
+from tools.calibrate.piezo_feedforward import for_instrument
 from tools.calibrate.piezo_prediction import command
 from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual, stack_of
 from tools.mismatch.recording import Recording, Split, TwinText
@@ -47,12 +55,25 @@ DEPENDENT = Shape(
 @dataclass(frozen=True)
 class Controller:
     """A way to command one stack. ``stack`` None: a straight line, V from um, ``line`` = (V per um, V at zero).
-    ``preview_s``: how far ahead of the path it is driven."""
+    ``preview_s``: how far ahead of the path it is driven; ``taps``: on the path, newest first."""
 
-    name: str
     stack: StackConfig | None
-    preview_s: float
+    preview_s: float = 0.0
     line: tuple[float, float] = (0.0, 0.0)
+    taps: tuple[float, ...] = (1.0,)
+
+
+@dataclass(frozen=True)
+class Stand:
+    """One stack in the lab: ``as_published`` without a model, rate-independent and rate-dependent as in 000, without
+    preview; ``with_preview`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and
+    taps; ``late``: our model and no preview."""
+
+    fit: PiezoFit
+    as_published: tuple[Controller, ...]
+    with_preview: tuple[Controller, ...]
+    ours: Controller
+    late: Controller
 
 
 @dataclass(frozen=True)
@@ -67,12 +88,12 @@ class Tracking:
 def recording(config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float) -> Recording:
     """One recording of the lab, as ``micron calibrate piezo`` would load it."""
     columns, _ = measure_piezo(config, axis, profile, rate_hz, seconds, SWING_V)
-    n = len(columns["command_V"])
+    n, dt = len(columns["command_V"]), 1.0 / sample_rate_hz(profile)
     return Recording(
         path=Path(f"{profile}-{rate_hz:g}Hz"),
         title=profile,
-        t=np.asarray(np.arange(n) * DT_S, dtype=np.float64),
-        dt=DT_S,
+        t=np.asarray(np.arange(n) * dt, dtype=np.float64),
+        dt=dt,
         inputs={"command": columns["command_V"]},
         outputs={"displacement": columns["displacement_um"]},
         context={},
@@ -110,23 +131,30 @@ def rising_line(sine: Recording, lag_s: float) -> tuple[float, float]:
     return float(slope), float(zero)
 
 
-def controllers(config: EmulationConfig, axis: int) -> tuple[list[Controller], float]:
-    """Without a model, the two published ones and ours, each from recordings of this stack; the interferometer's
-    reading at rest, um."""
+def stand(config: EmulationConfig, axis: int) -> Stand:
+    """Every way to command the stack ``axis``, each from recordings of this stack."""
     sine = recording(config, axis, "sine", 10.0, 4.0)
     everything = [recording(config, axis, *one) for one in CALIBRATION_SET]
     saw_teeth = [r for r in everything if r.path.name.startswith("sawtooth")]
-    ours = identify_stack(everything)
-    # the same preview for all, so that they differ by the hysteresis model alone
-    lag_s = ours.lag_s
     rest_um = float(np.mean(run(config, axis, np.full(200, NEUTRAL_V))))
-    slope, zero = rising_line(sine, lag_s)
-    return [
-        Controller("without model", None, lag_s, (slope, zero + slope * rest_um)),
-        Controller("rate-independent", published_model([sine], INDEPENDENT, lag_s), lag_s),
-        Controller("rate-dependent", published_model(saw_teeth, DEPENDENT, lag_s), lag_s),
-        Controller("ours", ours.stack, lag_s),
-    ], rest_um
+    fit = identify_stack(everything)
+
+    def three(lag_s: float) -> tuple[Controller, ...]:
+        slope, zero = rising_line(sine, lag_s)
+        return (
+            Controller(None, lag_s, (slope, zero + slope * rest_um)),
+            Controller(published_model([sine], INDEPENDENT, lag_s), lag_s),
+            Controller(published_model(saw_teeth, DEPENDENT, lag_s), lag_s),
+        )
+
+    inverse = for_instrument([fit.answer])
+    return Stand(
+        fit,
+        three(0.0),
+        three(fit.lag_s),
+        Controller(fit.stack, inverse.preview_s, taps=inverse.taps[0]),
+        Controller(fit.stack),
+    )
 
 
 def run(config: EmulationConfig, axis: int, volts: Array) -> Array:
@@ -150,6 +178,7 @@ def track(config: EmulationConfig, axis: int, controller: Controller, path_um: A
     t = np.arange(len(wanted)) * DT_S
     # linear between the path's samples, held at its end
     ahead = np.interp(t + controller.preview_s, t, wanted)
+    ahead = ahead[0] + np.asarray(lfilter(controller.taps, [1.0], ahead - ahead[0]), dtype=np.float64)
     limited = 0
     if controller.stack is None:
         slope, zero = controller.line

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,6 +15,8 @@ from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.manipulator import tip_displacement
 from sim_devices.plant.unit import build_unit
 from tools.calibrate.manipulator import identify_manipulator
+from tools.calibrate.piezo import PiezoFit
+from tools.calibrate.piezo_feedforward import for_instrument
 from tools.manipulator.workspace import analyse
 from tools.reproduce.actuation_hand import present, recorded_tip_m
 from tools.reproduce.actuation_lab import DT_S, run
@@ -42,20 +46,27 @@ def workspace_rows() -> list[Row]:
     ]  # fmt: skip
 
 
-def instrument(config: EmulationConfig, stacks: list) -> Actuation:
-    """The firmware's stage calibrated for the unit: stacks as given, geometry from a scan of the workspace."""
+def instrument(config: EmulationConfig, fits: Sequence[PiezoFit]) -> Actuation:
+    """The firmware's stage calibrated for the unit: stacks as identified, geometry from a scan of the workspace. The
+    taps are for tips that are read when a demand begins."""
     scan, _ = measure_scan(config, 4, np.random.default_rng(5))
-    geometry = identify_manipulator(scan).table
-    return Actuation(ActuationConfig.from_dict({**geometry, "stacks": stacks, "ramp_s": 0.002, "min_confidence": 0.0}))
+    inverse = for_instrument([fit.answer for fit in fits])
+    found = {
+        **identify_manipulator(scan).table,
+        "stacks": [fit.stack.model_dump() for fit in fits],
+        "feedforward": inverse.taps,
+        "preview_s": inverse.preview_s,
+    }
+    return Actuation(ActuationConfig.from_dict({**found, "ramp_s": 0.002, "min_confidence": 0.0}))
 
 
-def drive_tip(actuation: Actuation, config: EmulationConfig, path_m: Array, lag_s: float) -> Array:
+def drive_tip(actuation: Actuation, config: EmulationConfig, path_m: Array) -> Array:
     """(n, 3) tip in the body frame, m, when the stage is asked for ``path_m`` (n, 3)."""
     t = np.arange(len(path_m)) * DT_S
     frames = np.zeros((len(path_m), LAYOUT.size))
     frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
     for axis in range(3):
-        frames[:, TREMOR_AHEAD + axis] = -np.interp(t + lag_s, t, path_m[:, axis])
+        frames[:, TREMOR_AHEAD + axis] = -np.interp(t + actuation.config.preview_s, t, path_m[:, axis])
     actuation.reset()
     for frame in frames:
         actuation.step(frame)
@@ -72,9 +83,8 @@ def three_axes() -> list[Row]:
     """Recorded tremor in all three axes, 50 um p-p in the liveliest; then each axis alone for the cross-coupling."""
     from tools.reproduce.actuation import lab
 
-    config, ways = lab()
-    actuation = instrument(config, [ways[axis][3].stack.model_dump() for axis in range(3)])  # type: ignore[union-attr]
-    lag_s = float(np.mean([ways[axis][3].preview_s for axis in range(3)]))
+    config, stands = lab()
+    actuation = instrument(config, [s.fit for s in stands])
     source = "000, sec. 6.1.1 and 7.5, whole manipulator"
     rows: list[Row] = []
     for name, file in present().items():
@@ -83,7 +93,7 @@ def three_axes() -> list[Row]:
         path *= 50e-6 / np.max(np.ptp(path, axis=0))
         path *= np.minimum(1.0, np.arange(TICKS) * DT_S / 0.5)[:, None]
         condition = f"{name}, 50 um p-p in the liveliest axis, 5 s"
-        e = (drive_tip(actuation, config, path, lag_s) - path)[SCORED_FROM:] * 1e6
+        e = (drive_tip(actuation, config, path) - path)[SCORED_FROM:] * 1e6
         # where the tip rests is not part of a tremor
         e -= e.mean(axis=0)
         moving = [axis for axis in range(3) if np.ptp(path[:, axis]) > 1e-6]
@@ -99,7 +109,7 @@ def three_axes() -> list[Row]:
         for axis in moving:
             alone = np.zeros_like(path)
             alone[:, axis] = path[:, axis]
-            other = drive_tip(actuation, config, alone, lag_s)[SCORED_FROM:] * 1e6
+            other = drive_tip(actuation, config, alone)[SCORED_FROM:] * 1e6
             other -= other.mean(axis=0)
             across = [float(np.sqrt(np.mean(other[:, k] ** 2))) for k in range(3) if k != axis]
             rows.append(
