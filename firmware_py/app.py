@@ -241,7 +241,12 @@ def make_outcome(
             "unread": counts.unread,
         },
         "noticed": dict(counts.noticed),
-        "commands": {"sent": counts.commands, "clipped": counts.clipped},
+        "commands": {
+            "sent": counts.commands,
+            "clipped": counts.clipped,
+            # ticks by limit, as the actuation stage sees them
+            "limited": loop.stages.actuation.limited,
+        },
         "magnetometer_errors": counts.magnetometer_errors,
         "warnings": dict(supervisor.warnings),
         "safe_state": {

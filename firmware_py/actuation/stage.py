@@ -41,6 +41,7 @@ from hal.compiled import kernel
 Array = NDArray[np.float64]
 
 
+LIMITS = ("workspace", "voltage", "slew", "singular")  # the bits of Clip in order
 TAPS = 16  # the most that a configuration may have; one size, one compilation
 
 
@@ -77,6 +78,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
             ("plays", "f8", (3, n_plays)),
             ("creep", "f8", (3, n_creep)),
             ("slopes", "f8", (n_plays,)),
+            ("limited", "i8", (len(LIMITS),)),  # ticks in which each limit took
         ]
     )
 
@@ -206,6 +208,8 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
         state.command_V[i] = command
         frame[COMMAND + i] = command
     frame[CLIP] = clip
+    for bit in range(len(state.limited)):
+        state.limited[bit] += (clip >> bit) & 1
 
 
 class Actuation:
@@ -219,6 +223,11 @@ class Actuation:
     def step(self, frame: NDArray[np.float64]) -> None:
         actuate_kernel(frame, self.state, self.params)
 
+    @property
+    def limited(self) -> dict[str, int]:
+        """Ticks since the last reset in which the command ran into each limit."""
+        return dict(zip(LIMITS, map(int, self.state["limited"][0]), strict=True))
+
     def reset(self) -> None:
-        """At neutral, compensation off; to be called after the amplifier itself has gone to neutral."""
+        """At neutral, compensation off, counts at zero; to be called after the amplifier itself has gone to neutral."""
         copy_record(self.state, actuate_state(self.config, self.params))

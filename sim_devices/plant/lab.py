@@ -70,7 +70,8 @@ def sample_rate_hz(profile: str) -> float:
 
 
 def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: float, seed: int) -> Array:
-    """Demand in volts about 50 V at ``sample_rate_hz``: triangle (``sawtooth``), sine of growing amplitude, or a tremor."""
+    """Demand in volts about 50 V at ``sample_rate_hz``: triangle (``sawtooth``), sine of growing amplitude,
+    tremor, loops or small steps."""
     t = np.arange(round(seconds * sample_rate_hz(profile))) / sample_rate_hz(profile)
     if profile == "steps":
         return 50.0 + STEPS_SHARE * amplitude_V * np.where((rate_hz * t) % 1.0 < 0.5, 1.0, -1.0)

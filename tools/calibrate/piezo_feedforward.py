@@ -67,8 +67,8 @@ def _worst(taps: Array, answer: Answer, dt: float, preview_s: float, hz: Array) 
 
 @dataclass(frozen=True)
 class Answers:
-    """How one stack follows a held demand: its ``mechanism``, and ``sampled``, what recordings of ``dt`` show of it; both
-    later by ``more_s``."""
+    """How one stack follows a held demand: its ``mechanism``, and ``sampled``, what recordings of ``dt`` show of it.
+    Both come later by ``more_s``."""
 
     mechanism: Dynamics
     sampled: Dynamics

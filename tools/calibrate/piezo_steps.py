@@ -19,7 +19,7 @@ from tools.mismatch.recording import Recording
 Array = NDArray[np.float64]
 
 LONGEST_S = 0.03
-SLOW_S = (1e-3, 7e-3, 50e-3)
+SLOW_S = (10e-3, 50e-3)
 LEAST_STEPS = 8
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig, StackConfig
-from firmware_py.actuation.feedforward import design_feedforward, tracking_gain
 from tools.calibrate.piezo import identify_stack, piezo_calibration
 from tools.calibrate.piezo_dynamics import Dynamics, delayed
 from tools.calibrate.piezo_excitation import excitation_V
@@ -133,21 +132,6 @@ def test_rates_and_creep_come_back() -> None:
     # slopes that fall with the rate and a lag look much alike: together they must give the same displacement
     apart = simulate(fit.stack, delayed(drive, fit.lag_s, 1.0 / RATE_HZ)) - simulate(truth, drive)
     assert np.std(apart[3100:]) < 0.05  # of 5.5 um rms; unseen recordings leave 0.03
-
-
-def test_the_feedforward_inverse_undoes_a_resonance() -> None:
-    """A slow mechanism, 150 Hz and hardly damped: gain and phase of what comes out, exact sampled response."""
-    dynamics = Dynamics(lag_s=0.3e-3, resonance_hz=150.0, damping=0.05)
-    response = dynamics.response(1e-3)
-    hz = np.linspace(1.0, 40.0, 40)
-    preview_s = dynamics.sampled_delay_s(1e-3) + 1e-3
-    taps = design_feedforward(response, 1e-3, preview_s, taps=6)
-    assert taps.sum() == pytest.approx(1.0)
-    with_it = np.abs(tracking_gain(taps, response, 1e-3, preview_s, hz) - 1.0)
-    without = np.abs(tracking_gain(np.ones(1), response, 1e-3, dynamics.sampled_delay_s(1e-3), hz) - 1.0)
-    assert without[-1] > 0.05
-    assert with_it.max() < 0.2 * without.max()
-    assert np.abs(taps).sum() < 20.0  # stable, and no large gains
 
 
 def test_dynamics_step_against_the_differential_equation() -> None:
