@@ -39,6 +39,7 @@ NEUTRAL_V = 50.0
 SWING_V = 41.7  # half of peak to peak, about 12.5 um
 TEMPERATURE_C = 25.0
 APPROACH = 2000  # ticks from rest to the start of a path, not scored
+PAUSE = 200  # of them, at its end: where the displacement is set to zero
 SCORED = 5000  # 5 s, as in 000
 LOW_UM = -5.0  # lowest point of a path of 12.5 um p-p, from rest at neutral: the middle of the range
 
@@ -78,10 +79,13 @@ class Stand:
 
 @dataclass(frozen=True)
 class Tracking:
-    """Error of one run, um, and how many of its commands were limited."""
+    """Error of one run, um, counted from where its path begins; the same counted from rest before the approach; how
+    many of its commands were limited."""
 
     rms_um: float
     max_um: float
+    rest_rms_um: float
+    rest_max_um: float
     limited: int
 
 
@@ -188,8 +192,14 @@ def track(config: EmulationConfig, axis: int, controller: Controller, path_um: A
         volts, limited = asked.drive_V, asked.singular + asked.voltage + asked.slew
     z = run(config, axis, volts)
     noise = INTERFEROMETER_RMS_UM * np.random.default_rng(seed).standard_normal(len(z))
-    e = (z - z[0] + noise - wanted)[APPROACH:]
-    return Tracking(float(np.sqrt(np.mean(e**2))), float(np.max(np.abs(e))), limited)
+    from_rest = z - z[0] + noise - wanted
+    # an interferometer has no zero of its own: it is set in the pause before the path
+    e, rest = (from_rest[APPROACH:] - zero for zero in (from_rest[APPROACH - PAUSE : APPROACH].mean(), 0.0))
+    return Tracking(_rms(e), float(np.max(np.abs(e))), _rms(rest), float(np.max(np.abs(rest))), limited)
+
+
+def _rms(e: Array) -> float:
+    return float(np.sqrt(np.mean(e**2)))
 
 
 def stationary(frequency_hz: float) -> Array:

@@ -164,7 +164,7 @@ def test_rows_put_each_way_beside_its_column(monkeypatch: pytest.MonkeyPatch) ->
     """Controllers stand in for stacks: every way is tracked with its own errors and judged in its direction."""
     errors = {0: (1.5, 2.7), 1: (0.3, 0.9), 2: (0.2, 0.6), 3: (0.1, 0.3)}
     monkeypatch.setattr(actuation, "ways", lambda kind: [kind])
-    monkeypatch.setattr(actuation, "all_runs", lambda paths, by: [Tracking(*errors[by[0]], 0)] * 3)
+    monkeypatch.setattr(actuation, "all_runs", lambda paths, by: [Tracking(*errors[by[0]], 9.0, 9.0, 0)] * 3)
     rows = actuation.table_7_1()
     assert len(rows) == 4 * 2 * 8
     first = [row for row in rows if row.condition.startswith("1 Hz")]
