@@ -6,10 +6,8 @@ the Bluetooth stack, never yet against a radio.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 from drivers.imu.base import ImuSample
-from drivers.motion_card import CardQueue, card_channels
+from drivers.motion_card import QueuedCard
 from drivers.motion_card_protocol import (
     BATTERY_CHARACTERISTIC,
     IMU_CHARACTERISTIC,
@@ -18,12 +16,12 @@ from drivers.motion_card_protocol import (
 )
 from hal.contracts import Clock, GattClient
 from hal.errors import HalTimeout, ProtocolError
-from hal.types import ChannelInfo, Status
+from hal.types import Status
 
 RECEIVE_LIMIT = 64
 
 
-class BleMotionCard:
+class BleMotionCard(QueuedCard):
     """``probe`` subscribes, ``read`` gives the oldest sample not yet used and never waits."""
 
     def __init__(
@@ -36,36 +34,13 @@ class BleMotionCard:
         timeout_s: float = 5.0,
         name: str = "card",
     ) -> None:
-        self.name = name
+        super().__init__(name, rate_hz, "raw", spike_filter=spike_filter)
         self.battery_percent: int | None = None
         self.frames = 0
         self.bad_frames = 0
         self._link = link
         self._clock = clock
         self._timeout_s = timeout_s
-        self._queue = CardQueue(rate_hz, "raw", spike_filter=spike_filter)
-
-    @property
-    def card_status(self) -> int:
-        """0 inactive, 1 rotate, 2 zoom: of the sample read last."""
-        return self._queue.card_status
-
-    @property
-    def clicks(self) -> int:
-        return self._queue.clicks
-
-    @property
-    def lost(self) -> int:
-        return self._queue.lost
-
-    @property
-    def stale(self) -> int:
-        return self._queue.stale
-
-    @property
-    def masked(self) -> int:
-        """Samples that the spike filter held back."""
-        return self._queue.spikes.held if self._queue.spikes else 0
 
     def probe(self) -> str:
         """Read the battery, switch both notifications on, wait for a good packet."""
@@ -88,13 +63,6 @@ class BleMotionCard:
             if not self._receive(0.0):
                 break
         return self._queue.take(out)
-
-    def waiting(self) -> int:
-        """How many samples have arrived that ``read`` has not given out."""
-        return len(self._queue)
-
-    def channels(self) -> Sequence[ChannelInfo]:
-        return card_channels(self.name)
 
     def close(self) -> None:
         self._link.close()

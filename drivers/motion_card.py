@@ -97,25 +97,12 @@ class CardQueue:
         return status
 
 
-class MotionCard:
-    """The scanner card's serial port. Call ``read`` at least at ``rate_hz``; it never waits."""
+class QueuedCard:
+    """What a card shows of its queue, over wire or air."""
 
-    def __init__(
-        self,
-        port: SerialPort,
-        clock: Clock,
-        *,
-        rate_hz: float = 100.0,
-        fields: Fields = "raw",
-        spike_filter: bool = True,
-        name: str = "card",
-    ) -> None:
+    def __init__(self, name: str, rate_hz: float, fields: Fields, *, spike_filter: bool) -> None:
         self.name = name
-        self.parser = LineParser(fields)
-        self._port = port
-        self._clock = clock
         self._queue = CardQueue(rate_hz, fields, spike_filter=spike_filter)
-        self._buf = memoryview(bytearray(READ_BYTES))
 
     @property
     def card_status(self) -> int:
@@ -129,7 +116,7 @@ class MotionCard:
 
     @property
     def lost(self) -> int:
-        """Readings thrown away because ``read`` was not called; bad lines are in ``parser.bad_frames``."""
+        """Readings thrown away because ``read`` was not called; what could not be decoded is in ``bad_frames``."""
         return self._queue.lost
 
     @property
@@ -140,6 +127,33 @@ class MotionCard:
     def masked(self) -> int:
         """Samples that the spike filter held back."""
         return self._queue.spikes.held if self._queue.spikes else 0
+
+    def waiting(self) -> int:
+        """How many readings have arrived that ``read`` has not given out."""
+        return len(self._queue)
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        return card_channels(self.name)
+
+
+class MotionCard(QueuedCard):
+    """The scanner card's serial port. Call ``read`` at least at ``rate_hz``; it never waits."""
+
+    def __init__(
+        self,
+        port: SerialPort,
+        clock: Clock,
+        *,
+        rate_hz: float = 100.0,
+        fields: Fields = "raw",
+        spike_filter: bool = True,
+        name: str = "card",
+    ) -> None:
+        super().__init__(name, rate_hz, fields, spike_filter=spike_filter)
+        self.parser = LineParser(fields)
+        self._port = port
+        self._clock = clock
+        self._buf = memoryview(bytearray(READ_BYTES))
 
     @property
     def bad_frames(self) -> int:
@@ -169,13 +183,6 @@ class MotionCard:
         """The oldest reading not yet used; ``STALE`` (and the last one again) when there is none."""
         self._receive(0.0)
         return self._queue.take(out)
-
-    def waiting(self) -> int:
-        """How many readings have arrived that ``read`` has not given out."""
-        return len(self._queue)
-
-    def channels(self) -> Sequence[ChannelInfo]:
-        return card_channels(self.name)
 
     def close(self) -> None:
         self._port.close()
