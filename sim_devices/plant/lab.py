@@ -98,13 +98,15 @@ def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: flo
 
 
 CALIBRATION_SET = (
-    *(("sawtooth", hz, seconds) for hz, seconds in ((0.1, 25.0), (0.3, 12.0), (1.0, 7.0), (2.0, 5.0), (5.0, 4.0))),
-    *(("sawtooth", hz, 4.0) for hz in (10.0, 15.0, 20.0, 30.0, 40.0)),
-    *(("sine", hz, 4.0) for hz in (2.0, 10.0, 25.0)),
-    ("loops", 10.0, 20.0),
-    ("steps", 10.0, 4.0),
+    *(("sawtooth", hz, seconds, 1.0) for hz, seconds in ((0.1, 25.0), (0.3, 12.0), (1.0, 7.0), (2.0, 5.0), (5.0, 4.0))),
+    *(("sawtooth", hz, 4.0, 1.0) for hz in (10.0, 15.0, 20.0, 30.0, 40.0)),
+    *(("sine", hz, 4.0, 1.0) for hz in (2.0, 10.0, 25.0)),
+    ("loops", 10.0, 20.0, 1.0),
+    *(("sine", hz, 4.0, share) for hz, share in ((1.0, 0.3), (8.0, 0.3), (12.0, 0.15))),
+    ("steps", 10.0, 4.0, 1.0),
 )
-"""Profile, Hz, seconds: rates as in 000, sec. 7.4, minor loops, and steps for lag and resonance."""
+"""Profile, Hz, seconds, share of the amplitude: rates as in 000, sec. 7.4, minor loops, loops of a tremor's size about
+neutral, and steps for lag and resonance."""
 
 
 def measure_piezo(
@@ -317,9 +319,9 @@ def main(arguments: list[str] | None = None) -> int:
         config = load_config(given.bench, given.unit)
         twin = in_place(config, given.bench, given.axis, given.twin) if given.what == "piezo" else None
         if given.what == "piezo" and given.profile == "set":
-            for profile, rate_hz, seconds in CALIBRATION_SET:
+            for profile, rate_hz, seconds, share in CALIBRATION_SET:
                 columns, descriptor = measure_piezo(
-                    config, given.axis, profile, rate_hz, seconds, given.amplitude_V, twin
+                    config, given.axis, profile, rate_hz, seconds, share * given.amplitude_V, twin
                 )
                 write_recording(given.out / f"{profile}-{rate_hz:g}Hz", columns, descriptor)
             sys.stderr.write(f"{given.out}: {len(CALIBRATION_SET)} recordings\n")

@@ -39,7 +39,6 @@ NEUTRAL_V = 50.0
 SWING_V = 41.7  # half of peak to peak, about 12.5 um
 TEMPERATURE_C = 25.0
 APPROACH = 2000  # ticks from rest to the start of a path, not scored
-PAUSE = 200  # of them, at its end: where the displacement is set to zero
 SCORED = 5000  # 5 s, as in 000
 LOW_UM = -5.0  # lowest point of a path of 12.5 um p-p, from rest at neutral: the middle of the range
 
@@ -66,32 +65,34 @@ class Controller:
 
 @dataclass(frozen=True)
 class Stand:
-    """One stack in the lab: ``as_published`` without a model, rate-independent and rate-dependent as in 000, without
-    preview; ``with_preview`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and
-    taps; ``late``: our model and no preview."""
+    """One stack in the lab: ``late`` without a model, rate-independent and rate-dependent as in 000, without preview;
+    ``early`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and taps;
+    ``ours_late``: our model and no preview."""
 
     fit: PiezoFit
-    as_published: tuple[Controller, ...]
-    with_preview: tuple[Controller, ...]
+    late: tuple[Controller, ...]
+    early: tuple[Controller, ...]
     ours: Controller
-    late: Controller
+    ours_late: Controller
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """Error of one run, um, counted from where its path begins; the same counted from rest before the approach; how
-    many of its commands were limited."""
+    """Error of one run, um, counted from rest before the approach; the same less its mean; how many of its commands
+    were limited."""
 
     rms_um: float
     max_um: float
-    rest_rms_um: float
-    rest_max_um: float
+    free_rms_um: float
+    free_max_um: float
     limited: int
 
 
-def recording(config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float) -> Recording:
+def recording(
+    config: EmulationConfig, axis: int, profile: str, rate_hz: float, seconds: float, share: float = 1.0
+) -> Recording:
     """One recording of the lab, as ``micron calibrate piezo`` would load it."""
-    columns, _ = measure_piezo(config, axis, profile, rate_hz, seconds, SWING_V)
+    columns, _ = measure_piezo(config, axis, profile, rate_hz, seconds, share * SWING_V)
     n, dt = len(columns["command_V"]), 1.0 / sample_rate_hz(profile)
     return Recording(
         path=Path(f"{profile}-{rate_hz:g}Hz"),
@@ -192,10 +193,9 @@ def track(config: EmulationConfig, axis: int, controller: Controller, path_um: A
         volts, limited = asked.drive_V, asked.singular + asked.voltage + asked.slew
     z = run(config, axis, volts)
     noise = INTERFEROMETER_RMS_UM * np.random.default_rng(seed).standard_normal(len(z))
-    from_rest = z - z[0] + noise - wanted
-    # an interferometer has no zero of its own: it is set in the pause before the path
-    e, rest = (from_rest[APPROACH:] - zero for zero in (from_rest[APPROACH - PAUSE : APPROACH].mean(), 0.0))
-    return Tracking(_rms(e), float(np.max(np.abs(e))), _rms(rest), float(np.max(np.abs(rest))), limited)
+    e = (z - z[0] + noise - wanted)[APPROACH:]
+    free = e - e.mean()
+    return Tracking(_rms(e), float(np.max(np.abs(e))), _rms(free), float(np.max(np.abs(free))), limited)
 
 
 def _rms(e: Array) -> float:

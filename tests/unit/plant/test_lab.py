@@ -122,3 +122,17 @@ def test_compiled_and_python_agree():
         function(params, state, volts, 25.0, 8, x, v)
         results.append((x, v))
     assert np.allclose(results[0], results[1], rtol=1e-12, atol=0.0)
+
+
+def test_steps_are_small_held_and_read_at_eight_kilohertz():
+    columns, descriptor = measure_piezo(EmulationConfig(), 0, "steps", 10.0, 0.5, 40.0)
+    volts = columns["command_V"]
+    assert tomllib.loads(descriptor)["rate_hz"] == 8000.0
+    assert len(volts) == 4000
+    assert sorted(set(volts)) == [48.0, 52.0]
+    assert np.count_nonzero(np.diff(volts)) == 9
+    # 650 Hz: the step overshoots and the ring is there to be seen
+    after = columns["displacement_um"][400:420] - columns["displacement_um"][380:400].mean()
+    assert np.abs(after).max() > 1.3 * abs(
+        columns["displacement_um"][700:790].mean() - columns["displacement_um"][380:400].mean()
+    )
