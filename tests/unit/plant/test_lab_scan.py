@@ -14,7 +14,6 @@ from sim_devices.plant.lab_scan import INTERFEROMETER_RMS_UM, SAMPLES, TRACKER_R
 from sim_devices.plant.unit import build_unit
 from tests.unit.actuation.truth import tip_from_strokes
 
-
 CONFIG = EmulationConfig(unit=3, seed=3)
 
 
