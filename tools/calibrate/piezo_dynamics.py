@@ -65,8 +65,10 @@ class Dynamics:
         """(n,) the same as an instrument sees it that reads when a demand begins, at the same rate."""
         if not (self.resonance_hz or self.lag_s):
             return np.exp(-2j * np.pi * hz * self.delay_s)
-        weights = np.diff(self.step(np.arange(LONG) * dt), prepend=0.0)
-        return np.polynomial.polynomial.polyval(np.exp(-2j * np.pi * hz * dt), weights)
+        ticks: Array = np.arange(LONG, dtype=np.float64)
+        weights = np.diff(self.step(ticks * dt), prepend=0.0)
+        z = np.exp(-2j * np.pi * hz * dt)
+        return np.asarray(np.polynomial.polynomial.polyval(z, weights), dtype=np.complex128)
 
     def sampled_delay_s(self, dt: float, hz: float = TREMOR_HZ) -> float:
         """What a sinusoid of ``hz`` lags by at the sampling instants, when the drive is held for ``dt``."""

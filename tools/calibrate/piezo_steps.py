@@ -28,7 +28,7 @@ def is_steps(recording: Recording) -> bool:
     drive = recording.inputs.get("command")
     if drive is None or len(drive) < 2:
         return False
-    jumps = np.count_nonzero(np.diff(drive))
+    jumps = int(np.count_nonzero(np.diff(drive)))
     return 0 < jumps < 0.02 * len(drive)
 
 
@@ -55,7 +55,7 @@ def mean_step(recording: Recording) -> tuple[Array, float]:
 def fit_steps(recording: Recording) -> Dynamics:
     """Lag, resonance and damping; no resonance when none stands out of the noise."""
     z, noise = mean_step(recording)
-    t = np.arange(len(z)) * recording.dt
+    t: Array = np.arange(len(z), dtype=np.float64) * recording.dt
     # what follows slowly is hysteresis and creep, not lag
     slow = [-np.expm1(-t / tau) for tau in SLOW_S]
 
