@@ -91,6 +91,10 @@ def accelerometer(
     """Bias, scale and misalignment of a three-axis accelerometer, with intervals, condition and missing poses.
 
     Example: micron calibrate accelerometer log.npz --gravity 9.81744
+
+    Stage: micron calibrate accelerometer out/tumble --method stage --columns analog_V_4,analog_V_5,analog_V_1
+
+    Quick: micron calibrate accelerometer flat.csv --method flat --up z --counts-per-g 16384
     """
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.logs import load_log
