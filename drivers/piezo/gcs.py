@@ -6,6 +6,8 @@ ends with SP LF, the last with LF.
 
 from __future__ import annotations
 
+import math
+
 from hal.contracts import Clock, SerialPort
 from hal.errors import HalTimeout, ProtocolError
 
@@ -25,6 +27,7 @@ ERRORS = {
     307: "receive timeout",
     333: "hardware error",
 }
+LONGEST_REPLY = 4096  # a controller that never ends a line is not one
 
 
 class GcsLink:
@@ -50,7 +53,7 @@ class GcsLink:
         while not reply.endswith(b"\n") or reply.endswith(b" \n"):
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9
             n = self._port.read_into(self._buf, left_s) if left_s > 0 else 0
-            if n == 0:
+            if n == 0 or len(reply) > LONGEST_REPLY:
                 raise HalTimeout(
                     f"no answer to {text!r} within {self._timeout_s} s, got {reply!r}",
                     device=self.name,
@@ -63,7 +66,10 @@ class GcsLink:
         """Query of the form ``1=value`` per line. Raises ``ProtocolError`` for anything else."""
         lines = self.query(text)
         try:
-            return [float(line.split("=", 1)[1]) for line in lines]
+            values = [float(line.split("=", 1)[1]) for line in lines]
+            if not all(math.isfinite(value) for value in values):
+                raise ValueError("not finite")
+            return values
         except (IndexError, ValueError):
             raise ProtocolError(f"answer to {text!r} was {lines!r}", device=self.name) from None
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import csv
 import tomllib
-import zipfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import CubicSpline
 
 from hal.errors import BenchError
+from hal.npz import open_npz
 
 Array = NDArray[np.float64]
 
@@ -116,11 +116,11 @@ def _address(source: str) -> tuple[Path, str, tuple[float, float] | None]:
 
 def _read_npz(path: Path) -> dict[str, Array]:
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return {k: np.asarray(data[k]) for k in data.files}
+        with open_npz(path) as data:
+            return {k: data[k] for k in data.files}
     except FileNotFoundError:
         raise HandFileError(f"{path} does not exist") from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError) as error:
         raise HandFileError(f"{path} is not a readable .npz of plain arrays: {error}") from error
 
 

@@ -7,7 +7,6 @@ dimensions in an .npz become columns ``name_0``, ``name_1``, ...
 from __future__ import annotations
 
 import tomllib
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.npz import open_npz
 from tools.errors import InputError
 from tools.mismatch.recording_columns import column_names, read_columns
 
@@ -121,9 +121,9 @@ def _toml(path: Path) -> dict[str, Any]:
 
 def _npz(file: Path) -> dict[str, Array]:
     try:
-        with np.load(file, allow_pickle=False) as archive:
-            arrays = {name: np.asarray(archive[name]) for name in archive.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, TypeError, AttributeError) as error:
+        with open_npz(file) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+    except (OSError, ValueError) as error:
         raise InputError(f"{file}: cannot be read as .npz ({error})") from error
     arrays = {name: a for name, a in arrays.items() if a.dtype.kind in "fiub"}
     lengths = {len(a) for a in arrays.values() if a.ndim == 1 or (a.ndim == 2 and a.shape[1] <= 16)}

@@ -305,7 +305,7 @@ def _report(path: Path) -> dict[str, Any]:
         body = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give what diagnose --json wrote") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise InputError(f"{path}: not JSON ({error}); give what diagnose --json wrote") from error
     if not isinstance(body, dict):
         raise InputError(f"{path}: not a mismatch report; give what diagnose --json wrote")

@@ -5,18 +5,27 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-import zipfile
+import struct
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from mcap.exceptions import McapError
 from numpy.typing import NDArray
+from zstandard import ZstdError
 
+from hal.npz import open_npz
 from tools.mismatch.recording import RecordingError
 
 Array = NDArray[np.float64]
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000
+MAX_RECORD_BYTES = 1 << 28
+_MCAP_BROKEN = (
+    McapError, ZstdError, struct.error, EOFError, OSError, ValueError, KeyError, IndexError, TypeError, OverflowError,
+    RecursionError, MemoryError, RuntimeError, AttributeError, AssertionError,
+)  # fmt: skip
+"""What the mcap package and its decompressors raise for a damaged file."""
 
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
@@ -58,20 +67,19 @@ def column_names(path: Path) -> list[str]:
 
 
 def _mcap_names(path: Path) -> list[str]:
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
     names: dict[str, None] = {}
     try:
         with path.open("rb") as f:
-            for _, (_schema, channel, message) in zip(range(1000), make_reader(f).iter_messages(), strict=False):
+            for _, (_schema, channel, message) in zip(
+                range(1000), make_reader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages(), strict=False
+            ):
                 if channel.message_encoding == "json":
                     names.update(dict.fromkeys(_flatten(json.loads(message.data), channel.topic)))
                     names[f"{channel.topic}.log_time_s"] = None
-    except McapError as error:
+    except _MCAP_BROKEN as error:
         raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise RecordingError(f"{path}: not JSON ({error})") from None
     return list(names)
 
 
@@ -130,7 +138,7 @@ def _first_bad_line(path: Path, delimiter: str, header: list[str], use: list[int
 
 def _npz(path: Path, names: list[str]) -> dict[str, Array]:
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with open_npz(path) as data:
             have = list(data.files)
             out: dict[str, Array] = {}
             for name in names:
@@ -142,7 +150,7 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
                         f"{path}: column '{name}' is {a.dtype} of shape {a.shape}; needed: numbers, one dimension"
                     )
                 out[name] = np.asarray(a, np.float64)
-    except (zipfile.BadZipFile, OSError, EOFError) as error:
+    except OSError as error:
         raise RecordingError(f"{path}: not a readable npz file ({error})") from None
     except ValueError as error:
         if isinstance(error, RecordingError):
@@ -153,7 +161,6 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
 
 def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
     """JSON messages; a column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``."""
-    from mcap.exceptions import McapError
     from mcap.reader import make_reader
 
     wanted = {n: n.rsplit(".", 1)[0] for n in names}
@@ -162,7 +169,7 @@ def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
     number = 0
     try:
         with path.open("rb") as f:
-            for _schema, channel, message in make_reader(f).iter_messages():
+            for _schema, channel, message in make_reader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages():
                 number += 1
                 topic = channel.topic
                 if channel.message_encoding != "json":
@@ -176,10 +183,12 @@ def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
                         found[n].append(flat[n])
                     elif owner == topic:
                         raise RecordingError(f"{path}: message {number} of '{topic}' lacks '{n}'")
-    except McapError as error:
-        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except RecordingError:
+        raise
+    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
         raise RecordingError(f"{path}: message {number}: not JSON ({error})") from None
+    except _MCAP_BROKEN as error:
+        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
     for name, values in found.items():
         if not values:
             raise _missing(path, name, sorted(seen))

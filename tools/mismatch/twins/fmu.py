@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import shutil
+import stat
+import struct
 import weakref
+import zipfile
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, cast
 
 import numpy as np
@@ -13,6 +16,8 @@ import numpy as np
 from sim_devices.physics.effect import Array
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
+
+MOST_BYTES, MOST_FILES = 1 << 30, 10_000
 
 
 class FmuRun:
@@ -35,6 +40,7 @@ class FmuRun:
     def _opened(self) -> tuple[Any, str, Any]:
         if self._open is None:
             fm = _fmpy(self.path)
+            check_archive(self.path)
             try:
                 description = fm.read_model_description(str(self.path))
                 if description.coSimulation is None:
@@ -75,6 +81,24 @@ class FmuRun:
                 f"{self.path}: the FMU stopped ({_line(error)}); parameters {dict(parameters)}"
             ) from error
         return {o: np.interp(t, result["time"], result[o]) for o in self.outputs}
+
+
+def check_archive(path: Path) -> None:
+    """An archive that stays in its folder and within ``MOST_BYTES`` when it is unpacked; ``RecordingError`` if not."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+    except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, struct.error) as error:
+        raise RecordingError(f"{path}: cannot be opened as an FMU ({_line(error)})") from error
+    for member in members:
+        name = PurePosixPath(member.filename.replace("\\", "/"))
+        if name.is_absolute() or ".." in name.parts or ":" in member.filename:
+            raise RecordingError(f"{path}: the archive would unpack '{member.filename}' outside its folder; refused")
+        if stat.S_ISLNK(member.external_attr >> 16):
+            raise RecordingError(f"{path}: the archive holds a link, '{member.filename}'; refused")
+    size = sum(member.file_size for member in members)
+    if size > MOST_BYTES or len(members) > MOST_FILES:
+        raise RecordingError(f"{path}: {len(members)} files of {size} bytes when unpacked; that is no FMU")
 
 
 def _line(error: Exception) -> str:
