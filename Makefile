@@ -24,6 +24,17 @@ lint: setup
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
+# fails on a known vulnerability that has a repair; says so and goes on where the database cannot be reached
+audit: setup
+	$(BIN)/python -m tools.supply.audit
+
+# coverage guided, 60 s per parser: make fuzz SECONDS=600 TARGET=own_recording
+SECONDS ?= 60
+TARGET  ?= all
+fuzz: setup
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[fuzz]'
+	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS)
+
 bench: setup
 	$(BIN)/python -m benchmarks
 

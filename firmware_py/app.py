@@ -60,6 +60,8 @@ class RunRequest:
     """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
     truth_s: float | None = None
     """How much truth an emulated world keeps; None: all of it."""
+    clock_start_ns: int = 0
+    """Where the virtual clock begins: marks of time are crossed without waiting for them."""
 
     def to_json(self, runtime_dir: Path) -> str:
         """For the firmware's own process."""
@@ -155,6 +157,7 @@ def open_requested(
                 hand_scale=request.hand_scale,
                 seed=request.seed,
                 truth_s=request.truth_s,
+                start_ns=request.clock_start_ns,
                 wrap=wrap,
             )
         )

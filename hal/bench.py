@@ -269,11 +269,13 @@ def open_bench(
     hand_scale: float | None = None,
     seed: int | None = None,
     truth_s: float | None = None,
+    start_ns: int = 0,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
     ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps;
+    ``start_ns`` is where a virtual clock begins;
     ``wrap(bus, port, clock)`` may put middleware (trace, faults) around a port. Raises ``OpenFailed`` with every cause.
     """
     description = bench.description
@@ -283,7 +285,7 @@ def open_bench(
         raise BenchError(f"{bench.path}: virtual time needs every bus emulated, but {_names(real)} are real")
     if hand_file is not None and not emulated:
         raise BenchError(f"{bench.path}: --hand moves an emulated instrument, but this bench is all real")
-    clock = VirtualClock() if virtual else MonotonicClock()
+    clock = VirtualClock(start_ns) if virtual else MonotonicClock()
     opened = OpenBench(bench, clock, {}, None, runtime_dir)
     try:
         if emulated:

@@ -73,7 +73,13 @@ def _calibration(bench: BenchFile, name: str) -> dict[str, dict[str, Any]]:
         raise BenchError(f"{path}: not a calibration file: {error}") from error
     stages = {key: value for key, value in table.items() if key in STAGES}
     unknown = sorted(set(table) - set(STAGES) - {"format", "title", "made_by", "report"})
-    if unknown or table.get("format") != 1:
+    version = table.get("format")
+    if isinstance(version, int) and version > 1:
+        raise BenchError(
+            f"{path}: a calibration of format {version}, written by a later version; this one reads format 1. "
+            "Calibrate again, or use that version"
+        )
+    if unknown or version != 1:
         detail = f"unknown table [{unknown[0]}]" if unknown else "format = 1 is missing"
         raise BenchError(f"{path}: {detail}; a calibration has format = 1 and any of {', '.join(STAGES)}")
     return stages

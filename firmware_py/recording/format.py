@@ -126,6 +126,11 @@ def decode_block(message: bytes, crc: int) -> Block:
     if len(message) < _HEADER.size:
         raise RecordingError(f"a block of {len(message)} bytes is shorter than its header")
     magic, n_columns, n_rows, found_crc, row0 = _HEADER.unpack_from(message)
+    if magic[:3] == _MAGIC[:3] and magic != _MAGIC:
+        raise RecordingError(
+            f"blocks of format {magic[3:].decode('latin-1')}: a later version wrote them, this one reads format 1; "
+            "use that version, or let it export"
+        )
     if magic != _MAGIC or len(message) != _HEADER.size + 8 * n_columns * n_rows:
         raise RecordingError("a message of the ticks channel is not a block of ticks")
     if found_crc != crc:

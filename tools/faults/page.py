@@ -31,6 +31,38 @@ Uncounted: scans that the device took and that are neither received, nor reporte
 
 {unseen}
 
+## When the firmware is gone: the guardian
+
+A DAC has no watchdog. A second process (`firmware_py/guardian`) holds a heartbeat in shared memory, the reading end of
+a pipe that the kernel closes when the firmware dies, and a connection of its own to the amplifier's bus. It starts with
+every `micron run` on a bench whose output is a `dac_amplifier` (`[firmware.safety] guardian = false` leaves it out).
+Death: ramp at once, 16 steps of a millisecond, read back, then watched for 50 ms for a command that was still under
+way. Silence: noticed after 8 ms, taken over after 40 ms; a firmware that wakes up finds its commands refused and ends.
+`tests/unit/guardian` measures 17 ms from death to neutral in virtual time, also with half of the transfers lost;
+`tests/hil/test_guardian_process.py` kills and stops the real process. Limits: it runs on the same host, so it does not
+help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier (the CAN
+node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with more work
+than processors, the ramp begins when the guardian is given the processor.
+
+## What measures the amplifier
+
+`[device.monitor]` reads the voltages at the stacks through an ADS1115, each output every 7.5 ms, and compares with the
+commands that may have been in force (`drivers/amplifier_monitor.py`). A bench without it does not see open, shorted,
+stuck, slow or weak amplifiers.
+
+## Recording
+
+Every finished block survives `kill -9`, truncation at any byte and flipped bits elsewhere; `fdatasync` once a second,
+so a power failure takes about a second (simulated by dropping pages that were not synced). A full disk ends the
+recording, not the run: see `docs/recording-format.md`.
+
+## Hostile input
+
+`tests/fuzz` damages sound inputs of every parser (bench files, recordings, csv, npz, mcap, descriptors, hands, FMU
+archives, DI-4108 streams, motion card lines, GCS replies, CAN frames, page orders, WebSocket messages, reports) in the
+default tests; `make fuzz` does it coverage guided with atheris, 60 s each. npz files are read without pickle and sized
+before allocation, FMU archives checked for paths outside and for size.
+
 ## All faults
 
 Times in ms; error in um; "hand" is the operating point.

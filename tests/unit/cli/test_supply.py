@@ -1,0 +1,64 @@
+"""Licences and audit: from what packages and pip-audit say to a page and a status."""
+
+from __future__ import annotations
+
+from email.message import Message
+from types import SimpleNamespace
+from typing import Any, cast
+
+from tools.supply.audit import findings, verdict
+from tools.supply.licences import PYPROJECT, declared, page, parts
+
+
+def package(name: str, **fields: str) -> Any:
+    meta = Message()
+    meta["Name"] = name
+    for key, value in fields.items():
+        meta[key.replace("_", "-")] = value
+    return cast(Any, SimpleNamespace(metadata=meta, version="1.0", files=[]))
+
+
+def test_a_copyleft_part_is_named_and_where_it_is_used():
+    found = [
+        package("python-can", License_Expression="LGPL-3.0-only"),
+        package("numpy", License="BSD-3-Clause\nlong text"),
+        package("silent"),
+        package("micron-bench", License_Expression="Apache-2.0"),
+    ]
+    rows = parts(found, {"python-can": "", "numpy": ""})
+    assert [(p.name, p.licence, p.direct) for p in rows] == [
+        ("numpy", "BSD-3-Clause", True),
+        ("python-can", "LGPL-3.0-only", True),
+        ("silent", "not stated", False),
+    ]
+    copyleft, everything = page(rows).split("## All")
+    assert "| python-can | 1.0 | LGPL-3.0-only | the program |" in copyleft
+    assert "numpy" not in copyleft.split("## Copyleft parts")[1]
+    assert "silent" in everything
+
+
+def test_what_pyproject_names_is_known_with_its_extra():
+    named = declared(PYPROJECT)
+    assert named["python-can"] == ""
+    assert named["pytest"] == "dev"
+
+
+REPORT = {
+    "dependencies": [
+        {"name": "good", "version": "1.0", "vulns": []},
+        {"name": "local", "skip_reason": "not on the index"},
+        {"name": "old", "version": "0.9", "vulns": [{"id": "PYSEC-1", "fix_versions": ["1.0"]}]},
+        {"name": "sad", "version": "2.0", "vulns": [{"id": "PYSEC-2", "fix_versions": []}]},
+    ]
+}
+
+
+def test_only_a_vulnerability_with_a_repair_fails_the_audit():
+    found = findings(REPORT)
+    assert [(f.package, f.number, f.repaired_in) for f in found] == [
+        ("old", "PYSEC-1", ("1.0",)),
+        ("sad", "PYSEC-2", ()),
+    ]
+    assert verdict(found) == 1
+    assert verdict(found[1:]) == 0
+    assert verdict([]) == 0
