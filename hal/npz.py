@@ -10,7 +10,7 @@ import math
 import struct
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 from tokenize import TokenError
@@ -76,7 +76,7 @@ def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 @contextmanager
-def open_npz(path: Path, most_bytes: int = MOST_BYTES) -> Iterator[Npz]:
+def open_npz(path: Path, most_bytes: int = MOST_BYTES) -> Generator[Npz]:
     """The arrays of ``path``. Raises ``FileNotFoundError`` when it is not there, ``NpzError`` for all else."""
     try:
         archive = zipfile.ZipFile(path)

@@ -238,9 +238,9 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 
 def seeds() -> dict[str, list[bytes]]:
     """Sound inputs to start from, by target, besides those in ``corpus/``."""
-    n = np.arange(60)
+    n, long = np.arange(60), np.arange(260)
     csv = ("t,x\n" + "".join(f"{k * 0.001:.3f},{(k % 9) * 0.5}\n" for k in n)).encode()
-    hand = ("t_s,x_um,y_um,z_um\n" + "".join(f"{k * 0.001:.3f},{k % 5},{k % 3},1\n" for k in n)).encode()
+    hand = ("t_s,x_um,y_um,z_um\n" + "".join(f"{k * 0.02:.3f},{k % 5},{k % 3},1\n" for k in long)).encode()
     npz = _saved(t=n * 1e-3, x=np.sin(n))
     card = b"#:1:2:3:-4:5:6:7:0:\r\n" * 3
     return {
@@ -251,7 +251,7 @@ def seeds() -> dict[str, list[bytes]]:
         "columns_mcap": [_json_mcap()],
         "descriptor_toml": [_DESCRIPTOR.encode()],
         "hand_csv": [hand],
-        "hand_npz": [_saved(t=n * 1e-3, x=np.sin(n), y=np.cos(n), z=n * 0.0)],
+        "hand_npz": [_saved(t_s=long * 0.02, x_um=np.sin(long), y_um=np.cos(long), z_um=long * 0.0)],
         "fmu_archive": [_archive("modelDescription.xml"), _archive("../../outside"), npz],
         "di4108_stream": [bytes(range(256)) * 2, b"\x01\x00" * 64 + b"stop 01"],
         "di4108_answers": [b"stop\rinfo 1 4108\rinfo 2 65\rinfo 6 00000000\r"],

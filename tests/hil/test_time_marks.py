@@ -1,4 +1,4 @@
-"""Nothing happens at 2^31, 2^32 and 2^53 ns on the bench clock: a run across the mark is the run that starts at zero."""
+"""Nothing happens at 2^31, 2^32 and 2^53 ns on the bench clock: a run across a mark is the run from zero."""
 
 from __future__ import annotations
 

@@ -67,13 +67,13 @@ def column_names(path: Path) -> list[str]:
 
 
 def _mcap_names(path: Path) -> list[str]:
-    from mcap.reader import make_reader
+    from mcap.reader import SeekingReader
 
     names: dict[str, None] = {}
     try:
         with path.open("rb") as f:
             for _, (_schema, channel, message) in zip(
-                range(1000), make_reader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages(), strict=False
+                range(1000), SeekingReader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages(), strict=False
             ):
                 if channel.message_encoding == "json":
                     names.update(dict.fromkeys(_flatten(json.loads(message.data), channel.topic)))
@@ -161,7 +161,7 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
 
 def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
     """JSON messages; a column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``."""
-    from mcap.reader import make_reader
+    from mcap.reader import SeekingReader
 
     wanted = {n: n.rsplit(".", 1)[0] for n in names}
     found: dict[str, list[float]] = {n: [] for n in names}
@@ -169,7 +169,7 @@ def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
     number = 0
     try:
         with path.open("rb") as f:
-            for _schema, channel, message in make_reader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages():
+            for _schema, channel, message in SeekingReader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages():
                 number += 1
                 topic = channel.topic
                 if channel.message_encoding != "json":

@@ -54,10 +54,14 @@ def main() -> int:
         done = subprocess.run(
             [*command, "--timeout", "5"], capture_output=True, text=True, timeout=LIMIT_S, check=False
         )
+    except subprocess.TimeoutExpired:
+        print(f"audit skipped: the vulnerability database does not answer within {LIMIT_S} s")
+        return 0
+    try:
         report = json.loads(done.stdout)
-    except (subprocess.TimeoutExpired, ValueError) as error:
-        detail = done.stderr.strip().splitlines()[-1:] if isinstance(error, ValueError) else [f"no end in {LIMIT_S} s"]
-        print(f"audit skipped: the vulnerability database cannot be asked ({' '.join(detail) or 'no answer'})")
+    except ValueError:
+        detail = " ".join(done.stderr.strip().splitlines()[-1:]) or "no answer"
+        print(f"audit skipped: the vulnerability database cannot be asked ({detail})")
         return 0
     found = findings(report)
     for finding in found:

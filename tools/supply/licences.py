@@ -6,9 +6,10 @@ import re
 import sys
 import tomllib
 from collections.abc import Iterable, Mapping
+from email.message import Message
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 OWN = "micron-bench"
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
@@ -36,7 +37,7 @@ def declared(pyproject: Path) -> dict[str, str]:
 
 def licence_of(distribution: Distribution) -> str:
     """SPDX expression, else classifiers, else the first line of the licence field, else of the licence file."""
-    meta = distribution.metadata
+    meta = cast(Message, distribution.metadata)
     if expression := meta.get("License-Expression"):
         return expression
     classes = [c.rsplit("::", 1)[-1].strip() for c in meta.get_all("Classifier") or [] if c.startswith("License ::")]

@@ -24,15 +24,15 @@ def test_what_was_synced_survives_and_nothing_false_appears(tmp_path: Path, monk
 
     def note(fd: int) -> None:
         sync(fd)
-        synced.append((os.fstat(fd).st_size, written))
+        synced.append((os.fstat(fd).st_size, len(sizes)))
 
     monkeypatch.setattr(os, "fdatasync", note)
-    writer, written, sizes = RecordingWriter(path, COLUMNS, METADATA), 0, []
+    sizes: list[int] = []
+    writer = RecordingWriter(path, COLUMNS, METADATA)
     for start in range(0, 1200, 100):
         writer.write_block(start, rows[start : start + 100])
-        written += 1
         sizes.append(path.stat().st_size)
-        if written % 3 == 0:
+        if len(sizes) % 3 == 0:
             writer.sync()
     whole = path.read_bytes()
     assert len(synced) == 5
