@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -20,6 +21,7 @@ from rich.table import Table
 
 from firmware_py.app import RunRequest, run_in_process
 from firmware_py.endoscope.wiring import is_endoscope
+from firmware_py.guardian.process import REPORT, describe
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json
@@ -27,6 +29,7 @@ from tools.cli.common import write_text_atomic as write_text
 from tools.reports.run_report import html_page, picture, print_report, save_picture
 from tools.reports.tremor_figures import tremor_figures
 
+GUARDIAN_S = 3.0
 SETTLE_S = 2.0
 """After arming, the estimator locks and the soft start ends within this time; figures are taken after it."""
 
@@ -138,6 +141,8 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
             # the firmware ramps to neutral and reports; a second interrupt is the operator's own choice
             process.send_signal(signal.SIGINT)
         process.wait()
+        if process.returncode < 0:
+            _tell_of_the_guardian(runtime_dir, -process.returncode)
         outcome_file = runtime_dir / "outcome.json"
         if process.returncode not in (0, None) or not outcome_file.exists():
             raise typer.Exit(process.returncode if process.returncode and process.returncode > 0 else Exit.FAILED)
@@ -148,6 +153,16 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
             with np.load(truth_file, allow_pickle=False) as archive:
                 truth = {name: archive[name] for name in archive.files}
         return outcome, truth
+
+
+def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
+    """The firmware was killed: what became of the outputs."""
+    report = runtime_dir / REPORT
+    limit_s = time.monotonic() + GUARDIAN_S
+    while not report.exists() and time.monotonic() < limit_s:
+        time.sleep(0.01)
+    said = describe(json.loads(report.read_text())) if report.exists() else "no word from a guardian of the outputs"
+    console().print(f"the firmware was killed by signal {number}; {said}")
 
 
 def _watch(process: subprocess.Popen[str], seconds: float) -> None:

@@ -8,6 +8,10 @@ DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
 ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 100 Hz only"
+LOOKS = (
+    "each output is measured every 7.5 ms; a difference that is smaller than what the command moves by during one "
+    "conversion (up to 3.5 V) waits for a later look"
+)
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
 
@@ -91,9 +95,9 @@ def sensors() -> tuple[Fault, ...]:
 
 
 def output_bus() -> tuple[Fault, ...]:
-    def piezo(name: str, expected: str, *, why: str = "", **plan: float) -> Fault:
+    def piezo(name: str, expected: str, *, why: str = "", watch_s: float = 0.15, **plan: float) -> Fault:
         how, own = OnBus("i2c0", plan, only=DAC), "write_corruption" in plan
-        return Fault(f"output bus: {name}", how, expected, ("piezo",), own_output=own, effect=4, why=why)  # type: ignore[arg-type]
+        return Fault(f"output bus: {name}", how, expected, ("piezo",), watch_s, own_output=own, effect=4, why=why)  # type: ignore[arg-type]
 
     return (
         Fault("output bus: DAC refuses its address", InWorld("nack", "piezo"), "safe state", ("piezo",)),
@@ -103,7 +107,7 @@ def output_bus() -> tuple[Fault, ...]:
         Fault("output bus: SDA stuck for 5 ms", InWorld("stuck", "i2c0", "free", 0.005), "safe state", ("SDA",)),
         Fault("output bus: DAC restarts", InWorld("brown_out", "piezo"), "safe state", ("piezo",), own_output=True),
         Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", ("piezo",)),
-        piezo("one transfer in a hundred refused", "safe state", nack=0.01),
+        piezo("one transfer in a hundred refused", "safe state", watch_s=0.6, nack=0.01),
         piezo("half of the transfers lost", "safe state", loss=0.5),
         piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0),
         piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1),
@@ -154,7 +158,8 @@ def can_bus() -> tuple[Fault, ...]:
 
 def actuators() -> tuple[Fault, ...]:
     def one(name: str, fault: str) -> Fault:
-        return Fault(f"actuator: {name}", InWorld(f"actuator_{fault}", "1"), "safe state", ("output 2 is at",))
+        how = InWorld(f"actuator_{fault}", "1")
+        return Fault(f"actuator: {name}", how, "safe state", ("output 2 is at",), why=LOOKS)
 
     return (
         one("open", "open"),
