@@ -22,7 +22,7 @@ from firmware_py.recording.files import new_file, new_folder, refuse_existing
 from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
 
-_ROLES = (("command", "input"), ("volts", "output"), ("magnetometer_raw", "output"))
+_ROLES = (("command", "input"), ("volts", "output"))  # what the instrument twin computes
 _FLAGS_UNIT = "bits"
 
 
@@ -66,7 +66,7 @@ def export_folder(
     """The recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
 
     ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
-    converters outputs, the rest context. Flags, and columns that are not finite throughout, are no channels.
+    DAQ outputs, the rest context. Flags, and columns that are not finite throughout, are no channels.
     The bench description stored in the recording becomes ``bench.toml`` and the twin's ``bench``.
     """
     if data not in ("npz", "csv"):

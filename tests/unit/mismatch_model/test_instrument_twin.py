@@ -10,6 +10,7 @@ import pytest
 from hal.bench import load_bench
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
+from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.plant_factory import emulation_config
 from tests.conftest import DEFAULT_BENCH
 from tools.mismatch.engine.diagnose import diagnose
@@ -68,6 +69,21 @@ def test_the_twin_is_the_plant_without_its_noise():
     assert np.std(simulated["volts_0"] - volts[:, 0]) < 2e-3
 
 
+def test_the_benchs_own_hand_moves_the_twin_from_the_given_moment_on():
+    n, skipped = 120, 30
+    config = emulation_config(load_bench(DEFAULT_BENCH).description.model_dump())
+    hand = make_hand(config.hand, config.seed, None, None)
+    plant = Instrument(config, config.seed, hand, unit=config.unit, quiet=True)
+    volts = np.empty(n + skipped)
+    for k in range(n + skipped):
+        plant.advance_to(k * 1_000_000)
+        volts[k] = plant.analog_V[0]
+    inputs = {"t": np.arange(n) / RATE_HZ}
+    twin = simulate_instrument(config, inputs, ("volts_0",), own_hand=True, start_s=skipped / RATE_HZ)
+    np.testing.assert_allclose(twin["volts_0"], volts[skipped:], rtol=0.0, atol=1e-12)
+    assert np.ptp(volts) > 1e-4
+
+
 def test_wrong_signals_and_benches_are_named(tmp_path: Path):
     path = write(tmp_path, 300)
     good = path.read_text()
@@ -75,6 +91,9 @@ def test_wrong_signals_and_benches_are_named(tmp_path: Path):
         ("command_2", "drive_2", "no input 'drive_2'"),
         ('"tip_x"', '"nose_x"', "no output 'nose_x'"),
         (str(DEFAULT_BENCH), "nowhere.toml", "nowhere.toml"),
+        ("[twin.parameters]", "[twin.parameters]\nhand = 'left'", "'rest' or 'bench'"),
+        ("[twin.parameters]", "[twin.parameters]\nstart_s = -1.0", "0 to 3600 s"),
+        ("[twin.parameters]", "[twin.parameters]\ngain = 1.0", "'gain' is not a parameter of instrument"),
     ):
         path.write_text(good.replace(old, new))
         with pytest.raises(RecordingError, match=words):

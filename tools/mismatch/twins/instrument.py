@@ -4,6 +4,9 @@ Signals, each optional: inputs ``command_1..3`` (V, amplifier outputs asked for;
 where the tip would be with the manipulator at rest, world frame) and ``angle_x|y|z`` (rad, small, about the attitude
 in which the bench's hand holds the instrument); outputs ``volts_0..7`` (V at the DAQ) and ``tip_x|y|z`` (m). These are
 the names that ``micron export`` gives. The physics is the bench file's ``[emulation]`` table without its noise.
+
+``[twin.parameters]`` may also say ``hand = "bench"`` where no motion was recorded: the bench's own hand moves the
+instrument (else it rests in a vice), and ``start_s``: how long the world had run at the first sample.
 """
 
 from __future__ import annotations
@@ -22,6 +25,7 @@ from hal.errors import BenchError
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
+from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.plant_factory import emulation_config
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin
@@ -64,20 +68,30 @@ class GivenHand:
 
 
 def simulate_instrument(
-    config: EmulationConfig, inputs: Mapping[str, Array], outputs: Sequence[str] = ALL_OUTPUTS
+    config: EmulationConfig,
+    inputs: Mapping[str, Array],
+    outputs: Sequence[str] = ALL_OUTPUTS,
+    *,
+    own_hand: bool = False,
+    start_s: float = 0.0,
 ) -> dict[str, Array]:
-    """One noiseless run. ``inputs`` holds ``t`` (n,) s and any of the twin's inputs (n,); ``outputs`` (n,) return."""
+    """One noiseless run. ``inputs`` holds ``t`` (n,) s and any of the twin's inputs (n,); ``outputs`` (n,) return.
+
+    ``own_hand``: moved by the bench's own hand, not as ``inputs`` say; ``start_s`` of that world before the first
+    sample.
+    """
     t_s = inputs["t"]
     n = len(t_s)
     resting = np.zeros(n)
-    hand = GivenHand(holding_frame(config.hand), t_s, np.column_stack([inputs.get(k, resting) for k in MOTION]))
+    given = GivenHand(holding_frame(config.hand), t_s, np.column_stack([inputs.get(k, resting) for k in MOTION]))
+    hand = make_hand(config.hand, config.seed, None, None) if own_hand else given
     instrument = Instrument(config, config.seed, hand, unit=config.unit, quiet=True)
     held = np.full(n, NEUTRAL_V)
     commands = np.column_stack([inputs.get(f"command_{i}", held) for i in (1, 2, 3)]).tolist()
     wants_volts = any(name.startswith("volts") for name in outputs)
     volts = np.empty((n, 8))
     sent = [float("nan")] * 3
-    times_ns = np.round((t_s - t_s[0]) * 1e9).astype(np.int64)
+    times_ns = np.round((t_s - t_s[0] + start_s) * 1e9).astype(np.int64)
     for k, t_ns in enumerate(times_ns.tolist()):
         instrument.advance_to(t_ns)
         if wants_volts:
@@ -94,6 +108,23 @@ def simulate_instrument(
 
 def _si_unit(signal: str) -> str:
     return {"command": "V", "volts": "V", "path": "m", "tip": "m", "angle": "rad"}[signal.split("_")[0]]
+
+
+def _world(recording: Recording) -> tuple[bool, float]:
+    """Whether the bench's own hand moves the instrument, and how long its world had run at the first sample."""
+    given = recording.twin.parameters
+    where = f"{recording.path}: [twin.parameters]"
+    unknown = [k for k in given if k not in ("bench", "hand", "start_s")]
+    if unknown:
+        raise RecordingError(f"{where} '{unknown[0]}' is not a parameter of instrument; known: bench, hand, start_s")
+    hand, start_s = given.get("hand", "rest"), given.get("start_s", 0.0)
+    if hand not in ("rest", "bench"):
+        raise RecordingError(f"{where} hand must be 'rest' or 'bench', got {hand!r}")
+    if hand == "bench" and any(s in MOTION for s in recording.inputs):
+        raise RecordingError(f"{where} hand = 'bench': its motion was recorded too; leave one of them out")
+    if isinstance(start_s, bool) or not isinstance(start_s, int | float) or not 0.0 <= start_s <= 3600.0:
+        raise RecordingError(f"{where} start_s must be 0 to 3600 s, got {start_s!r}")
+    return hand == "bench", float(start_s)
 
 
 def instrument_twin(recording: Recording) -> OpaqueTwin:
@@ -113,6 +144,7 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
                     f"{recording.path}: {role} '{signal}' is in {recording.unit[signal]}, not a unit of the dimension "
                     f"of {_si_unit(signal)}"
                 )
+    own_hand, start_s = _world(recording)
     try:
         file = load_bench((recording.path.parent / bench).resolve())
         config = emulation_config(file.description.model_dump())
@@ -121,7 +153,7 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
 
     def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
         si = {k: x if k == "t" else convert(x, recording.unit[k], _si_unit(k)) for k, x in inputs.items()}
-        found = simulate_instrument(config, si, tuple(recording.outputs))
+        found = simulate_instrument(config, si, tuple(recording.outputs), own_hand=own_hand, start_s=start_s)
         return {k: convert(x, _si_unit(k), recording.unit[k]) for k, x in found.items()}
 
     return OpaqueTwin(
@@ -131,7 +163,7 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
         units=recording.unit,
         call=call,
         free=(),
-        given={"bench": bench},
+        given=dict(recording.twin.parameters),
         parameters=(),
         source=str(Path(bench)),
     )
