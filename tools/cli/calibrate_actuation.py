@@ -137,7 +137,7 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforw
     data_console().print(table)
     data_console().print(
         f"preview: {1e3 * inverse.preview_s:.2f} ms from demand to extension (error by lag: with it alone -> with the "
-        "taps); loop_delay_s of [firmware.tremor] is this and the time from sample to command",
+        "taps). The tremor stage's loop_delay_s is this and the time from sample to command.",
         soft_wrap=True,
     )
     for i, fit in enumerate(fits):
