@@ -42,8 +42,9 @@ def real_stack() -> list[Row]:
                 float(np.std(e[start:stop])),
                 "lower",
                 "recording",
-                why=f"published: desired minus measured {'without a model' if published > 1.0 else 'with their inverse'}; "
-                f"with its mean ours is {_rms(e[start:stop]):.2f}",
+                why="published: desired minus measured "
+                + ("without a model" if published > 1.0 else "with their inverse")
+                + f"; with its mean ours is {_rms(e[start:stop]):.2f}",
             )
         )
     rows.append(
