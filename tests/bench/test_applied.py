@@ -10,12 +10,14 @@ from typing import Any
 
 import pytest
 
+from firmware_py.control.config import load_firmware_config
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH
 from tools.bench.applied import Applied
 from tools.bench.firmware import Choice
 from tools.bench.mismatch import figures
+from tools.calibrate.calibration_file import calibration_toml
 from tools.errors import InputError
 
 TWIN = """
@@ -25,6 +27,9 @@ kind = "piezo_stack"
 gain_um_per_V = 0.13
 offset_um = 0.0
 """
+
+
+CALIBRATION = "format = 1\n[sensing]\nrange_g = 1.6\n"
 
 
 class Stub:
@@ -38,12 +43,6 @@ class Stub:
     async def start(self, choice: Choice) -> None:
         self.choice = choice
         self.started.append(choice.bench)
-
-
-def calibration(folder: Path) -> Path:
-    path = folder / "found.toml"
-    path.write_text("format = 1\n[sensing]\nrange_g = 1.6\n")
-    return path
 
 
 def twin(folder: Path) -> Path:
@@ -61,7 +60,7 @@ def bench(tmp_path: Path) -> tuple[Applied, Stub]:
 
 def test_one_over_the_other_and_back(bench: tuple[Applied, Stub], tmp_path: Path):
     applied, session = bench
-    first = asyncio.run(applied.calibration("poses", calibration(tmp_path)))
+    first = asyncio.run(applied.calibration("poses", CALIBRATION))
     second = asyncio.run(applied.twin(twin(tmp_path)))
     assert applied.what == ["poses", "corrected twin"]
     assert session.started == [first, second]
@@ -84,7 +83,7 @@ def test_a_second_twin_and_a_running_recording_are_refused(bench: tuple[Applied,
         asyncio.run(applied.twin(twin(tmp_path)))
     session.recorder.active = True
     with pytest.raises(InputError, match="a recording is running"):
-        asyncio.run(applied.calibration("poses", calibration(tmp_path)))
+        asyncio.run(applied.calibration("poses", CALIBRATION))
     assert len(session.started) == 1
 
 
@@ -106,3 +105,11 @@ def test_figures_of_a_run(tmp_path: Path):
         ' "whole_band_error": {"uncompensated_rms_um": 30.0, "compensated_rms_um": 9.0, "reduction_percent": 70.0}}}'
     )
     assert figures(path) == {"band": [25.0, 5.0, 80.0], "all": [30.0, 9.0]}
+
+
+def test_another_attitude_filter_for_the_firmware(bench: tuple[Applied, Stub]):
+    applied, _ = bench
+    toml = calibration_toml("attitude filter", "micron bench", {"sensing": {"attitude_method": "observer"}})
+    out = asyncio.run(applied.calibration("attitude filter", toml))
+    _, stages = load_firmware_config(load_bench(out), {})
+    assert stages.sensing.attitude_method == "observer"

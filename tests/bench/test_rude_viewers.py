@@ -110,6 +110,8 @@ def test_bad_requests_are_one_clear_line(server: Server):
         ("/api/recording/start", b'{"name": "../../etc/passwd"}'),
         ("/api/recording/note", b"[]"),
         ("/api/compare", b'{"method": "magic"}'),
+        ("/api/filters/use", b'{"method": "magic"}'),
+        ("/api/mismatch/apply", b"{}"),
         ("/api/mismatch/start", b'{"recording": "none"}'),
         ("/api/calibrate/poses", b'{"means_V": [[1, 2]]}'),
         ("/api/firmware/start", b'{"bench": "/etc/passwd"}'),

@@ -25,15 +25,15 @@ class Applied:
         self.what: list[str] = []
         self._copies = 0
 
-    async def calibration(self, kind: str, source: Path) -> Path:
-        """Start the firmware again with ``source`` over the calibrations that the bench has."""
-        return await self._apply(kind, f"{kind}.toml", source, with_calibration)
+    async def calibration(self, kind: str, toml: str) -> Path:
+        """Start the firmware again with the calibration file ``toml`` over the calibrations that the bench has."""
+        return await self._apply(kind, f"{kind}.toml", toml, with_calibration)
 
     async def twin(self, source: Path) -> Path:
         """Start the emulated bench again with a corrected twin in its stacks' place. ``BenchError`` when it cannot."""
         if TWIN in self.what:
             raise InputError("a corrected twin is applied already; go back to the original bench first")
-        return await self._apply(TWIN, "twin.toml", source, with_twin)
+        return await self._apply(TWIN, "twin.toml", source.read_text(encoding="utf-8"), with_twin)
 
     async def discard(self) -> None:
         """Back to the original bench, if something was applied."""
@@ -41,16 +41,14 @@ class Applied:
             original, self.original, self.what = self.original, None, []
             await self._session.start(replace(self._session.choice, bench=original))
 
-    async def _apply(
-        self, what: str, name: str, source: Path, laid_over: Callable[[BenchFile, Path, Path], Path]
-    ) -> Path:
+    async def _apply(self, what: str, name: str, toml: str, laid_over: Callable[[BenchFile, Path, Path], Path]) -> Path:
         if self._session.recorder.active:
             raise InputError("a recording is running; stop it first: the firmware starts again with the copy")
         choice = self._session.choice
         original = self.original or choice.bench
         self._folder.mkdir(parents=True, exist_ok=True)
         kept = self._folder / name
-        write_text_atomic(kept, source.read_text(encoding="utf-8"))
+        write_text_atomic(kept, toml)
         # a new copy each time: the one before stays what it was for whoever compares
         copy = self._folder / f"{original.stem}.{self._copies + 1}.toml"
         out = laid_over(load_bench(choice.bench), kept, copy)

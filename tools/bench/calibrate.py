@@ -109,7 +109,7 @@ class Calibration:
         else:
             name = "piezo.toml" if kind == "piezo" else "sensors.toml"
             source = self._jobs.file("calibrate", name)
-        return {"bench": str(await self._applied.calibration(kind, source))}
+        return {"bench": str(await self._applied.calibration(kind, source.read_text(encoding="utf-8")))}
 
     async def discard(self, _: Request) -> Any:
         """Forget what was found; back to the original bench if something was applied."""

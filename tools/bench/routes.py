@@ -21,6 +21,7 @@ from tools.bench.mismatch import mismatch_routes
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.bench.shadow import METHODS
+from tools.calibrate.calibration_file import calibration_toml
 from tools.errors import InputError
 
 
@@ -28,7 +29,7 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     """Everything besides the core."""
     applied = Applied(session)
     return [
-        *_attitude(session),
+        *_attitude(session, applied),
         *_targets(session),
         *collect_routes(session, jobs),
         *mismatch_routes(session, jobs, applied),
@@ -70,15 +71,25 @@ def _targets(session: Session) -> list[BaseRoute]:
     ]
 
 
-def _attitude(session: Session) -> list[BaseRoute]:
+def _attitude(session: Session, applied: Applied) -> list[BaseRoute]:
     async def filters(_: Request) -> Any:
         stages = json.loads(session.metadata().get("stages", "{}"))
-        return {"methods": METHODS, "running": stages.get("sensing", {}).get("attitude_method", ""), "stages": stages}
+        running = stages.get("sensing", {}).get("attitude_method", "")
+        return {"methods": METHODS, "running": running, "stages": stages, "applied": applied.what}
 
     async def compare(request: Request) -> Any:
         await session.compare(text(await body(request), "method"))
 
+    async def use(request: Request) -> Any:
+        """The firmware starts again with another filter."""
+        method = text(await body(request), "method")
+        if method not in METHODS:
+            raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(METHODS)}")
+        stages = {"sensing": {"attitude_method": method}}
+        await applied.calibration("attitude filter", calibration_toml("attitude filter", "micron bench", stages))
+
     return [
         Route("/api/filters", clear(filters)),
         Route("/api/compare", clear(compare), methods=["POST"]),
+        Route("/api/filters/use", clear(use), methods=["POST"]),
     ]

@@ -30,6 +30,8 @@ export function mount(root, { link }) {
   const title = h("h2", {}, "Firmware");
   const choice = h("select", { "aria-label": "Filter beside it", onchange: () => compare(choice.value) });
   const gap = h("span.num.soft");
+  const use = h("button", { id: "use-filter", onclick: () => change(() => post("/api/filters/use", { method: choice.value })) }, "Use it in the firmware");
+  const back = h("button", { hidden: true, onclick: () => change(() => post("/api/calibrate/discard")) }, "Back to the original bench");
   const secondPanel = h("section.panel", { style: "display:flex;flex-direction:column", hidden: true },
     h("h2", {}, "Beside it: ", gap), h("div", { style: "flex:1;min-height:0" }, second));
   const numbers = h("table");
@@ -43,11 +45,28 @@ export function mount(root, { link }) {
     try { await post("/api/compare", { method }); } catch (problem) { error.textContent = problem.message; }
   }
 
-  get("/api/filters").then(({ methods, running }) => {
+  /** The firmware starts again: with another filter, or as the bench file says. */
+  async function change(work) {
+    error.textContent = "";
+    try { await work(); } catch (problem) { error.textContent = problem.message; }
+  }
+
+  let running = "";
+  let known = "";
+  async function listFilters() {
+    const found = await get("/api/filters");
+    running = found.running;
     title.replaceChildren("Firmware: ", h("b", { style: "color:var(--text)" }, running));
-    choice.replaceChildren(h("option", { value: "" }, "nothing"), ...methods.map((m) => h("option", { value: m }, m)));
+    if (!choice.options.length) choice.replaceChildren(h("option", { value: "" }, "nothing"), ...found.methods.map((m) => h("option", { value: m }, m)));
     choice.value = link.state?.shadow || "";
-  }).catch(() => {});
+    back.hidden = !found.applied.includes("attitude filter");
+  }
+  const offState = link.on("state", (state) => {
+    const now = `${state.run} ${state.phase === "running"}`;
+    if (now !== known) { known = now; listFilters().catch(() => {}); }
+    use.disabled = !link.mayOrder || !choice.value || choice.value === running;
+    back.disabled = !link.mayOrder;
+  });
 
   root.append(h("div.cols", { style: "grid-template:minmax(0,1fr) 170px / minmax(0,1fr) 270px" },
     h("div", { style: "display:flex;gap:12px;min-height:0" },
@@ -56,8 +75,8 @@ export function mount(root, { link }) {
     h("div.stack",  { style: "overflow:auto" },
       h("section.panel", {}, h("h2", {}, "Attitude ", h("small", {}, "body to world")), numbers,
         h("div.row", { style: "margin-top:10px" }, h("button", { onclick: () => { reference = q; } }, "Zero the drift here"))),
-      h("section.panel", {}, h("h2", {}, "Compare with"), choice, error,
-        h("p.note", {}, "Drag the picture to look from elsewhere. The other filter runs in the server on the same raw samples; the firmware keeps its own filter. Change that with attitude_method in the bench file."))),
+      h("section.panel", {}, h("h2", {}, "Compare with"), h("div.row", {}, choice, use, back), error,
+        h("p.note", {}, "It runs in the server on the same raw samples. Drag a picture to turn it."))),
     h("div", { style: "grid-column:1/3;display:flex" }, strip.element)));
   secondPanel.style.flex = "1";
 
@@ -104,6 +123,7 @@ export function mount(root, { link }) {
     clearInterval(timer);
     window.removeEventListener("themechange", retheme);
     offRun();
+    offState();
     link.drop(subscription);
     link.drop(history);
     strip.destroy();
