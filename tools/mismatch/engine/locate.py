@@ -38,7 +38,7 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
     if not problem.twin.static:
         # a plant's own motion is what friction, springs and play follow
         motion = problem.measured[output] - fitted.residual[output]
-        k = max(1, int(np.ceil(motion.size / e.size)))
+        k = max(1, round(dt / problem.recording.dt))
         signals[output] = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
     features = features_of(signals, dt, drive=problem.twin.drive(output), motion=output)
     found = dependences(e, features)
