@@ -228,6 +228,20 @@ class SampleCounter:
         self.t_ns = t_ns
         return lost
 
+    def count(self, out: ImuSample, new: bool, t_ns: int) -> Status:
+        """Head of ``out`` for what was read at ``t_ns``; ``STALE``, and the last time again, when it was not new."""
+        if new:
+            out.lost = self.fresh(t_ns)
+            status = Status.OVERRUN if out.lost else Status.OK
+        else:
+            self.stale += 1
+            out.lost = 0
+            status = Status.STALE
+        out.t_ns = self.t_ns
+        out.seq = self.seq
+        out.source = TimeSource.HOST
+        return status
+
 
 class FifoTimeline:
     """Times, numbers and losses of FIFO frames; ``period_ns`` apart as far as the chip's clock is good."""

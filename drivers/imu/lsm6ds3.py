@@ -38,7 +38,7 @@ from drivers.imu.base import (
 from drivers.imu.registers import Field, RegisterFile, join
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError
-from hal.types import ChannelInfo, Status, TimeSource
+from hal.types import ChannelInfo, Status
 
 ADDRESSES = (0x6A, 0x6B)  # SA0 low, high
 STATUS_TO_DATA = 2  # STATUS_REG, one reserved byte, then temperature
@@ -124,15 +124,8 @@ class Lsm6ds3:
         t_ns = self._clock.now_ns()
         data = self._burst()
         temperature, gx, gy, gz, ax, ay, az = FRAME.unpack_from(data, STATUS_TO_DATA)
-        counter = self._counter
         needed = m.GDA.mask | m.XLDA.mask if self._gyro_on else m.XLDA.mask
-        if data[0] & needed == needed:
-            out.lost = counter.fresh(t_ns)
-            status = Status.OVERRUN if out.lost else Status.OK
-        else:
-            counter.stale += 1
-            out.lost = 0
-            status = Status.STALE
+        status = self._counter.count(out, data[0] & needed == needed, t_ns)
         raw = (ax, ay, az, gx, gy, gz)
         if max(raw) >= 32767 or min(raw) <= -32767:
             status |= Status.SATURATED
@@ -148,9 +141,6 @@ class Lsm6ds3:
         else:
             out.gyro_rad_s[:] = np.nan
         out.temperature_C = celsius(temperature)
-        out.t_ns = counter.t_ns
-        out.seq = counter.seq
-        out.source = TimeSource.HOST
         out.status = status
         return status
 

@@ -36,7 +36,7 @@ from drivers.imu.base import (
 from drivers.imu.registers import RegisterFile, join
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, HalTimeout
-from hal.types import ChannelInfo, Status, TimeSource
+from hal.types import ChannelInfo, Status
 
 ADDRESSES = (0x68, 0x69)  # AD0 low, high
 GYRO_START_UP_S = 0.03  # PS 6.1: sleep to ready, typical
@@ -120,14 +120,7 @@ class Mpu6050:
         t_ns = self._clock.now_ns()
         data = self._burst()
         ax, ay, az, temperature, gx, gy, gz = FRAME.unpack_from(data, 1)
-        counter = self._counter
-        if data[0] & m.DATA_RDY_INT.mask:
-            out.lost = counter.fresh(t_ns)
-            status = Status.OVERRUN if out.lost else Status.OK
-        else:
-            counter.stale += 1
-            out.lost = 0
-            status = Status.STALE
+        status = self._counter.count(out, bool(data[0] & m.DATA_RDY_INT.mask), t_ns)
         raw = (ax, ay, az, gx, gy, gz)
         if max(raw) == 32767 or min(raw) == -32768:
             status |= Status.SATURATED
@@ -139,9 +132,6 @@ class Mpu6050:
         k = setup.gyro_lsb_rad_s if self._gyro_on else math.nan
         out.gyro_rad_s[:] = (gx * k, gy * k, gz * k)
         out.temperature_C = celsius(temperature) if self._temperature_on else math.nan
-        out.t_ns = counter.t_ns
-        out.seq = counter.seq
-        out.source = TimeSource.HOST
         out.status = status
         return status
 
