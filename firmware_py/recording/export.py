@@ -66,7 +66,7 @@ def export_folder(
     """The recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
 
     ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
-    DAQ outputs, the rest context. Flags, and columns that are not finite throughout, are no channels.
+    DAQ outputs, and the rest, computed from these volts with their noise, no channels. Flags, and columns that are not finite throughout, are no channels.
     The bench description stored in the recording becomes ``bench.toml`` and the twin's ``bench``.
     """
     if data not in ("npz", "csv"):
@@ -74,6 +74,7 @@ def export_folder(
     refuse_existing(out, overwrite=False)
     finite = _finite_columns(recording)
     channels, notes = [], []
+    computed = 0
     for index, (name, unit) in enumerate(recording.columns):
         if name == fmt.TIME_COLUMN:
             continue
@@ -83,7 +84,12 @@ def export_folder(
             notes.append(f"{name} is not a finite number throughout: it is in the data, but no channel")
         else:
             role = roles.get(name, "context") if roles is not None else _default_role(name)
+            if role is None:
+                computed += 1
+                continue
             channels.append({"column": name, "role": role, "signal": name, "unit": unit})
+    if computed:
+        notes.append(f"{computed} columns that the firmware computed are in the data, but no channels")
     for role in ("input", "output"):
         if not any(channel["role"] == role for channel in channels):
             raise RecordingError(f"{recording.path}: no column has the role {role!r}; say which with 'roles'")
@@ -99,8 +105,8 @@ def export_folder(
     return ExportReport(out, "folder", recording.n_rows, len(recording.columns), tuple(notes))
 
 
-def _default_role(name: str) -> str:
-    return next((role for prefix, role in _ROLES if name == prefix or name.startswith(f"{prefix}_")), "context")
+def _default_role(name: str) -> str | None:
+    return next((role for prefix, role in _ROLES if name == prefix or name.startswith(f"{prefix}_")), None)
 
 
 def _descriptor(

@@ -34,6 +34,10 @@ def _available(signals: Mapping[str, Array], output: str) -> str:
     return "" if others(signals, output) else "no other axis was recorded, or none changes"
 
 
+def _turnable(signals: Mapping[str, Array], output: str) -> str:
+    return _available(signals, output) if own_axis(output) in "xyz" else "the output is no axis of a vector"
+
+
 def _columns_of(ctx: Context, axes: Sequence[str]) -> list[Array]:
     vector = vector_of(ctx.signals)
     return [ctx.signals[vector[a]] for a in axes]
@@ -114,7 +118,7 @@ _ROTATION = Effect(
     report=_rot_report,
     driven=False,
     sites=("output",),
-    available=_available,
+    available=_turnable,
     shared=True,
 )
 

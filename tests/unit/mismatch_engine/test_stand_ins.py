@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.hysteresis import one_loop, turning_points
 from tools.mismatch.engine.fit import STAND_OFF, stand_ins
+from tools.mismatch.engine.unexplained import about
 
 
 def test_every_excused_row_has_a_usual_one_of_its_own_off_the_edge() -> None:
@@ -35,3 +37,8 @@ def test_turning_points_and_single_loops() -> None:
     assert one_loop(sine, keep)
     assert not one_loop(sine * (1 + t) / 4, keep)
     assert not one_loop(np.zeros(100), np.ones(100, bool))
+
+
+def test_what_a_current_coupling_follows_is_the_current() -> None:
+    assert "actuator_current" in about(EFFECTS["current_coupling"])
+    assert about(EFFECTS["temperature_sensitivity"]) == ("temperature",)

@@ -155,13 +155,13 @@ class TestExport:
         assert text["twin"] == {"kind": "instrument", "parameters": {"bench": "bench.toml"}}
         assert (tmp_path / "for_mismatch" / "bench.toml").read_text(encoding="utf-8") == METADATA["bench"]
         assert text["channels"] == [
-            {"column": "tick", "role": "context", "signal": "tick", "unit": "1"},
             {"column": "volts_0", "role": "output", "signal": "volts_0", "unit": "V"},
             {"column": "command_1", "role": "input", "signal": "command_1", "unit": "V"},
         ]
-        assert len(report.notes) == 2
+        assert len(report.notes) == 3
         assert "tremor_x is not a finite number throughout" in report.notes[0]
         assert "status holds flags" in report.notes[1]
+        assert "1 columns that the firmware computed" in report.notes[2]
         with np.load(tmp_path / "for_mismatch" / "data.npz", allow_pickle=False) as data:
             assert same_bits(data["tremor_x"], rows[:, 4])
         loaded = load(tmp_path / "for_mismatch")  # the mismatch tool itself takes it

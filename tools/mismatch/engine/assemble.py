@@ -34,9 +34,9 @@ from tools.mismatch.engine.revise import reduced
 from tools.mismatch.engine.score import compare, held_rms, misfits, paired_t
 from tools.mismatch.engine.select import Rule, Selection, as_good
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.engine.unexplained import Leftover
+from tools.mismatch.engine.unexplained import Leftover, about
 from tools.mismatch.report.wording import scaled
-from tools.mismatch.simulate import Model
+from tools.mismatch.simulate import Model, Placed
 
 Array = NDArray[np.float64]
 
@@ -75,11 +75,13 @@ def _rms(r: Array) -> float:
     return float(np.sqrt(np.mean(r**2)))
 
 
-def _units(problem: Problem, trial_unit: str, target: str, output: str, site: str) -> str:
+def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: Placed) -> str:
     units = problem.twin.units
     drive = problem.twin.drive(output) or target
-    # a force inside the equation of motion has the unit of what drives it
-    source = drive if site == "feedback" or target not in units else target
+    # a force inside the equation of motion has the unit of what drives it, and what is added to a static twin's
+    # output is driven by its input
+    driven = placed.site == "feedback" or (problem.twin.static and placed.effect.kind == "add")
+    source = drive if driven or target not in units else target
     return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", units.get(output, "1"))
 
 
@@ -105,7 +107,7 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
             for i in (*range(a.start, a.stop), *range(b.start, b.stop))
         }
         parameters = {
-            n: ParameterValue(v.value, _units(problem, v.unit, placed.target, worst, placed.site), v.ci95)
+            n: ParameterValue(v.value, _units(problem, v.unit, placed.target, worst, placed), v.ci95)
             for n, v in values.get(placed.label, {}).items()
         }
         out.append(
@@ -362,7 +364,7 @@ def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[D
     """
     first = fitted.model.placed[0]
     effect = first.effect
-    context = [s for s in effect.needs if s in problem.recording.context]
+    context = [s for s in about(effect) if s in problem.recording.context]
     if not context and effect.driven:
         return list(depends)
     o = first.outputs[0]
@@ -412,7 +414,7 @@ def summary(
     if verdict == "missing_physics":
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
-        factor, unit = scaled(b[o], problem.twin.units[o])
+        factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o])
         return (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
             f" from {factor * a[o]:.3g} to {factor * b[o]:.3g} {unit}."
