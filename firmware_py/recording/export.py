@@ -66,8 +66,9 @@ def export_folder(
     """The recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
 
     ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
-    DAQ outputs, and the rest, computed from these volts with their noise, no channels. Flags, and columns that are not finite throughout, are no channels.
-    The bench description stored in the recording becomes ``bench.toml`` and the twin's ``bench``.
+    DAQ outputs, and the rest, computed from these volts with their noise, no channels. Flags, and columns that are
+    not finite throughout, are no channels either. The bench description stored in the recording becomes
+    ``bench.toml`` and the twin's ``bench``.
     """
     if data not in ("npz", "csv"):
         raise RecordingError(f"{out}: the data file is npz or csv, not {data!r}")
