@@ -143,6 +143,11 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforw
     for i, fit in enumerate(fits):
         for warning in fit.warnings:
             data_console().print(f"stack {i + 1}, missing: {warning}", soft_wrap=True)
+        if not fit.answer.mechanism.resonance_hz:
+            data_console().print(
+                f"stack {i + 1}, no resonance was found: steps of a few volts, read fast enough, show it ring",
+                soft_wrap=True,
+            )
         if not fit.warnings:
             data_console().print(f"stack {i + 1}: nothing is missing in the excitation")
         for name, left, kept in fit.parts:
