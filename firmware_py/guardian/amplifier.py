@@ -62,5 +62,5 @@ class GuardedAmplifier:
         if self._heart.taken_ns and not self._yielded:
             self._inner.lose_position()
             self._yielded = True
-        self._inner.close()
+        self._inner.close()  # where this fails, the guardian goes on trying
         self._heart.say(Phase.IDLE)

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import threading
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -53,13 +53,16 @@ def test_closed_loop_over_real_ports_cancels_tremor(patient_bench: Path, tmp_pat
 def test_losing_the_link_in_real_time_ends_safe_and_names_it(patient_bench: Path, blow: str):
     timers: list[threading.Timer] = []
 
-    def schedule(bench: OpenBench) -> None:
+    def prepare(bench: OpenBench) -> None:
         world = cast(ProcessWorld, bench.world)
         strike = (lambda: os.kill(world.pid, signal.SIGKILL)) if blow == "kill" else (lambda: world.inject(blow, "daq"))
-        timers.append(threading.Timer(2.0, strike))
-        timers[0].start()
+        timers.append(threading.Timer(0.3, strike))
 
-    outcome, truth = run_in_process(RunRequest(patient_bench, 30.0), on_open=schedule)
+    def start_when_running(status: dict[str, Any]) -> None:
+        if status.get("state") == "running" and not timers[0].is_alive() and not timers[0].finished.is_set():
+            timers[0].start()
+
+    outcome, truth = run_in_process(RunRequest(patient_bench, 30.0), start_when_running, on_open=prepare)
     timers[0].join()
     safe = outcome["safe_state"]
     assert not safe["normal"]
