@@ -286,6 +286,8 @@ def apply(
         from tools.mismatch.apply import corrected_twin
 
         twin = corrected_twin(recording, _report(report))
+        if original is not None and twin.kind != "piezo_stack":
+            raise InputError(f"{bench}: an emulated bench runs twins of piezo_stack, this one is a {twin.kind}")
         write_text_atomic(out, twin.text)
         for note in twin.notes:
             console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
