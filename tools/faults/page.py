@@ -56,6 +56,12 @@ Every finished block survives `kill -9`, truncation at any byte and flipped bits
 so a power failure takes about a second (simulated by dropping pages that were not synced). A full disk ends the
 recording, not the run: see `docs/recording-format.md`.
 
+## Long runs
+
+`pytest -m slow tests/hil/test_long_run.py` runs half an hour in virtual time (`MICRON_LONG_S=28800`: eight hours) and
+asks for flat memory, exact counts and nothing noticed; `tests/hil/test_time_marks.py` crosses 2^31, 2^32 and 2^53 ns and
+asks for the same bits as from zero.
+
 ## Hostile input
 
 `tests/fuzz` damages sound inputs of every parser (bench files, recordings, csv, npz, mcap, descriptors, hands, FMU
