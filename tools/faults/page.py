@@ -59,8 +59,8 @@ recording, not the run: see `docs/recording-format.md`.
 ## Long runs
 
 `pytest -m slow tests/hil/test_long_run.py` runs half an hour in virtual time (`MICRON_LONG_S=28800`: eight hours) and
-asks for flat memory, exact counts and nothing noticed; `tests/hil/test_time_marks.py` crosses 2^31, 2^32 and 2^53 ns and
-asks for the same bits as from zero.
+asks for flat memory, exact counts and nothing noticed; `tests/hil/test_time_marks.py` crosses 2^31, 2^32 and 2^53 ns
+and asks for the same bits as from zero.
 
 ## Hostile input
 
