@@ -61,14 +61,14 @@ def _check_targets(*files: str | Path | None) -> None:
             raise InputError(f"{file}: the folder {path.absolute().parent} is not writable")
 
 
-def _check_folder(folder: Path | None) -> None:
+def _check_folder(folder: Path | None, option: str = "--out") -> None:
     if folder is None:
         return
     check_writable(folder)
     if folder.exists() and not folder.is_dir():
-        raise InputError(f"--out {folder}: is a file; name a folder")
+        raise InputError(f"{option} {folder}: is a file; name a folder")
     if not os.access(folder if folder.exists() else folder.absolute().parent, os.W_OK):
-        raise InputError(f"--out {folder}: is not writable")
+        raise InputError(f"{option} {folder}: is not writable")
 
 
 @app.command()
@@ -199,7 +199,8 @@ def prove(
     json_file: JsonOption = None,
     jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
     keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep recordings, sealed answers and reports there.")
+        Path | None,
+        typer.Option(metavar="FOLDER", help="Recordings, sealed answers and reports; a stopped run goes on there."),
     ] = None,
 ) -> None:
     """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
@@ -208,7 +209,7 @@ def prove(
     """
     with _clear_errors():
         _check_targets(json_file)
-        _check_folder(keep)
+        _check_folder(keep, "--keep")
         from tools.mismatch.prove import prove as run_proof
         from tools.mismatch.prove.table import show
 
