@@ -25,7 +25,7 @@ def main() -> int:
                    "agrees, recalibrate, unknown or pair")  # fmt: skip
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--keep", type=Path, default=None, help="folder for recordings, sealed answers and reports")
-    p.add_argument("--max-samples", type=int, default=24_000)
+    p.add_argument("--max-samples", type=int, default=12_000)
     p.add_argument("--json", type=Path, default=None)
     p.add_argument("--generate-only", action="store_true", help="write recordings and answers, diagnose nothing")
     args = p.parse_args()

@@ -32,7 +32,7 @@ class ProofResult:
     summary: dict[str, Any]
     seconds: float
     folder: Path
-    max_samples: int = 24_000
+    max_samples: int = 12_000
 
     def to_json(self) -> dict[str, Any]:
         """What `micron mismatch prove --json` writes."""
@@ -76,7 +76,7 @@ def generate(
     folder: Path,
     *,
     jobs: int = 1,
-    max_samples: int = 24_000,
+    max_samples: int = 12_000,
     each_noise: Sequence[str] | None = None,
 ) -> tuple[dict[str, Path], dict[str, dict[str, Any]]]:
     """Write the recordings of these plans; (paths, answers). A plan that no scene shows is left out.
@@ -101,7 +101,7 @@ def prove(
     *,
     only: tuple[str, str, float] | None = None,
     plans: Sequence[draw.Plan] | None = None,
-    max_samples: int = 24_000,
+    max_samples: int = 12_000,
     diagnose: Diagnose = tool,
     progress: Any = None,
 ) -> ProofResult:
