@@ -33,6 +33,12 @@ def _share(got: int, of: int) -> str:
     return f"{100 * got / of:.0f} % ({100 * low:.0f} to {100 * high:.0f})"
 
 
+def _count(p: Mapping[str, Any]) -> str:
+    """How many cases, and of how many when the run was stopped before its end."""
+    n = len(p["cases"])
+    return f"the first {n} of {p['asked']}" if p.get("asked", n) != n else str(n)
+
+
 def _totals(s: Mapping[str, Any]) -> list[str]:
     lines = ["| measure | count | share (95 % interval) | goal |", "|---|---|---|---|"]
     for key, text, goal, more in LINES:
@@ -72,7 +78,7 @@ def document(proofs: Sequence[Mapping[str, Any]]) -> str:
         "",
         "| seed | cases | samples at most | sha256 of the answers |",
         "|---|---|---|---|",
-        *(f"| {p['seed']} | {len(p['cases'])} | {p['max_samples']} | `{p['answers_sha256']}` |" for p in proofs),
+        *(f"| {p['seed']} | {_count(p)} | {p['max_samples']} | `{p['answers_sha256']}` |" for p in proofs),
         "",
         *_totals(s),
         "",
