@@ -34,8 +34,9 @@ def positions(
     Put the tip into a dimple, switch the manipulator to neutral, swing the handle by 20 degrees and more about all
     axes, slowly and at 1 to 2 Hz mixed, for a minute.
 
-    Example: python -m sim_devices.plant.lab pivot --bench benches/micron.toml --out out/pivot;
-    micron calibrate positions out/pivot --bench benches/micron.toml --out out/positions.toml
+    A recording to try: python -m sim_devices.plant.lab pivot --bench benches/micron.toml --out out/pivot
+
+    Example: micron calibrate positions out/pivot --bench benches/micron.toml --out out/positions.toml
     """
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.instrument_log import bench_sensing, instrument_readings

@@ -23,8 +23,8 @@ from hal.clock import VirtualClock
 from hal.types import ScanConfig
 from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, ScriptedSerial
 
-# a bare voltage, any of NI's devices, a part of another sheet
-NOT_PARTS = {"analog", "nidaqmx", "nidaqmx_ao", "ble_motion_card"}
+# a bare voltage, any of NI's devices, dividers in front of an ADC, a part of another sheet
+NOT_PARTS = {"analog", "nidaqmx", "nidaqmx_ao", "amplifier_monitor", "ble_motion_card"}
 
 
 class Strap:
