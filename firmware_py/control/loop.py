@@ -273,13 +273,21 @@ class InstrumentLoop:
                 self.incidents.trip(impossible)
         if self._field is not None:
             self._field.fill(frame)
-        self.stages.sense()
-        if not int(frame[STATUS]) & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(frame)):
-            self.incidents.trip(apart)
 
     def _estimate(self, info: TickInfo) -> None:
-        self.stages.estimate()
-        status = int(self._frame[STATUS]) & (FrameStatus.JERK | FrameStatus.DRIFT)
+        """The whole step in one compiled call; of scans that came late only the newest is commanded."""
+        assert self._ticks is not None
+        if self.supervisor.may_move and info.k == self._ticks.k0 + self._ticks.n - 1:
+            if self.manual.active:
+                self.stages.follow(self.manual.step(self._clock.now_ns()))
+            else:
+                self.stages.command()
+        self.stages.step()
+        bits = int(self._frame[STATUS])
+        # before the command goes out: a sensor that contradicts its twin must not move anything
+        if not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
+            self.incidents.trip(apart)
+        status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:
             for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):
                 if status & ~self._warned & bit:
@@ -289,11 +297,6 @@ class InstrumentLoop:
 
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:
-            if self.manual.active:
-                self.stages.command_V[:] = self.manual.step(self._clock.now_ns())
-                self.stages.follow()
-            else:
-                self.stages.actuate()
             try:
                 clipped = self._devices.amplifier.write(self.stages.command_V)
             except HalError as error:

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.hysteresis import extension, slopes_at
-from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CLIP, COMMAND, DESIRED_TIP, STROKE
 from firmware_py.records import Record
 from hal.compiled import kernel
@@ -90,8 +89,3 @@ def follow_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
         state.command_V[i] = command
         state.on[i] = 0.0
     frame[CLIP] = 0
-
-
-def follow(actuation: Actuation, frame: NDArray[np.float64]) -> None:
-    """``follow_kernel`` with the stage's own state."""
-    follow_kernel(frame, actuation.state, actuation.params)

@@ -8,17 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.stages import StageConfigs, Stages
-from firmware_py.frame import COMMAND, LAYOUT, STATUS, VOLTS, FrameStatus
+from firmware_py.frame import LAYOUT, VOLTS
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.replay import ReplayReport, replay
 
-_NAMES = LAYOUT.scalar_names()
-INPUT_COLUMNS = (*_NAMES[:VOLTS], *_NAMES[COMMAND : COMMAND + 3], "status")
-"""What a replay is given: everything left of the volts, commands chosen by hand, and the bits that the loop set."""
-OUTPUT_COLUMNS = _NAMES[VOLTS:]
-"""What it must find again."""
-_GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE)
+OUTPUT_COLUMNS = LAYOUT.scalar_names()[VOLTS:]
+"""What a replay must find again. It is given the rest, commands chosen by hand, and the bits that the loop set."""
 
 
 def recorded_configs(recording: Recording) -> StageConfigs:
@@ -33,20 +29,9 @@ def replay_recording(recording: Recording) -> ReplayReport:
     """Run the recorded configuration over the recorded inputs."""
     stages = Stages(recorded_configs(recording))
     stages.warm_up()
-    frame = stages.frame
-    outputs = frame[VOLTS:]
 
-    def step(inputs: NDArray[np.float64]) -> NDArray[np.float64]:
-        status = int(inputs[-1])
-        frame[:VOLTS] = inputs[:VOLTS]
-        frame[STATUS] = status & _GIVEN_BITS
-        stages.sense()
-        stages.estimate()
-        if status & FrameStatus.COMMANDED:
-            stages.actuate()
-        elif status & FrameStatus.MANUAL:
-            frame[COMMAND : COMMAND + 3] = inputs[VOLTS:-1]
-            stages.follow()
-        return outputs
+    def run(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        stages.run(rows)
+        return rows[:, VOLTS:]
 
-    return replay(recording, step, INPUT_COLUMNS, OUTPUT_COLUMNS)
+    return replay(recording, run, LAYOUT.scalar_names(), OUTPUT_COLUMNS)

@@ -1,4 +1,4 @@
-"""The three compiled stages in the order in which a sample passes: sense, estimate, actuate.
+"""The stages with their numbers and their memory, and the one compiled call that runs them (``firmware_py.chain``).
 
 One implementation for the live loop and for replay: whoever fills the frame's input columns gets the same
 estimates and commands.
@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.control.manual import follow
-from firmware_py.frame import COMMAND, LAYOUT, STATUS, FrameStatus
+from firmware_py.chain import COMMANDED, MANUAL, run_kernel, step_kernel
+from firmware_py.frame import COMMAND, LAYOUT, STATUS
+from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing
 from firmware_py.tremor.config import TremorConfig
@@ -67,29 +68,39 @@ class Stages:
         self.detectors = Detectors(configs.tremor.detectors, configs.tremor.tick_hz)
         self.actuation = Actuation(configs.actuation)
 
-    def sense(self) -> None:
-        self.sensing.step(self.frame)
+        # the arrays keep their place for life, so that a tick hands over the same tuple every time
+        self._arguments: tuple[Record, ...] = tuple(
+            part
+            for stage in (self.sensing, self.tremor, self.detectors, self.actuation)
+            for part in (stage.state, stage.params)
+        )
 
-    def estimate(self) -> None:
-        self.tremor.step(self.frame)
-        self.detectors.step(self.frame)
+    @property
+    def arguments(self) -> tuple[Record, ...]:
+        """State and parameters of every stage, in the order of the chain's kernels."""
+        return self._arguments
 
-    def actuate(self) -> None:
-        """Compute the command for the newest scan and mark the frame as one that was commanded."""
-        self.frame[STATUS] = int(self.frame[STATUS]) | FrameStatus.COMMANDED
-        self.actuation.step(self.frame)
+    def step(self) -> None:
+        """One tick on ``frame``, whose input columns and ``GIVEN_BITS`` of the status are set."""
+        step_kernel(self.frame, *self._arguments)
 
-    def follow(self) -> None:
-        """The command in the frame was chosen by hand: mark it, and let the stage's memory follow."""
-        self.frame[STATUS] = int(self.frame[STATUS]) | FrameStatus.MANUAL
-        follow(self.actuation, self.frame)
+    def run(self, rows: Frame) -> None:
+        """Ticks ``rows`` (n, Layout.size), C order, in place: the same numbers as n steps, the memory goes on."""
+        run_kernel(rows, self.frame, *self._arguments)
+
+    def command(self) -> None:
+        """The tick's step shall compute a command: this is the newest scan and the outputs may move."""
+        self.frame[STATUS] = int(self.frame[STATUS]) | COMMANDED
+
+    def follow(self, command_V: Frame) -> None:
+        """The tick's step shall follow ``command_V`` (3,), chosen by hand."""
+        self.command_V[:] = command_V
+        self.frame[STATUS] = int(self.frame[STATUS]) | MANUAL
 
     def warm_up(self) -> None:
-        """Compile or load every kernel, then forget what that did. A cold start takes seconds, a tick may not."""
-        self.sense()
-        self.estimate()
-        self.actuate()
-        self.follow()
+        """Compile or load every kernel, then forget what that did. A cold start takes minutes, a tick may not."""
+        self.step()
+        self.run(np.zeros((1, LAYOUT.size)))
         self.reset()
 
     def reset(self) -> None:

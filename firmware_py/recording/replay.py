@@ -17,8 +17,8 @@ from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
 
 
-class ReplayRow(NamedTuple):
-    """``inputs`` and ``recorded`` are the row's values of the two groups of columns, in their order."""
+class ReplayBlock(NamedTuple):
+    """Rows ``number`` and following: ``inputs`` (n, n_inputs) and ``recorded`` (n, n_outputs), C order."""
 
     number: int
     inputs: Float64Array
@@ -69,45 +69,44 @@ class ReplayReport:
         }
 
 
-def replay_rows(recording: Recording, inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[ReplayRow]:
-    """The rows before the first gap, one by one. The arrays of a row are views that the next block replaces."""
+def replay_blocks(recording: Recording, inputs: Sequence[str], outputs: Sequence[str]) -> Iterator[ReplayBlock]:
+    """The rows before the first gap, as they were recorded; one block of memory at a time."""
     names = recording.names
     take = [_index(recording, names, name) for name in inputs]
     compare = [_index(recording, names, name) for name in outputs]
-    next_row: int | None = None
+    next_row = 0
     for block in recording.blocks():
-        if next_row is None and block.row0 != 0:
-            return
-        if next_row is not None and block.row0 != next_row:
+        if block.row0 != next_row:
             return
         next_row = block.row0 + block.data.shape[1]
-        given = np.ascontiguousarray(block.data[take].T)
-        recorded = np.ascontiguousarray(block.data[compare].T)
-        for i in range(len(given)):
-            yield ReplayRow(block.row0 + i, given[i], recorded[i])
+        yield ReplayBlock(
+            block.row0, np.ascontiguousarray(block.data[take].T), np.ascontiguousarray(block.data[compare].T)
+        )
 
 
 def replay(
     recording: Recording,
-    step: Callable[[Float64Array], Float64Array],
+    run: Callable[[Float64Array], Float64Array],
     inputs: Sequence[str],
     outputs: Sequence[str],
 ) -> ReplayReport:
-    """Run ``step(inputs[n_inputs]) -> outputs[n_outputs]`` over the recording and compare the bits.
+    """Run ``run(inputs (n, n_inputs)) -> outputs (n, n_outputs)`` over the recording and compare the bits.
 
-    ``step`` may return a view of its own frame; NaN equals the same NaN, 0.0 is not -0.0.
+    ``run`` gets the rows in order, a few at a time, and remembers what it must. NaN equals the same NaN, 0.0 is
+    not -0.0.
     """
     rows = mismatching = 0
     first: Mismatch | None = None
-    for row in replay_rows(recording, inputs, outputs):
-        replayed = np.ascontiguousarray(step(row.inputs), dtype=np.float64)
-        rows += 1
-        different = replayed.view(np.uint64) != row.recorded.view(np.uint64)
+    for block in replay_blocks(recording, inputs, outputs):
+        replayed = np.ascontiguousarray(run(block.inputs), dtype=np.float64)
+        rows += len(replayed)
+        different = replayed.view(np.uint64) != block.recorded.view(np.uint64)
         if different.any():
-            mismatching += 1
+            mismatching += int(np.count_nonzero(different.any(axis=1)))
             if first is None:
-                at = int(np.argmax(different))
-                first = Mismatch(row.number, outputs[at], float(row.recorded[at]), float(replayed[at]))
+                row, at = (int(i) for i in np.argwhere(different)[0])
+                recorded, found = float(block.recorded[row, at]), float(replayed[row, at])
+                first = Mismatch(block.number + row, outputs[at], recorded, found)
     return ReplayReport(rows, mismatching, first, recording.n_rows - rows)
 
 

@@ -8,7 +8,7 @@ import pytest
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.hysteresis import extension, plays_at
 from firmware_py.actuation.stage import Actuation
-from firmware_py.control.manual import ARM_S, HOLD_S, RETURN_V_PER_S, ManualDrive, follow, follow_kernel
+from firmware_py.control.manual import ARM_S, HOLD_S, RETURN_V_PER_S, ManualDrive, follow_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STROKE
 from firmware_py.records import attributes
 from tests.unit.pure_python import without_compiler
@@ -79,7 +79,7 @@ def test_stroke_is_the_forward_model_of_the_command():
     rng = np.random.default_rng(3)
     for volts in 50.0 + 40.0 * rng.uniform(-1, 1, (60, 3)):
         frame[COMMAND : COMMAND + 3] = volts
-        follow(stage, frame)
+        follow_kernel(frame, stage.state, stage.params)
         expected = [
             extension(volts[i], param.stacks[i].slope, plays[i], np.zeros(4), param.stacks[i])
             - param.neutral_extension[i]
