@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from numba.core.runtime import rtsys
 from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
@@ -96,3 +97,14 @@ def test_warming_up_leaves_no_trace() -> None:
     for a, b in zip(warm.arguments, fresh.arguments, strict=True):
         assert a.tobytes() == b.tobytes()
     assert not warm.frame.any()
+
+
+def test_a_step_allocates_nothing() -> None:
+    """Also not where it aligns, follows a hand-chosen command, meets a bad reading or an unreachable tip."""
+    one = stages()
+    one.warm_up()
+    rows = scans(N)
+    rows[800:, COUNTS] += 8000.0 * (np.arange(100) % 20 < 10)  # far beyond what the manipulator can follow
+    before = rtsys.get_allocation_stats().alloc
+    one.run(rows)
+    assert rtsys.get_allocation_stats().alloc == before
