@@ -18,42 +18,12 @@ from firmware_py.control.stages import Stages
 SOURCE = Path(__file__).with_suffix(".c")
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-fPIC", "-shared", "-std=gnu11")
 STAGES = ("sense", "estimate", "detect", "actuate")
-CONSTANTS = [
-    "TICK",
-    "COUNTS",
-    "MAGNETOMETER_RAW",
-    "MAGNETOMETER_FRESH",
-    "VOLTS",
-    "SUPPLY",
-    "TEMPERATURE",
-    "ACCELEROMETER",
-    "MAGNETOMETER",
-    "SPECIFIC_FORCE",
-    "ANGULAR_ACCELERATION",
-    "RATE",
-    "QUATERNION",
-    "TIP_ACCELERATION",
-    "TIP_DISPLACEMENT",
-    "TREMOR",
-    "TREMOR_AHEAD",
-    "TREMOR_FREQUENCY",
-    "TREMOR_AMPLITUDE",
-    "CONFIDENCE",
-    "DESIRED_TIP",
-    "STROKE",
-    "COMMAND",
-    "CLIP",
-    "STATUS",
-    "SIZE",
-    "SATURATED",
-    "ALIGNING",
-    "SETTLING",
-    "JERK",
-    "DRIFT",
-    "CLIP_VOLTAGE",
-    "CLIP_SLEW",
-    "CLIP_SINGULAR",
-]
+CONSTANTS = """
+TICK COUNTS MAGNETOMETER_RAW MAGNETOMETER_FRESH VOLTS SUPPLY TEMPERATURE ACCELEROMETER MAGNETOMETER SPECIFIC_FORCE
+ANGULAR_ACCELERATION RATE QUATERNION TIP_ACCELERATION TIP_DISPLACEMENT TREMOR TREMOR_AHEAD TREMOR_FREQUENCY
+TREMOR_AMPLITUDE CONFIDENCE DESIRED_TIP STROKE COMMAND CLIP STATUS SIZE SATURATED ALIGNING SETTLING JERK DRIFT
+CLIP_VOLTAGE CLIP_SLEW CLIP_SINGULAR
+""".split()
 
 
 def compiler() -> str | None:
@@ -62,7 +32,7 @@ def compiler() -> str | None:
 
 
 def _struct(name: str, dtype: np.dtype, done: dict[str, str]) -> None:
-    """C structs of a record dtype and of what is nested in it, innermost first. All fields are multiples of 8 bytes: no padding."""
+    """C structs of a record dtype and of what is nested in it, innermost first. Whole multiples of 8 bytes: no padding."""
     lines = []
     for field in dtype.names or ():
         kind, shape = dtype[field].base, dtype[field].shape

@@ -4,6 +4,9 @@ Such an array lives as long as the call that made it: hand it down, never return
 interpreter it is an ordinary array.
 """
 
+# pyright: basic
+# numba's extension interface has no types
+
 from __future__ import annotations
 
 from typing import Any
@@ -83,19 +86,19 @@ def _matrix(typing_context: Any, rows: Any, columns: Any) -> Any:
 @overload(scratch, prefer_literal=True, strict=False)
 def _scratch(n: Any) -> Any:
     if isinstance(n, types.IntegerLiteral):
-        return lambda n: _vector(n)
+        return lambda n: _vector(n)  # pyright: ignore[reportCallIssue]
     return None
 
 
 @overload(scratch_index, prefer_literal=True, strict=False)
 def _scratch_index(n: Any) -> Any:
     if isinstance(n, types.IntegerLiteral):
-        return lambda n: _index(n)
+        return lambda n: _index(n)  # pyright: ignore[reportCallIssue]
     return None
 
 
 @overload(scratch_matrix, prefer_literal=True, strict=False)
 def _scratch_matrix(rows: Any, columns: Any) -> Any:
     if isinstance(rows, types.IntegerLiteral) and isinstance(columns, types.IntegerLiteral):
-        return lambda rows, columns: _matrix(rows, columns)
+        return lambda rows, columns: _matrix(rows, columns)  # pyright: ignore[reportCallIssue]
     return None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -123,7 +123,7 @@ def open_devices(bench: OpenBench) -> Devices:
     scan = daq.configure(
         ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
     )
-    sensing = _sensing_table(options, scan, where)
+    sensing = sensing_table(options, scan.channels, scan.rate_hz, scan.lsb_V[0], where)
     if magnetometer is not None:
         # set and reset pulses tell the bridge's offset of today; the DAQ takes no commands while it scans
         for _ in magnetometer.measure_offset():
@@ -216,9 +216,11 @@ def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tup
     return amplifier, amplifier.probe
 
 
-def _sensing_table(options: Mapping[str, Any], scan: ScanInfo, where: str) -> dict[str, Any]:
-    """Which column of a scan carries which sensor: the part of [firmware.sensing] that the wiring decides."""
-    position = {channel: column for column, channel in enumerate(scan.channels)}
+def sensing_table(
+    options: Mapping[str, Any], channels: Sequence[int], rate_hz: float, lsb_V: float, where: str
+) -> dict[str, Any]:
+    """Which column of a scan of ``channels`` carries which sensor: what the wiring decides of [firmware.sensing]."""
+    position = {channel: column for column, channel in enumerate(channels)}
     try:
         accelerometers = [position[options[device].channels[axis]] for device, axis in ACCELEROMETERS]
         supply, temperature = (position[options[name].channel] for name in ("supply", "temperature"))
@@ -228,8 +230,8 @@ def _sensing_table(options: Mapping[str, Any], scan: ScanInfo, where: str) -> di
             "supply and temperature"
         ) from error
     return {
-        "tick_hz": scan.rate_hz,
-        "lsb_V": scan.lsb_V[0],
+        "tick_hz": rate_hz,
+        "lsb_V": lsb_V,
         "channels": accelerometers,
         "supply_channel": supply,
         "temperature_channel": temperature,

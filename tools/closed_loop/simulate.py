@@ -1,0 +1,164 @@
+"""A run of the instrument without wires: the same bench file, hand and seed as ``micron run --virtual``, compiled."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.specs import Ads1115Options, DacAmplifierOptions, Di4108Options, check_devices
+from firmware_py.control.config import load_firmware_config
+from firmware_py.control.stages import Stages
+from firmware_py.control.wiring import sensing_table
+from firmware_py.frame import LAYOUT
+from firmware_py.records import Record, new_record
+from hal.bench import BenchFile
+from sim_devices.plant.blocks import PlantBlocks
+from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, advance, outputs_later
+from sim_devices.plant.recorded_hand import make_hand
+from sim_devices.plant_factory import emulation_config
+from tools.closed_loop.kernel import WIRES, closed_loop
+from tools.errors import InputError
+
+Array = NDArray[np.float64]
+
+COMMAND_DELAY_S = 497.5e-6
+"""Scan to command of the default bench: 125 us of USB, 372.5 us on the I2C bus."""
+SETTLE_MS = 12
+OFFSET_READINGS = 4
+READING_MS = 9
+"""The magnetometer's offset before the run: strap, settling, four triples of three conversions each."""
+
+
+@dataclass(frozen=True)
+class SimulatedRun:
+    """``truth`` as of a run over the wire; ``frames`` (n, Layout.size) where they were asked for, one a tick."""
+
+    truth: dict[str, NDArray]
+    started_ns: int
+    armed_ns: int
+    safe_ns: int
+    clipped: int
+    frames: Array | None
+
+
+def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
+    """The converters' numbers (dtype ``WIRES``). ``InputError`` for a bench whose output is not the DAC amplifier."""
+    where = str(bench.path)
+    options: dict[str, Any] = dict(check_devices(bench.description, where))
+
+    def only(kind: type, what: str) -> Any:
+        found = [o for o in options.values() if isinstance(o, kind)]
+        if len(found) != 1:
+            raise InputError(f"{where}: a run without wires needs exactly one {what}, this bench has {len(found)}")
+        return found[0]
+
+    daq, adc = only(Di4108Options, "di4108"), only(Ads1115Options, "ads1115")
+    amplifier = only(DacAmplifierOptions, "dac_amplifier")
+    tick_hz = bench.description.clock.tick_hz
+    if tick_hz != 1000 or daq.rate_hz != tick_hz or tuple(daq.channels) != tuple(range(8)):
+        raise InputError(f"{where}: a run without wires ticks at 1000 Hz and scans channels 0 to 7 in order")
+    steps, rest_s = divmod(delay_s, STEP_S)
+    if not 0.0 <= delay_s < STEPS_PER_MS * STEP_S:
+        raise InputError(f"a delay of {1e3 * delay_s:g} ms: it is 0 or more and less than a tick of 1 ms")
+    return new_record(
+        WIRES,
+        counts_per_V=32768.0 / daq.range_V,
+        field_lsb_V=adc.full_scale_V / 32768.0,
+        drive_lsb_V=5.0 * amplifier.gain / 65536.0,
+        drive_top=65535.0,
+        delay_steps=int(steps),
+        delay_part=rest_s / STEP_S,
+        armed_tick=armed_tick,
+    )
+
+
+def _measure_offset(world: PlantBlocks) -> tuple[Array, int]:
+    """(3,) V of the magnetometer's bridges, from readings after a set and a reset pulse; the milliseconds it took."""
+    state, at = world.state[0], 0
+    mean = np.zeros(3)
+    for strap in (-1.0, 1.0):
+        state["strap"] = strap
+        for wait_ms in (SETTLE_MS, *(READING_MS,) * OFFSET_READINGS):
+            _advance(world, at, at + wait_ms)
+            at += wait_ms
+            outputs_later(world.plant, world.state, 0.0)
+            if wait_ms == READING_MS:
+                mean += state["magnetometer_V"] / (2 * OFFSET_READINGS)
+    return mean, at
+
+
+def _advance(world: PlantBlocks, start_ms: int, stop_ms: int) -> None:
+    steps = start_ms * STEPS_PER_MS, stop_ms * STEPS_PER_MS
+    arrays = world.plant, world.state, world.nodes, world.parts, world.noise, world.slow
+    advance(*arrays, *steps, world.truth, start_ms + 1)
+
+
+def simulate(
+    bench: BenchFile,
+    seconds: float,
+    *,
+    seed: int | None = None,
+    hand_file: str | None = None,
+    hand_scale: float | None = None,
+    delay_s: float = COMMAND_DELAY_S,
+    keep_frames: bool = False,
+    on_time: Callable[[float], None] | None = None,
+) -> SimulatedRun:
+    """``seconds`` in closed loop after arming. Same arguments, same bits.
+
+    Raises ``BenchError`` or ``InputError`` for a bench that is not this instrument. ``on_time`` hears the seconds done.
+    """
+    table = bench.description.model_dump()
+    if seed is not None:
+        table["emulation"]["seed"] = seed
+    emulation = emulation_config(table)
+    if emulation.endoscope is not None:
+        raise InputError(f"{bench.path}: an endoscope bench has no closed loop")
+    config, configs = load_firmware_config(bench, {})
+    watch = round(config.self_test.watch_ms)
+    wire = wires_of(bench, watch, delay_s)
+    ticks = watch + round(1000.0 * seconds)
+    hand = make_hand(emulation.hand, emulation.seed, hand_file, hand_scale)
+    ms = 256
+    world = PlantBlocks(emulation, hand, ticks + 2 * ms)
+    world.next_block()
+    offset_V, before = _measure_offset(world)
+    sensing = configs.sensing.model_copy(
+        update={**sensing_table_of(bench), "magnetometer_bias_V": tuple(offset_V.tolist())}
+    )
+    stages = Stages(type(configs)(sensing, configs.tremor, configs.actuation))
+    _advance(world, before, ms)  # scans begin with a block
+    size = LAYOUT.size
+    frames = np.zeros((ticks if keep_frames else 0, size))
+    row, done = ms + 1, 0
+    while done < ticks:
+        world.next_block()
+        n = min(ms, ticks - done)
+        part = frames[done : done + n]
+        row = closed_loop(
+            n, world.plant, world.state, world.nodes, world.parts, world.noise, world.slow, world.truth, row,
+            wire, part, stages.frame, *stages.arguments,
+        )  # fmt: skip
+        done += n
+        if on_time is not None:
+            on_time(done * 1e-3)
+    start_ns = ms * 1_000_000
+    return SimulatedRun(
+        truth=world.truth_columns(row),
+        started_ns=start_ns,
+        armed_ns=start_ns + watch * 1_000_000,
+        safe_ns=start_ns + ticks * 1_000_000,
+        clipped=int(wire["clipped"][0]),
+        frames=frames if keep_frames else None,
+    )
+
+
+def sensing_table_of(bench: BenchFile) -> dict[str, Any]:
+    """What the wiring says of the sensors, as the opened bench would."""
+    options = check_devices(bench.description, str(bench.path))
+    daq = next(o for o in options.values() if isinstance(o, Di4108Options))
+    return sensing_table(options, daq.channels, daq.rate_hz, daq.range_V / 32768.0, str(bench.path))
