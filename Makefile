@@ -35,8 +35,10 @@ fuzz: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS)
 
+# installs the peers that it compares with; make bench ONLY="step world" for some of it
 bench: setup
-	$(BIN)/python -m benchmarks
+	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[bench]'
+	$(BIN)/python -m benchmarks $(ONLY)
 
 # the site in out/site; strict: a broken link or an undocumented name in the reference fails
 docs: setup

@@ -1,4 +1,4 @@
-"""Sample to command over real ports, against a bare echo on a pty: what the machine and the bus cost anyway."""
+"""(b) Sample to command over real ports, against a bare echo on a pty: what the machine and the bus cost anyway."""
 
 from __future__ import annotations
 
@@ -13,7 +13,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from benchmarks.row import Row
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import LOOP_PRIORITY, RunRequest, run_in_process
+from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from tools.cli.bench_option import bench_path
 
 ECHO = """
@@ -25,45 +26,48 @@ while True:
 """
 
 
-def echo_us(n: int = 3000) -> float:
-    """Median round trip of one 16-byte packet a millisecond to a process that sends it back with pyserial."""
+def echo_us(n: int = 3000) -> np.ndarray:
+    """Round trip of one 16-byte packet a millisecond to a process that sends it back with pyserial, us each.
+
+    Both ends ask for the policy that the firmware and its emulated world get.
+    """
     master, slave = pty.openpty()
     tty.setraw(master)
     tty.setraw(slave)
-    peer = subprocess.Popen([sys.executable, "-c", ECHO, os.ttyname(slave)])
     times_ns = []
+    peer = subprocess.Popen([sys.executable, "-c", ECHO, os.ttyname(slave)])
     try:
-        due_ns = time.monotonic_ns() + 300_000_000
-        for _ in range(n):
-            due_ns += 1_000_000
-            time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
-            sent_ns = time.monotonic_ns()
-            os.write(master, bytes(16))
-            got = 0
-            while got < 16:
-                got += len(os.read(master, 16 - got))
-            times_ns.append(time.monotonic_ns() - sent_ns)
+        with realtime(RealtimeConfig(priority=LOOP_PRIORITY)):
+            due_ns = time.monotonic_ns() + 1_000_000_000
+            for _ in range(n):
+                due_ns += 1_000_000
+                time.sleep(max(0.0, (due_ns - time.monotonic_ns()) * 1e-9))
+                sent_ns = time.monotonic_ns()
+                os.write(master, bytes(16))
+                got = 0
+                while got < 16:
+                    got += len(os.read(master, 16 - got))
+                times_ns.append(time.monotonic_ns() - sent_ns)
     finally:
         peer.kill()
         peer.wait()
         os.close(master)
         os.close(slave)
-    return float(np.median(times_ns)) * 1e-3
+    return np.array(times_ns) * 1e-3
 
 
 def rows() -> Iterator[Row]:
     echo = echo_us()
     outcome, _ = run_in_process(RunRequest(bench_path(None), 5.0))
-    ours = outcome["latency"]["sample_to_command_us"]["p50"]
+    latency = outcome["latency"]["sample_to_command_us"]
     bus_us = 16 * 9 / 0.4 + 12 / 0.4
-    yield Row(
-        "sample to command, p50",
-        f"scan instant to acknowledged DAC transfer; {bus_us:.0f} us of it is the emulated I2C bus at 400 kHz",
-        ours,
-        echo,
-        "bare echo on a pty",
-        "us",
-        ours / echo,
-        "bus time subtracted <= 1.5 x",
-        (ours - bus_us) / echo <= 1.5,
-    )
+    for name, share, must in (("p50", 50.0, True), ("p99", 99.0, False), ("p99_9", 99.9, False)):
+        ours, peer = latency[name] - bus_us, float(np.percentile(echo, share))
+        yield Row(
+            f"sample to command, {name.replace('_', '.')}",
+            f"scan instant to acknowledged DAC transfer, less the {bus_us:.0f} us of the emulated I2C bus at 400 kHz",
+            ours, peer, "bare echo, same pty and policy", "us", ours / peer,
+            "<= 1.5 x" if must else "-", ours <= 1.5 * peer if must else None, must=must,
+            why="the sample crosses a pty and the command a socket, so two processes are woken where the echo wakes one"
+            if must else "",
+        )  # fmt: skip

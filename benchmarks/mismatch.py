@@ -1,4 +1,5 @@
-"""Diagnosis of a recording: a minute at 1 kHz end to end, one candidate, and growth with the length of the record."""
+"""(g) Diagnosis of a recording: a minute at 1 kHz end to end, one candidate, growth with length, jobs, and what pysindy
+and SysIdentPy do with the same recording: they fit one model, name no physics and hold nothing out by themselves."""
 
 from __future__ import annotations
 
@@ -6,13 +7,14 @@ import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from benchmarks.row import Row
+from benchmarks.row import Row, exponent, process_cpu_s
 
 RATE_HZ = 1000.0
-SECONDS = (15.0, 60.0)
+SECONDS = (15.0, 60.0, 1800.0)
 GOAL_S = 30.0
 
 
@@ -47,27 +49,49 @@ def measure(seconds: float, jobs: int) -> tuple[float, float, int]:
     return time.perf_counter() - wall, time.process_time() - cpu, len(report.tested)
 
 
+def peers(recording: Any) -> Iterator[Row]:
+    """The nearest general tools: one call of the kind that their documents show, on the recording's first minute."""
+    import pysindy
+    from sysidentpy.basis_function import Polynomial
+    from sysidentpy.model_structure_selection import FROLS
+
+    u, y = recording.inputs["command"][:, None], recording.outputs["displacement"][:, None]
+
+    def sindy() -> None:
+        # displacement and a memory of it as states, driven by the command
+        model = pysindy.SINDy(optimizer=pysindy.STLSQ(threshold=1e-4), feature_library=pysindy.PolynomialLibrary(2))
+        model.fit(y, t=1.0 / RATE_HZ, u=u)
+
+    def narx() -> None:
+        FROLS(order_selection=True, n_info_values=8, ylag=2, xlag=2, basis_function=Polynomial(degree=2)).fit(X=u, y=y)
+
+    yield from (
+        Row(f"mismatch, {name}", "one fit of one model: no candidates, no names, nothing held out", np.nan,
+            process_cpu_s(function), name, "s", np.nan)
+        for name, function in (("pysindy", sindy), ("SysIdentPy", narx))
+    )  # fmt: skip
+
+
 def rows() -> Iterator[Row]:
     measure(4.0, 1)  # kernels compiled or read
-    short_s, long_s = (measure(s, 1) for s in SECONDS)
-    exponent = float(np.log(long_s[1] / short_s[1]) / np.log(SECONDS[1] / SECONDS[0]))
+    runs = [measure(s, 1) for s in SECONDS]
+    grows = exponent(SECONDS, [cpu for _, cpu, _ in runs])
+    long_s = runs[1]
     cores = min(2, os.cpu_count() or 1)
     wall_s = measure(SECONDS[1], cores)[0] if cores > 1 else long_s[0]
+    reached = wall_s <= GOAL_S
     yield Row(
-        "mismatch diagnose, 60 s at 1 kHz", f"wall time with {cores} processes", wall_s, long_s[0], "one process", "s",
-        long_s[0] / wall_s, f"<= {GOAL_S:g} s", wall_s <= GOAL_S,
+        "mismatch, 60 s at 1 kHz", f"all candidates, wall time with {cores} processes; CPU {long_s[1]:.1f} s with one",
+        wall_s, long_s[0], "one process", "s", long_s[0] / wall_s, f"<= {GOAL_S:g} s", reached, must=True,
+        why="" if reached else f"wall time on a shared machine: {long_s[1]:.1f} s of CPU",
     )  # fmt: skip
     share = long_s[1] / max(long_s[2], 1)
     yield Row(
-        "mismatch diagnose, one candidate", "CPU of the whole diagnosis over the places tried first", share, long_s[1],
-        "whole diagnosis", "s", share / long_s[1], "-", None,
+        "mismatch, one candidate", "CPU of the whole diagnosis over the places tried first", share, long_s[1],
+        "whole diagnosis", "s", share / long_s[1],
     )  # fmt: skip
     yield Row(
-        "mismatch diagnose, growth with length", "exponent of CPU time, 15 s to 60 s", exponent, 1.0, "linear", "1",
-        exponent, "<= 1.2", exponent <= 1.2,
+        "mismatch, growth with length", "exponent of CPU over 15 s, 60 s, 30 min", grows, 1.0, "linear", "1", grows,
+        "<= 1.2", grows <= 1.2, must=True,
     )  # fmt: skip
-
-
-if __name__ == "__main__":
-    for row in rows():
-        print(f"{row.name}: {row.ours:.3g} {row.unit} ({row.peer_name} {row.peer:.3g}), goal {row.goal}: {row.meets}")
+    yield from peers(stack_recording(SECONDS[1]))

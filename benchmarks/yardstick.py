@@ -23,7 +23,7 @@ TICK COUNTS MAGNETOMETER_RAW MAGNETOMETER_FRESH VOLTS SUPPLY TEMPERATURE ACCELER
 ANGULAR_ACCELERATION RATE QUATERNION TIP_ACCELERATION TIP_DISPLACEMENT TREMOR TREMOR_AHEAD TREMOR_FREQUENCY
 TREMOR_AMPLITUDE CONFIDENCE DESIRED_TIP STROKE COMMAND CLIP STATUS SIZE SATURATED ALIGNING SETTLING JERK DRIFT
 CLIP_VOLTAGE CLIP_SLEW CLIP_SINGULAR
-""".split()
+""".split()  # noqa: SIM905, forty names read better as text
 
 
 def compiler() -> str | None:
@@ -32,7 +32,7 @@ def compiler() -> str | None:
 
 
 def _struct(name: str, dtype: np.dtype, done: dict[str, str]) -> None:
-    """C structs of a record dtype and of what is nested in it, innermost first. Whole multiples of 8 bytes: no padding."""
+    """C structs of a record dtype and of what is nested in it, innermost first; nothing needs padding."""
     lines = []
     for field in dtype.names or ():
         kind, shape = dtype[field].base, dtype[field].shape

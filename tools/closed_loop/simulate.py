@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from drivers.specs import Ads1115Options, DacAmplifierOptions, Di4108Options, check_devices
 from firmware_py.control.config import load_firmware_config
-from firmware_py.control.stages import Stages
+from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import sensing_table
 from firmware_py.frame import LAYOUT
 from firmware_py.records import Record, new_record
@@ -43,6 +43,7 @@ class SimulatedRun:
     safe_ns: int
     clipped: int
     frames: Array | None
+    configs: StageConfigs
 
 
 def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
@@ -61,9 +62,9 @@ def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
     tick_hz = bench.description.clock.tick_hz
     if tick_hz != 1000 or daq.rate_hz != tick_hz or tuple(daq.channels) != tuple(range(8)):
         raise InputError(f"{where}: a run without wires ticks at 1000 Hz and scans channels 0 to 7 in order")
-    steps, rest_s = divmod(delay_s, STEP_S)
     if not 0.0 <= delay_s < STEPS_PER_MS * STEP_S:
         raise InputError(f"a delay of {1e3 * delay_s:g} ms: it is 0 or more and less than a tick of 1 ms")
+    steps, rest_s = divmod(delay_s, STEP_S)
     return new_record(
         WIRES,
         counts_per_V=32768.0 / daq.range_V,
@@ -130,7 +131,7 @@ def simulate(
     sensing = configs.sensing.model_copy(
         update={**sensing_table_of(bench), "magnetometer_bias_V": tuple(offset_V.tolist())}
     )
-    stages = Stages(type(configs)(sensing, configs.tremor, configs.actuation))
+    stages = Stages(StageConfigs(sensing, configs.tremor, configs.actuation))
     _advance(world, before, ms)  # scans begin with a block
     size = LAYOUT.size
     frames = np.zeros((ticks if keep_frames else 0, size))
@@ -154,6 +155,7 @@ def simulate(
         safe_ns=start_ns + ticks * 1_000_000,
         clipped=int(wire["clipped"][0]),
         frames=frames if keep_frames else None,
+        configs=stages.configs,
     )
 
 
