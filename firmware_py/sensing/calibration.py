@@ -29,7 +29,6 @@ from firmware_py.frame import (
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
 from hal.compiled import kernel
-from hal.scratch import scratch
 
 TEMPERATURE_SMOOTHING_S = 1.0
 
@@ -128,7 +127,7 @@ def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params:
     ratio = params.nominal_supply_V / smoothed[0]
     rise = smoothed[1] - params.reference_C
     bits = 0
-    line = scratch(6)
+    line = np.empty(6)
     for i in range(6):
         volts = frame[VOLTS + params.channel[i]] * ratio - params.bias_V[i] - params.bias_V_per_C[i] * rise
         line[i] = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))

@@ -48,7 +48,6 @@ from firmware_py.sensing.translation import (
     translation_params,
 )
 from hal.compiled import kernel
-from hal.scratch import scratch
 
 MAX_RATE_RAD_S = 20.0
 LEAN_CORNER_HZ = 0.5
@@ -115,7 +114,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
     attitude = state.attitude
     corrected = attitude.error_state.corrected
     dt = param.attitude.dt_s
-    sudden, turn = scratch(3), scratch(3)
+    sudden, turn = np.empty(3), np.empty(3)
     for i in range(3):
         sudden[i] = (corrected[0, i] - state.turned[i]) / (dt * dt) + corrected[1, i] / dt - corrected[2, i]
         state.turned[i] = corrected[0, i]
@@ -163,7 +162,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
         status |= ALIGNING
         align(attitude, param.attitude, motion, field, fresh)
     else:
-        felt = scratch(6)
+        felt = np.empty(6)
         point_force(motion, attitude.bias, attitude.rate, param.quiet_point, felt[:3])
         felt[3:] = motion[3:]
         step_attitude(attitude, param.attitude, felt, field, fresh, steps)
@@ -171,7 +170,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     if status & ALIGNING:
         tip[:] = 0.0
     else:
-        up = scratch(3)
+        up = np.empty(3)
         _smooth_up(state, param, up)
         tip_acceleration(motion, attitude.bias, attitude.rate, up, param.translation, tip)
     integrate_band(tip, state.memory, param.translation.sections, frame[TIP_DISPLACEMENT : TIP_DISPLACEMENT + 3])
