@@ -229,7 +229,7 @@ class NumpyStep:
         a, q = self.e.adaptive, self.ep.adaptive
         lifted = biquads(a.pending, a.weigh[:, None, :], q.weight[None, :])
         a.weighted[:] = self.turned(a.weighted, lifted)
-        a.sum += lifted
+        a["sum"] += lifted
         a.in_block += 1
         if a.in_block < q.block_ticks:
             return
@@ -238,8 +238,8 @@ class NumpyStep:
         a.n_blocks += 1
         taps = q.taps.shape[1]
         lag = taps // 2
-        a.blocks[:, at % taps] = a.sum / q.block_ticks
-        a.sum[:] = 0.0
+        a.blocks[:, at % taps] = a["sum"] / q.block_ticks
+        a["sum"][:] = 0.0
         a.snapshots[:, at % (lag + 1)] = a.weighted
         if at >= 2 * taps:
             self.regress(at, taps, lag)

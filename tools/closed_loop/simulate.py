@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.specs import Ads1115Options, DacAmplifierOptions, Di4108Options, check_devices
+from drivers.specs import DacAmplifierOptions, Di4108Options, Hmc2003Options, check_devices
 from firmware_py.control.config import load_firmware_config
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import sensing_table
@@ -52,13 +52,14 @@ def wires_of(bench: BenchFile, armed_tick: int, delay_s: float) -> Record:
     options: dict[str, Any] = dict(check_devices(bench.description, where))
 
     def only(kind: type, what: str) -> Any:
-        found = [o for o in options.values() if isinstance(o, kind)]
+        found = [name for name, option in options.items() if isinstance(option, kind)]
         if len(found) != 1:
             raise InputError(f"{where}: a run without wires needs exactly one {what}, this bench has {len(found)}")
         return found[0]
 
-    daq, adc = only(Di4108Options, "di4108"), only(Ads1115Options, "ads1115")
-    amplifier = only(DacAmplifierOptions, "dac_amplifier")
+    magnetometer = bench.description.device[only(Hmc2003Options, "hmc2003")]
+    daq, adc = options[only(Di4108Options, "di4108")], options[magnetometer.adc or ""]
+    amplifier = options[only(DacAmplifierOptions, "dac_amplifier")]
     tick_hz = bench.description.clock.tick_hz
     if tick_hz != 1000 or daq.rate_hz != tick_hz or tuple(daq.channels) != tuple(range(8)):
         raise InputError(f"{where}: a run without wires ticks at 1000 Hz and scans channels 0 to 7 in order")
