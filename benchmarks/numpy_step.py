@@ -216,7 +216,7 @@ class NumpyStep:
         e.predicted[:, e.at] = ahead
         e.power += p.smoothing * (now**2 - e.power)
         e.miss += p.smoothing * (missed**2 - e.miss)
-        frequency = e.combiner.wflc.omega * p.combiner.seen.tick_hz / (2.0 * np.pi)
+        frequency = e.combiner["wflc"]["omega"] * p.combiner.seen.tick_hz / (2.0 * np.pi)
         settled = e.ticks > p.settle_ticks
         trust = np.maximum(0.0, 1.0 - np.sqrt((e.miss + p.floor2) / (e.power + p.floor2))) if settled else np.zeros(3)
         out = np.stack([now, ahead, frequency, np.sqrt(2.0 * e.power), trust])
@@ -277,8 +277,8 @@ class NumpyStep:
         a.filter[axis] = np.linalg.solve(whole, (right * scale).T).T * scale
 
     def combine(self, sample: Array) -> None:
-        c, p = self.e.combiner, self.ep.combiner
-        w, q = c.wflc, p.wflc
+        c, p = self.e.combiner.view(np.recarray), self.ep.combiner
+        w, q = c["wflc"].view(np.recarray), p.wflc
         in_band = biquads(sample, c.memory, p.sections)
         w.phase[:] = (w.phase + w.omega) % (2.0 * np.pi)
         w.power += q.power_smoothing * (in_band**2 - w.power)
@@ -331,8 +331,8 @@ class NumpyStep:
         f[AT["stroke"]] = stroke
         a.strokes[:, 1:] = a.strokes[:, :-1].copy()
         a.strokes[:, 0] = stroke
-        target = a.strokes @ p.taps
-        k = p.stacks
+        target = (a.strokes * p.taps).sum(axis=1)
+        k = p.stacks.view(np.recarray)
         rate = np.abs(target - a.target)[:, None] * p.tick_hz
         slope = k.slope + k.slope_per_rate * np.minimum(np.maximum(rate, k.rate_low[:, None]), k.rate_high)
         slope = np.maximum(slope, k.least_slope[:, None])

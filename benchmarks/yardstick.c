@@ -622,7 +622,7 @@ static int actuate(double *f, actuate_state *s, const actuate_params *p)
         memmove(past + 1, past, 15 * sizeof(double));
         past[0] = stroke[i];
         double target = 0.0;
-        for (int n = 0; n < 16; n++) target += p->taps[n] * past[n];
+        for (int n = 0; n < 16; n++) target += p->taps[i][n] * past[n];
         double rate = fabs(target - s->target[i]) * p->tick_hz;
         for (int n = 0; n < PLAYS; n++) {
             double w = rate > k->rate_low ? rate : k->rate_low;
