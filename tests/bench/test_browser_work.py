@@ -1,0 +1,145 @@
+"""What a person does on the page beside looking: recordings taken away, filters compared, the card, long jobs."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from firmware_py.recording.reader import Recording
+from tests.bench.conftest import Server, go
+
+pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
+
+RECORDING = """
+format = 1
+title = "a stack with another gain"
+data = "data.npz"
+rate_hz = 200.0
+[twin]
+kind = "piezo_stack"
+[twin.parameters]
+gain_um_per_V = 0.12
+[[channels]]
+column = "command_V"
+role = "input"
+signal = "command"
+unit = "V"
+[[channels]]
+column = "displacement_um"
+role = "output"
+signal = "displacement"
+unit = "um"
+noise_rms = 0.02
+"""
+
+
+def test_a_recording_is_looked_at_downloaded_and_exported(page: Any, server: Server, tmp_path: Path):
+    go(page, "collect")
+    page.fill("input[placeholder^='Name']", "taken away")
+    page.click("#rec-start")
+    page.wait_for_selector("#rec:not([hidden])")
+    page.fill("input[placeholder='Notes']", "in the middle")
+    page.click("text=Add note")
+    server.wait_for(lambda s: (s["recording"] or {}).get("written", 0) > 300, "rows")
+    page.click("#rec-stop")
+    row = page.locator("tr", has_text="taken away")
+    row.locator("button", has_text="Download").wait_for()
+    assert "in the middle" in row.inner_text()
+    row.locator("button", has_text="taken away").click()
+    page.wait_for_selector("select[aria-label='What to look at']")
+    assert page.locator(".plot .legend").inner_text().count("command") == 3
+    with page.expect_download() as download:
+        row.locator("button", has_text="Download").click()
+    download.value.save_as(tmp_path / "run.mcap")
+    recording = Recording(tmp_path / "run.mcap")
+    ticks = sum(block.data.shape[1] for block in recording.blocks())
+    assert ticks > 300
+    assert server.token not in str(recording.metadata)
+    assert all(server.token.encode() not in path.read_bytes() for path in server.recordings.glob("taken away*"))
+    with page.expect_download(timeout=240_000) as download:
+        row.locator("select").select_option("csv")
+    download.value.save_as(tmp_path / "run.csv")
+    with (tmp_path / "run.csv").open() as file:
+        assert sum(1 for _ in csv.DictReader(file)) == ticks
+
+
+def test_another_filter_runs_beside_the_firmwares_and_then_in_it(page: Any, server: Server, artefacts: Path):
+    go(page, "attitude")
+    choice = "select[aria-label='Filter beside it']"
+    page.wait_for_selector(f"{choice} option[value=observer]", state="attached")
+    for method in ("quaternion-kalman", "observer"):
+        page.select_option(choice, method)
+        page.wait_for_function(f"micron.link.state.shadow === '{method}' && micron.link.shadow")
+        page.wait_for_function(f"document.getElementById('view').innerText.includes('{method}, ')")
+    assert np.linalg.norm(page.evaluate("micron.link.shadow")) == pytest.approx(1.0, abs=1e-3)
+    page.screenshot(path=artefacts / "attitude-beside.png")
+    run, original = (server.state()[key] for key in ("run", "bench_file"))
+    page.click("#use-filter")
+    server.wait_for(lambda s: s["run"] > run and s["phase"] == "running", "the firmware with the other filter", 220)
+    page.wait_for_selector("h2:has-text('Firmware: observer')")
+    page.click("text=Back to the original bench")
+    server.wait_for(lambda s: s["bench_file"] == original and s["phase"] == "running", "the original bench", 220)
+
+
+def test_the_emulated_motion_card_steers_the_game(page: Any):
+    go(page, "targets")
+    page.click("text=motion card")
+    page.wait_for_selector("select option[value$='endoscope.toml']", state="attached")
+    page.click("#target-start")
+    # the emulated hand turns the card and presses its button by plan: the view follows while it is active
+    page.wait_for_function("micron.game() && micron.game().source === 'card' && micron.game().status === 1")
+    view = page.evaluate("micron.game().view")
+    page.wait_for_function(f"Math.hypot(micron.game().view.x - {view['x']}, micron.game().view.y - {view['y']}) > 5")
+    assert page.evaluate("micron.game().error") == ""
+
+
+def test_a_diagnosis_from_the_page_and_its_twin_on_the_emulated_bench(page: Any, server: Server, artefacts: Path):
+    folder = server.recordings / "stack"
+    folder.mkdir()
+    (folder / "recording.toml").write_text(RECORDING)
+    rng = np.random.default_rng(1)
+    command = 50.0 + 20.0 * np.sin(np.arange(800) / 200.0 * 2.0 * np.pi * 3.0) + rng.standard_normal(800)
+    displacement = 0.15 * command + 0.02 * rng.standard_normal(800)
+    np.savez(folder / "data.npz", command_V=command, displacement_um=displacement)
+    go(page, "mismatch")
+    page.select_option("select[aria-label=Recording]", "stack/")
+    page.click("text=Diagnose")
+    page.wait_for_selector("iframe.report", timeout=240_000)
+    apply = page.locator("button", has_text="Apply to the emulated bench")
+    apply.wait_for(timeout=120_000)
+    page.screenshot(path=artefacts / "mismatch-report.png")
+    original = server.state()["bench_file"]
+    apply.click()
+    server.wait_for(lambda s: s["bench_file"] != original and s["phase"] == "running", "the other bench", 220)
+    assert 'twin = "' in Path(server.state()["bench_file"]).read_text()
+    page.wait_for_selector("#difference")
+    assert server.request("POST", "/api/jobs/difference/cancel", b"{}")[0] == 200
+    page.click("text=Back to the original bench")
+    server.wait_for(lambda s: s["bench_file"] == original and s["phase"] == "running", "the original bench", 220)
+
+
+def test_a_calibration_is_applied_over_the_bench_and_discarded(page: Any, server: Server):
+    go(page, "calibrate")
+    page.click("text=Identify the stacks")
+    page.wait_for_function("document.getElementById('view').innerText.includes('step 1 of 4')")
+    assert server.request("POST", "/api/calibrate/lab", b'{"what": "tumble"}')[0] == 400  # one at a time
+    assert server.request("POST", "/api/jobs/calibrate/cancel", b"{}")[0] == 200
+    page.wait_for_function("document.getElementById('view').innerText.includes('cancelled')")
+    # poses cannot be turned on an emulated bench that nobody holds: what the wizard would have sent
+    unit = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
+    unit /= np.linalg.norm(unit, axis=1, keepdims=True)
+    axes = [0, 2, 1, 2, 0, 1]  # 1x 1z 2y 2z 3x 3y
+    means = (2.5 + unit[:, axes]).tolist()
+    code, found = server.request("POST", "/api/calibrate/poses", json.dumps({"means_V": means}).encode())
+    assert code == 200, found
+    original = server.state()["bench_file"]
+    assert server.request("POST", "/api/calibrate/apply", b'{"kind": "poses"}')[0] == 200
+    page.wait_for_function("document.getElementById('view').innerText.includes('Applied over the bench file: poses')")
+    assert "poses.toml" in Path(server.state()["bench_file"]).read_text()
+    page.click("text=Discard, back to the original")
+    server.wait_for(lambda s: s["bench_file"] == original, "the original bench")
