@@ -60,7 +60,7 @@ def rows() -> Iterator[Row]:
         filter_ = imufusion.Ahrs()
         update = filter_.update
         for k in range(N):
-            update(degrees[k], in_g[k], field[k], 1.0 / RATE_HZ)
+            update(degrees[k], in_g[k], field[k])
         return filter_.quaternion
 
     mine, theirs = side_by_side((ours("mahony", N), compiled_vqf), N)
