@@ -61,7 +61,7 @@ def rows() -> Iterator[Row]:
         update = filter_.update
         for k in range(N):
             update(degrees[k], in_g[k], field[k])
-        return filter_.quaternion
+        return filter_.get_quaternion()
 
     mine, theirs = side_by_side((ours("mahony", N), compiled_vqf), N)
     yield Row(
