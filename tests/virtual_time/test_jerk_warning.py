@@ -17,12 +17,11 @@ def test_jerks_reach_the_report(tmp_path: Path) -> None:
     text = BENCH.read_text().replace('"calibration/', f'"{BENCH.parent}/calibration/')
     text = text.replace(
         "[emulation] # read only when a bus URI starts with sim://\n",
-        "[emulation]\nhand = { jerk_um = 1500.0, jerk_interval_s = 1.0 }\n",
+        "[emulation]\nhand = { jerk_um = 600.0, jerk_interval_s = 4.0 }\n",
     )
-    text += "\n[firmware.tremor.detectors]\nsettle_s = 1.0\n"
     bench = tmp_path / "twitching.toml"
     bench.write_text(text)
-    outcome, truth = run_in_process(RunRequest(bench, 5.0, virtual=True, seed=3))
+    outcome, truth = run_in_process(RunRequest(bench, 20.0, virtual=True, seed=3))
     assert truth is not None
     assert outcome["warnings"]["jerk"] >= 1
     assert outcome["warnings"]["drift"] == 0
