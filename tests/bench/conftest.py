@@ -190,7 +190,7 @@ def page(browser: Any, server: Server) -> Iterator[Any]:
     context.set_default_timeout(60_000)
     tab = context.new_page()
     errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
     tab.goto(f"{server.base}/#token={server.token}")
     tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
     yield tab

@@ -98,6 +98,7 @@ def test_the_emulated_motion_card_steers_the_game(page: Any):
     assert page.evaluate("micron.game().error") == ""
 
 
+@pytest.mark.slow
 def test_a_diagnosis_from_the_page_and_its_twin_on_the_emulated_bench(page: Any, server: Server, artefacts: Path):
     folder = server.recordings / "stack"
     folder.mkdir()

@@ -96,7 +96,7 @@ export function mount(root, { link }) {
     secondPanel.hidden = !method;
     other = method && link.shadow && Math.hypot(...link.shadow) > 0.5 ? link.shadow : null;
     main.redraw();
-    if (other) {
+    if (q && other) {
       second.redraw();
       gap.textContent = `${method}, ${digits((angleBetween(q, other) * 180) / Math.PI, 3)}° apart`;
     }
@@ -107,7 +107,7 @@ export function mount(root, { link }) {
     }
   }
   const timer = setInterval(() => {
-    if (!q) return;
+    if (!q || !reference) return; // a new run has not shown its first sample yet
     const [roll, pitch, yaw] = euler(q);
     const rows = [["roll (x)", `${roll.toFixed(2)}°`], ["pitch (y)", `${pitch.toFixed(2)}°`], ["yaw (z)", `${yaw.toFixed(2)}°`],
       ["q w, x", `${q[0].toFixed(5)}  ${q[1].toFixed(5)}`], ["q y, z", `${q[2].toFixed(5)}  ${q[3].toFixed(5)}`],
@@ -116,7 +116,7 @@ export function mount(root, { link }) {
   }, 100);
   const retheme = () => { colours = palette(); strip.build(); };
   window.addEventListener("themechange", retheme);
-  const offRun = link.on("run", () => { reference = null; });
+  const offRun = link.on("run", () => { q = reference = null; });
   draw();
   return () => {
     cancelAnimationFrame(frame);
