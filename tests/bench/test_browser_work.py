@@ -86,6 +86,7 @@ def test_another_filter_runs_beside_the_firmwares_and_then_in_it(page: Any, serv
     server.wait_for(lambda s: s["bench_file"] == original and s["phase"] == "running", "the original bench", 220)
 
 
+@pytest.mark.slow
 def test_the_emulated_motion_card_steers_the_game(page: Any):
     go(page, "targets")
     page.click("text=motion card")
