@@ -68,6 +68,7 @@ def test_a_recording_is_looked_at_downloaded_and_exported(page: Any, server: Ser
         assert sum(1 for _ in csv.DictReader(file)) == ticks
 
 
+@pytest.mark.slow
 def test_another_filter_runs_beside_the_firmwares_and_then_in_it(page: Any, server: Server, artefacts: Path):
     go(page, "attitude")
     choice = "select[aria-label='Filter beside it']"
