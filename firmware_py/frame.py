@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 XYZ = ("x", "y", "z")
 AXES = ("1x", "1z", "2y", "2z", "3x", "3y")  # sensor order, 000 (2.34)
+MORE_AXES = ("7", "8")  # the converter has eight inputs
+PARITIES = ("1", "2")
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +53,8 @@ _QUANTITIES: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("supply", "V", (), "supply of the accelerometers, behind the same low-pass as their outputs"),
     ("temperature", "degC", (), "temperature of the sensor suite, smoothed"),
     ("accelerometer", "m/s^2", AXES, "calibrated readings, specific force along each sensor's axis"),
+    ("accelerometer_more", "m/s^2", MORE_AXES, "axes beyond six, 0 where there are none"),
+    ("parity", "1", PARITIES, "what more than six axes contradict, in deviations of a sample's noise; 0 with six"),
     ("magnetometer", "uT", XYZ, "magnetic field, body frame"),
     ("specific_force", "m/s^2", XYZ, "specific force at the origin of the body frame"),
     ("angular_acceleration", "rad/s^2", XYZ, "body frame, bias removed"),
@@ -147,6 +151,8 @@ VOLTS = LAYOUT.start("volts")
 SUPPLY = LAYOUT.start("supply")
 TEMPERATURE = LAYOUT.start("temperature")
 ACCELEROMETER = LAYOUT.start("accelerometer")
+ACCELEROMETER_MORE = LAYOUT.start("accelerometer_more")
+PARITY = LAYOUT.start("parity")
 MAGNETOMETER = LAYOUT.start("magnetometer")
 SPECIFIC_FORCE = LAYOUT.start("specific_force")
 ANGULAR_ACCELERATION = LAYOUT.start("angular_acceleration")

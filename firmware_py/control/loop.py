@@ -94,8 +94,11 @@ class InstrumentLoop:
             limit_ms = config.safety.magnetometer_ms
             self._field = FieldInput(devices.magnetometer, self.incidents, self.counts, limit_ms)
         wired = devices.sensing_table
-        watched = (*wired["channels"], wired["supply_channel"], wired["temperature_channel"])
-        self._check = ScanCheck(config.plausibility, wired["lsb_V"], watched, devices.scan_labels)
+        watched = [*wired["channels"], wired["supply_channel"], wired["temperature_channel"]]
+        columns = [column for column in watched if column is not None]
+        self._check = ScanCheck(
+            config.plausibility, wired["lsb_V"], columns, devices.scan_labels, sensors=len(wired["channels"])
+        )
         self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
         if live is not None:

@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from firmware_py.frame import ACCELEROMETER
 from hal.compiled import kernel
 
-SENSORS, SUPPLY = 6, 6  # accelerometers come first, the supply after them
+SENSORS = 6
 PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
 """Places in AXES of two sensors along one body axis: 1x and 3x, 1z and 2z, 2y and 3y."""
 
@@ -170,11 +170,21 @@ class PairState(NamedTuple):
 class ScanCheck:
     """Looks at every scan, before it is believed.
 
-    ``columns``: places in a scan of the accelerometers (AXES order), the supply and the temperature; ``labels`` names
-    them for people.
+    ``columns``: places in a scan of the ``sensors`` accelerometer axes (AXES order), then of the supply and the
+    temperature where they are wired; ``labels`` names them for people.
     """
 
-    def __init__(self, limits: PlausibilityLimits, lsb_V: float, columns: Sequence[int], labels: Sequence[str]) -> None:
+    def __init__(
+        self,
+        limits: PlausibilityLimits,
+        lsb_V: float,
+        columns: Sequence[int],
+        labels: Sequence[str],
+        *,
+        sensors: int = SENSORS,
+    ) -> None:
+        self._sensors = sensors
+        self._supply = sensors if len(columns) > sensors else None
         self.limits = limits
         self._order = np.array(columns, dtype=np.intp)
         self._labels = tuple(labels)
@@ -198,17 +208,18 @@ class ScanCheck:
         steps = tick - self._tick if self._tick >= 0 else 1
         self._tick = tick
         np.take(row, self._order, out=self._counts)
-        supply_before = int(self._last[SUPPLY])
+        supply = self._supply
+        supply_before = 0 if supply is None else int(self._last[supply])
         found = check_counts(
-            self._counts, SENSORS, self._last, self._same, self._slope, self._odd, steps, self._jump, self._outlier,
-            self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
+            self._counts, self._sensors, self._last, self._same, self._slope, self._odd, steps, self._jump,
+            self._outlier, self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
         )  # fmt: skip
         if not found:
             return ""
         channel, finding = divmod(found, 16)
-        if supply_before and abs(int(self._counts[SUPPLY]) - supply_before) > self._jump // 2:
+        if supply is not None and supply_before and abs(int(self._counts[supply]) - supply_before) > self._jump // 2:
             # the sensors are ratiometric: all of them follow their supply
-            return f"{self._labels[SUPPLY]} jumped; check the sensors' supply, its wire and the DAQ's line"
+            return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
         return f"{self._labels[channel]} {WORDS[Finding(finding)].format(n=self.limits.stuck_ticks)}"
 
     def odd(self) -> str:
@@ -222,8 +233,8 @@ class ScanCheck:
             return ""
         self._told = total
         worst = int(self._odd.argmax())
-        if worst == SUPPLY:
-            return f"{self._labels[SUPPLY]} stepped"
+        if worst == self._supply:
+            return f"{self._labels[worst]} stepped"
         return f"{self._labels[worst]} read a value out of line with its neighbours"
 
     def pairs(self, frame: NDArray[np.float64]) -> str:

@@ -8,13 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.stages import StageConfigs, Stages
-from firmware_py.frame import LAYOUT, VOLTS
+from firmware_py.frame import ACCELEROMETER_MORE, LAYOUT, PARITIES, PARITY, VOLTS
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.replay import ReplayReport, replay
 
-OUTPUT_COLUMNS = LAYOUT.scalar_names()[VOLTS:]
+_NAMES = LAYOUT.scalar_names()
+OUTPUT_COLUMNS = _NAMES[VOLTS:]
 """What a replay must find again. It is given the rest, commands chosen by hand, and the bits that the loop set."""
+LATER_COLUMNS = _NAMES[ACCELEROMETER_MORE : PARITY + len(PARITIES)]
+"""Recordings made before these columns were there are compared in the others."""
 
 
 def recorded_configs(recording: Recording) -> StageConfigs:
@@ -29,9 +32,13 @@ def replay_recording(recording: Recording) -> ReplayReport:
     """Run the recorded configuration over the recorded inputs."""
     stages = Stages(recorded_configs(recording))
     stages.warm_up()
+    known = [i for i, name in enumerate(_NAMES) if name in recording.names or name not in LATER_COLUMNS]
+    outputs = [i for i in known if i >= VOLTS]
 
-    def run(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def run(recorded: NDArray[np.float64]) -> NDArray[np.float64]:
+        rows = np.zeros((len(recorded), LAYOUT.size))
+        rows[:, known] = recorded
         stages.run(rows)
-        return rows[:, VOLTS:]
+        return rows[:, outputs]
 
-    return replay(recording, run, LAYOUT.scalar_names(), OUTPUT_COLUMNS)
+    return replay(recording, run, [_NAMES[i] for i in known], [_NAMES[i] for i in outputs])

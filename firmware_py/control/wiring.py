@@ -19,6 +19,7 @@ from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
 from drivers.specs import (
     Ads1115Options,
+    Adxl203Options,
     AmplifierMonitorOptions,
     CanAmplifierOptions,
     DacAmplifierOptions,
@@ -129,8 +130,10 @@ def open_devices(bench: OpenBench) -> Devices:
         for _ in magnetometer.measure_offset():
             wait_s(bench.clock, 0.001)
         sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
-    labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in ACCELEROMETERS)
-    labels += tuple(f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature"))
+    labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in _axes(options))
+    labels += tuple(
+        f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature") if name in options
+    )
     verify = amplifier.verify if isinstance(amplifier, DacAmplifier) else None
     return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities)
 
@@ -216,14 +219,26 @@ def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tup
     return amplifier, amplifier.probe
 
 
+def _axes(options: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """The six of the instrument, then those of further accelerometers in the order of their names."""
+    first = {device for device, _ in ACCELEROMETERS}
+    others = sorted(name for name, o in options.items() if isinstance(o, Adxl203Options) and name not in first)
+    return (*ACCELEROMETERS, *((name, axis) for name in others for axis in sorted(options[name].channels)))
+
+
 def sensing_table(
     options: Mapping[str, Any], channels: Sequence[int], rate_hz: float, lsb_V: float, where: str
 ) -> dict[str, Any]:
     """Which column of a scan of ``channels`` carries which sensor: what the wiring decides of [firmware.sensing]."""
     position = {channel: column for column, channel in enumerate(channels)}
     try:
-        accelerometers = [position[options[device].channels[axis]] for device, axis in ACCELEROMETERS]
-        supply, temperature = (position[options[name].channel] for name in ("supply", "temperature"))
+        axes = _axes(options)
+        accelerometers = [position[options[device].channels[axis]] for device, axis in axes]
+        more = len(axes) > len(ACCELEROMETERS)  # then inputs are short: supply and temperature may be missing
+        supply, temperature = (
+            None if more and name not in options else position[options[name].channel]
+            for name in ("supply", "temperature")
+        )
     except KeyError as error:
         raise BenchError(
             f"{where}: [device] {error} is missing: the instrument needs acc1 (x, z), acc2 (y, z), acc3 (x, y), "

@@ -86,7 +86,7 @@ def error_state_params(config: SensingConfig) -> Record:
         still_density=config.hand_velocity_m_s**2 * config.hand_velocity_s,
         heading_density=heading_density(config),
         held_density=0.01**2,
-        disturbance_rad=radians(0.3),
+        disturbance_rad=radians(config.heading_disturbance_deg),
         disturbance_s=3.0,
         start_variance=np.array([0.01**2, 0.02**2, 0.02**2, 0.002**2]),
         # the bias is the mean over the alignment, the tremor's own angular acceleration included

@@ -1,4 +1,4 @@
-"""Volts to physical quantities: six accelerometer axes, supply, temperature, magnetometer.
+"""Volts to physical quantities: accelerometer axes, supply, temperature, magnetometer.
 
 The ADXL-203 is ratiometric (data sheet, "Ratiometricity"): bias and scale follow the supply. Its outputs sit
 behind the RC filter and the supply reading does not, so the supply passes the same filter here before it
@@ -11,16 +11,19 @@ say, A = (L - g(L_y) - h(L_z)) / (1 + r(L_z)), which is 000 (3.11)-(3.14) with V
 from __future__ import annotations
 
 from math import exp
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.frame import (
     ACCELEROMETER,
+    ACCELEROMETER_MORE,
     AXES,
     COUNTS,
     MAGNETOMETER,
     MAGNETOMETER_RAW,
+    MORE_AXES,
     SATURATED,
     SUPPLY,
     TEMPERATURE,
@@ -33,47 +36,50 @@ from hal.compiled import kernel
 TEMPERATURE_SMOOTHING_S = 1.0
 
 
-CALIBRATION = np.dtype(
-    [
-        ("lsb_V", "f8"),
-        ("channel", "i8", (6,)),
-        ("bias_V", "f8", (6,)),
-        ("scale_V", "f8", (6,)),  # per m/s^2
-        ("bias_V_per_C", "f8", (6,)),
-        ("scale_per_C", "f8", (6,)),
-        ("in_plane", "i8", (6,)),
-        ("out_of_plane", "i8", (6,)),
-        ("bias_in_plane", "f8", (6, 2)),  # 1, s^2/m
-        ("bias_out_of_plane", "f8", (6, 2)),
-        ("scale_out_of_plane", "f8", (6, 2)),  # s^2/m, s^4/m^2
-        ("range", "f8"),  # m/s^2
-        ("supply_channel", "i8"),
-        ("supply_divider", "f8"),
-        ("nominal_supply_V", "f8"),
-        ("supply_smoothing", "f8"),
-        ("temperature_channel", "i8"),
-        ("temperature_offset_V", "f8"),
-        ("temperature_C_per_V", "f8"),
-        ("reference_C", "f8"),
-        ("temperature_smoothing", "f8"),
-        ("magnetometer_bias_V", "f8", (3,)),
-        ("magnetometer_uT_per_V", "f8", (3, 3)),  # misalignment included
-    ]
-)
+def calibration_dtype(n: int) -> np.dtype[Any]:
+    """Numbers of ``n`` axes; a supply or temperature channel of -1 is not there."""
+    return np.dtype(
+        [
+            ("lsb_V", "f8"),
+            ("channel", "i8", (n,)),
+            ("bias_V", "f8", (n,)),
+            ("scale_V", "f8", (n,)),  # per m/s^2
+            ("bias_V_per_C", "f8", (n,)),
+            ("scale_per_C", "f8", (n,)),
+            ("in_plane", "i8", (n,)),
+            ("out_of_plane", "i8", (n,)),
+            ("bias_in_plane", "f8", (n, 2)),  # 1, s^2/m
+            ("bias_out_of_plane", "f8", (n, 2)),
+            ("scale_out_of_plane", "f8", (n, 2)),  # s^2/m, s^4/m^2
+            ("range", "f8"),  # m/s^2
+            ("supply_channel", "i8"),
+            ("supply_divider", "f8"),
+            ("nominal_supply_V", "f8"),
+            ("supply_smoothing", "f8"),
+            ("temperature_channel", "i8"),
+            ("temperature_offset_V", "f8"),
+            ("temperature_C_per_V", "f8"),
+            ("reference_C", "f8"),
+            ("temperature_smoothing", "f8"),
+            ("magnetometer_bias_V", "f8", (3,)),
+            ("magnetometer_uT_per_V", "f8", (3, 3)),  # misalignment included
+        ]
+    )
 
 
 def reading_names(axes: int) -> tuple[str, ...]:
     """Names of the calibrated readings, as recordings have them."""
-    return tuple(f"accelerometer_{AXES[i] if i < len(AXES) else i + 1}" for i in range(axes))
+    names = (*(f"accelerometer_{a}" for a in AXES), *(f"accelerometer_more_{a}" for a in MORE_AXES))
+    return names[:axes]
 
 
 def calibration_params(config: SensingConfig) -> Record:
-    """The kernels' numbers (dtype ``CALIBRATION``) from the configuration."""
+    """The kernels' numbers (``calibration_dtype``) from the configuration."""
     g = config.gravity_m_s2
     dt = 1.0 / config.tick_hz
     magnetometer_scale = np.array(config.magnetometer_scale_V_per_uT)
     return new_record(
-        CALIBRATION,
+        calibration_dtype(len(config.channels)),
         lsb_V=config.lsb_V,
         channel=config.channels,
         bias_V=config.bias_V,
@@ -86,11 +92,11 @@ def calibration_params(config: SensingConfig) -> Record:
         bias_out_of_plane=np.array(config.bias_out_of_plane) / (1.0, g),
         scale_out_of_plane=np.array(config.scale_out_of_plane) / (g, g * g),
         range=config.range_g * g,
-        supply_channel=config.supply_channel,
+        supply_channel=-1 if config.supply_channel is None else config.supply_channel,
         supply_divider=config.supply_divider,
         nominal_supply_V=config.nominal_supply_V,
         supply_smoothing=1.0 - exp(-config.cutoff_rad_s * dt),
-        temperature_channel=config.temperature_channel,
+        temperature_channel=-1 if config.temperature_channel is None else config.temperature_channel,
         temperature_offset_V=config.temperature_offset_V,
         temperature_C_per_V=1.0 / config.temperature_scale_V_per_C,
         reference_C=config.reference_temperature_C,
@@ -102,9 +108,11 @@ def calibration_params(config: SensingConfig) -> Record:
 
 
 @kernel
-def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params: Record) -> int:
-    """Fill volts, supply, temperature and accelerometer columns; returns status bits, or -1 for a reading
-    that is not finite (nothing but ``volts`` is written then).
+def calibrate(
+    frame: NDArray[np.float64], smoothed: NDArray[np.float64], params: Record, readings: NDArray[np.float64]
+) -> int:
+    """Fill volts, supply, temperature, accelerometer columns and ``readings`` (N,); returns status bits, or -1 for a
+    reading that is not finite (nothing but ``volts`` is written then).
 
     ``smoothed`` holds supply V and temperature degC; nan means not started.
     """
@@ -112,10 +120,14 @@ def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params:
         frame[VOLTS + i] = frame[COUNTS + i] * params.lsb_V
         if not np.isfinite(frame[VOLTS + i]):
             return -1
-    supply = frame[VOLTS + params.supply_channel] * params.supply_divider
+    supply, warm = params.nominal_supply_V, params.reference_C
+    if params.supply_channel >= 0:
+        supply = frame[VOLTS + params.supply_channel] * params.supply_divider
     if supply < 0.2 * params.nominal_supply_V:
         return -1
-    warm = (frame[VOLTS + params.temperature_channel] - params.temperature_offset_V) * params.temperature_C_per_V
+    if params.temperature_channel >= 0:
+        volts = frame[VOLTS + params.temperature_channel] - params.temperature_offset_V
+        warm = volts * params.temperature_C_per_V
     if np.isnan(smoothed[0]):
         smoothed[0] = supply
         smoothed[1] = warm
@@ -127,19 +139,24 @@ def calibrate(frame: NDArray[np.float64], smoothed: NDArray[np.float64], params:
     ratio = params.nominal_supply_V / smoothed[0]
     rise = smoothed[1] - params.reference_C
     bits = 0
-    line = np.empty(6)
-    for i in range(6):
+    n = len(readings)
+    line = np.empty(n)
+    for i in range(n):
         volts = frame[VOLTS + params.channel[i]] * ratio - params.bias_V[i] - params.bias_V_per_C[i] * rise
         line[i] = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))
         if abs(line[i]) > params.range:
             bits = SATURATED
-    composite(line, params, frame[ACCELEROMETER : ACCELEROMETER + 6])
+    composite(line, params, readings)
+    for i in range(6):
+        frame[ACCELEROMETER + i] = readings[i]
+    for i in range(6, n):
+        frame[ACCELEROMETER_MORE + i - 6] = readings[i]
     return bits
 
 
 @kernel
 def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64]) -> None:
-    """``out`` (6,) m/s^2 from the axes' lines (6,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (000 (3.4))."""
+    """``out`` (N,) m/s^2 from the axes' lines (N,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (000 (3.4))."""
     for i in range(len(line)):
         y, z = line[params.in_plane[i]], line[params.out_of_plane[i]]
         g, h, r = params.bias_in_plane[i], params.bias_out_of_plane[i], params.scale_out_of_plane[i]

@@ -13,14 +13,24 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from hal.bench import validate_table
 
 Vector = tuple[float, float, float]
-Six = tuple[float, float, float, float, float, float]
 NotNegative = Annotated[float, Field(ge=0.0)]
-SixNotNegative = tuple[NotNegative, NotNegative, NotNegative, NotNegative, NotNegative, NotNegative]
 Pair = tuple[float, float]
-SixPairs = tuple[Pair, Pair, Pair, Pair, Pair, Pair]
-Places = tuple[Vector, Vector, Vector] | tuple[Vector, Vector, Vector, Vector, Vector, Vector]
-Axis = Annotated[int, Field(ge=0, le=5)]
-SixAxes = tuple[Axis, Axis, Axis, Axis, Axis, Axis]
+Input = Annotated[int, Field(ge=0, le=7)]
+Axis = Annotated[int, Field(ge=0, le=7)]
+LEAST_AXES, MOST_AXES = 6, 8
+"""Six unknowns; the converter has eight inputs."""
+PER_AXIS = (
+    "noise_ug_per_rtHz",
+    "axis_drift_m_s2",
+    "bias_V",
+    "scale_V_per_g",
+    "bias_V_per_C",
+    "scale_per_C",
+    "bias_in_plane",
+    "bias_out_of_plane",
+    "scale_out_of_plane",
+)
+"""Keys with a value for each axis; absent ones are filled with the default of all."""
 Positive = Annotated[float, Field(gt=0.0)]
 STANDARD_GRAVITY = 9.80665
 DRIFT_S = 100.0
@@ -36,29 +46,32 @@ UNIT_AXES: tuple[Vector, ...] = (
 
 
 class SensingConfig(BaseModel):
-    """Sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
+    """Sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34)), then more.
+
+    Seven or eight axes: ``channels``, ``positions_m`` and ``axes`` name them; supply and temperature give up inputs.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     tick_hz: Positive = 1000.0
     lsb_V: Positive = 10.0 / 65536.0
-    channels: tuple[int, int, int, int, int, int] = (0, 1, 2, 3, 4, 5)
-    supply_channel: int = Field(default=6, ge=0, le=7)
-    temperature_channel: int = Field(default=7, ge=0, le=7)
+    channels: tuple[Input, ...] = (0, 1, 2, 3, 4, 5)
+    supply_channel: Input | None = 6  # None: the supply is taken as nominal
+    temperature_channel: Input | None = 7  # None: the temperature is taken as the reference
 
     # 000 (2.54), second: d1 = 20.2, d2 = 14.3, d3 = 116.0 mm; front sensor on the tool axis
-    # three packages of two axes, or a place for each of the six axes
-    positions_m: Places = (
+    # packages of two axes in the order of the axes, or a place for each axis
+    positions_m: tuple[Vector, ...] = (
         (0.0059, -0.0143, 0.0),
         (-0.0143, 0.0059, 0.0),
         (0.0, 0.0, 0.116),
     )
-    axes: tuple[Vector, Vector, Vector, Vector, Vector, Vector] = UNIT_AXES  # pyright: ignore[reportAssignmentType]
+    axes: tuple[Vector, ...] = UNIT_AXES
     tip_m: Vector = (0.0, 0.0, 0.155)
     gravity_m_s2: Positive = 9.80131
-    noise_ug_per_rtHz: Six = (110.0,) * 6  # pyright: ignore[reportAssignmentType]
+    noise_ug_per_rtHz: tuple[float, ...] = (110.0,) * 6
     # rms of an axis' slow drift over 100 s, beside alpha_drift_rad_s2; both keys as `micron noise` measures them
-    axis_drift_m_s2: SixNotNegative = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
+    axis_drift_m_s2: tuple[NotNegative, ...] = (0.0,) * 6
     filter_ohm: Positive = 32_000.0  # ADXL-203 output resistance with the external capacitor, 000 sec. 3.2.1.7
     filter_farad: Positive = 0.33e-6
 
@@ -67,19 +80,19 @@ class SensingConfig(BaseModel):
     temperature_offset_V: float = 0.5  # TMP36
     temperature_scale_V_per_C: Positive = 0.010
     reference_temperature_C: float = 25.0
-    bias_V: Six = (2.5,) * 6  # pyright: ignore[reportAssignmentType]
-    scale_V_per_g: Six = (1.0,) * 6  # pyright: ignore[reportAssignmentType]
-    bias_V_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
-    scale_per_C: Six = (0.0,) * 6  # pyright: ignore[reportAssignmentType]
+    bias_V: tuple[float, ...] = (2.5,) * 6
+    scale_V_per_g: tuple[float, ...] = (1.0,) * 6
+    bias_V_per_C: tuple[float, ...] = (0.0,) * 6
+    scale_per_C: tuple[float, ...] = (0.0,) * 6
     range_g: Positive = 1.7
     # composite model, 000 (3.4)-(3.14): which axes stand for V_y and V_z, and their polynomials without constant
     # (ERRATA 29) in the first reading of those axes: linear part 1 and quadratic part 1/g of the bias in g; for the
     # scale factor 1/g and 1/g^2
-    in_plane: SixAxes = (1, 0, 3, 2, 5, 4)
-    out_of_plane: SixAxes = (2, 2, 0, 0, 1, 1)
-    bias_in_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
-    bias_out_of_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
-    scale_out_of_plane: SixPairs = ((0.0, 0.0),) * 6  # pyright: ignore[reportAssignmentType]
+    in_plane: tuple[Axis, ...] = (1, 0, 3, 2, 5, 4)
+    out_of_plane: tuple[Axis, ...] = (2, 2, 0, 0, 1, 1)
+    bias_in_plane: tuple[Pair, ...] = ((0.0, 0.0),) * 6
+    bias_out_of_plane: tuple[Pair, ...] = ((0.0, 0.0),) * 6
+    scale_out_of_plane: tuple[Pair, ...] = ((0.0, 0.0),) * 6
 
     magnetometer_bias_V: Vector = (2.5, 2.5, 2.5)
     magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
@@ -95,6 +108,7 @@ class SensingConfig(BaseModel):
     hand_acceleration_m_s2: Positive = 0.05  # rms below the tremor band: quaternion filter
     alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
     heading_noise_rad: Positive = 0.005  # per square root of a second: the surroundings' own fluctuation
+    heading_disturbance_deg: Positive = 0.3  # rms of what turns the field slowly, over some seconds
     magnetometer_noise_uT: NotNegative = 0.0  # white, per square root of a second
     horizontal_field_uT: Positive = 20.0
     align_s: Annotated[float, Field(ge=0.02, le=10.0)] = 0.08
@@ -103,10 +117,39 @@ class SensingConfig(BaseModel):
     attitude_lowpass_hz: Positive = 1.5
     max_gap_ticks: Annotated[int, Field(ge=1, le=1000)] = 50
 
+    @model_validator(mode="before")
+    @classmethod
+    def _fill(cls, data: Any) -> Any:
+        """Per-axis keys that are absent, for another number of axes than six."""
+        if not isinstance(data, Mapping) or not isinstance(data.get("channels"), list | tuple):
+            return data
+        n = len(data["channels"])
+        if n == LEAST_AXES or not LEAST_AXES <= n <= MOST_AXES:
+            return data
+        table = dict(data)
+        for name in PER_AXIS:
+            table.setdefault(name, (cls.model_fields[name].default[0],) * n)
+        more = range(LEAST_AXES, n)
+        table.setdefault("in_plane", cls.model_fields["in_plane"].default + tuple(i - 1 for i in more))
+        table.setdefault("out_of_plane", cls.model_fields["out_of_plane"].default + tuple(i - 2 for i in more))
+        return table
+
     @model_validator(mode="after")
     def _check(self) -> SensingConfig:
-        used = (*self.channels, self.supply_channel, self.temperature_channel)
-        if len(set(used)) != len(used) or not all(0 <= channel <= 7 for channel in used):
+        n = len(self.channels)
+        if not LEAST_AXES <= n <= MOST_AXES:
+            raise ValueError(f"{n} channels: {LEAST_AXES} to {MOST_AXES} axes are possible")
+        for name in ("axes", "in_plane", "out_of_plane", *PER_AXIS):
+            if len(getattr(self, name)) != n:
+                raise ValueError(f"{name} has {len(getattr(self, name))} values for {n} channels")
+        if len(self.positions_m) not in (n, n / 2):
+            raise ValueError(
+                f"positions_m has {len(self.positions_m)} places: one for each of {n} axes, or for two each"
+            )
+        if any(i >= n for i in self.in_plane + self.out_of_plane):
+            raise ValueError(f"in_plane and out_of_plane name axes 0 to {n - 1}")
+        used = (*self.channels, *(c for c in (self.supply_channel, self.temperature_channel) if c is not None))
+        if len(set(used)) != len(used):
             raise ValueError(f"channels {used} must be different numbers from 0 to 7")
         if any(scale == 0.0 for scale in self.scale_V_per_g + self.magnetometer_scale_V_per_uT):
             raise ValueError("a scale factor is zero")
@@ -134,12 +177,12 @@ class SensingConfig(BaseModel):
         return self.cutoff_rad_s / (2.0 * pi)
 
     def axis_positions(self) -> NDArray[np.float64]:
-        """Position of each of the six axes, shape (6, 3), m."""
+        """Position of each axis, shape (N, 3), m."""
         places = np.array(self.positions_m)
-        return places if len(places) == 6 else places[[0, 0, 1, 1, 2, 2]]
+        return np.repeat(places, len(self.channels) // len(places), axis=0)
 
     def observation(self) -> NDArray[np.float64]:
-        """The 6 x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""
+        """The N x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""
         from firmware_py.sensing.kinematics import observation_matrix
 
         return observation_matrix(self.axis_positions(), np.array(self.axes))

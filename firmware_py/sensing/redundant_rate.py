@@ -27,18 +27,25 @@ def redundant_dtype(n: int) -> np.dtype[Any]:
 REDUNDANT_STATE = np.dtype([("rate", "f8", (3,)), ("covariance", "f8", (3, 3)), ("motion", "f8", (6,))])
 
 
+def parity_rows(
+    positions: NDArray[np.float64], axes: NDArray[np.float64], noise: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """(N - 6, N) combinations of readings free of f and alpha, of unit noise; ``noise`` (N,) rms per sample, m/s^2."""
+    whitened = observation_matrix(positions, axes) / noise[:, None]
+    left, _, _ = np.linalg.svd(whitened)
+    return left[:, 6:].T / noise
+
+
 def redundant_params(positions: NDArray[np.float64], axes: NDArray[np.float64], noise: NDArray[np.float64]) -> Record:
     """N > 6 axes: positions (N, 3) m, unit axes (N, 3), noise (N,) rms per sample, m/s^2. ValueError otherwise."""
     if len(axes) <= 6:
         raise ValueError(f"{len(axes)} axes leave nothing over after f and alpha; more than six are needed")
     kinematics = kinematic_params(positions, axes, noise)
-    whitened = observation_matrix(positions, axes) / noise[:, None]
-    left, _, _ = np.linalg.svd(whitened)
     solve = kinematics["solve"][0][3:]
     return new_record(
         redundant_dtype(len(axes)),
         kinematics=kinematics,
-        null=left[:, 6:].T / noise,
+        null=parity_rows(positions, axes, noise),
         alpha_noise=(solve * noise**2) @ solve.T,
     )
 
@@ -62,22 +69,40 @@ def redundant_rate_step(readings: NDArray[np.float64], dt_s: float, state: Recor
     for i in range(3):
         s.rate[i] += dt_s * s.motion[3 + i]
     covariance = step @ s.covariance.copy() @ step.T + dt_s * dt_s * p.alpha_noise.copy()
-    centripetal_slope(s.rate, kin, slope)
-    null = p.null.copy()
-    h = null @ slope
-    left = np.empty(n)
-    for i in range(n):
-        # c(omega) is of second degree without lower terms: slope omega = 2 c
-        c = 0.5 * (slope[i, 0] * s.rate[0] + slope[i, 1] * s.rate[1] + slope[i, 2] * s.rate[2])
-        left[i] = readings[i] - c
+    h, left = np.empty((n - 6, 3)), np.empty(n - 6)
+    parity(readings, s.rate, kin, p.null, slope, left, h)
     innovation = h @ covariance @ h.T + np.eye(n - 6)
     gain = np.linalg.solve(innovation, h @ covariance).T.copy()
-    change = gain @ (null @ left)
+    change = gain @ left
     for i in range(3):
         s.rate[i] += change[i]
     keep = np.eye(3) - gain @ h
     s.covariance[:, :] = keep @ covariance @ keep.T + gain @ gain.T
     solve_motion(readings, s.rate, kin, s.motion)
+
+
+@kernel
+def parity(
+    readings: NDArray[np.float64],
+    rate: NDArray[np.float64],
+    kinematics: Record,
+    null: NDArray[np.float64],
+    slope: NDArray[np.float64],
+    out: NDArray[np.float64],
+    by_rate: NDArray[np.float64],
+) -> None:
+    """``out`` (M,): what ``null`` (M, N) leaves of readings (N,) without their centripetal part; ``by_rate`` (M, 3) its
+    slope with the rate, sign turned. ``slope`` (N, 3) is work space."""
+    centripetal_slope(rate, kinematics, slope)
+    for m in range(len(out)):
+        out[m] = 0.0
+        by_rate[m, 0] = by_rate[m, 1] = by_rate[m, 2] = 0.0
+        for i in range(len(readings)):
+            # c(omega) is of second degree without lower terms: slope omega = 2 c
+            c = 0.5 * (slope[i, 0] * rate[0] + slope[i, 1] * rate[1] + slope[i, 2] * rate[2])
+            out[m] += null[m, i] * (readings[i] - c)
+            for k in range(3):
+                by_rate[m, k] += null[m, i] * slope[i, k]
 
 
 @kernel

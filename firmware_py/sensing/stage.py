@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.frame import (
-    ACCELEROMETER,
     ALIGNING,
     ANGULAR_ACCELERATION,
     INVALID,
     MAGNETOMETER,
     MAGNETOMETER_FRESH,
+    PARITIES,
+    PARITY,
     QUATERNION,
     RATE,
     RESTARTED,
@@ -32,13 +35,14 @@ from firmware_py.sensing.attitude import (
 )
 from firmware_py.sensing.attitude_params import quiet_point
 from firmware_py.sensing.calibration import (
-    CALIBRATION,
     calibrate,
     calibrate_magnetometer,
+    calibration_dtype,
     calibration_params,
 )
-from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
+from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
     TRANSLATION,
     integrate_band,
@@ -53,36 +57,53 @@ MAX_RATE_RAD_S = 20.0
 LEAN_CORNER_HZ = 0.5
 """Corrections of the attitude slower than this reach the tip's gravity."""
 
-SENSE = np.dtype(
-    [
-        ("calibration", CALIBRATION),
-        ("kinematics", kinematics_dtype(6)),
-        ("attitude", ATTITUDE),
-        ("translation", TRANSLATION),
-        ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
-        ("lean_sections", "f8", (2, 5)),
-        ("max_gap_ticks", "f8"),
-    ]
-)
-SENSE_STATE = np.dtype(
-    [
-        ("attitude", ATTITUDE_STATE),
-        ("smoothed", "f8", (2,)),  # supply V, temperature degC
-        ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
-        ("memory", "f8", (3, 2, 2)),  # band integrator
-        ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
-        ("turned", "f8", (3,)),  # correction of the last tick
-        ("last_tick", "f8"),
-    ]
-)
+
+def sense_dtype(n: int) -> np.dtype[Any]:
+    """Numbers of the stage with ``n`` axes."""
+    return np.dtype(
+        [
+            ("calibration", calibration_dtype(n)),
+            ("kinematics", kinematics_dtype(n)),
+            ("attitude", ATTITUDE),
+            ("translation", TRANSLATION),
+            ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
+            ("lean_sections", "f8", (2, 5)),
+            ("max_gap_ticks", "f8"),
+            ("parities", "i8"),
+            ("null", "f8", (len(PARITIES), n)),  # combinations of readings free of f and alpha; zeros beyond N - 6
+        ]
+    )
+
+
+def sense_state_dtype(n: int) -> np.dtype[Any]:
+    """State of the stage with ``n`` axes."""
+    return np.dtype(
+        [
+            ("attitude", ATTITUDE_STATE),
+            ("smoothed", "f8", (2,)),  # supply V, temperature degC
+            ("readings", "f8", (n,)),
+            ("motion", "f8", (6,)),  # specific force and angular acceleration of the origin
+            ("memory", "f8", (3, 2, 2)),  # band integrator
+            ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
+            ("turned", "f8", (3,)),  # correction of the last tick
+            ("last_tick", "f8"),
+        ]
+    )
 
 
 def sense_params(config: SensingConfig) -> Record:
-    """All numbers of the stage (dtype ``SENSE``)."""
+    """All numbers of the stage (``sense_dtype``)."""
+    places, axes, n = config.axis_positions(), np.array(config.axes), len(config.channels)
+    # rms of a sample behind the RC: density times the root of its noise bandwidth, a quarter of the corner in rad/s
+    noise = 1e-6 * STANDARD_GRAVITY * np.array(config.noise_ug_per_rtHz) * (0.25 * config.cutoff_rad_s) ** 0.5
+    null = np.zeros((len(PARITIES), n))
+    null[: n - 6] = parity_rows(places, axes, noise)
     return new_record(
-        SENSE,
+        sense_dtype(n),
+        parities=n - 6,
+        null=null,
         calibration=calibration_params(config),
-        kinematics=kinematic_params(config.axis_positions(), np.array(config.axes), np.array(config.noise_ug_per_rtHz)),
+        kinematics=kinematic_params(places, axes, np.array(config.noise_ug_per_rtHz)),
         attitude=attitude_params(config),
         translation=translation_params(config),
         quiet_point=quiet_point(config)[0],
@@ -91,9 +112,9 @@ def sense_params(config: SensingConfig) -> Record:
     )
 
 
-def sense_state() -> Record:
-    """Before the first sample (dtype ``SENSE_STATE``)."""
-    state = new_record(SENSE_STATE, smoothed=np.nan, last_tick=np.nan)
+def sense_state(axes: int) -> Record:
+    """Before the first sample (``sense_state_dtype``)."""
+    state = new_record(sense_state_dtype(axes), smoothed=np.nan, last_tick=np.nan)
     restart(attributes(state)[0].attitude)
     return state
 
@@ -126,6 +147,16 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
 
 
 @kernel
+def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> None:
+    """What the axes beyond six contradict goes into the frame."""
+    n = len(state.readings)
+    slope, left, by_rate = np.empty((n, 3)), np.empty(len(PARITIES)), np.empty((len(PARITIES), 3))
+    parity(state.readings, state.attitude.rate, param.kinematics, param.null, slope, left, by_rate)
+    for m in range(param.parities):
+        frame[PARITY + m] = left[m]
+
+
+@kernel
 def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
     """Fill the columns from ``volts`` to ``tip_displacement``; adds its bits to ``status``.
 
@@ -136,7 +167,8 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     state = states[0]
     param = params[0]
     status = int(frame[STATUS])
-    bits = calibrate(frame, state.smoothed, param.calibration)
+    readings = state.readings
+    bits = calibrate(frame, state.smoothed, param.calibration, readings)
     if bits < 0:
         frame[STATUS] = status | INVALID
         return
@@ -156,7 +188,9 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     fresh = frame[MAGNETOMETER_FRESH] != 0.0 and calibrate_magnetometer(frame, param.calibration)
     attitude = state.attitude
     motion = state.motion
-    solve_motion(frame[ACCELEROMETER : ACCELEROMETER + 6], attitude.rate, param.kinematics, motion)
+    if param.parities > 0:
+        _redundancy(state, param, frame)
+    solve_motion(readings, attitude.rate, param.kinematics, motion)
     field = frame[MAGNETOMETER : MAGNETOMETER + 3]
     if attitude.aligned == 0.0:
         status |= ALIGNING
@@ -189,11 +223,11 @@ class Sensing:
     def __init__(self, config: SensingConfig) -> None:
         self.config = config
         self.params = sense_params(config)
-        self.state = sense_state()
+        self.state = sense_state(len(config.channels))
 
     def step(self, frame: NDArray[np.float64]) -> None:
         sense_kernel(frame, self.state, self.params)
 
     def reset(self) -> None:
         """As before the first sample."""
-        copy_record(self.state, sense_state())
+        copy_record(self.state, sense_state(len(self.config.channels)))

@@ -23,7 +23,7 @@ from tools.errors import InputError
 
 Array = NDArray[np.float64]
 INPUTS = 8
-_AXES, _FIELD = LAYOUT.start("accelerometer"), LAYOUT.start("magnetometer")
+_FIELD = LAYOUT.start("magnetometer")
 
 
 @kernel
@@ -35,10 +35,8 @@ def calibrate_rows(counts, field_V, params, smoothed, frame, readings, field):
             frame[COUNTS + i] = counts[k, i]
         for i in range(3):
             frame[MAGNETOMETER_RAW + i] = field_V[k, i]
-        if calibrate(frame, smoothed, p) < 0:
+        if calibrate(frame, smoothed, p, readings[k]) < 0:
             return k
-        for i in range(readings.shape[1]):
-            readings[k, i] = frame[_AXES + i]
         if calibrate_magnetometer(frame, p):
             for i in range(3):
                 field[k, i] = frame[_FIELD + i]

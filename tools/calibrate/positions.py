@@ -257,7 +257,7 @@ def _prepare(readings: Array, field: Array, rate_hz: float, config: SensingConfi
     rows = np.round(t * rate_hz).astype(np.intp)
     places = len(config.positions_m)
     axes = np.array(config.axes)
-    place_of = np.arange(len(axes)) if places == len(axes) else np.repeat(np.arange(places), 2)
+    place_of = np.repeat(np.arange(places), len(axes) // places)
     undone = smooth + slope / config.cutoff_rad_s
     # as regressors of what the filters are off, slopes must be free of the noise that the readings have too
     quiet = butter(4, SLOPE_HZ, fs=rate_hz, output="sos")

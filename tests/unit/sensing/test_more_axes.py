@@ -1,0 +1,159 @@
+"""Seven and eight axes: weighted least squares over all of them, and parity."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.specs import Adxl203Options
+from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
+from firmware_py.control.stages import StageConfigs
+from firmware_py.control.wiring import _axes  # pyright: ignore[reportPrivateUsage]
+from firmware_py.frame import COUNTS, INVALID, LAYOUT, STATUS
+from firmware_py.records import attributes
+from firmware_py.sensing import stage
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.redundant_rate import redundant_params, redundant_rate_step, redundant_state
+from firmware_py.sensing.stage import Sensing
+from hal.errors import BenchError
+from tests.unit.pure_python import without_compiler
+from tests.unit.sensing.rigid_body import Motion, frames_of, hand_motion, rc_filter
+
+PLACES = ((0.0101, -0.0101, 0.0), (-0.0101, 0.0101, 0.0), (0.0042, 0.0042, 0.116), (0.013, 0.0, 0.06))
+AXES = np.eye(3)[[0, 2, 1, 2, 0, 1, 1, 2]]
+EIGHT: dict[str, Any] = {
+    "channels": tuple(range(8)),
+    "supply_channel": None,
+    "temperature_channel": None,
+    "positions_m": PLACES,
+    "axes": tuple(map(tuple, AXES)),
+}
+SEVEN = EIGHT | {
+    "channels": tuple(range(7)),
+    "positions_m": tuple(PLACES[i // 2] for i in range(7)),
+    "axes": EIGHT["axes"][:7],
+}
+
+
+def frames(motion: Motion, config: SensingConfig, seed: int | None = None) -> np.ndarray:
+    """Input columns of ideal sensors behind their filters; with a ``seed`` their noise as configured."""
+    n = len(config.channels)
+    volts = 2.5 + motion.readings(config.axis_positions(), np.array(config.axes)) / 9.80131
+    if seed is not None:
+        volts += 110e-6 * np.sqrt(500.0) * np.random.default_rng(seed).standard_normal(volts.shape)
+    out = frames_of(np.zeros((len(volts), 6)), motion)
+    out[:, COUNTS : COUNTS + 8] = 0.0
+    out[:, COUNTS : COUNTS + n] = rc_filter(volts) * 6553.6
+    return out
+
+
+def trembling(seconds: float = 1.0) -> Motion:
+    t = np.arange(round(1000.0 * seconds))[:, None] / 1000.0
+    shake = np.sin(2.0 * np.pi * 10.0 * t)
+    return hand_motion(3, seconds, 1e-5 * shake * [1.0, -1.0, 0.5], 1e-4 * shake * [1.0, 0.6, -0.8])
+
+
+def run(rows: np.ndarray, config: SensingConfig) -> np.ndarray:
+    sensing = Sensing(config)
+    for row in rows:
+        sensing.step(row)
+    return rows
+
+
+@pytest.mark.parametrize("table", [SEVEN, EIGHT])
+def test_more_axes_solve_the_same_motion_and_leave_no_parity(table: dict[str, Any]) -> None:
+    motion, config, six = trembling(0.5), SensingConfig.model_validate(table), SensingConfig(positions_m=PLACES[:3])
+    more, fewer = Sensing(config), Sensing(six)
+    rows = frames(motion, config)
+    for row in rows:
+        more.step(row)
+    for row in frames_of(motion.readings(six.axis_positions(), np.array(six.axes)), motion):
+        fewer.step(row)
+        assert np.all(row[LAYOUT["parity"]] == 0.0)
+    assert not np.any(rows[:, STATUS].astype(int) & INVALID)
+    # specific force and angular acceleration before the filter takes its bias off; both know the rate to a mrad/s or so
+    np.testing.assert_allclose(more.state["motion"], fewer.state["motion"], atol=1e-3)
+    assert np.max(np.abs(fewer.state["motion"][0, 3:])) > 0.02
+    assert np.max(np.abs(rows[:, LAYOUT["parity"]])) < 0.05
+
+
+def test_parity_has_the_noise_of_a_sample_and_shows_a_sensor_that_lies() -> None:
+    motion, config = trembling(4.0), SensingConfig.model_validate(EIGHT)
+    rows = frames(motion, config, seed=4)
+    rows[3000:, COUNTS + 3] += 6553.6 * 0.05  # one axis 50 mg off
+    parity = run(rows, config)[:, LAYOUT["parity"]]
+    # the filter's own first samples aside; 3 s hold some 140 independent ones: 12 % is two deviations
+    np.testing.assert_allclose(parity[100:3000].std(axis=0), 1.0, atol=0.15)
+    assert np.max(np.abs(parity[3100:].mean(axis=0))) > 20.0
+
+
+def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = SensingConfig.model_validate(EIGHT | {"align_s": 0.02})
+    rows = frames(trembling(0.05), config, seed=1)
+    twins = rows.copy()
+    run(rows, config)
+    without_compiler(monkeypatch)
+    twin = Sensing(config)
+    for row in twins:
+        stage.sense_kernel(row, attributes(twin.state), attributes(twin.params))
+    np.testing.assert_allclose(twins, rows, rtol=1e-9, atol=1e-12)
+
+
+def test_the_rate_filter_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    places = np.repeat(np.array(PLACES), 2, axis=0)
+    params = redundant_params(places, AXES, np.full(8, 1e-2))
+    state, twin = (redundant_state(np.array([1.0, -2.0, 0.5]), 0.1) for _ in range(2))
+    readings = 5.0 * rng.standard_normal((5, 8))
+    for y in readings:
+        redundant_rate_step(y, 1e-3, state, params)
+    without_compiler(monkeypatch)
+    for y in readings:
+        redundant_rate_step.py_func(y, 1e-3, attributes(twin), attributes(params))  # type: ignore[attr-defined]
+    for name in ("rate", "covariance", "motion"):
+        np.testing.assert_allclose(twin[name], state[name], rtol=1e-9, atol=1e-12)
+
+
+def test_a_recorded_configuration_of_eight_axes_is_the_same_again() -> None:
+    tables = {"sensing": EIGHT, "tremor": {}, "actuation": {}}
+    configs = StageConfigs.from_dict(tables, "bench")
+    assert StageConfigs.from_dict(configs.as_dict(), "recording") == configs
+    assert len(configs.sensing.bias_V) == len(configs.sensing.in_plane) == 8
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"channels": (0, 1, 2, 3, 4, 5, 6, 7, 8)}, "channels"),
+        ({"channels": (0, 1, 2, 3, 4)}, "6 to 8"),
+        ({"axes": EIGHT["axes"][:7]}, "axes has 7 values for 8"),
+        ({"positions_m": PLACES[:3]}, "3 places"),
+        ({"supply_channel": 6}, "different numbers"),
+        ({"bias_V": (2.5,) * 6}, "bias_V has 6"),
+    ],
+)
+def test_a_configuration_that_does_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(BenchError, match=message):
+        SensingConfig.from_dict(EIGHT | change)
+
+
+def test_axes_of_further_packages_come_after_the_six() -> None:
+    six = {"acc1": ("x", "z"), "acc2": ("y", "z"), "acc3": ("x", "y")}
+    options: dict[str, Any] = {
+        name: Adxl203Options(channels=dict(zip(axes, (0, 1), strict=True)))  # pyright: ignore[reportArgumentType]
+        for name, axes in {**six, "acc4": ("z", "y")}.items()
+    }
+    options["mag"] = SimpleNamespace(channels=(0, 1, 2))
+    assert _axes(options)[6:] == (("acc4", "y"), ("acc4", "z"))
+
+
+def test_scans_without_a_supply_are_checked_too() -> None:
+    check = ScanCheck(PlausibilityLimits(), 10.0 / 65536.0, range(8), [f"axis {i}" for i in range(8)], sensors=8)
+    row = np.full(8, 16384, dtype=np.int16)
+    assert check.scan(row, 0) == ""
+    row = row + 7
+    row[7] += 2000
+    assert check.scan(row.astype(np.int16), 1).startswith("axis 7 jumped")
