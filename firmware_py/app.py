@@ -75,12 +75,15 @@ def run_in_process(
     runtime_dir: Path | None = None,
     on_open: Callable[[OpenBench], None] | None = None,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
+    *,
+    own_process: bool = False,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Run the instrument; returns the outcome (JSON values) and, from an emulated world, the truth.
 
     Raises ``HalError`` when the bench cannot be opened. What goes wrong later is in the outcome's
     ``safe_state``; a world that died leaves no truth. ``on_open`` may prepare the bench before its devices are
-    opened, ``wrap`` put middleware around its ports (fault tests).
+    opened, ``wrap`` put middleware around its ports (fault tests). ``own_process``: this process is the firmware and
+    nothing else; the guardian may kill it where it stands still in the middle of a command.
     """
     bench = load_bench(request.bench)
     if is_endoscope(bench.description):
@@ -100,7 +103,7 @@ def run_in_process(
             stalled_ms = max(request.stale_ms, config.safety.stalled_ms)
             safety = config.safety.model_copy(update={"stale_ms": request.stale_ms, "stalled_ms": stalled_ms})
             config = config.model_copy(update={"safety": safety})
-        heart = stack.enter_context(guarded(opened, devices, config.safety, opened.runtime_dir))
+        heart = stack.enter_context(guarded(opened, devices, config.safety, opened.runtime_dir, may_end_us=own_process))
         stages = Stages(configs)
         recorder = _recorder(request, bench, configs, opened)
         live = None
@@ -312,7 +315,7 @@ def main(arguments: list[str]) -> int:
         live_fds=tuple(live_fds) if live_fds is not None else None,
     )
     try:
-        outcome, truth = run_in_process(request, _status_pipe(), runtime_dir)
+        outcome, truth = run_in_process(request, _status_pipe(), runtime_dir, own_process=True)
     except HalError as error:
         sys.stderr.write(f"micron: {error}\n")
         return int(exit_code_of(error))

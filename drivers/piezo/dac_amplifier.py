@@ -11,6 +11,7 @@ The DAC has no watchdog: the safe state is the firmware's duty.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 
@@ -28,6 +29,16 @@ PATTERNS = (0x5AA5, 0x0000, 0xA55A)  # into DAC D; the last one stays there and 
 DAC_SPAN_V = 5.0
 CODES = 65536
 RAMP_TICK_S = 0.001
+
+
+class OutputGate(Protocol):
+    """Asked immediately before every transfer that moves outputs, told when it is over."""
+
+    def enter(self, codes: tuple[int, int, int]) -> None:
+        """May raise: then nothing is sent."""
+        ...
+
+    def leave(self) -> None: ...
 
 
 class DacAmplifier:
@@ -59,6 +70,7 @@ class DacAmplifier:
         top_V = min(hi_V, full_V - self.lsb_V)  # the highest code is one step below full scale
         self.limits = (OutputLimit(lo_V, top_V, slew_V_per_s, neutral_V),) * CHANNELS
         self.guard = OutputGuard(name, self.limits, clock)
+        self.gate: OutputGate | None = None
         self._bus = bus
         self._clock = clock
         self._address = address
@@ -116,7 +128,7 @@ class DacAmplifier:
         done = self.guard.ramp()
         self._send()
         if done:
-            found = self._read_codes()
+            found = self.read_codes()
             wanted = [self._code(limit.safe_V) for limit in self.limits]
             self.guard.require(found == wanted, f"neutral codes {wanted} read back as {found}")
         return done
@@ -141,7 +153,7 @@ class DacAmplifier:
 
     def readback_V(self) -> Float64Array:
         """Contents of the input registers, which equal the outputs after each update command."""
-        return np.array(self._read_codes(), dtype=np.float64) * self.lsb_V
+        return np.array(self.read_codes(), dtype=np.float64) * self.lsb_V
 
     def close(self) -> None:
         """Ramp to neutral unless there; the bus belongs to the bench and stays open."""
@@ -166,17 +178,23 @@ class DacAmplifier:
         k = self._codes_per_V
         a, b, c = self.guard.next_V
         a, b, c = int(a * k + 0.5), int(b * k + 0.5), int(c * k + 0.5)
-        self._bus.transfer(
-            self._address,
-            (
-                I2cWrite(bytes((0x11, a >> 8, a & 0xFF))),
-                I2cWrite(bytes((0x12, b >> 8, b & 0xFF))),
-                I2cWrite(bytes((0x14, c >> 8, c & 0xFF))),
-                self._update,
-            ),
+        segments = (
+            I2cWrite(bytes((0x11, a >> 8, a & 0xFF))),
+            I2cWrite(bytes((0x12, b >> 8, b & 0xFF))),
+            I2cWrite(bytes((0x14, c >> 8, c & 0xFF))),
+            self._update,
         )
+        if self.gate is None:
+            self._bus.transfer(self._address, segments)
+        else:
+            self.gate.enter((a, b, c))
+            try:
+                self._bus.transfer(self._address, segments)
+            finally:
+                self.gate.leave()
         self.guard.sent()
 
-    def _read_codes(self) -> list[int]:
+    def read_codes(self) -> list[int]:
+        """Input registers A, B, C as codes."""
         answer = self._bus.transfer(self._address, self._read_abc)
         return [int.from_bytes(answer[2 * i : 2 * i + 2], "big") for i in range(CHANNELS)]

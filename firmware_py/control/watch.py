@@ -14,6 +14,8 @@ from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
+GUARDIAN_SILENT_NS = 100_000_000
+
 
 class Watch:
     """Reads the frame and the devices; its only consequence is a trip."""
@@ -57,6 +59,7 @@ class Watch:
             incidents.bad_for(name, outside, t_ns, 100.0, reason)
         if odd := self._check.odd():
             incidents.notice(odd)
+        self._look_after_the_guardian(t_ns)
         telemetry = self._devices.telemetry
         if telemetry is not None:
             if telemetry.poll():
@@ -65,6 +68,12 @@ class Watch:
                 incidents.trip(
                     f"{telemetry.name}: the stop button is not heard any more; check the CAN bus and the button"
                 )
+
+    def _look_after_the_guardian(self, t_ns: int) -> None:
+        """Heartbeats go both ways: without a guardian the run goes on, but somebody should know."""
+        heart = self._devices.guardian
+        if heart is not None and t_ns - heart.watched_ns > GUARDIAN_SILENT_NS and self._supervisor.may_move:
+            self._incidents.notice("the guardian of the outputs is not heard any more")
 
     def verify_output(self, info: TickInfo) -> None:
         """Task, 100 Hz, or 300 without a monitor: the amplifier must hold what it was told. A DAC that restarted or

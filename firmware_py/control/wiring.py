@@ -30,6 +30,7 @@ from drivers.specs import (
     NiOutputOptions,
     check_devices,
 )
+from firmware_py.guardian.heart import Heart
 from hal.bench import DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
@@ -55,7 +56,8 @@ class Devices:
 
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
-    ``monitor`` measures what arrives at the stacks, where the bench has wires for it.
+    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian``: heartbeats of the
+    firmware and of the guardian beside it, where there is one.
     """
 
     daq: Daq
@@ -68,6 +70,7 @@ class Devices:
     verify_output: Callable[[], str] | None = None
     monitor: AmplifierMonitor | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
+    guardian: Heart | None = None
 
 
 def open_devices(bench: OpenBench) -> Devices:

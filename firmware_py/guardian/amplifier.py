@@ -1,28 +1,35 @@
-"""The amplifier as the firmware sees it beside a guardian: every command is a heartbeat, and none goes out after the
+"""The amplifier as the firmware sees it beside a guardian: every command renews a lease, and none goes out after the
 guardian has taken the outputs."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Heart, Phase
 from hal.contracts import Clock, Float64Array
-from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
-PATIENCE_NS = 40_000_000
-"""So long the guardian may take for its ramp before the firmware does it itself."""
+PATIENCE_NS = 22_000_000
+"""So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
 
 
 class GuardedAmplifier:
-    """AnalogOutput around ``inner``."""
+    """AnalogOutput around ``inner``. ``evict`` ends the guardian and returns when it cannot command any more."""
 
-    def __init__(self, inner: DacAmplifier, heart: Heart, clock: Clock) -> None:
+    def __init__(
+        self, inner: DacAmplifier, heart: Heart, clock: Clock, *, lease_ms: float, evict: Callable[[], None]
+    ) -> None:
         self.name = inner.name
         self.limits: tuple[OutputLimit, ...] = inner.limits
         self._inner = inner
         self._heart = heart
         self._clock = clock
-        self._yielded = False
+        self._evict = evict
+        self._gate = LeaseGate(heart, clock, inner.name, lease_ms)
+        self._lost_ns = 0
+        inner.gate = self._gate
 
     def arm(self) -> None:
         self._heart.say(Phase.ARMING)
@@ -31,36 +38,41 @@ class GuardedAmplifier:
         self._heart.say(Phase.RUNNING)
 
     def write(self, values_V: Float64Array) -> int:
-        """Raises ``SafetyTrip`` when the guardian has the outputs."""
-        heart, now_ns = self._heart, self._clock.now_ns()
-        if heart.taken_ns:
-            stood_ms = (heart.taken_ns - heart.beat_ns) * 1e-6
-            raise SafetyTrip(
-                f"the host stood still for {stood_ms:.0f} ms, so the guardian has taken the outputs to neutral",
-                device=self.name,
-            )
-        heart.beat(now_ns)
+        """Raises ``SafetyTrip`` when the guardian has the outputs, or will have them because the lease is over."""
         return self._inner.write(values_V)
 
     def safe_step(self) -> bool:
-        heart, now_ns = self._heart, self._clock.now_ns()
-        if heart.taken_ns and not self._yielded:
-            if not heart.reached_ns and now_ns - heart.taken_ns < PATIENCE_NS:
-                return False  # two ramps at once would not be one
-            self._inner.lose_position()
-            self._yielded = True
-        heart.beat(now_ns)
+        if (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
+            return bool(self._heart.reached_ns)
         done = self._inner.safe_step()
         if done:
-            heart.say(Phase.IDLE)
+            self._heart.say(Phase.IDLE)
         return done
 
     def readback_V(self) -> Float64Array:
         return self._inner.readback_V()
 
     def close(self) -> None:
-        if self._heart.taken_ns and not self._yielded:
-            self._inner.lose_position()
-            self._yielded = True
+        if self._gate.lost or self._heart.taken_ns:
+            self._lost_ns = 1  # no more patience
+            if self._is_ours_again():
+                self._inner.safe_step()
         self._inner.close()  # where this fails, the guardian goes on trying
         self._heart.say(Phase.IDLE)
+
+    def _is_ours_again(self) -> bool:
+        """After the guardian has taken the outputs: only when it has not reached neutral in time and is gone."""
+        heart, now_ns = self._heart, self._clock.now_ns()
+        if heart.reached_ns:
+            self._inner.lose_position()
+            heart.say(Phase.IDLE)
+            return False
+        self._gate.lost = True
+        heart.say(Phase.YIELDED)
+        self._lost_ns = self._lost_ns or now_ns
+        if now_ns - self._lost_ns < PATIENCE_NS:
+            return False  # two ramps at once would not be one
+        self._evict()
+        self._gate.regain()
+        self._inner.lose_position()
+        return True

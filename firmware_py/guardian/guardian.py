@@ -1,7 +1,12 @@
-"""What the guardian does, one step a millisecond: watch the heartbeat, and when it is gone ramp to neutral."""
+"""What the guardian does, one step a millisecond: watch the heartbeat, and when it is gone ramp to neutral.
+
+Before it moves anything it makes sure that the firmware does not (``gate.py`` has the firmware's half): either no
+command is going out, or the one that was going out has arrived, or the firmware's process is dead.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import suppress
 from enum import Enum
 from typing import Any, Protocol
@@ -14,6 +19,10 @@ STEP_NS = 1_000_000
 HOLD_NS = 50_000_000
 """A command that the firmware had under way may still arrive after the ramp: so long it is looked for and undone."""
 GIVE_UP_NS = 2_000_000_000
+CLAIM_NS = 5_000_000
+"""A command that has been going out for so long will not arrive by itself: its process is ended."""
+LAST_RESORT_NS = 100_000_000
+"""Outputs do not stay where they are for ever because nobody can say whether a command is still to come."""
 ATTEMPTS = 3
 
 
@@ -22,22 +31,38 @@ class Output(Protocol):
 
     def safe_step(self) -> bool: ...
     def verify(self) -> str: ...
+    def read_codes(self) -> list[int]: ...
     def lose_position(self) -> None: ...
 
 
 class State(Enum):
     WATCHING = "watching"
+    CLAIMING = "claiming"
     RAMPING = "ramping"
     HOLDING = "holding"
     DONE = "done"
 
 
 class Guardian:
-    """``notice_ms`` without a beat is remembered, ``limit_ms`` without one takes the outputs."""
+    """``notice_ms`` without a beat is remembered, ``limit_ms`` without one takes the outputs. ``end`` kills the
+    firmware's process; without it one that stands still within a command can only be waited for."""
 
-    def __init__(self, heart: Heart, output: Output, clock: Clock, *, notice_ms: float, limit_ms: float) -> None:
+    def __init__(
+        self,
+        heart: Heart,
+        output: Output,
+        clock: Clock,
+        *,
+        notice_ms: float,
+        limit_ms: float,
+        end: Callable[[], None] | None = None,
+    ) -> None:
         self.state = State.WATCHING
         self.problem = ""
+        self.ended = False
+        self.exclusive = True
+        """Whether no command of the firmware can have come after the outputs were taken."""
+        self._end = end
         self._heart = heart
         self._output = output
         self._clock = clock
@@ -46,12 +71,19 @@ class Guardian:
 
     def step(self, alive: bool) -> None:
         """``alive``: the firmware's process exists."""
+        self._heart.watch(self._clock.now_ns())
         if self.state is State.WATCHING:
             self._watch(alive)
+        elif self.state is State.CLAIMING:
+            self._claim(alive)
         if self.state is State.RAMPING:
             self._ramp()
         elif self.state is State.HOLDING:
             self._hold(alive)
+
+    def retire(self) -> None:
+        """Command nothing any more."""
+        self.state = State.DONE
 
     def report(self) -> dict[str, Any]:
         """What happened, JSON values; times on the bench clock in ns, ``None``: did not happen."""
@@ -63,6 +95,8 @@ class Guardian:
             "noticed_ns": heart.noticed_ns or None,
             "taken_ns": heart.taken_ns or None,
             "neutral_ns": heart.reached_ns or None,
+            "firmware_ended": self.ended,
+            "exclusive": self.exclusive,
             "problem": self.problem,
         }
 
@@ -74,6 +108,8 @@ class Guardian:
                 self.state = State.DONE
             else:
                 self._take(Why.DIED, now_ns)
+        elif phase is Phase.YIELDED:
+            self._take(Why.SILENT, now_ns)
         elif phase is Phase.RUNNING:
             silent_ns = now_ns - heart.beat_ns
             if silent_ns > self._notice_ns:
@@ -82,9 +118,31 @@ class Guardian:
                 self._take(Why.SILENT, now_ns)
 
     def _take(self, why: Why, now_ns: int) -> None:
+        """From now on no command begins; the next step looks whether one had begun."""
         self._heart.take(why, now_ns)
+        self.state = State.RAMPING if why is Why.DIED else State.CLAIMING
+        self._output.lose_position()
+
+    def _claim(self, alive: bool) -> None:
+        if alive and self._heart.inside is not None and not self._arrived():
+            waited_ns = self._clock.now_ns() - self._heart.taken_ns
+            if waited_ns > CLAIM_NS and self._end is not None and not self.ended:
+                self.ended = True
+                self._end()
+            if waited_ns < LAST_RESORT_NS:
+                return
+            self.exclusive = False
         self._output.lose_position()
         self.state = State.RAMPING
+
+    def _arrived(self) -> bool:
+        """The command that the firmware stands in is the one that the DAC holds: nothing is still to come. One that
+        does not change anything cannot be told from one that has not been sent, and counts as not arrived."""
+        ordered = self._heart.inside
+        try:
+            return ordered is not None and not ordered.repeats and self._output.read_codes() == list(ordered.codes)
+        except HalError:
+            return False
 
     def _ramp(self) -> None:
         now_ns = self._clock.now_ns()

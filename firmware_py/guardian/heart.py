@@ -5,17 +5,21 @@ from __future__ import annotations
 import mmap
 import os
 from enum import IntEnum
+from typing import NamedTuple
 
-_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY = range(6)
+_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY, _INSIDE, _WATCHED = range(8)
 _BYTES = 64
+_SOMEBODY, _REPEATS = 1 << 48, 1 << 49
 
 
 class Phase(IntEnum):
-    """What the firmware says of the outputs: at rest, being armed (only a death counts), or moving with every beat."""
+    """What the firmware says of the outputs: at rest, being armed (only a death counts), moving with every beat, or
+    not its own any more."""
 
     IDLE = 0
     ARMING = 1
     RUNNING = 2
+    YIELDED = 3
 
 
 class Why(IntEnum):
@@ -26,8 +30,16 @@ class Why(IntEnum):
     SILENT = 2
 
 
+class Order(NamedTuple):
+    """A command that is going out: three 16-bit codes. ``repeats``: they are those of the command before it."""
+
+    codes: tuple[int, int, int]
+    repeats: bool
+
+
 class Heart:
-    """``phase`` and ``beat`` are the firmware's words, the others the guardian's. Times: bench clock, ns; 0: never.
+    """``phase``, ``beat`` and ``inside`` are the firmware's words, the others the guardian's. Times: bench clock, ns;
+    0: never.
 
     Without ``fd`` in private memory, for a guardian in the same process.
     """
@@ -51,7 +63,20 @@ class Heart:
     def say(self, phase: Phase) -> None:
         self._words[_PHASE] = phase
 
+    def enter(self, order: Order) -> None:
+        """A command is about to go out."""
+        a, b, c = order.codes
+        self._words[_INSIDE] = _SOMEBODY | _REPEATS * order.repeats | a << 32 | b << 16 | c
+
+    def leave(self) -> None:
+        """It has gone out, or will not."""
+        self._words[_INSIDE] = 0
+
     # -- the guardian's side
+
+    def watch(self, t_ns: int) -> None:
+        """The guardian is there."""
+        self._words[_WATCHED] = t_ns
 
     def notice(self, t_ns: int) -> None:
         """The beat is late; the first time is kept."""
@@ -75,6 +100,18 @@ class Heart:
     @property
     def beat_ns(self) -> int:
         return self._words[_BEAT]
+
+    @property
+    def inside(self) -> Order | None:
+        """The command that is going out just now."""
+        word = self._words[_INSIDE]
+        if not word:
+            return None
+        return Order((word >> 32 & 0xFFFF, word >> 16 & 0xFFFF, word & 0xFFFF), bool(word & _REPEATS))
+
+    @property
+    def watched_ns(self) -> int:
+        return self._words[_WATCHED]
 
     @property
     def noticed_ns(self) -> int:

@@ -42,8 +42,9 @@ class GuardianProcess:
         self._report = report
 
     @classmethod
-    def start(cls, order: dict[str, Any], runtime_dir: Path) -> GuardianProcess:
-        """``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``.
+    def start(cls, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> GuardianProcess:
+        """``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``. ``may_end_us``:
+        this process is the firmware and nothing else, and may be killed when it stands still within a command.
 
         Returns at once; ``await_ready`` says whether it came up.
         """
@@ -51,16 +52,19 @@ class GuardianProcess:
         assert heart.fd is not None
         theirs, ours = os.pipe()
         report = runtime_dir / REPORT
-        order = {**order, "heart": heart.fd, "pipe": theirs, "report": str(report)}
+        ourselves = os.pidfd_open(os.getpid()) if may_end_us else -1
+        order = {**order, "heart": heart.fd, "pipe": theirs, "report": str(report), "firmware": ourselves}
         process = subprocess.Popen(
             [sys.executable, "-m", "firmware_py.guardian.process", json.dumps(order)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            pass_fds=(heart.fd, theirs),
+            pass_fds=(heart.fd, theirs, *((ourselves,) if may_end_us else ())),
             env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])},
             start_new_session=True,  # Ctrl-C is for the firmware
         )
         os.close(theirs)
+        if may_end_us:
+            os.close(ourselves)
         return cls(process, heart, ours, report)
 
     @property
@@ -76,6 +80,11 @@ class GuardianProcess:
             self.stop()
             why = line.strip() or f"no word from it within {START_S:g} s"
             raise OpenFailed([HalError(f"the guardian of the outputs did not start: {why}", device="guardian")])
+
+    def evict(self) -> None:
+        """End it now; it commands nothing any more when this returns."""
+        self._process.kill()
+        self._process.wait()
 
     def stop(self) -> dict[str, Any] | None:
         """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent."""
@@ -115,9 +124,11 @@ def main(arguments: list[str]) -> int:
     except HalError as error:
         sys.stdout.write(f"{error}\n")
         return 1
+    firmware = order["firmware"]
     guardian = Guardian(
-        Heart(order["heart"]), amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"]
-    )
+        Heart(order["heart"]), amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"],
+        end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
+    )  # fmt: skip
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     with realtime(RealtimeConfig(priority=PRIORITY)):
@@ -135,6 +146,10 @@ def main(arguments: list[str]) -> int:
 def describe(report: dict[str, Any]) -> str:
     """A report in words."""
     why = {"died": "the firmware died", "silent": "the loop stood still"}.get(report["why"], "nothing to do")
+    if report["firmware_ended"]:
+        why += " in the middle of a command, so its process was ended"
+    if not report["exclusive"]:
+        why += "; a command of it may have come afterwards"
     if report["neutral_ns"] and report["last_beat_ns"]:
         after_ms = (report["neutral_ns"] - report["last_beat_ns"]) * 1e-6
         return f"{why}; outputs neutral and read back {after_ms:.1f} ms after the last command"

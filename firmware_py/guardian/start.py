@@ -12,6 +12,7 @@ from drivers.specs import DacAmplifierOptions, device_options
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.wiring import Devices
 from firmware_py.guardian.amplifier import GuardedAmplifier
+from firmware_py.guardian.gate import LEASE_MARGIN_MS
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart
 from firmware_py.guardian.process import GuardianProcess
@@ -20,9 +21,12 @@ from hal.clock import VirtualClock
 
 
 @contextlib.contextmanager
-def guarded(opened: OpenBench, devices: Devices, limits: SafetyLimits, runtime_dir: Path) -> Iterator[Heart | None]:
+def guarded(
+    opened: OpenBench, devices: Devices, limits: SafetyLimits, runtime_dir: Path, *, may_end_us: bool = False
+) -> Iterator[Heart | None]:
     """Puts a guardian beside ``devices.amplifier`` where that is a DAC without a watchdog; yields its heartbeat.
 
+    ``may_end_us``: it may kill this process when that stands still in the middle of a command.
     Raises ``OpenFailed`` when it has no way to the amplifier.
     """
     amplifier = devices.amplifier
@@ -30,33 +34,28 @@ def guarded(opened: OpenBench, devices: Devices, limits: SafetyLimits, runtime_d
         yield None
         return
     # without scans there are no commands: the loop's own limit for those comes first
-    limit_ms = max(limits.guardian_ms, 2.0 * limits.stale_ms)
+    lease_ms = max(limits.guardian_ms, 2.0 * limits.stale_ms)
+    limit_ms, notice_ms = lease_ms + LEASE_MARGIN_MS, limits.guardian_notice_ms
+    options = _options(opened, amplifier.name)
     if isinstance(opened.clock, VirtualClock):
         heart = Heart()
-        own = DacAmplifier(_bus_of(opened, amplifier.name), opened.clock, **_options(opened, amplifier.name))
-        guardian = Guardian(heart, own, opened.clock, notice_ms=limits.guardian_notice_ms, limit_ms=limits.guardian_ms)
+        own = DacAmplifier(_bus_of(opened, amplifier.name), opened.clock, **options)
+        guardian = Guardian(heart, own, opened.clock, notice_ms=notice_ms, limit_ms=limit_ms)
         _step_in_virtual_time(guardian, opened.clock)
-        devices.amplifier = GuardedAmplifier(amplifier, heart, opened.clock)
-        try:
-            yield heart
-        finally:
-            guardian.state = State.DONE
-        return
-    process = GuardianProcess.start(
-        {
-            **_uri(opened, amplifier.name),
-            "options": _options(opened, amplifier.name),
-            "notice_ms": limits.guardian_notice_ms,
-            "limit_ms": limit_ms,
-        },
-        runtime_dir,
-    )
+        process, evict = None, guardian.retire
+    else:
+        order = {**_uri(opened, amplifier.name), "options": options, "notice_ms": notice_ms, "limit_ms": limit_ms}
+        process = GuardianProcess.start(order, runtime_dir, may_end_us=may_end_us)
+        heart, evict = process.heart, process.evict
     try:
-        process.await_ready()
-        devices.amplifier = GuardedAmplifier(amplifier, process.heart, opened.clock)
-        yield process.heart
+        if process is not None:
+            process.await_ready()
+        heart.watch(opened.clock.now_ns())
+        devices.guardian = heart
+        devices.amplifier = GuardedAmplifier(amplifier, heart, opened.clock, lease_ms=lease_ms, evict=evict)
+        yield heart
     finally:
-        process.stop()
+        evict() if process is None else process.stop()
 
 
 def _step_in_virtual_time(guardian: Guardian, clock: VirtualClock) -> None:

@@ -35,6 +35,9 @@ class I2cLine:
         self.stuck = False
         self.transfers = 0
         self.busy_ns = 0
+        self.taken = False
+        self.busy_until_ns = 0
+        """For who carries transfers of several masters: whether one is under way, and when its segment ends."""
         self._bit_ns = 1e9 / speed_hz
 
     def attach(self, address: int, face: I2cFace) -> None:

@@ -15,7 +15,7 @@ from hal.errors import BenchError, BusError, Closed, Disconnected, ErrorKind, I2
 from hal.types import CanFrame, CanStats, I2cOp, PortInfo, TimeSource
 from sim_devices.devices.faces import ByteFace
 from sim_devices.transports.can_hub import EXTENDED, CanHub
-from sim_devices.transports.i2c_line import I2cLine, I2cStatus
+from sim_devices.transports.i2c_line import I2cLine, I2cStatus, TransferResult
 
 USB_TRANSFER_NS = 125_000  # one high-speed USB microframe between a full packet and the host
 
@@ -104,7 +104,11 @@ class LockstepSerialPort(_Port):
 
 
 class LockstepI2cBus(_Port):
-    """``hal`` I2cBus on an ``I2cLine``; a transfer burns its bus time."""
+    """``hal`` I2cBus on an ``I2cLine``; a transfer burns its bus time.
+
+    The adapter drives the wire by itself: a transfer that has begun goes on when the host that waits for it stalls.
+    Another master waits for its STOP.
+    """
 
     def __init__(self, name: str, line: I2cLine, clock: VirtualClock, on_activity: Callable[[], None]) -> None:
         super().__init__(name, clock, on_activity, "emulated I2C bus in virtual time")
@@ -114,13 +118,27 @@ class LockstepI2cBus(_Port):
         if self._closed or self.unplugged:
             self._refuse()
         check_address(address, self._name)
-        advance_to = self._clock.advance_to
-        steps = self._line.transfer(address, ops, self._clock.now_ns())
-        try:
-            while True:
-                advance_to(next(steps))
-        except StopIteration as done:
-            status, data = done.value
+        clock, line = self._clock, self._line
+        while line.taken:
+            clock.advance_to(line.busy_until_ns)
+        line.taken = True
+        steps = line.transfer(address, ops, clock.now_ns())
+        results: list[TransferResult] = []
+
+        def go_on(_: int) -> None:
+            try:
+                at_ns = next(steps)
+            except StopIteration as done:
+                line.taken = False
+                results.append(done.value)
+            else:
+                line.busy_until_ns = at_ns
+                clock.at(at_ns, go_on)
+
+        go_on(0)
+        while not results:
+            clock.advance_to(line.busy_until_ns)
+        status, data = results[0]
         face = self._line.faces.get(address)
         if face is None or face.next_event_ns() is not None:
             self._on_activity()

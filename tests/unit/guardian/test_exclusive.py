@@ -1,0 +1,219 @@
+"""One of two commands the amplifier, never both: exact in virtual time, at every length and phase of a stall."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+
+from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.amplifier import GuardedAmplifier
+from firmware_py.guardian.guardian import CLAIM_NS, LAST_RESORT_NS, STEP_NS, Guardian, State
+from firmware_py.guardian.heart import Heart, Order, Phase, Why
+from hal.clock import VirtualClock
+from hal.errors import SafetyTrip
+from hal.middleware.faults import FaultI2c, FaultPlan
+from hal.types import I2cOp, I2cWrite, PortInfo
+from sim_devices.devices.ad5696r import Ad5696r
+from sim_devices.transports.i2c_line import I2cLine
+from sim_devices.transports.lockstep import LockstepI2cBus
+
+MS = 1_000_000
+LEASE_MS = 40.0
+FAR_V = np.array([90.0, 10.0, 60.0])
+
+
+class Spy:
+    """I2cBus that notes who began to send a command, and when."""
+
+    def __init__(self, bus: Any, who: str, log: list[tuple[int, str]], clock: VirtualClock) -> None:
+        self._bus, self._who, self._log, self._clock = bus, who, log, clock
+
+    def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
+        if len([op for op in ops if isinstance(op, I2cWrite)]) > 1:
+            self._log.append((self._clock.now_ns(), self._who))
+        return self._bus.transfer(address, ops)
+
+    def info(self) -> PortInfo:
+        return self._bus.info()
+
+    def close(self) -> None:
+        self._bus.close()
+
+
+class Rig:
+    """Firmware and guardian at one DAC, the guardian stepping by itself half a tick beside the firmware."""
+
+    def __init__(self, *, end: Callable[[], None] | None = None, guardian_steps: bool = True) -> None:
+        self.clock = VirtualClock()
+        self.path: list[tuple[int, int, float]] = []
+        self.sent: list[tuple[int, str]] = []
+        self.alive = True
+        line = I2cLine(400_000)
+        self.dac = Ad5696r(on_output=lambda channel, volts, t_ns: self.path.append((t_ns, channel, 20.0 * volts)))
+        line.attach(0x0C, self.dac)
+        bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
+        self.slow = FaultI2c(Spy(bus, "firmware", self.sent, self.clock), self.clock, FaultPlan())
+        self.heart = Heart()
+        self.guardian = Guardian(
+            self.heart, DacAmplifier(Spy(bus, "guardian", self.sent, self.clock), self.clock), self.clock,
+            notice_ms=8.0, limit_ms=LEASE_MS + 1.0, end=end,
+        )  # fmt: skip
+        self.amplifier = GuardedAmplifier(
+            DacAmplifier(self.slow, self.clock), self.heart, self.clock, lease_ms=LEASE_MS, evict=self.guardian.retire
+        )
+        self.amplifier.arm()
+        if guardian_steps:
+            self.clock.at(self.clock.now_ns() + STEP_NS // 2, self._step)
+
+    def _step(self, t_ns: int) -> None:
+        self.guardian.step(self.alive)
+        if self.guardian.state is not State.DONE:
+            self.clock.at(t_ns + STEP_NS, self._step)
+
+    def tick(self) -> None:
+        self.clock.advance_to((self.clock.now_ns() // STEP_NS + 1) * STEP_NS)
+
+    def run(self, ticks: int, wish_V: Callable[[int], np.ndarray] = lambda k: FAR_V) -> str:
+        """Ticks of the firmware: commands, and after a refusal its way to the safe state. The refusal, or empty."""
+        refusal = ""
+        for k in range(ticks):
+            if refusal:
+                self.amplifier.safe_step()
+            else:
+                try:
+                    self.amplifier.write(wish_V(k))
+                except SafetyTrip as error:
+                    refusal = str(error)
+            self.tick()
+        return refusal
+
+    def volts(self) -> list[float]:
+        return [20.0 * v for v in self.dac.output_V[:3]]
+
+    def commands_of(self, who: str) -> list[int]:
+        return [t_ns for t_ns, sender in self.sent if sender == who]
+
+
+def alternating(k: int) -> np.ndarray:
+    return np.array([50.0, 50.0, 50.0]) + (15.0 if k % 2 else -15.0)
+
+
+@pytest.mark.parametrize("phase_us", [0, 50, 180, 300, 371, 600, 990])
+@pytest.mark.parametrize("stall_ms", [35.0, 39.0, 39.7, 40.0, 40.4, 41.0, 41.6, 42.1, 45.0, 50.0, 57.0, 70.0])
+def test_nobody_moves_the_outputs_beside_the_guardian(stall_ms: float, phase_us: int):
+    rig = Rig()
+    rig.run(5, alternating)
+    at_ns = (rig.clock.now_ns() // STEP_NS + 3) * STEP_NS + phase_us * 1000
+    rig.clock.at(at_ns, lambda _: rig.clock.burn_ns(round(stall_ms * MS)))
+    refusal = rig.run(130, alternating)
+    taken_ns = rig.heart.taken_ns
+    if not taken_ns:  # too short: the firmware has gone on as if nothing had been
+        assert not refusal
+        assert stall_ms <= LEASE_MS
+        return
+    assert "lost the outputs to the guardian" in refusal
+    assert max(rig.commands_of("firmware")) < taken_ns
+    assert rig.heart.why is Why.SILENT
+    assert rig.guardian.exclusive
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    for channel in range(3):
+        ramp = np.array([v for t_ns, c, v in rig.path if c == channel and t_ns > taken_ns])
+        assert np.all(np.diff(np.abs(ramp - 50.0)) <= 1e-9)  # nothing but nearer and nearer
+        assert np.abs(np.diff(ramp)).max() <= 20.0
+
+
+def test_a_command_that_stands_before_the_wire_ends_the_firmware_before_the_guardian_moves():
+    ended: list[int] = []
+    rig = Rig(end=lambda: ended.append(rig.clock.now_ns()))
+    rig.run(5, alternating)
+    late_ns = 0
+
+    def die(_: int) -> None:
+        rig.alive = False  # what a kill does: nothing of the firmware runs any more
+        raise KeyboardInterrupt
+
+    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.2))
+    rig.clock.at(rig.clock.now_ns() + 60 * MS, die)
+    with pytest.raises(KeyboardInterrupt):
+        rig.run(1, lambda k: FAR_V)
+    late_ns = rig.clock.now_ns()
+    assert len(ended) == 1
+    assert CLAIM_NS < ended[0] - rig.heart.taken_ns <= CLAIM_NS + 2 * MS
+    assert rig.commands_of("guardian") == []  # it waits for the death
+    while rig.guardian.state is not State.DONE:
+        rig.tick()
+    assert min(rig.commands_of("guardian")) >= late_ns
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert rig.guardian.report()["firmware_ended"]
+    assert rig.guardian.exclusive
+
+
+def test_who_may_not_end_the_firmware_waits_for_its_command_and_undoes_it_in_the_end():
+    rig = Rig()
+    rig.run(5, alternating)
+    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.08))
+    began_ns = rig.clock.now_ns()
+    rig.run(1, lambda k: FAR_V)  # comes out 80 ms late, before the last resort
+    assert rig.commands_of("firmware")[-1] > rig.heart.taken_ns
+    assert all(t_ns > rig.commands_of("firmware")[-1] for t_ns in rig.commands_of("guardian"))
+    assert rig.run(60)
+    assert rig.guardian.exclusive
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert rig.clock.now_ns() - began_ns < 160 * MS
+
+
+def test_outputs_do_not_wait_for_ever_and_the_report_says_so():
+    rig = Rig()
+    rig.run(5, alternating)
+    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.4))
+    rig.run(1, lambda k: FAR_V)
+    first_ns = min(rig.commands_of("guardian"))
+    assert LAST_RESORT_NS <= first_ns - rig.heart.taken_ns < LAST_RESORT_NS + 2 * MS
+    assert not rig.guardian.report()["exclusive"]
+
+
+def test_a_command_that_has_arrived_is_no_reason_to_end_anybody():
+    ended: list[int] = []
+    rig = Rig(end=lambda: ended.append(1))
+    rig.run(5, alternating)
+    at_ns = (rig.clock.now_ns() // STEP_NS + 1) * STEP_NS + 100_000  # in the middle of a transfer
+    rig.clock.at(at_ns, lambda _: rig.clock.burn_ns(60 * MS))
+    assert rig.run(100, alternating)
+    assert ended == []
+    assert rig.volts() == pytest.approx([50.0] * 3)
+
+
+def test_a_guardian_that_does_not_come_is_ended_and_the_firmware_ramps():
+    rig = Rig(guardian_steps=False)
+    rig.run(5)
+    rig.clock.burn_ns(50 * MS)
+    assert rig.run(42)
+    assert rig.guardian.state is State.DONE
+    assert rig.commands_of("guardian") == []
+    assert rig.volts() == pytest.approx([50.0] * 3)
+
+
+def test_close_does_not_wait_for_a_guardian_that_is_gone():
+    rig = Rig(guardian_steps=False)
+    rig.run(5)
+    rig.clock.burn_ns(50 * MS)
+    with pytest.raises(SafetyTrip):
+        rig.amplifier.write(FAR_V)
+    rig.amplifier.close()
+    assert rig.guardian.state is State.DONE
+    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert rig.heart.phase is Phase.IDLE
+
+
+@pytest.mark.parametrize("repeats", [False, True])
+def test_the_word_in_shared_memory_carries_codes_and_flag(repeats: bool):
+    heart = Heart.shared()
+    assert heart.fd is not None
+    assert heart.inside is None
+    heart.enter(Order((0xFFFF, 0, 0x8001), repeats))
+    assert Heart(heart.fd).inside == ((0xFFFF, 0, 0x8001), repeats)
+    heart.leave()
+    assert Heart(heart.fd).inside is None
