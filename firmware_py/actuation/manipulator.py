@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from firmware_py.records import Record
 from hal.compiled import kernel
+from hal.scratch import scratch, scratch_matrix
 
 Array = NDArray[np.float64]
 
@@ -50,7 +51,7 @@ def star_tip(heights: Array, circle_m: float, shaft_m: float, out: Array) -> Non
 @kernel
 def tip_from_strokes(strokes: Array, geometry: Record, out: Array) -> None:
     """Forward kinematics: ``out`` (3,) m tip displacement from neutral for ``strokes`` (3,) m, manipulator frame."""
-    heights = np.empty(3)
+    heights = scratch(3)
     for i in range(3):
         heights[i] = geometry.rest_m[i] + geometry.lever[i] * strokes[i]
     star_tip(heights, geometry.circle_m, geometry.shaft_m, out)
@@ -75,13 +76,13 @@ def tilt_jacobian(ax: float, ay: float, circle_m: float, shaft_m: float, out: Ar
 def tip_jacobian(strokes: Array, geometry: Record, out: Array) -> None:
     """``out`` (3, 3): derivative of the tip displacement by the strokes, m/m."""
     r, shaft = geometry.circle_m, geometry.shaft_m
-    z = np.empty(3)
+    z = scratch(3)
     for i in range(3):
         z[i] = geometry.rest_m[i] + geometry.lever[i] * strokes[i]
     ax = -(2.0 * z[0] - z[1] - z[2]) / (3.0 * r)
     ay = -(z[1] - z[2]) / (SQRT3 * r)
     az = sqrt(1.0 - ax * ax - ay * ay)
-    m = np.empty((2, 2))
+    m = scratch_matrix(2, 2)
     tilt_jacobian(ax, ay, r, shaft, m)
     for i in range(3):
         # how ball i turns the shaft
@@ -107,7 +108,7 @@ def strokes_from_tip(tip: Array, geometry: Record, warm: Array, out: Array) -> i
     x = tip[0] + geometry.rest_tip[0]
     y = tip[1] + geometry.rest_tip[1]
     ax, ay = warm[0], warm[1]
-    m = np.empty((2, 2))
+    m = scratch_matrix(2, 2)
     passes = 0
     good = True
     while True:

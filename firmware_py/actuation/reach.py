@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from firmware_py.actuation.manipulator import tip_from_strokes, tip_jacobian
 from firmware_py.records import Record
 from hal.compiled import kernel
+from hal.scratch import scratch, scratch_index, scratch_matrix
 
 Array = NDArray[np.float64]
 
@@ -32,8 +33,8 @@ def box_least_squares(h: Array, g: Array, low: Array, high: Array, out: Array) -
     the answer moves continuously with the data.
     """
     best = np.inf
-    x = np.empty(3)
-    free = np.empty(3, np.int64)
+    x = scratch(3)
+    free = scratch_index(3)
     for face in range(27):
         code = face
         n = 0
@@ -73,8 +74,12 @@ def box_least_squares(h: Array, g: Array, low: Array, high: Array, out: Array) -
 @kernel
 def solve_free(h: Array, g: Array, x: Array, free: NDArray[np.int64], n: int) -> None:
     """Stationary ``x[free[:n]]`` with the other components held (Gauss elimination, n <= 3)."""
-    a = np.zeros((3, 4))
-    held = np.ones(3)
+    a = scratch_matrix(3, 4)
+    held = scratch(3)
+    for k in range(3):
+        held[k] = 1.0
+        for m in range(4):
+            a[k, m] = 0.0
     for k in range(n):
         held[free[k]] = 0.0
     for k in range(n):
@@ -104,11 +109,12 @@ def nearest_reachable(tip: Array, geometry: Record, low: Array, high: Array, str
 
     Starts from neutral, so the answer depends on ``tip`` alone. A ``tip`` that is not finite gives neutral.
     """
-    e, at, g = np.empty(3), np.empty(3), np.empty(3)
-    below, above, move = np.empty(3), np.empty(3), np.zeros(3)
-    jacobian, h = np.empty((3, 3)), np.empty((3, 3))
+    e, at, g = scratch(3), scratch(3), scratch(3)
+    below, above, move = scratch(3), scratch(3), scratch(3)
+    jacobian, h = scratch_matrix(3, 3), scratch_matrix(3, 3)
     for i in range(3):
         strokes[i] = 0.0
+        move[i] = 0.0
     if np.isfinite(tip[0]) and np.isfinite(tip[1]) and np.isfinite(tip[2]):
         for _ in range(REACH_PASSES):
             tip_from_strokes(strokes, geometry, at)

@@ -37,6 +37,7 @@ from firmware_py.frame import (
 )
 from firmware_py.records import Record, attributes, copy_record, new_record
 from hal.compiled import kernel
+from hal.scratch import scratch
 
 Array = NDArray[np.float64]
 
@@ -176,7 +177,7 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     param = params[0]
     status = int(frame[STATUS])
     ready = status & (ALIGNING | SETTLING) == 0
-    wish = np.empty(3)
+    wish = scratch(3)
     for i in range(3):
         ahead = frame[TREMOR_AHEAD + i]
         trusted = ready and frame[CONFIDENCE + i] >= param.min_confidence and np.isfinite(ahead)

@@ -43,6 +43,7 @@ from firmware_py.sensing.quaternion_kalman import (
 )
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
+from hal.scratch import scratch
 
 # closer to the corner the low-pass would eat the observer's phase margin
 LOWPASS_PER_CORNER = 6.0
@@ -214,7 +215,7 @@ def propagate(
     state.time_s += dt
     # --- observer with three poles at -corner
     present = (ex, ey, ez)
-    turn = np.empty(3)
+    turn = scratch(3)
     for i in range(3):
         corner = max(params.corner_rad_s[i], min(params.start_rad_s, 3.0 / state.time_s))
         lowpass = max(params.lowpass_rad_s, LOWPASS_PER_CORNER * corner)

@@ -30,8 +30,9 @@ from firmware_py.frame import (
     VOLTS,
 )
 from firmware_py.records import Record, new_record
-from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.config import MOST_AXES, SensingConfig
 from hal.compiled import kernel
+from hal.scratch import scratch
 
 TEMPERATURE_SMOOTHING_S = 1.0
 
@@ -140,7 +141,7 @@ def calibrate(
     rise = smoothed[1] - params.reference_C
     bits = 0
     n = len(readings)
-    line = np.empty(n)
+    line = scratch(MOST_AXES)[:n]
     for i in range(n):
         volts = frame[VOLTS + params.channel[i]] * ratio - params.bias_V[i] - params.bias_V_per_C[i] * rise
         line[i] = volts / (params.scale_V[i] * (1.0 + params.scale_per_C[i] * rise))

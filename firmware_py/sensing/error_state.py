@@ -28,6 +28,7 @@ from numpy.typing import NDArray
 from firmware_py.records import Record
 from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
+from hal.scratch import scratch
 
 ERRORS = 13
 TURN, RATE, BIAS, VELOCITY, DISTURBANCE = 0, 3, 6, 9, 12
@@ -141,17 +142,18 @@ def propagate_errors(
     """P <- F P F^T + Q over ``dt`` s; ``c`` = C_WB, ``up`` (3,) = C f. F is sparse, its products are written out."""
     p, w = e.covariance, e.work
     fade = exp(-dt / params.disturbance_s)
+    # row by row, so that the inner loops run along memory
+    for k in range(3):
+        ck0, ck1, ck2 = dt * c[k, 0], dt * c[k, 1], dt * c[k, 2]
+        u0, u1 = dt * up[(k + 2) % 3], dt * up[(k + 1) % 3]
+        first, second = (k + 1) % 3, (k + 2) % 3
+        for j in range(ERRORS):
+            w[TURN + k, j] = p[TURN + k, j] + (ck0 * p[RATE, j] + ck1 * p[RATE + 1, j] + ck2 * p[RATE + 2, j])
+            w[RATE + k, j] = p[RATE + k, j] - dt * p[BIAS + k, j]
+            w[BIAS + k, j] = p[BIAS + k, j]
+            # theta x up
+            w[VELOCITY + k, j] = p[VELOCITY + k, j] + (u0 * p[first, j] - u1 * p[second, j])
     for j in range(ERRORS):
-        for i in range(3):
-            w[TURN + i, j] = p[TURN + i, j] + dt * (
-                c[i, 0] * p[RATE, j] + c[i, 1] * p[RATE + 1, j] + c[i, 2] * p[RATE + 2, j]
-            )
-            w[RATE + i, j] = p[RATE + i, j] - dt * p[BIAS + i, j]
-            w[BIAS + i, j] = p[BIAS + i, j]
-        x, y, z = p[0, j], p[1, j], p[2, j]
-        w[VELOCITY, j] = p[VELOCITY, j] + dt * (y * up[2] - z * up[1])
-        w[VELOCITY + 1, j] = p[VELOCITY + 1, j] + dt * (z * up[0] - x * up[2])
-        w[VELOCITY + 2, j] = p[VELOCITY + 2, j] + dt * (x * up[1] - y * up[0])
         w[DISTURBANCE, j] = fade * p[DISTURBANCE, j]
     for i in range(ERRORS):
         for k in range(3):
@@ -165,6 +167,8 @@ def propagate_errors(
         p[i, VELOCITY + 1] = w[i, VELOCITY + 1] + dt * (z * up[0] - x * up[2])
         p[i, VELOCITY + 2] = w[i, VELOCITY + 2] + dt * (x * up[1] - y * up[0])
         p[i, DISTURBANCE] = fade * w[i, DISTURBANCE]
+        for j in range(i):  # symmetric to the last bit, whatever rounding did
+            p[j, i] = p[i, j]
     spin = params.turn_per_rate * (rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     for i in range(3):
         for k in range(3):
@@ -190,11 +194,12 @@ def correct(
     """
     e = state.error_state
     p = e.covariance
-    column = np.empty(ERRORS)
+    column = scratch(ERRORS)
     for i in range(ERRORS):
-        column[i] = p[i, first]
-        if second >= 0:
-            column[i] -= p[i, second]
+        column[i] = p[first, i]
+    if second >= 0:
+        for i in range(ERRORS):
+            column[i] -= p[second, i]
     innovation = column[first] + variance
     rest = residual - gain[first]
     if second >= 0:
@@ -202,15 +207,15 @@ def correct(
         rest += gain[second]
     if rest * rest > gate * gate * innovation:
         return False
+    root = 1.0 / sqrt(innovation)
     for i in range(ERRORS):
-        column[i] /= innovation
-        gain[i] += column[i] * rest
-    # (I - k h) P (I - k h)^T + k r k^T with h P = innovation k^T: symmetric and positive by construction
+        gain[i] += column[i] * (rest / innovation)
+        column[i] *= root
+    # (I - k h) P (I - k h)^T + k r k^T with h P = innovation k^T: symmetric by construction
     for i in range(ERRORS):
-        for j in range(i + 1):
-            value = p[i, j] - innovation * column[i] * column[j]
-            p[i, j] = value
-            p[j, i] = value
+        own = column[i]
+        for j in range(ERRORS):
+            p[i, j] -= own * column[j]
     return True
 
 
@@ -252,7 +257,7 @@ def error_state_step(
     """
     e = state.error_state
     c = state.matrix
-    turn = np.empty(3)
+    turn = scratch(3)
     for i in range(3):
         now = alpha[i] - state.bias[i]
         before = state.rate[i]
@@ -261,7 +266,7 @@ def error_state_step(
         turn[i] = (before + params.lead * (state.rate[i] - before)) * dt  # mean rate of the interval: ERRATA 42
     rotate_by(state.quaternion, turn[0], turn[1], turn[2])
     to_matrix(state.quaternion, c)
-    up = np.empty(3)
+    up = scratch(3)
     for i in range(3):
         up[i] = c[i, 0] * force[0] + c[i, 1] * force[1] + c[i, 2] * force[2]
         e.velocity[i] += up[i] * dt
@@ -269,7 +274,9 @@ def error_state_step(
     e.disturbance *= exp(-dt / params.disturbance_s)
     propagate_errors(e, params, c, up, state.rate, dt)
 
-    x = np.zeros(ERRORS)
+    x = scratch(ERRORS)
+    for i in range(ERRORS):
+        x[i] = 0.0
     resting = params.rest_density > 0.0 and _resting(state, params, force, dt)
     gate = params.velocity_gate if params.velocity_gate > 0.0 else 1e9
     moving = False

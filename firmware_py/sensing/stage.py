@@ -40,7 +40,7 @@ from firmware_py.sensing.calibration import (
     calibration_dtype,
     calibration_params,
 )
-from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import MOST_AXES, STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
 from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
@@ -52,8 +52,10 @@ from firmware_py.sensing.translation import (
     translation_params,
 )
 from hal.compiled import kernel
+from hal.scratch import scratch, scratch_matrix
 
 MAX_RATE_RAD_S = 20.0
+N_PARITIES = len(PARITIES)
 LEAN_CORNER_HZ = 0.5
 """Corrections of the attitude slower than this reach the tip's gravity."""
 
@@ -135,7 +137,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
     attitude = state.attitude
     corrected = attitude.error_state.corrected
     dt = param.attitude.dt_s
-    sudden, turn = np.empty(3), np.empty(3)
+    sudden, turn = scratch(3), scratch(3)
     for i in range(3):
         sudden[i] = (corrected[0, i] - state.turned[i]) / (dt * dt) + corrected[1, i] / dt - corrected[2, i]
         state.turned[i] = corrected[0, i]
@@ -150,7 +152,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
 def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> None:
     """What the axes beyond six contradict goes into the frame."""
     n = len(state.readings)
-    slope, left, by_rate = np.empty((n, 3)), np.empty(len(PARITIES)), np.empty((len(PARITIES), 3))
+    slope, left, by_rate = scratch_matrix(MOST_AXES, 3)[:n], scratch(N_PARITIES), scratch_matrix(N_PARITIES, 3)
     parity(state.readings, state.attitude.rate, param.kinematics, param.null, slope, left, by_rate)
     for m in range(param.parities):
         frame[PARITY + m] = left[m]
@@ -196,7 +198,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
         status |= ALIGNING
         align(attitude, param.attitude, motion, field, fresh)
     else:
-        felt = np.empty(6)
+        felt = scratch(6)
         point_force(motion, attitude.bias, attitude.rate, param.quiet_point, felt[:3])
         felt[3:] = motion[3:]
         step_attitude(attitude, param.attitude, felt, field, fresh, steps)
@@ -204,7 +206,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     if status & ALIGNING:
         tip[:] = 0.0
     else:
-        up = np.empty(3)
+        up = scratch(3)
         _smooth_up(state, param, up)
         tip_acceleration(motion, attitude.bias, attitude.rate, up, param.translation, tip)
     integrate_band(tip, state.memory, param.translation.sections, frame[TIP_DISPLACEMENT : TIP_DISPLACEMENT + 3])

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.frame import (
+    CLIP,
     COMMAND,
     COUNTS,
     LAYOUT,
@@ -16,10 +17,12 @@ from firmware_py.frame import (
     STATUS,
     TICK,
     VOLTS,
+    Clip,
 )
 from firmware_py.frame import FrameStatus as S
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.tremor.config import TremorConfig
+from tests.unit.allocations import allocations
 
 Rows = NDArray[np.float64]
 N = 900
@@ -105,3 +108,21 @@ def test_warming_up_leaves_no_trace() -> None:
     for a, b in zip(warm.arguments, fresh.arguments, strict=True):
         assert a.tobytes() == b.tobytes()
     assert not warm.frame.any()
+
+
+def test_a_step_allocates_nothing() -> None:
+    """Also not where it follows a hand-chosen command, meets a bad reading or an unreachable tip; aligning may.
+
+    A call from Python wraps each array it hands over, once a call: one tick and seven hundred ask for the same.
+    """
+    one = stages()
+    rows = scans(N)
+    one.run(rows[:200])
+    one.actuation.params["gain"] = 100.0  # far beyond what the manipulator can follow
+    asked = []
+    for part in (rows[200:201], rows[201:]):
+        before = allocations()
+        one.run(part)
+        asked.append(allocations() - before)
+    assert asked[0] == asked[1] == 1 + len(one.arguments) + 1
+    assert np.any(rows[800:, CLIP].astype(int) & int(Clip.WORKSPACE))
