@@ -6,12 +6,15 @@ The live loop calls ``step_kernel`` once a tick; replay and batches loop the sam
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.stage import actuate_kernel
 from firmware_py.control.manual import follow_kernel
-from firmware_py.frame import COMMAND, STATUS, VOLTS, FrameStatus
+from firmware_py.frame import COMMAND, LAYOUT, STATUS, VOLTS, FrameStatus
 from firmware_py.records import Record
 from firmware_py.sensing.stage import sense_kernel
 from firmware_py.tremor.detectors import detect_kernel
@@ -24,50 +27,48 @@ GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE | FrameStatus.COMMANDED | F
 """Bits of ``status`` that the caller sets before a step; the kernels add the others."""
 
 
+PARTS = ("sense", "estimate", "detect", "actuate")
+
+
+def memory_dtype(parts: Sequence[tuple[np.dtype[Any], np.dtype[Any]]]) -> np.dtype[Any]:
+    """The frame and each stage's ``NAME_state`` and ``NAME_params``, given as dtypes in the order of ``PARTS``.
+
+    One record for all, because each array that Python hands to a compiled kernel costs about 0.35 us a call.
+    """
+    fields: list[Any] = [("frame", "f8", (LAYOUT.size,))]
+    for name, (state, params) in zip(PARTS, parts, strict=True):
+        fields += [(f"{name}_state", state, (1,)), (f"{name}_params", params, (1,))]
+    return np.dtype(fields)
+
+
 @kernel
-def step_kernel(
-    frame: NDArray[np.float64],
-    sense_state: Record,
-    sense_params: Record,
-    estimate_state: Record,
-    estimate_params: Record,
-    detect_state: Record,
-    detect_params: Record,
-    actuate_state: Record,
-    actuate_params: Record,
-) -> None:
+def step_kernel(memory: Record) -> None:
     """One tick: the frame's columns left of the volts and the ``GIVEN_BITS`` of its status are the input.
 
     COMMANDED: a command is computed. MANUAL: ``command`` is given and the actuation stage follows it. Neither: the
     outputs are not free to move, or a newer scan is there already; the last command stays in its column.
+    ``memory`` (1,) is of ``memory_dtype``.
     """
-    sense_kernel(frame, sense_state, sense_params)
-    estimate_kernel(frame, estimate_state, estimate_params)
-    detect_kernel(frame, detect_state, detect_params)
+    m = memory[0]
+    frame = m.frame
+    sense_kernel(frame, m.sense_state, m.sense_params)
+    estimate_kernel(frame, m.estimate_state, m.estimate_params)
+    detect_kernel(frame, m.detect_state, m.detect_params)
     status = int(frame[STATUS])
     if status & COMMANDED:
-        actuate_kernel(frame, actuate_state, actuate_params)
+        actuate_kernel(frame, m.actuate_state, m.actuate_params)
     elif status & MANUAL:
-        follow_kernel(frame, actuate_state, actuate_params)
+        follow_kernel(frame, m.actuate_state, m.actuate_params)
 
 
 @kernel
-def run_kernel(
-    rows: NDArray[np.float64],
-    frame: NDArray[np.float64],
-    sense_state: Record,
-    sense_params: Record,
-    estimate_state: Record,
-    estimate_params: Record,
-    detect_state: Record,
-    detect_params: Record,
-    actuate_state: Record,
-    actuate_params: Record,
-) -> None:
+def run_kernel(rows: NDArray[np.float64], memory: Record) -> None:
     """``step_kernel`` over ``rows`` (n, Layout.size), in place: inputs in, the whole frame out.
 
-    ``frame`` is the running one: a column that a tick does not write keeps the last tick's value, as in the live loop.
+    The memory's frame is the running one: a column that a tick does not write keeps the last tick's value, as in the
+    live loop.
     """
+    frame = memory[0].frame
     for k in range(len(rows)):
         row = rows[k]
         status = int(row[STATUS]) & GIVEN_BITS
@@ -77,16 +78,6 @@ def run_kernel(
         if status & MANUAL:
             for i in range(COMMAND, COMMAND + 3):
                 frame[i] = row[i]
-        step_kernel(
-            frame,
-            sense_state,
-            sense_params,
-            estimate_state,
-            estimate_params,
-            detect_state,
-            detect_params,
-            actuate_state,
-            actuate_params,
-        )
+        step_kernel(memory)
         for i in range(len(frame)):
             row[i] = frame[i]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.chain import COMMANDED, MANUAL, run_kernel, step_kernel
+from firmware_py.chain import COMMANDED, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STATUS
 from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig
@@ -61,32 +61,41 @@ class Stages:
 
     def __init__(self, configs: StageConfigs) -> None:
         self.configs = configs
-        self.frame: Frame = LAYOUT.new_frame()
-        self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
         self.sensing = Sensing(configs.sensing)
         self.tremor = Tremor(configs.tremor)
         self.detectors = Detectors(configs.tremor.detectors, configs.tremor.tick_hz)
         self.actuation = Actuation(configs.actuation)
+        self.memory = self._gathered()
+        """The frame and all that the stages know, in one record (``chain.memory_dtype``), which keeps its place."""
+        self.frame: Frame = self.memory["frame"][0]
+        self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
 
-        # the arrays keep their place for life, so that a tick hands over the same tuple every time
-        self._arguments: tuple[Record, ...] = tuple(
-            part
-            for stage in (self.sensing, self.tremor, self.detectors, self.actuation)
-            for part in (stage.state, stage.params)
-        )
+    def _stages(self) -> tuple[Sensing, Tremor, Detectors, Actuation]:
+        return self.sensing, self.tremor, self.detectors, self.actuation
+
+    def _gathered(self) -> Record:
+        """Each stage's state and parameters become views of one record."""
+        stages = self._stages()
+        memory = np.zeros(1, memory_dtype([(stage.state.dtype, stage.params.dtype) for stage in stages]))
+        for name, stage in zip(PARTS, stages, strict=True):
+            for part in ("state", "params"):
+                place = memory[f"{name}_{part}"][0]
+                place[:] = getattr(stage, part)
+                setattr(stage, part, place)
+        return memory
 
     @property
     def arguments(self) -> tuple[Record, ...]:
-        """State and parameters of every stage, in the order of the chain's kernels."""
-        return self._arguments
+        """State and parameters of every stage, in the order of ``chain.PARTS``."""
+        return tuple(part for stage in self._stages() for part in (stage.state, stage.params))
 
     def step(self) -> None:
         """One tick on ``frame``, whose input columns and ``GIVEN_BITS`` of the status are set."""
-        step_kernel(self.frame, *self._arguments)
+        step_kernel(self.memory)
 
     def run(self, rows: Frame) -> None:
         """Ticks ``rows`` (n, Layout.size), C order, in place: the same numbers as n steps, the memory goes on."""
-        run_kernel(rows, self.frame, *self._arguments)
+        run_kernel(rows, self.memory)
 
     def command(self) -> None:
         """The tick's step shall compute a command: this is the newest scan and the outputs may move."""
@@ -105,6 +114,6 @@ class Stages:
 
     def reset(self) -> None:
         """As before the first sample."""
-        for stage in (self.sensing, self.tremor, self.detectors, self.actuation):
+        for stage in self._stages():
             stage.reset()
         self.frame[:] = 0.0

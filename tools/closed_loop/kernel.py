@@ -83,35 +83,17 @@ def closed_loop(
     row: int,
     wire: Record,
     frames: Array,
-    frame: Array,
-    sense_state: Record,
-    sense_params: Record,
-    estimate_state: Record,
-    estimate_params: Record,
-    detect_state: Record,
-    detect_params: Record,
-    actuate_state: Record,
-    actuate_params: Record,
+    memory: Record,
 ) -> int:
     """``n`` ticks of 1 ms from the start of a block (``PlantBlocks``); the next free row of ``truth``.
 
     ``frames`` (n, Layout.size) takes the finished frames, or is empty (0, ...) when nobody wants them.
     """
-    s, wires = state[0], wire[0]
+    s, wires, frame = state[0], wire[0], memory[0].frame
     for k in range(n):
         first = k * STEPS_PER_MS
         scan(s, wires, frame)
-        step_kernel(
-            frame,
-            sense_state,
-            sense_params,
-            estimate_state,
-            estimate_params,
-            detect_state,
-            detect_params,
-            actuate_state,
-            actuate_params,
-        )
+        step_kernel(memory)
         if len(frames) > 0:
             for i in range(len(frame)):
                 frames[k, i] = frame[i]

@@ -143,7 +143,7 @@ def simulate(
         part = frames[done : done + n]
         row = closed_loop(
             n, world.plant, world.state, world.nodes, world.parts, world.noise, world.slow, world.truth, row,
-            wire, part, stages.frame, *stages.arguments,
+            wire, part, stages.memory,
         )  # fmt: skip
         done += n
         if on_time is not None:
