@@ -58,6 +58,8 @@ class RunRequest:
     """Another limit for missing or belated scans than the bench file's."""
     realtime: bool = True
     """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
+    sense_only: bool = False
+    """Nothing is armed; readings that would end a run are noticed."""
     truth_s: float | None = None
     """How much truth an emulated world keeps; None: all of it."""
     clock_start_ns: int = 0
@@ -120,6 +122,7 @@ def run_in_process(
             recorder=recorder,
             on_status=on_status,
             live=live,
+            sense_only=request.sense_only,
         )
         if on_status is not None and live is not None:
             on_status({"event": "devices", "identities": devices.identities, "histograms": list(loop.histograms())})

@@ -23,6 +23,8 @@ class _Table(BaseModel):
 class HandConfig(_Table):
     """The surgeon. Sources and reasons: docstring of ``sim_devices.plant.hand``."""
 
+    performs: Literal["work", "poses"] = "work"
+    """"poses": turns the instrument through the 14 resting poses of a calibration by hand, over and over."""
     tilt_deg: float = 40.0
     """Instrument axis away from straight down."""
     azimuth_deg: float = 25.0

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.safety import Supervisor
+from firmware_py.control.safety import State, Supervisor
 from firmware_py.scheduler.histogram import DurationHistogram
 from hal.contracts import Clock
 from hal.errors import HalError
@@ -71,13 +71,20 @@ class Incidents:
         self._supervisor.trip(reason, tick=self.tick, t_ns=self._clock.now_ns(), normal=normal)
         self.note({"event": "safe state", "reason": reason})
 
+    def doubt(self, what: str, reason: str) -> None:
+        """A reading that nothing may be moved by: ``reason`` of a trip; where nothing is armed, ``what`` is noticed."""
+        if self._supervisor.state is State.SENSING_ONLY:
+            self.notice(what)
+        else:
+            self.trip(reason)
+
     def trip_for(self, device: str, error: HalError) -> None:
         """Trip with the bench's name of the device in front: a port knows only its path."""
         self.trip(f"{error}" if str(error).startswith(device) else f"{device}: {error}")
 
     def bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
-        """Trip when ``bad`` has held for ``limit_ms``."""
+        """Doubt when ``bad`` has held for ``limit_ms``."""
         if not bad:
             self._bad_since.pop(what, None)
         elif (t_ns - self._bad_since.setdefault(what, t_ns)) * 1e-6 >= limit_ms:
-            self.trip(reason)
+            self.doubt(f"{what}: beyond its limit", reason)

@@ -49,7 +49,8 @@ LATE_PART = 0.9  # of a period: the prediction bridges a known delay, not this o
 
 
 class InstrumentLoop:
-    """Runs the opened devices. ``on_status`` gets a small dict now and then and must not block."""
+    """Runs the opened devices. ``on_status`` gets a small dict now and then and must not block. ``sense_only``: nothing
+    is armed, and a reading that would end a run is only noticed."""
 
     def __init__(
         self,
@@ -62,8 +63,10 @@ class InstrumentLoop:
         recorder: Recorder | None = None,
         on_status: Callable[[dict[str, object]], None] | None = None,
         live: LiveLink | None = None,
+        sense_only: bool = False,
     ) -> None:
         self._live = live
+        self._sense_only = sense_only
         self._devices = devices
         self.stages = stages
         self._frame = stages.frame
@@ -163,7 +166,10 @@ class InstrumentLoop:
             return {}
 
     def _start(self) -> None:
-        self.supervisor.begin_self_test()
+        if self._sense_only:
+            self.supervisor.begin_sensing()
+        else:
+            self.supervisor.begin_self_test()
         self._started_ns = self._clock.now_ns()
         self._devices.daq.start()
 
@@ -193,6 +199,8 @@ class InstrumentLoop:
                 self.incidents.trip(f"stopped by the operator ({self._interrupted})", normal=True)
             elif end_ns is not None and newest_ns >= end_ns:
                 self.incidents.trip(FINISHED, normal=True)
+            elif end_ns is None and self._sense_only:
+                end_ns = newest_ns + round(seconds * 1e9)
             self.scheduler.run(ticks)
             if self.supervisor.state is State.SELF_TEST and self._watch.self_test_passed(
                 (newest_ns - self._started_ns) * 1e-6
@@ -273,7 +281,7 @@ class InstrumentLoop:
             scan = self._rows[row]
             frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
             if impossible := self._check.scan(scan, info.k):
-                self.incidents.trip(impossible)
+                self.incidents.doubt("an input read something impossible", impossible)
         if self._field is not None:
             self._field.fill(frame)
 
@@ -289,7 +297,7 @@ class InstrumentLoop:
         bits = int(self._frame[STATUS])
         # before the command goes out: a sensor that contradicts its twin must not move anything
         if not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
-            self.incidents.trip(apart)
+            self.incidents.doubt("parallel axes disagree", apart)
         status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:
             for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):

@@ -29,6 +29,7 @@ class State(IntEnum):
     RUNNING = 2
     SAFE_RAMP = 3
     SAFE = 4
+    SENSING_ONLY = 5
 
 
 class SafetyLimits(BaseModel):
@@ -93,6 +94,11 @@ class Supervisor:
     def begin_self_test(self) -> None:
         if self.state is State.BOOT:
             self.state = State.SELF_TEST
+
+    def begin_sensing(self) -> None:
+        """A run that looks and never arms: for poses by hand, for sensors that nobody has calibrated yet."""
+        if self.state is State.BOOT:
+            self.state = State.SENSING_ONLY
 
     def arm(self) -> None:
         """Arm the amplifier (it tests itself) and allow motion. Nothing is armed after a trip."""

@@ -42,7 +42,7 @@ class Watch:
         status = int(frame[STATUS])
         t_ns = info.due_ns
         if status & FrameStatus.INVALID:
-            incidents.trip("a reading or estimate is not a number; see the recording")
+            incidents.doubt("not a number", "a reading or estimate is not a number; see the recording")
         incidents.bad_for(
             "saturation",
             bool(status & FrameStatus.SATURATED),

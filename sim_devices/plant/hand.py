@@ -51,6 +51,8 @@ Array = NDArray[np.float64]
 NODE_S = 1e-3
 """A hand is given by nodes this far apart."""
 _JERK_PAUSE_S = 1.0
+POSE_HOLD_S = 1.5
+"""Rest in each calibration pose, beside ``hold_s``: a second of it is taken."""
 
 
 class Hand(Protocol):
@@ -80,6 +82,19 @@ def holding_frame(config: HandConfig) -> Array:
     return _rz(azimuth) @ _ry(pitch) @ _rz(roll)
 
 
+def pose_angles() -> Array:
+    """(14, 3) angles, close to each other in the list: up is each half axis and each octant of the body once.
+
+    With the identity as frame, up in body axes is (-sin a1, cos a1 sin a0, cos a1 cos a0): it stays on a cone about
+    the body's x axis while the instrument rolls.
+    """
+    corner = math.asin(1.0 / math.sqrt(3.0))
+    square, diagonal = np.radians([0.0, 90.0, 180.0, 270.0]), np.radians([45.0, 135.0, 225.0, 315.0])
+    rings = [(-math.pi / 2, diagonal[:1]), (-corner, diagonal), (0.0, square[::-1]), (corner, diagonal)]
+    rings.append((math.pi / 2, diagonal[-1:]))
+    return np.array([[roll, pitch, 0.0] for pitch, rolls in rings for roll in rolls])
+
+
 def tremor_matrix(config: HandConfig, frame: Array) -> Array:
     """(6, 6) from unit sources to tip displacement (world, m) and body angles (rad).
 
@@ -105,7 +120,7 @@ class SyntheticHand:
 
     def __init__(self, config: HandConfig, seed: int) -> None:
         self._config, self._seed = config, seed
-        self.frame = holding_frame(config)
+        self.frame = np.eye(3) if config.performs == "poses" else holding_frame(config)
         person = stream(seed, "hand.person").standard_normal()
         low, high = min(8.5, config.tremor_frequency_hz), max(11.5, config.tremor_frequency_hz)
         frequency_hz = config.tremor_frequency_hz + person * config.tremor_frequency_spread_hz
@@ -155,6 +170,9 @@ class SyntheticHand:
         hold = config.hold_s[0] + (config.hold_s[1] - config.hold_s[0]) * draw[:, 1]
         size = np.repeat([config.voluntary_range_um * 1e-6, math.radians(config.voluntary_angle_deg)], 3)
         target = (2.0 * draw[:, 2:] - 1.0) * size
+        if config.performs == "poses":
+            hold += POSE_HOLD_S
+            target[:, 3:] += pose_angles()[np.arange(count) % len(pose_angles())]
         self._reaches = np.zeros((count, 14))
         self._reaches[:, 0] = np.cumsum(hold + duration) - duration
         self._reaches[:, 1] = duration

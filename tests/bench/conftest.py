@@ -18,7 +18,7 @@ import time
 import urllib.error
 import urllib.request
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -107,15 +107,14 @@ class Server:
         return pages * os.sysconf("SC_PAGE_SIZE")
 
 
-@pytest.fixture(scope="session")
-def server() -> Iterator[Server]:
-    """One server for all tests of a session; its files are in a short path, for the sake of Unix sockets."""
+@contextmanager
+def bench_server(more_toml: str) -> Iterator[Server]:
+    """``micron bench`` on the default bench and ``more_toml``; its files are in a short path, for Unix sockets."""
     folder = Path(tempfile.mkdtemp(prefix="mb", dir="/tmp"))
     recordings = folder / "recordings"
-    # the injected spike is to be seen, not to end the run: a sensor that jumps trips the firmware
     bench = folder / "bench.toml"
     text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')
-    bench.write_text(text + "\n[firmware.plausibility]\njump_V = 2.0\n")
+    bench.write_text(text + more_toml)
     shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)  # has the motion card
     command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
     command += ["--bench", str(bench)]
@@ -146,6 +145,14 @@ def server() -> Iterator[Server]:
         rest.join()
         process.stderr.close()
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    """One server for all tests of a session."""
+    # the injected spike is to be seen, not to end the run: a sensor that jumps trips the firmware
+    with bench_server("\n[firmware.plausibility]\njump_V = 2.0\n") as running:
+        yield running
 
 
 def go(page: Any, view: str) -> None:
@@ -182,8 +189,8 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
-@pytest.fixture
-def page(browser: Any, server: Server) -> Iterator[Any]:
+@contextmanager
+def opened_page(browser: Any, server: Server) -> Iterator[Any]:
     """The bench page with the token, 1280 x 720; an error in the page fails the test."""
     server.wait_running()
     context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True)
@@ -196,6 +203,13 @@ def page(browser: Any, server: Server) -> Iterator[Any]:
     yield tab
     context.close()
     assert not errors
+
+
+@pytest.fixture
+def page(browser: Any, server: Server) -> Iterator[Any]:
+    """The page of the session's server."""
+    with opened_page(browser, server) as tab:
+        yield tab
 
 
 @pytest.fixture

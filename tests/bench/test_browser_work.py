@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,8 @@ import numpy as np
 import pytest
 
 from firmware_py.recording.reader import Recording
-from tests.bench.conftest import Server, go
+from tests.bench.conftest import Server, bench_server, go, opened_page
+from tests.conftest import DEFAULT_BENCH
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
 
@@ -133,11 +135,11 @@ def test_a_calibration_is_applied_over_the_bench_and_discarded(page: Any, server
     assert server.request("POST", "/api/calibrate/lab", b'{"what": "tumble"}')[0] == 400  # one at a time
     assert server.request("POST", "/api/jobs/calibrate/cancel", b"{}")[0] == 200
     page.wait_for_function("document.getElementById('view').innerText.includes('cancelled')")
-    # poses cannot be turned on an emulated bench that nobody holds: what the wizard would have sent
+    # what the wizard would have sent
     unit = np.array([[x, y, z] for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if x or y or z], float)
     unit /= np.linalg.norm(unit, axis=1, keepdims=True)
     axes = [0, 2, 1, 2, 0, 1]  # 1x 1z 2y 2z 3x 3y
-    means = (2.5 + unit[:, axes]).tolist()
+    means = np.column_stack([2.5 + unit[:, axes], np.zeros((len(unit), 2)), np.full(len(unit), 5.0)]).tolist()
     code, found = server.request("POST", "/api/calibrate/poses", json.dumps({"means_V": means}).encode())
     assert code == 200, found
     original = server.state()["bench_file"]
@@ -146,3 +148,31 @@ def test_a_calibration_is_applied_over_the_bench_and_discarded(page: Any, server
     assert "poses.toml" in Path(server.state()["bench_file"]).read_text()
     page.click("text=Discard, back to the original")
     server.wait_for(lambda s: s["bench_file"] == original, "the original bench")
+
+
+TURNING = """
+[emulation.hand]
+performs = "poses"
+reach_s = [2.0, 2.2]
+hold_s = [0.0, 0.0]
+"""
+
+
+@pytest.mark.slow
+def test_the_pose_wizard_takes_what_a_trembling_hand_shows_it(browser: Any, artefacts: Path):
+    known = tomllib.loads((DEFAULT_BENCH.parent / "calibration" / "sensors.toml").read_text())["sensing"]
+    with bench_server(TURNING) as server, opened_page(browser, server) as page:
+        go(page, "calibrate")
+        page.click("button:has-text('Arm nothing while I turn')")
+        server.wait_for(lambda s: s["status"].get("state") == "sensing only", "sensing only", 220)
+        page.wait_for_selector("b:has-text('All poses are taken')", timeout=120_000)
+        page.click("button:has-text('Identify')")
+        page.wait_for_selector("button:has-text('Apply to this bench')")
+        page.screenshot(path=artefacts / "poses-taken.png")
+        found = server.request("GET", "/api/calibrate")[1]["found"]
+        page.click("button:has-text('Arm again')")
+        server.wait_for(lambda s: s["status"].get("state") == "running", "running", 220)
+    assert found["poses"] == 14
+    # the stage's calibration of the same unit, which knows cross-axis terms that poses by hand cannot
+    assert found["table"]["bias_V"] == pytest.approx(known["bias_V"], abs=0.01)
+    assert found["table"]["scale_V_per_g"] == pytest.approx(known["scale_V_per_g"], rel=0.01)

@@ -11,7 +11,7 @@ import pytest
 from hal.bench import load_bench
 from tests.conftest import DEFAULT_BENCH
 from tools.bench.bench_copy import with_calibration
-from tools.bench.poses import TRIADS, identify
+from tools.bench.poses import TRIADS, at_nominal_supply, identify
 from tools.bench.recorder import check_name
 from tools.errors import InputError
 
@@ -47,6 +47,19 @@ def test_poses_off_by_twenty_degrees_and_noise_do_little():
     found = identify(means, GRAVITY)
     np.testing.assert_allclose(found["table"]["bias_V"], BIAS_V, atol=2e-3)
     np.testing.assert_allclose(found["table"]["scale_V_per_g"], SCALE_V_PER_G, atol=2e-3)
+
+
+def test_poses_at_another_supply_are_the_same_poses():
+    wired = (5, 4, 3, 2, 1, 0)
+    rows = np.zeros((14, 9))
+    rows[:, 8] = np.linspace(4.9, 5.1, 14)
+    rows[:, wired] = volts(DIRECTIONS) * rows[:, 8:] / 5.0
+    found = at_nominal_supply(rows, {"channels": list(wired), "nominal_supply_V": 5.0})
+    np.testing.assert_allclose(found, volts(DIRECTIONS), atol=1e-12)
+    unsupplied = rows * np.array([1.0] * 8 + [0.0])
+    for wrong, sensing in ((rows[:, :6], {}), (rows, {"channels": list(range(8))}), (unsupplied, {})):
+        with pytest.raises(InputError):
+            at_nominal_supply(wrong, sensing)
 
 
 @pytest.mark.parametrize("means", [np.ones((3, 6)), np.full((14, 6), np.nan), np.ones((14, 6)), np.ones((14, 5))])

@@ -57,7 +57,11 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
         bench = text(table, "bench")
         if bench and Path(bench) not in session.home.glob("*.toml"):
             raise InputError(f"{bench} is not one of the benches in {session.home}")
-        await session.start(replace(session.choice, bench=Path(bench)) if bench else None)
+        sense_only = table.get("sense_only", False)
+        if not isinstance(sense_only, bool):
+            raise InputError("sense_only must be true or false")
+        choice = replace(session.choice, sense_only=sense_only)
+        await session.start(replace(choice, bench=Path(bench)) if bench else choice)
 
     async def stop(_: Request) -> Any:
         await session.stop()

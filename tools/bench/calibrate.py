@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from firmware_py.frame import LAYOUT
 from tools.bench.applied import Applied
 from tools.bench.history import BLOCK
 from tools.bench.jobs import Jobs
-from tools.bench.poses import identify
+from tools.bench.poses import at_nominal_supply, identify
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.calibrate.calibration_file import calibration_toml
@@ -44,10 +45,10 @@ class Calibration:
         try:
             means = np.array(table["means_V"], dtype=np.float64)
         except (KeyError, TypeError, ValueError):
-            raise InputError("means_V must be rows of six voltages") from None
-        sensing = self._session.bench.description.firmware.get("sensing", {})
+            raise InputError("means_V must be rows of nine voltages: eight inputs and the supply") from None
+        sensing = json.loads(self._session.metadata().get("stages", "{}")).get("sensing", {})
         gravity = float(sensing.get("gravity_m_s2", STANDARD_GRAVITY))
-        result = await asyncio.to_thread(identify, means, gravity)
+        result = await asyncio.to_thread(identify, at_nominal_supply(means, sensing), gravity)
         stages = {"sensing": result["table"]}
         self._keep("poses", calibration_toml("sensors, poses by hand", "micron bench", stages), result)
         return result

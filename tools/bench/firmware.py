@@ -33,6 +33,7 @@ class Choice:
     hand_scale: float | None = None
     seed: int | None = None
     stale_ms: float | None = None
+    sense_only: bool = False
 
 
 class Firmware:
@@ -65,6 +66,7 @@ class Firmware:
             hand_scale=choice.hand_scale,
             seed=choice.seed,
             stale_ms=choice.stale_ms,
+            sense_only=choice.sense_only,
             live_fds=fds,
             truth_s=TRUTH_S,
         )

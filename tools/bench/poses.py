@@ -7,6 +7,7 @@ stay as they are, since a triad's own axes are known only up to a turn.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,25 @@ AXES = ("1x", "1z", "2y", "2z", "3x", "3y")
 TRIADS = ((0, 2, 1), (4, 5, 3))
 """Columns x, y, z of each triad in the firmware's sensor order."""
 MIN_POSES = 12
+INPUTS = 8
+"""Voltages of a frame."""
+
+
+def at_nominal_supply(rows: NDArray[np.float64], sensing: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(n, 6) volts of the axes from ``rows`` (n, 9): eight inputs and the supply, V, each the mean of a pose.
+
+    The sensors are ratiometric, and the calibration file speaks of the nominal supply. ``sensing``: the firmware's
+    sensing stage, for the inputs of the axes. ``InputError`` for rows or benches that do not fit.
+    """
+    channels = list(sensing.get("channels", range(6)))
+    if rows.ndim != 2 or rows.shape[1] != INPUTS + 1:
+        raise InputError(f"a pose is {INPUTS} voltages and the supply's; these are {rows.shape}")
+    if len(channels) != len(AXES):
+        raise InputError(f"poses by hand are for the axes {', '.join(AXES)}; this bench has {len(channels)} axes")
+    supply = rows[:, INPUTS]
+    if not (np.isfinite(supply) & (supply > 0.0)).all():
+        raise InputError("the supply of a pose is not a positive voltage")
+    return rows[:, channels] * (float(sensing.get("nominal_supply_V", 5.0)) / supply[:, None])
 
 
 def identify(means_V: NDArray[np.float64], gravity_m_s2: float) -> dict[str, Any]:

@@ -45,6 +45,9 @@ def run(
         float | None,
         typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
     ] = None,
+    sense_only: Annotated[
+        bool, typer.Option("--sense-only", help="Arm nothing: to record poses turned by hand, or raw sensors.")
+    ] = False,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
     json_file: JsonOption = None,
@@ -69,9 +72,10 @@ def run(
             hand_scale=scale,
             record=record,
             seed=seed,
+            sense_only=sense_only,
         )
-        if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None):
-            raise InputError("--hand and --html belong to the instrument; an endoscope bench has neither")
+        if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None or sense_only):
+            raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
         outcome, truth = _run_virtual(request) if virtual else _run_real(request)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 from scipy.signal import welch
+from scipy.spatial.transform import Rotation
 
 from sim_devices.config import HandConfig
-from sim_devices.plant.hand import SyntheticHand, holding_frame, tremor_matrix
+from sim_devices.plant.hand import POSE_HOLD_S, SyntheticHand, holding_frame, pose_angles, tremor_matrix
 from sim_devices.plant.hand_kernel import between, hand_nodes, hand_pose, jerk_motion, pose_between, reach_motion
 from sim_devices.plant.smooth_noise import smooth_noise
 
@@ -176,3 +177,20 @@ def test_compiled_and_python_agree():
     pose_between.py_func(r, 0.3, 1e-3, y)
     assert np.allclose(q, r, rtol=1e-12, atol=1e-20)
     assert np.allclose(x, y, rtol=1e-9, atol=1e-12)
+
+
+def test_calibration_poses_are_every_half_axis_and_octant_once_and_are_held():
+    """Up in body axes, by scipy's rotations; then the hand itself: still for the pose's rest, in fourteen places."""
+    ups = Rotation.from_euler("ZYX", pose_angles()[:, ::-1]).inv().apply([0.0, 0.0, 1.0])
+    assert {tuple(up) for up in np.sign(ups.round(9))} == {
+        (x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1) if abs(x) + abs(y) + abs(z) in (1, 3)
+    }
+    assert np.abs(np.diff(pose_angles(), axis=0)).max() <= math.pi / 2 + 1e-12
+    config = HandConfig(
+        performs="poses", reach_s=(1.0, 1.0), hold_s=(0.0, 0.0), voluntary_angle_deg=0.0, tremor_pp_um=0.0,
+        roll_tremor_mrad=0.0,
+    )  # fmt: skip
+    pose, _ = motion(config, 2, 14 * 2500)
+    rests = [k * 2500 for k in range(1, 15)]  # each reach ends here and the next begins after POSE_HOLD_S
+    assert np.allclose(pose[rests, 3:6], pose_angles(), atol=1e-12)
+    assert np.ptp(pose[2500 : 2500 + round(1000 * POSE_HOLD_S), 3:6], axis=0).max() == 0.0

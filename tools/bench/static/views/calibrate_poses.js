@@ -3,7 +3,7 @@
 import { post } from "../api.js";
 import { canvas, css, digits, h } from "../dom.js";
 
-const VOLTS = [0, 1, 2, 3, 4, 5].map((i) => `volts_${i}`);
+const VOLTS = [...[0, 1, 2, 3, 4, 5, 6, 7].map((i) => `volts_${i}`), "supply"];
 const FORCE = ["specific_force_x", "specific_force_y", "specific_force_z"];
 const REACH = (22 * Math.PI) / 180;
 const STILL_M_S2 = 0.25;
@@ -29,11 +29,13 @@ export function poseWizard(link, apply, fail) {
   const outcome = h("div");
   const identify = h("button.primary", { onclick: run }, "Identify");
   const again = h("button", { onclick: () => { taken.clear(); result = null; outcome.replaceChildren(); } }, "Start over");
+  const quiet = h("button", { title: "Starts the firmware again without arming the outputs: turning is not tremor", onclick: () => post("/api/firmware/start", { sense_only: !senseOnly() }).catch(fail) });
+  const senseOnly = () => link.state?.status.state === "sensing only";
   const element = h("section.panel", { style: "display:flex;flex-direction:column;min-height:0" },
     h("h2", {}, "Poses by hand ", h("small", {}, "hold each until it is taken; the arrow shows the way")),
     h("div", { style: "flex:1;min-height:120px" }, picture),
     h("div.row", { style: "margin-top:6px" }, hint), h("div.meter", { style: "margin:6px 0" }, meter),
-    h("div.row", {}, identify, again, count), outcome);
+    h("div.row", {}, identify, again, quiet, count), outcome);
 
   function mean(c) {
     const v = subscription.buckets.lows(c);
@@ -41,6 +43,8 @@ export function poseWizard(link, apply, fail) {
   }
 
   function step() {
+    quiet.textContent = senseOnly() ? "Arm again" : "Arm nothing while I turn";
+    quiet.disabled = !link.mayOrder;
     const b = subscription.buckets;
     if (b.n < 900 || b.perBucket !== 1) return;
     const f = [0, 1, 2].map(mean);

@@ -1,0 +1,34 @@
+"""A run that arms nothing: an instrument turned by hand, which an armed run takes for two sensors that disagree."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.app import RunRequest, run_in_process
+from tests.conftest import DEFAULT_BENCH
+
+
+@pytest.fixture
+def turned(tmp_path: Path) -> Path:
+    text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')
+    bench = tmp_path / "turned.toml"
+    bench.write_text(
+        text + '\n[emulation.hand]\nperforms = "poses"\nreach_s = [0.9, 0.9]\nhold_s = [0, 0]\n', encoding="utf-8"
+    )
+    return bench
+
+
+def test_turned_by_hand(turned: Path):
+    armed, _ = run_in_process(RunRequest(turned, 3.0, virtual=True))
+    assert "disagree" in armed["safe_state"]["reason"]
+    assert armed["commands"]["sent"] > 0
+    sensed, truth = run_in_process(RunRequest(turned, 3.0, virtual=True, sense_only=True))
+    assert sensed["safe_state"]["normal"]
+    assert sensed["noticed"].keys() >= {"parallel axes disagree"}
+    assert (sensed["commands"]["sent"], sensed["armed_ns"]) == (0, None)
+    assert sensed["samples"]["lost"] == 0
+    assert truth is not None
+    assert np.ptp(truth["amplifier_V"], axis=0).max() < 1e-6
