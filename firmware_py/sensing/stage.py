@@ -56,7 +56,7 @@ from hal.scratch import scratch, scratch_matrix
 
 MAX_RATE_RAD_S = 20.0
 N_PARITIES = len(PARITIES)
-LEAN_CORNER_HZ = 0.5
+LEAN_CORNER_HZ = 0.3
 """Corrections of the attitude slower than this reach the tip's gravity."""
 
 

@@ -96,9 +96,18 @@ def _saturated(raw: Array) -> NDArray[np.bool_]:
 
 
 def fit_gyroscope(
-    force_raw: Array, rate_raw: Array, rate_hz: float, gravity: float, shortest_s: float = 0.5
+    force_raw: Array,
+    rate_raw: Array,
+    rate_hz: float,
+    gravity: float,
+    shortest_s: float = 0.5,
+    *,
+    keep_saturated: bool = False,
 ) -> GyroscopeFit:
-    """Fit (n, 3) counts of both sensors. ``InputError`` when the turns do not show all nine parameters."""
+    """Fit (n, 3) counts of both sensors. ``InputError`` when the turns do not show all nine parameters.
+
+    ``keep_saturated``: also turns in which the gyroscope stood at its end, to compare with those who keep them.
+    """
     accelerometer = identify_poses(force_raw, rate_hz, gravity, shortest_s)
     window, shortest = max(5, round(0.5 * rate_hz)), max(3, round(shortest_s * rate_hz))
     poses = find_poses(force_raw, window, accelerometer.threshold, shortest)
@@ -109,7 +118,7 @@ def fit_gyroscope(
     stuck = _saturated(rate_raw)
     clean = np.array([not stuck[a:b].any() for a, b in bounds], dtype=bool)
     turned = np.arccos(np.clip(np.sum(up[:-1] * up[1:], axis=1), -1.0, 1.0)) > LEAST_TURN_RAD
-    use = clean & turned
+    use = turned if keep_saturated else clean & turned
     saturated = int(np.sum(turned & ~clean))
     if np.sum(use) < LEAST_TURNS:
         raise InputError(

@@ -1,7 +1,8 @@
 """Calibration of a three-axis accelerometer from poses at unknown angles (Tedaldi, Pretto, Menegatti, ICRA 2014).
 
 a = T K (raw - b), T = [[1, -t0, t1], [0, 1, -t2], [0, 0, 1]], and |a| = g in every still pose. Nine parameters, so nine
-poses at least; x keeps its direction.
+poses at least; x keeps its direction. Ten poses hardly tell the misalignments: there a maker's limits
+hold them.
 """
 
 from __future__ import annotations
@@ -19,6 +20,9 @@ from tools.errors import InputError
 Array = NDArray[np.float64]
 NAMES = ("misalignment_0", "misalignment_1", "misalignment_2", "scale_x", "scale_y", "scale_z")
 NAMES += ("bias_x", "bias_y", "bias_z")
+
+MISALIGNMENT_RAD = 0.02
+"""Standard deviation of a misalignment before any pose is seen: 2 % cross-axis sensitivity, as data sheets print it."""
 
 
 @dataclass(frozen=True)
@@ -85,15 +89,17 @@ def fit_poses(
     unit = np.concatenate([np.ones(3), gravity / reach, reach])
     base = np.concatenate([np.zeros(3), gravity / reach, offset])
     root = np.sqrt(weight / weight.mean())
+    pose_m_s2 = pose_noise * gravity / float(np.median(reach))
 
     def residual(x: Array) -> Array:
-        return root * (np.linalg.norm(compensate(base + x * unit, mean), axis=1) - gravity)
+        seen = root * (np.linalg.norm(compensate(base + x * unit, mean), axis=1) - gravity)
+        return np.append(seen, pose_m_s2 / MISALIGNMENT_RAD * x[:3])
 
     fit = least_squares(residual, np.zeros(9), x_scale="jac", method="lm", max_nfev=2000)
     values = base + fit.x * unit
     condition = float(np.linalg.cond(fit.jac / np.linalg.norm(fit.jac, axis=0)))
-    freedom = max(1, n - 9)
-    sigma2 = max(float(fit.fun @ fit.fun) / freedom, (pose_noise * gravity / float(np.median(reach))) ** 2)
+    freedom = max(1, n - 9 + (3 if pose_noise > 0.0 else 0))
+    sigma2 = max(float(fit.fun @ fit.fun) / freedom, pose_m_s2**2)
     deviation = unit * np.sqrt(np.maximum(np.diag(sigma2 * np.linalg.pinv(fit.jac.T @ fit.jac)), 0.0))
     reach95 = float(student.ppf(0.975, freedom)) * deviation
     magnitude = np.linalg.norm(compensate(values, mean), axis=1)

@@ -16,7 +16,8 @@ import numpy as np
 from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.gyroscope import fit_gyroscope
 from tools.calibrate.logs import load_log
-from tools.calibrate.multi_position import identify_poses
+from tools.calibrate.multi_position import fit_poses, identify_poses
+from tools.calibrate.still import quiet_level
 from tools.noise.allan import allan_curve
 from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
 from tools.reproduce.rows import Row, Table, build
@@ -88,13 +89,23 @@ def xsens() -> list[Row]:
 
 
 def mpu6050() -> list[Row]:
-    """Accelerometer of an MPU-6050 from ten poses."""
+    """Accelerometer of an MPU-6050 from ten poses: those that we find, and the author's, three of them under 0.3 s."""
     log = load_log(data_folder() / "mpu6050_tomisuarez" / "calibration.npz", 100.0)
-    reference = _meta("mpu6050_tomisuarez")["reference_accelerometer"]
-    result = identify_poses(log.matrix(ACCELEROMETER), 100.0, 9.80665)
-    source, condition = "tomisuarez2/ImuCalibration, MPU-6050", f"{result.poses} poses"
+    meta = _meta("mpu6050_tomisuarez")
+    reference, intervals = meta["reference_accelerometer"], meta["reference_static_intervals"]
+    raw = log.matrix(ACCELEROMETER)
+    found = identify_poses(raw, 100.0, 9.80665)
+    bounds = list(zip(intervals["start_sample"], intervals["stop_sample"], strict=True))
+    mean = np.array([raw[a : b + 1].mean(axis=0) for a, b in bounds])
+    samples = np.array([b + 1 - a for a, b in bounds], dtype=np.float64)
+    noise = quiet_level(raw, 50) / np.sqrt(3.0 * np.median(samples))
+    result = fit_poses(mean, np.minimum(samples, 200.0), 9.80665, pose_noise=float(noise))
+    source, condition = "tomisuarez2/ImuCalibration, MPU-6050", "the author's own ten intervals"
     published = reference["magnitude_calibrated_m_s2"][1]
-    rows = [Row(source, "residual of |a|", "m/s^2", condition, published, result.residual_m_s2, "lower", "recording")]
+    rows = [
+        Row(source, "residual of |a|", "m/s^2", what, published, fit.residual_m_s2, "lower", "recording")
+        for what, fit in ((f"{found.poses} poses found", found), (condition, result))
+    ]
     for i, axis in enumerate("xyz"):
         scale, bias = result.parameters[f"scale_{axis}"], result.parameters[f"bias_{axis}"]
         rows += [
@@ -121,10 +132,13 @@ def mpu6050() -> list[Row]:
                 "equal",
                 "recording",
                 tolerance=published / reference["scale_m_s2_per_count"][i],
-                why="nine parameters from ten poses, three of them shorter than 0.15 s in the published fit",
+                why="nine parameters from ten poses; ours hold the misalignments at a data sheet's 2 %",
             ),
         ]
     return rows
+
+
+SATURATED = "in two turns the gyroscope is at its end; with them, as the author has it, the x scale rises (rows below)"
 
 
 def gyroscopes() -> list[Row]:
@@ -132,18 +146,23 @@ def gyroscopes() -> list[Row]:
     rows = []
     xsens_factory = [1.0 / v for v in _meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]]
     mpu = _meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
-    for source, file, rate_hz, gravity, published in (
-        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory),
-        ("tomisuarez2/ImuCalibration, MPU-6050", "mpu6050_tomisuarez/calibration.npz", 100.0, 9.80665, mpu),
+    author = "tomisuarez2/ImuCalibration, MPU-6050"
+    cheap = "mpu6050_tomisuarez/calibration.npz"
+    for source, file, rate_hz, gravity, published, keep in (
+        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory, False),
+        (author, cheap, 100.0, 9.80665, mpu, False),
+        (author, cheap, 100.0, 9.80665, mpu, True),
     ):
         log = load_log(data_folder() / file, rate_hz)
-        fit = fit_gyroscope(log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE), log.need_rate(), gravity)
+        force, turning = log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE)
+        fit = fit_gyroscope(force, turning, log.need_rate(), gravity, keep_saturated=keep)
         condition = (
-            f"{fit.turns} turns between poses, {fit.saturated} saturated ones left out; gravity after a turn "
-            f"off by {np.degrees(fit.residual_rad):.2f} deg rms"
+            f"{fit.turns} turns between poses, {fit.saturated} saturated ones {'kept' if keep else 'left out'}; "
+            f"gravity after a turn off by {np.degrees(fit.residual_rad):.2f} deg rms"
         )
         for i, axis in enumerate("xyz"):
             scale = fit.parameters[f"scale_{axis}"]
+            interval = f"our 95 % interval is +-{100.0 * (scale.high / scale.value - 1.0):.2f} %"
             rows.append(
                 Row(
                     source,
@@ -155,7 +174,7 @@ def gyroscopes() -> list[Row]:
                     "equal",
                     "recording",
                     tolerance=scale.high - scale.value,
-                    why=f"our 95 % interval is +-{100.0 * (scale.high / scale.value - 1.0):.2f} %",
+                    why=f"{interval}; {SATURATED}" if fit.saturated and not keep else interval,
                 )
             )
     return rows

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from tools.calibrate.ellipsoid import fit_ellipsoid
-from tools.calibrate.multi_position import identify_poses, missing_poses
+from tools.calibrate.multi_position import fit_poses, identify_poses, missing_poses
 from tools.calibrate.quick import flat, free_fall, turn
 from tools.calibrate.still import remove_drift, warm_up
 from tools.cli.common import InputError
@@ -53,6 +53,26 @@ def test_poses_give_bias_and_scale_inside_their_intervals() -> None:
 def test_too_few_poses_are_refused() -> None:
     with pytest.raises(InputError, match="nine are needed"):
         identify_poses(posed_log(7), RATE_HZ, G)
+
+
+def test_what_the_poses_do_not_tell_stays_within_what_a_maker_allows() -> None:
+    """The ten poses of the MPU-6050's log: none is turned about z, so nothing tells the angle between x and y."""
+    up = np.array([[0, 0, 1.0], [0.1, 0, -1], [-1, 0, -0.1], [1, 0, 0], [0, -1, 0], [0, 1, 0]])
+    up = np.vstack([up, [[0, 0.8, 0.6], [0, -0.7, 0.7], [-0.9, 0, 0.4], [0.6, 0, 0.8]]])
+    force = G * up / np.linalg.norm(up, axis=1)[:, None]
+    rng = np.random.default_rng(1)
+    off, inside = np.empty(20), 0
+    for k in range(20):
+        t = 0.02 * rng.standard_normal(3)
+        turn_in = np.linalg.inv([[1.0, -t[0], t[1]], [0.0, 1.0, -t[2]], [0.0, 0.0, 1.0]])
+        mean = (force @ turn_in.T) * TRUE_SCALE + TRUE_BIAS + 3.0 * rng.standard_normal((10, 3))
+        held = fit_poses(mean, np.ones(10), G, pose_noise=3.0).parameters
+        off[k] = held["misalignment_0"].value - t[0]
+        true = [*t, *(1.0 / TRUE_SCALE), *TRUE_BIAS]
+        inside += sum(e.low < v < e.high for e, v in zip(held.values(), true, strict=True))
+    # without that some of them are radians off
+    assert np.max(np.abs(off)) < 0.06
+    assert inside >= 0.95 * 20 * 9
 
 
 def test_missing_poses_are_named() -> None:
