@@ -1,19 +1,21 @@
 """Monitor outputs of a piezo amplifier, or sense wires at the stacks, read by an ADC and compared with the commands.
 
-What is measured must lie between the lowest and the highest voltage that was commanded during the conversion and
-the amplifier's settling time before it, give or take a tolerance: no model of the amplifier is needed. A reading
-a little outside is looked at once more, on the same channel, before anything is said. Wired to the stack's terminals
-it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
+The converter averages over its conversion, so what is measured must be a mean of the commands that were in force
+meanwhile, each with a weight between the shortest and the longest time that it can have been in force: no model of
+the amplifier is needed, only how long it may take to settle. What a healthy output differs by (gain and offset of
+amplifier and divider) is learnt within the tolerance, and a change of it is as suspicious as a difference beyond the
+tolerance. A suspicious reading is looked at once more, on the same channel, before anything is said. Wired to the stack's terminals it sees a broken cable too; wired to the amplifier's
+monitor socket it sees the amplifier only.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from drivers.adc.ads1115 import Ads1115
+from drivers.adc.ads1115 import ORDER_NS, RATE_TOLERANCE, WAKE_UP_NS, Ads1115
 from hal.contracts import Clock, Float64Array
 from hal.output_guard import OutputGuard
 
@@ -21,11 +23,46 @@ GROSS = 8.0
 """Times the tolerance: no noise and no mistake of a model, believed at once."""
 
 
+class Window(NamedTuple):
+    """When a conversion begins at the earliest and at the latest (bench ns), and its longest and shortest time."""
+
+    earliest_ns: int
+    latest_ns: int
+    longest_ns: int
+    shortest_ns: int
+
+
+LEARN = 60
+"""Readings of an output before what is usual counts as known; its memory is four times as long."""
+INSIDE = 0.3
+"""Of the width of what is expected: where in it a healthy amplifier's mean lies hardly changes."""
+
+
+class Usual:
+    """Straight line through what one output has lately differed by from the middle of what was expected."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._sums = [0.0] * 5  # 1, x, x x, y, x y, forgetting
+
+    def at(self, x_V: float) -> float:
+        n, sx, sxx, sy, sxy = self._sums
+        slope = (sxy - sx * sy / n) / (sxx - sx * sx / n + n)  # as if known to 0 +- the difference over 1 V rms
+        return sy / n + slope * (x_V - sx / n)
+
+    def learn(self, x_V: float, y_V: float) -> None:
+        keep = 1.0 - 0.25 / LEARN
+        new = (1.0, x_V, x_V * x_V, y_V, x_V * y_V)
+        self._sums = [keep * old + term for old, term in zip(self._sums, new, strict=True)]
+        self.count += 1
+
+
 class AmplifierMonitor:
     """``channels``: ADC inputs of outputs 1, 2, 3; output volts = ADC volts x ``ratio``.
 
     ``settle_s``: how long the amplifier may take to follow a step of one tick. ``tolerance_V``: sum of the errors of
-    gain and offset of amplifier, divider and ADC.
+    gain and offset of amplifier, divider and ADC. ``change_V``: by how much more or less than usual a reading may
+    differ.
     """
 
     def __init__(
@@ -38,6 +75,7 @@ class AmplifierMonitor:
         ratio: float = 20.0,
         tolerance_V: float = 0.5,
         settle_s: float = 0.0003,
+        change_V: float = 0.15,
         name: str = "monitor",
     ) -> None:
         self.name = name
@@ -51,7 +89,12 @@ class AmplifierMonitor:
         self._channels = tuple(channels)
         self._ratio = ratio
         self._tolerance_V = tolerance_V
+        self._change_V = change_V
+        self._usual = [Usual() for _ in channels]
         self._settle_ns = round(settle_s * 1e9)
+        nominal_ns = (adc.conversion_ns - WAKE_UP_NS) / (1.0 + RATE_TOLERANCE)
+        self._longest_ns = round(nominal_ns * (1.0 + RATE_TOLERANCE))
+        self._shortest_ns = round(nominal_ns * (1.0 - RATE_TOLERANCE))
         self._output = 0
         self._asked_ns = self._started_ns = 0  # the conversion under way began in between
         self._suspected = False
@@ -77,23 +120,41 @@ class AmplifierMonitor:
         self._adc.pending = None
         self._suspected = False
 
-    def expected_V(self, output: int, from_ns: int, to_ns: int) -> tuple[float, float] | None:
-        """Lowest and highest command that may have been in force between two times; ``None``: not known any more."""
-        lowest, highest = math.inf, -math.inf
+    def window(self) -> Window:
+        """Of the conversion under way: it began while its order was on the bus, or woke up after it."""
+        early_ns = self._asked_ns + ORDER_NS
+        return Window(early_ns, self._started_ns + WAKE_UP_NS, self._longest_ns, self._shortest_ns)
+
+    def expected_V(self, output: int, window: Window) -> tuple[float, float] | None:
+        """Lowest and highest mean of the commands of ``output`` over a conversion; ``None``: not known any more.
+
+        A command is in force from some time between its offer and its acknowledge, plus the settling time, until the
+        next one is.
+        """
+        shortest: list[tuple[float, float, float]] = []  # volts, least weight, further weight
+        end_ns = window.latest_ns + window.longest_ns
+        gone_late_ns = gone_early_ns = end_ns  # when the next command took over, at the latest and at the earliest
         for told in reversed(self._guard.told):
-            if told.offered_ns < to_ns:
-                v = told.volts[output]
-                lowest, highest = min(lowest, v), max(highest, v)
-            if told.sent_ns <= from_ns:  # all that came before had been replaced by this one
-                return lowest, highest
+            since_late_ns = told.sent_ns + self._settle_ns
+            if told.offered_ns < end_ns:
+                least_ns = min(gone_early_ns, window.earliest_ns + window.shortest_ns) - max(
+                    since_late_ns, window.latest_ns
+                )
+                most_ns = min(gone_late_ns, end_ns) - max(told.offered_ns, window.earliest_ns)
+                least = max(0, least_ns) / window.longest_ns
+                most = min(1.0, max(0, most_ns) / window.shortest_ns)
+                shortest.append((told.volts[output], least, most - least))
+            if since_late_ns <= window.earliest_ns:  # all that came before had been replaced by this one
+                return _mean(sorted(shortest)), _mean(sorted(shortest, reverse=True))
+            gone_late_ns, gone_early_ns = since_late_ns, told.offered_ns
         return None  # commands older than those that are kept
 
     def _judge(self, measured_V: float) -> str:
         output = self._output
         self.volts[output] = measured_V
         self.readings += 1
-        span = self.expected_V(output, self._asked_ns - self._settle_ns, self._started_ns + self._adc.conversion_ns)
-        if span is None or span[0] - self._tolerance_V <= measured_V <= span[1] + self._tolerance_V:
+        span = self.expected_V(output, self.window())
+        if span is None or not self._is_odd(output, measured_V, span):
             self._suspected = False
             self._output = (output + 1) % len(self._channels)
             return ""
@@ -107,3 +168,26 @@ class AmplifierMonitor:
             f"output {output + 1} is at {measured_V:.2f} V and was told {told}: the amplifier, its supply, a cable or "
             f"a stack is broken (or {self.name} is); switch the amplifier off"
         )
+
+    def _is_odd(self, output: int, measured_V: float, span: tuple[float, float]) -> bool:
+        if not span[0] - self._tolerance_V <= measured_V <= span[1] + self._tolerance_V:
+            return True
+        usual, middle_V = self._usual[output], 0.5 * (span[0] + span[1])
+        off_V = measured_V - middle_V
+        if usual.count >= LEARN:
+            allowed_V = self._change_V + INSIDE * (span[1] - span[0])
+            if abs(off_V - usual.at(middle_V)) > allowed_V:
+                return True
+        usual.learn(middle_V, off_V)
+        return False
+
+
+def _mean(commands: Sequence[tuple[float, float, float]]) -> float:
+    """Mean of volts with weights that sum to one: each its least, the rest to the first ones."""
+    left = 1.0 - sum(least for _, least, _ in commands)
+    mean_V = 0.0
+    for volts, least, further in commands:
+        extra = min(left, further)
+        left -= extra
+        mean_V += volts * (least + extra)
+    return mean_V

@@ -70,6 +70,7 @@ class AmplifierMonitorOptions(Options):
     ratio: float = Field(default=20.0, gt=0, le=1000)
     tolerance_V: float = Field(default=0.5, gt=0)
     settle_ms: float = Field(default=0.3, ge=0, le=10.0)
+    change_V: float = Field(default=0.15, gt=0)
 
 
 class DacAmplifierOptions(Options):

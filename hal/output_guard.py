@@ -21,7 +21,7 @@ TOLD = 16
 
 
 class Told(NamedTuple):
-    """One command: it took force between the two times (bench clock, ns)."""
+    """One command: it took force between the two times (bench clock, ns), where the driver says no better."""
 
     offered_ns: int
     sent_ns: int
@@ -143,6 +143,10 @@ class OutputGuard:
             if step_V > 0.0:
                 fewest = min(fewest, int(limit.slew_V_per_s * self._ramp_step_ns * 1e-9 / step_V))
         return max(1, fewest)
+
+    def not_before(self, t_ns: int) -> None:
+        """``next_V`` cannot take force before ``t_ns``: its transfer takes so long."""
+        self._offered_ns = t_ns
 
     def sent(self) -> None:
         """The device has been told ``next_V``."""

@@ -268,7 +268,8 @@ class World:
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
         monitored = self._monitors.get(name)
-        adc = Ads1115(self._magnetometer_V if monitored is None else self._stack_monitor(monitored))
+        # outputs step within a conversion; the field does not
+        adc = Ads1115(self._magnetometer_V) if monitored is None else Ads1115(self._stack_monitor(monitored), looks=8)
         self._add_i2c(name, device, adc)
         self._timed.append(adc)
 

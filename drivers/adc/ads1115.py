@@ -23,6 +23,8 @@ PGA_CODES = {6.144: 0, 4.096: 1, 2.048: 2, 1.024: 3, 0.512: 4, 0.256: 5}
 RATE_CODES = {8: 0, 16: 1, 32: 2, 64: 3, 128: 4, 250: 5, 475: 6, 860: 7}
 WAKE_UP_NS = 50_000  # 25 us typical from power-down, doubled
 RATE_TOLERANCE = 0.10
+ORDER_NS = 90_000
+"""Address and three bytes at 400 kHz, the fastest without the high-speed master code: no conversion begins before."""
 
 
 class Ads1115:

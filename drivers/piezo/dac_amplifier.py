@@ -29,6 +29,7 @@ PATTERNS = (0x5AA5, 0x0000, 0xA55A)  # into DAC D; the last one stays there and 
 DAC_SPAN_V = 5.0
 CODES = 65536
 RAMP_TICK_S = 0.001
+TRANSFER_NS = 365_000  # 4 segments of 4 bytes at 400 kHz, the fastest that the part allows, less a bit each
 
 
 class OutputGate(Protocol):
@@ -184,6 +185,7 @@ class DacAmplifier:
             I2cWrite(bytes((0x14, c >> 8, c & 0xFF))),
             self._update,
         )
+        self.guard.not_before(self._clock.now_ns() + TRANSFER_NS)
         if self.gate is None:
             self._bus.transfer(self._address, segments)
         else:

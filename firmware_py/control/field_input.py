@@ -13,14 +13,19 @@ from hal.errors import HalError
 
 
 class FieldInput:
-    """``limit_ms``: how long the field may be missing or stand still before the run ends."""
+    """``limit_ms``: how long the field may be missing or stand still before the run ends. ``outlier_V``: a second
+    difference of an axis' readings beyond it is noticed; a hand turns and trembles too slowly for it."""
 
-    def __init__(self, magnetometer: Hmc2003, incidents: Incidents, counts: LoopCounts, limit_ms: float) -> None:
+    def __init__(
+        self, magnetometer: Hmc2003, incidents: Incidents, counts: LoopCounts, limit_ms: float, outlier_V: float
+    ) -> None:
         self._magnetometer = magnetometer
         self._incidents = incidents
         self._counts = counts
         self._limit_ms = limit_ms
+        self._outlier_V = outlier_V
         self._volts = np.zeros(3)
+        self._before, self._slope = np.full(3, np.nan), np.full(3, np.nan)
         self._fresh = False
         self._hangs = False
 
@@ -42,6 +47,7 @@ class FieldInput:
                 if hangs and self._hangs:
                     incidents.notice("magnetometer's converter hangs")
                 self._hangs = hangs
+                self._look_for_outliers(volts)
                 self._volts[:] = volts
                 self._fresh = not hangs
             reason = f"{magnetometer.name}: its converter gives one reading for all axes; it hangs"
@@ -50,3 +56,10 @@ class FieldInput:
             self._counts.magnetometer_errors += 1
             incidents.notice("magnetometer does not answer")
             incidents.bad_for("magnetometer", True, info.due_ns, self._limit_ms, str(error))
+
+    def _look_for_outliers(self, volts: NDArray[np.float64]) -> None:
+        """The I2C bus has no checksum: a flipped bit is a reading out of line with its neighbours."""
+        slope = volts - self._before
+        if np.any(np.abs(slope - self._slope) > self._outlier_V):  # never of the first two: NaN
+            self._incidents.notice(f"{self._magnetometer.name} read a value out of line with its neighbours")
+        self._slope, self._before = slope, volts.copy()

@@ -94,8 +94,8 @@ class InstrumentLoop:
             self._orders = PageOrders(live, self.manual, stages, self.supervisor, self.incidents, clock)
         self._field = None
         if devices.magnetometer is not None:
-            limit_ms = config.safety.magnetometer_ms
-            self._field = FieldInput(devices.magnetometer, self.incidents, self.counts, limit_ms)
+            limit_ms, outlier_V = config.safety.magnetometer_ms, config.plausibility.magnetometer_outlier_V
+            self._field = FieldInput(devices.magnetometer, self.incidents, self.counts, limit_ms, outlier_V)
         wired = devices.sensing_table
         watched = [*wired["channels"], wired["supply_channel"], wired["temperature_channel"]]
         columns = [column for column in watched if column is not None]

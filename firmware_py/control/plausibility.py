@@ -28,8 +28,9 @@ PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
 class PlausibilityLimits(BaseModel):
     """What no healthy sensor does. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter.
 
-    ``outlier_V``: second difference of an accelerometer's readings, ``supply_step_V``: of the supply's from tick to
-    tick; both are noticed only. ``pair_m_s2``: parallel axes may not differ by more on average over ``pair_s``. What
+    ``outlier_V``: second difference of an accelerometer's readings, ``magnetometer_outlier_V``: of the magnetometer's
+    (10 ms apart), ``supply_step_V``: change of the supply's from tick to tick; all three are noticed only.
+    ``pair_m_s2``: parallel axes may not differ by more on average over ``pair_s``. What
     they differ by at once, against their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` (of x, z, y:
     1.3 rad/s^2 over the distance of the two) plus PAIR_SPREADS times their usual spread.
     """
@@ -43,6 +44,7 @@ class PlausibilityLimits(BaseModel):
     pair_s: float = Field(default=0.1, ge=0.02)
     outlier_V: float = Field(default=0.005, gt=0.0)
     supply_step_V: float = Field(default=0.004, gt=0.0)
+    magnetometer_outlier_V: float = Field(default=0.01, gt=0.0)
     pair_step_m_s2: tuple[float, float, float] = (0.15, 0.05, 0.15)
     pair_memory_s: float = Field(default=5.0, gt=0.0)
 

@@ -113,7 +113,8 @@ def open_devices(bench: OpenBench) -> Devices:
         probe(adc.name, adc.probe)
         monitor = AmplifierMonitor(
             adc, _guard_of(amplifier, where, name), bench.clock, monitor_options.channels, ratio=monitor_options.ratio,
-            tolerance_V=monitor_options.tolerance_V, settle_s=monitor_options.settle_ms * 1e-3, name=name,
+            tolerance_V=monitor_options.tolerance_V, settle_s=monitor_options.settle_ms * 1e-3,
+            change_V=monitor_options.change_V, name=name,
         )  # fmt: skip
     telemetry = None
     for name, spec in description.devices_with("can_telemetry").items():

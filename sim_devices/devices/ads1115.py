@@ -6,7 +6,8 @@ Wire face: I2C segments. Truth face: a callable that gives the four input voltag
 observable ``alert_asserted``.
 
 Model limits
-- The modulator's averaging is a trapezoid over one conversion: the mean of the inputs at its start and end.
+- The modulator's averaging is a trapezoid over ``looks`` equal parts of one conversion; with one look the mean of the
+  inputs at its start and end.
 - No noise, offset or gain error, no input impedance; inputs beyond GND..VDD are measured as if allowed.
 - The data rate has one constant error (data sheet: +-10 %) instead of a drifting oscillator; the 25 us wake-up
   of a single shot is added. A config write during a conversion lets it end with the old settings.
@@ -34,7 +35,7 @@ OS_BIT, MODE_BIT = 0x8000, 0x0100
 class Ads1115:
     """One ADS1115. ``rate_error`` = 0.05 makes conversions 5 % faster than the nominal data rate."""
 
-    def __init__(self, inputs: VoltageSource, *, rate_error: float = 0.0) -> None:
+    def __init__(self, inputs: VoltageSource, *, rate_error: float = 0.0, looks: int = 1) -> None:
         if not -0.1 <= rate_error <= 0.1:
             raise ValueError(f"rate_error {rate_error} is outside the data sheet's +-10 %")
         self.nack_address = False
@@ -43,6 +44,7 @@ class Ads1115:
         self.conversions = 0
         self._inputs = inputs
         self._rate_error = rate_error
+        self._looks = looks
         self._reset()
 
     def _reset(self) -> None:
@@ -51,7 +53,10 @@ class Ads1115:
         self._pointer = 0
         self._due_ns: int | None = None
         self._running = 0  # config that the running conversion uses
-        self._start_V = 0.0
+        self._begun_ns = 0
+        self._part_ns = 0
+        self._looked = 0
+        self._sum_V = 0.0
         self._beyond = 0  # successive conversions beyond the thresholds
 
     # ------------------------------------------------------------------ wire face
@@ -85,11 +90,15 @@ class Ads1115:
         return not self.nack_address
 
     def next_event_ns(self) -> int | None:
-        return None if self.frozen else self._due_ns
+        return None if self.frozen else self._look_ns()
 
     def advance_to(self, t_ns: int) -> None:
-        while self._due_ns is not None and self._due_ns <= t_ns and not self.frozen:
-            self._finish(self._due_ns)
+        while (due_ns := self._look_ns()) is not None and due_ns <= t_ns and not self.frozen:
+            if due_ns == self._due_ns:
+                self._finish(due_ns)
+            else:
+                self._looked += 1
+                self._sum_V += self._differential_V(due_ns)
 
     # ------------------------------------------------------------------ conversions
 
@@ -110,8 +119,17 @@ class Ads1115:
     def _begin(self, t_ns: int, delay_ns: int) -> None:
         self._running = self.registers[CONFIG]
         rate_hz = RATES_HZ[self._running >> 5 & 0x7] * (1.0 + self._rate_error)
-        self._start_V = self._differential_V(t_ns)
-        self._due_ns = t_ns + delay_ns + round(1e9 / rate_hz)
+        self._sum_V = 0.5 * self._differential_V(t_ns)
+        self._begun_ns = t_ns + delay_ns
+        self._part_ns = round(1e9 / rate_hz) // self._looks
+        self._due_ns = self._begun_ns + round(1e9 / rate_hz)
+        self._looked = 1
+
+    def _look_ns(self) -> int | None:
+        """When the input is looked at next; the last time is the end of the conversion."""
+        if self._due_ns is None or self._looked >= self._looks:
+            return self._due_ns
+        return self._begun_ns + self._looked * self._part_ns
 
     def _differential_V(self, t_ns: int) -> float:
         volts = self._inputs(t_ns)
@@ -119,7 +137,7 @@ class Ads1115:
         return float(volts[positive]) - (0.0 if negative is None else float(volts[negative]))
 
     def _finish(self, t_ns: int) -> None:
-        mean_V = 0.5 * (self._start_V + self._differential_V(t_ns))
+        mean_V = (self._sum_V + 0.5 * self._differential_V(t_ns)) / self._looks
         full_scale_V = FULL_SCALE_V[self._running >> 9 & 0x7]
         code = int(np.clip(np.rint(mean_V * 32768.0 / full_scale_V), -32768, 32767))
         self.registers[CONVERSION] = code & 0xFFFF

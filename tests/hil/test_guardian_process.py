@@ -108,3 +108,20 @@ def test_a_firmware_that_stands_still_is_taken_over_and_says_so_when_it_wakes(ru
     assert outcome["safe_state"]["reached"]
     assert "no command for a while (guardian)" in outcome["noticed"]
     assert run.report()["why"] == "silent"
+
+
+def test_a_guardian_that_is_killed_is_missed(run: Run, tmp_path: Path) -> None:
+    run.wait_until_moving(0.1)
+    task = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children")
+    children = [int(pid) for pid in task.read_text().split()]
+    guardians = [pid for pid in children if b"guardian.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    assert len(guardians) == 1
+    os.kill(guardians[0], signal.SIGKILL)
+    time.sleep(0.5)
+    run.process.send_signal(signal.SIGINT)
+    assert run.process.stdout is not None
+    run.process.stdout.read()
+    assert run.process.wait(60.0) == 0
+    outcome = json.loads((tmp_path / "outcome.json").read_text())
+    assert "the guardian of the outputs is not heard any more" in outcome["noticed"]
+    assert outcome["safe_state"]["reached"]  # the firmware is not less able to stop

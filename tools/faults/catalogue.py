@@ -8,10 +8,7 @@ DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
 ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 100 Hz only"
-LOOKS = (
-    "each output is measured every 7.5 ms; a difference that is smaller than what the command moves by during one "
-    "conversion (up to 3.5 V) waits for a later look"
-)
+LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
 
@@ -128,7 +125,7 @@ def magnetometer() -> tuple[Fault, ...]:
         Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "safe state", ("mag",), 0.3),
         Fault("magnetometer: one transfer in ten refused", OnBus("i2c0", {"nack": 0.1}, ADC), "noticed", ("mag",)),
         Fault(
-            "magnetometer: bits of its readings flipped", OnBus("i2c0", {"corruption": 0.1}, ADC), "harmless",
+            "magnetometer: bits of its readings flipped", OnBus("i2c0", {"corruption": 0.1}, ADC), "noticed", ("mag",),
             why="gated by the field's norm; " + coasts,
         ),
         Fault("magnetometer: no ADC at start", InWorld("nack", "mag_adc"), "refused", ("0x48",), at_start=True),

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from drivers.adc.ads1115 import Ads1115
-from drivers.amplifier_monitor import AmplifierMonitor
+from drivers.amplifier_monitor import AmplifierMonitor, Usual, Window
 from hal.clock import VirtualClock
-from hal.output_guard import OutputGuard
+from hal.output_guard import OutputGuard, Told
 from hal.types import OutputLimit
 from sim_devices.devices.ads1115 import Ads1115 as EmulatedAds1115
 from sim_devices.transports.i2c_line import I2cLine
@@ -21,16 +21,17 @@ LIMIT = OutputLimit(0.0, 100.0, 20_000.0, 50.0)
 class Rig:
     """Outputs follow the commands at once, plus ``error_V``."""
 
-    def __init__(self) -> None:
+    def __init__(self, settle_s: float = 0.0003) -> None:
         self.clock = VirtualClock()
         self.guard = OutputGuard("piezo", (LIMIT,) * 3, self.clock)
         self.guard.armed = True
         self.error_V = np.zeros(3)
         self.gain = np.ones(3)
         line = I2cLine(400_000)
-        line.attach(0x49, EmulatedAds1115(lambda _: np.append(self.outputs_V() / 20.0, 0.0)))
+        self.adc = EmulatedAds1115(lambda _: np.append(self.outputs_V() / 20.0, 0.0), looks=8)
+        line.attach(0x49, self.adc)
         bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
-        self.monitor = AmplifierMonitor(Ads1115(bus, self.clock, 0x49), self.guard, self.clock)
+        self.monitor = AmplifierMonitor(Ads1115(bus, self.clock, 0x49), self.guard, self.clock, settle_s=settle_s)
         self.time_ms = 0
 
     def outputs_V(self) -> np.ndarray:
@@ -41,6 +42,7 @@ class Rig:
         said = []
         for _ in range(ticks):
             t = self.time_ms * 1e-3
+            self.adc.advance_to(self.clock.now_ns())  # it has seen what was there until now
             self.guard.admit(50.0 + 20.0 * np.sin(2 * np.pi * 10.0 * t + np.arange(3)))
             self.guard.sent()
             if self.time_ms % 2 and (text := self.monitor.poll()):
@@ -101,7 +103,41 @@ def test_a_command_under_way_may_have_arrived_already():
     rig.clock.burn_ns(3 * MS)
     rig.guard.sent()
     last_V = rig.guard.told[-2].volts[0]
-    assert rig.monitor.expected_V(0, begun_ns, begun_ns + 2 * MS) == (min(last_V, 60.0), max(last_V, 60.0))
+    window = Window(begun_ns, begun_ns, 2 * MS, 2 * MS)
+    assert rig.monitor.expected_V(0, window) == pytest.approx((min(last_V, 60.0), max(last_V, 60.0)))
+
+
+def told_at(rig: Rig, *commands: tuple[float, float, float]) -> None:
+    """Commands of output 1: offered at, taken in force at the latest at (ms), volts."""
+    for offered_ms, sent_ms, volts in commands:
+        rig.guard.told.append(Told(round(offered_ms * MS), round(sent_ms * MS), (volts, 50.0, 50.0)))
+
+
+@pytest.mark.parametrize(
+    ("window_ms", "expected_V"),
+    [
+        ((2.0, 2.0, 1.0, 1.0), (20.0, 20.0)),  # within one command
+        ((1.5, 1.5, 1.0, 1.0), (15.0, 15.0)),  # half of the old, half of the new
+        ((2.6, 2.6, 1.0, 1.0), (24.0, 26.0)),  # the third comes at 3.0 to 3.2 ms
+        ((1.2, 1.4, 1.0, 1.0), (12.0, 14.0)),  # begins 0.8 to 0.6 ms before the second
+        ((1.2, 1.2, 1.1, 0.9), (10 + 10 * 0.1 / 0.9, 10 + 10 * 0.3 / 1.1)),  # ends 0.1 to 0.3 ms after it
+    ],
+)
+def test_the_mean_of_commands_over_a_conversion(window_ms: tuple[float, ...], expected_V: tuple[float, float]):
+    """Worked out by hand for steps at 1, 2 and 3.0 to 3.2 ms and an amplifier without delay."""
+    rig = Rig(settle_s=0.0)
+    told_at(rig, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0), (3.0, 3.2, 30.0))
+    found = rig.monitor.expected_V(0, Window(*(round(ms * MS) for ms in window_ms)))
+    assert found is not None
+    assert found[0] <= expected_V[0] + 1e-9
+    assert found[1] >= expected_V[1] - 1e-9
+    assert found == pytest.approx(expected_V, abs=1.0)  # bounds may be wider, but not by much
+
+
+def test_an_amplifier_that_settles_may_be_late():
+    rig = Rig(settle_s=0.0003)
+    told_at(rig, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0))
+    assert rig.monitor.expected_V(0, Window(2 * MS, 2 * MS, MS, MS)) == pytest.approx((17.0, 20.0))
 
 
 def test_what_is_within_the_tolerance_is_nothing():
@@ -112,11 +148,43 @@ def test_what_is_within_the_tolerance_is_nothing():
 
 def test_a_command_that_nobody_remembers_judges_nothing():
     rig = Rig()
-    assert rig.monitor.expected_V(0, 0, 10) is None
+    assert rig.monitor.expected_V(0, Window(0, 0, 10, 10)) is None
     rig.run(100)
-    now_ns = rig.clock.now_ns()
-    assert rig.monitor.expected_V(0, now_ns - 50 * MS, now_ns) is None
-    low, high = rig.monitor.expected_V(0, now_ns - 3 * MS, now_ns) or (0.0, 0.0)
-    # sent in no time at 97, 98 and 99 ms; the one before is in force up to 97 ms and not a nanosecond longer
-    told = [50.0 + 20.0 * np.sin(2 * np.pi * 10.0 * k * 1e-3) for k in (97, 98, 99)]
-    assert (low, high) == pytest.approx((min(told), max(told)))
+    early_ns = rig.clock.now_ns() - 50 * MS
+    assert rig.monitor.expected_V(0, Window(early_ns, early_ns, MS, MS)) is None
+
+
+def test_a_small_change_of_what_is_usual_is_seen_within_the_tolerance():
+    rig = Rig()
+    rig.error_V[:], rig.gain[:] = 0.2, 1.01  # trimmed that badly, and healthy for it
+    assert rig.run(1000) == []
+    assert rig.monitor.suspicions == 0
+    rig.error_V[2] -= 0.4  # still within +- 0.5 V
+    said = rig.run(60)
+    assert said
+    assert said[0][0] - 1000 <= 20
+    assert said[0][1].startswith("output 3 is at ")
+
+
+def test_what_changes_slowly_becomes_usual():
+    rig = Rig()
+    assert rig.run(500) == []
+    for _ in range(40):
+        rig.error_V[0] += 0.01
+        assert rig.run(100) == []
+
+
+def test_a_change_while_nothing_is_known_yet_is_judged_by_the_tolerance_alone():
+    rig = Rig()
+    assert rig.run(100) == []
+    rig.error_V[1] = 0.3
+    assert rig.run(300) == []
+
+
+def test_the_usual_line_is_the_one_through_the_readings():
+    usual = Usual()
+    for k in range(400):
+        x = 20.0 * np.sin(0.7 * k)
+        usual.learn(50.0 + x, 0.1 + 0.02 * x)
+    assert usual.at(50.0) == pytest.approx(0.1, abs=1e-3)
+    assert usual.at(70.0) == pytest.approx(0.5, abs=3e-3)  # the slope is drawn to 0 by 1 V^2 of 200 V^2

@@ -159,3 +159,15 @@ def test_nack_hooks_and_freeze() -> None:
     device.write(b"\x01\xc1\xe3", 0)
     device.frozen = True
     assert register(device, 1, 10**9) & 0x8000 == 0  # never ready
+
+
+@pytest.mark.parametrize(("looks", "tolerance_V"), [(1, 0.2501), (4, 0.126), (8, 0.0626)])
+def test_a_step_within_a_conversion_is_averaged(looks: int, tolerance_V: float) -> None:
+    """1 V from the 30th part of a hundred on: a mean of 0.7 V, to half of one look's part."""
+    length_ns = 1_162_791
+    step_ns = WAKE_UP_NS + round(0.3 * length_ns)
+    device = Ads1115(lambda t_ns: [float(t_ns >= step_ns), 0.0, 0.0, 0.0], looks=looks)
+    device.write(bytes.fromhex("01c1e3"), 0)  # AIN0, single shot, 6.144 V, 860 SPS
+    device.advance_to(WAKE_UP_NS + length_ns)
+    assert device.conversions == 1
+    assert register(device, 0, 2_000_000) * 6.144 / 32768 == pytest.approx(0.7, abs=tolerance_V)
