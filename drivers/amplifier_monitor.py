@@ -4,8 +4,8 @@ The converter averages over its conversion, so what is measured must be a mean o
 meanwhile, each with a weight between the shortest and the longest time that it can have been in force: no model of
 the amplifier is needed, only how long it may take to settle. What a healthy output differs by (gain and offset of
 amplifier and divider) is learnt within the tolerance, and a change of it is as suspicious as a difference beyond the
-tolerance. A suspicious reading is looked at once more, on the same channel, before anything is said. Wired to the stack's terminals it sees a broken cable too; wired to the amplifier's
-monitor socket it sees the amplifier only.
+tolerance. A suspicious reading is looked at once more, on the same channel, before anything is said. Wired to the
+stack's terminals it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
 """
 
 from __future__ import annotations
