@@ -60,6 +60,8 @@ class RunRequest:
     """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
     sense_only: bool = False
     """Nothing is armed; readings that would end a run are noticed."""
+    method: str | None = None
+    """Another tremor estimator than the bench file's."""
     truth_s: float | None = None
     """How much truth an emulated world keeps; None: all of it."""
     clock_start_ns: int = 0
@@ -93,14 +95,14 @@ def run_in_process(
 
         return run_request(request, bench, on_status, runtime_dir, on_open, wrap)
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
-    _, configs = load_firmware_config(bench, {})
+    _, configs = load_firmware_config(bench, {}, request.method)
     Stages(configs).warm_up()
     with contextlib.ExitStack() as stack:
         opened = stack.enter_context(open_requested(request, bench, runtime_dir, wrap))
         if on_open is not None:
             on_open(opened)
         devices = open_devices(opened)
-        config, configs = load_firmware_config(bench, devices.sensing_table)
+        config, configs = load_firmware_config(bench, devices.sensing_table, request.method)
         if request.stale_ms is not None:
             stalled_ms = max(request.stale_ms, config.safety.stalled_ms)
             safety = config.safety.model_copy(update={"stale_ms": request.stale_ms, "stalled_ms": stalled_ms})

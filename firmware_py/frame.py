@@ -64,6 +64,7 @@ _QUANTITIES: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("tip_displacement", "m", XYZ, "displacement in the tremor band, body frame, phase: translation.py"),
     ("tremor", "m", XYZ, "estimated tremor of the tip now, body frame"),
     ("tremor_ahead", "m", XYZ, "tremor predicted over the loop's delay, body frame"),
+    ("tremor_core", "m", XYZ, "the part of tremor_ahead that does not yield when the stroke runs out, body frame"),
     ("tremor_frequency", "Hz", XYZ, "tracked frequency"),
     ("tremor_amplitude", "m", XYZ, "amplitude of the estimated tremor"),
     ("confidence", "1", XYZ, "0 not settled .. 1 the estimate explains the signal"),
@@ -100,6 +101,7 @@ class Clip(IntFlag):
     VOLTAGE = 2  # the command was limited to the amplifier's range
     SLEW = 4  # the command moved as far as the amplifier can in one tick
     SINGULAR = 8  # so fast that a slope of the hysteresis model had to be kept positive
+    YIELD = 16  # slow motion was scaled down so that the tremor keeps its stroke: no limit was met
 
 
 class Layout:
@@ -162,6 +164,7 @@ TIP_ACCELERATION = LAYOUT.start("tip_acceleration")
 TIP_DISPLACEMENT = LAYOUT.start("tip_displacement")
 TREMOR = LAYOUT.start("tremor")
 TREMOR_AHEAD = LAYOUT.start("tremor_ahead")
+TREMOR_CORE = LAYOUT.start("tremor_core")
 TREMOR_FREQUENCY = LAYOUT.start("tremor_frequency")
 TREMOR_AMPLITUDE = LAYOUT.start("tremor_amplitude")
 CONFIDENCE = LAYOUT.start("confidence")
@@ -185,3 +188,4 @@ CLIP_WORKSPACE = int(Clip.WORKSPACE)
 CLIP_VOLTAGE = int(Clip.VOLTAGE)
 CLIP_SLEW = int(Clip.SLEW)
 CLIP_SINGULAR = int(Clip.SINGULAR)
+CLIP_YIELD = int(Clip.YIELD)

@@ -92,6 +92,9 @@ class ActuationConfig(BaseModel):
     rest_heights_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the balls at neutral, against a level star
     mounting: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
+    yield_s: Positive = 2.0
+    """How long a peak is remembered that makes slow motion yield to tremor (firmware_py/actuation/yielding.py)."""
+
     low_V: float = 0.0
     high_V: float = 100.0
     neutral_V: float = 50.0

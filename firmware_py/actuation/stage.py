@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import exp
 from typing import Any
 
 import numpy as np
@@ -18,8 +19,9 @@ from firmware_py.actuation.hysteresis import (
     slopes_at,
 )
 from firmware_py.actuation.limits import limit_slew, limit_voltage
-from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip
+from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip, tip_from_strokes
 from firmware_py.actuation.reach import inside, nearest_reachable
+from firmware_py.actuation.yielding import YIELD_STATE, yield_rest
 from firmware_py.frame import (
     ALIGNING,
     CLIP,
@@ -27,6 +29,7 @@ from firmware_py.frame import (
     CLIP_SLEW,
     CLIP_VOLTAGE,
     CLIP_WORKSPACE,
+    CLIP_YIELD,
     COMMAND,
     CONFIDENCE,
     DESIRED_TIP,
@@ -34,6 +37,7 @@ from firmware_py.frame import (
     STATUS,
     STROKE,
     TREMOR_AHEAD,
+    TREMOR_CORE,
 )
 from firmware_py.records import Record, attributes, copy_record, new_record
 from hal.compiled import kernel
@@ -42,7 +46,7 @@ from hal.scratch import scratch
 Array = NDArray[np.float64]
 
 
-LIMITS = ("workspace", "voltage", "slew", "singular")  # the bits of Clip in order
+LIMITS = ("workspace", "voltage", "slew", "singular", "yield")  # the bits of Clip in order
 TAPS = 16  # the most that a configuration may have; one size, one compilation
 
 
@@ -53,6 +57,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("ramp_step", "f8"),
             ("min_confidence", "f8"),
             ("tick_hz", "f8"),
+            ("yield_keep", "f8"),
             ("mounting", "f8", (3, 3)),
             ("geometry", GEOMETRY),
             ("low_V", "f8"),
@@ -73,6 +78,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
         [
             ("on", "f8", (3,)),  # 0 .. 1, how far compensation of each axis is switched on
             ("tilt", "f8", (2,)),  # of the shaft, where the next inverse kinematics starts
+            ("yielding", YIELD_STATE),
             ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
             ("target", "f8", (3,)),  # extension from neutral that was asked of the stack, m
             ("command_V", "f8", (3,)),
@@ -106,6 +112,7 @@ def actuate_params(config: ActuationConfig) -> Record:
         ramp_step=1.0 / (config.ramp_s * config.tick_hz),
         min_confidence=config.min_confidence,
         tick_hz=config.tick_hz,
+        yield_keep=exp(-1.0 / (config.yield_s * config.tick_hz)),
         mounting=config.mounting,
         geometry=geometry_of(config),
         low_V=config.low_V,
@@ -171,27 +178,35 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     """Fill the columns ``desired_tip`` to ``clip`` from ``tremor_ahead``, ``confidence`` and ``status``.
 
     Compensation of an axis fades in while its estimate is trusted and out while it is not. A wish that is not
-    finite counts as zero.
+    finite counts as zero. What is not ``tremor_core`` yields before a stroke ends (``yielding``).
     """
     state = states[0]
     param = params[0]
     status = int(frame[STATUS])
     ready = status & (ALIGNING | SETTLING) == 0
-    wish = scratch(3)
+    wish, least = scratch(3), scratch(3)
     for i in range(3):
-        ahead = frame[TREMOR_AHEAD + i]
+        ahead, core = frame[TREMOR_AHEAD + i], frame[TREMOR_CORE + i]
         trusted = ready and frame[CONFIDENCE + i] >= param.min_confidence and np.isfinite(ahead)
         step = param.ramp_step if trusted else -param.ramp_step
         state.on[i] = max(0.0, min(1.0, state.on[i] + step))
         wish[i] = -param.gain * state.on[i] * ahead if np.isfinite(ahead) else 0.0
+        least[i] = -param.gain * state.on[i] * core if np.isfinite(ahead) and np.isfinite(core) else 0.0
+    core_tip, core_stroke = scratch(3), scratch(3)
     tip = frame[DESIRED_TIP : DESIRED_TIP + 3]
     stroke = frame[STROKE : STROKE + 3]
     for i in range(3):
-        tip[i] = param.mounting[i, 0] * wish[0] + param.mounting[i, 1] * wish[1] + param.mounting[i, 2] * wish[2]
+        row = param.mounting[i]
+        tip[i] = row[0] * wish[0] + row[1] * wish[1] + row[2] * wish[2]
+        core_tip[i] = row[0] * least[0] + row[1] * least[1] + row[2] * least[2]
     clip = 0
     strokes_from_tip(tip, param.geometry, state.tilt, stroke)
+    strokes_from_tip(core_tip, param.geometry, state.yielding.tilt, core_stroke)
+    if yield_rest(stroke, core_stroke, param.stroke_low, param.stroke_high, param.yield_keep, state.yielding):
+        clip |= CLIP_YIELD
+        tip_from_strokes(stroke, param.geometry, tip)
     if not inside(stroke, param.stroke_low, param.stroke_high):
-        clip = CLIP_WORKSPACE
+        clip |= CLIP_WORKSPACE
         nearest_reachable(tip, param.geometry, param.stroke_low, param.stroke_high, stroke)
     for i in range(3):
         past = state.strokes[i]

@@ -45,10 +45,13 @@ class FirmwareConfig(BaseModel):
     actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
 
 
-def load_firmware_config(bench: BenchFile, wired: Mapping[str, Any]) -> tuple[FirmwareConfig, StageConfigs]:
-    """Bench table, then calibration files over it (in order), then what the wiring decides, then measured noise.
+def load_firmware_config(
+    bench: BenchFile, wired: Mapping[str, Any], method: str | None = None
+) -> tuple[FirmwareConfig, StageConfigs]:
+    """Bench table, then calibration files over it (in order), then what the wiring decides, then measured noise, then
+    ``method``.
 
-    Raises ``BenchError`` naming file and key.
+    ``method``: another tremor estimator than the bench file's. Raises ``BenchError`` naming file and key.
     """
     where = str(bench.path)
     config = validate_table(FirmwareConfig, bench.description.firmware, f"{where}: firmware")
@@ -60,6 +63,8 @@ def load_firmware_config(bench: BenchFile, wired: Mapping[str, Any]) -> tuple[Fi
     if config.noise is not None:
         sensing = SensingConfig.from_dict(tables["sensing"], f"{where}: firmware.sensing")
         tables["sensing"].update(noise_table(bench.resolve(config.noise), sensing))
+    if method is not None:
+        tables["tremor"]["method"] = method
     return config, StageConfigs.from_dict(tables, where)
 
 

@@ -27,8 +27,8 @@ class LoopCounts:
 
     ``lost``: scans known to be missing; ``unread``: scans that were due after the last
     one read, when the loop stopped.
-    ``clipped``: commands that ran into a limit. ``noticed``: bench time at which something that does not end a run
-    was first seen.
+    ``clipped``: commands that ran into a limit (yielding is none). ``noticed``: bench time at which something that
+    does not end a run was first seen.
     """
 
     expected: int = 0

@@ -25,6 +25,7 @@ from firmware_py.control.watch import Watch
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import (
     CLIP,
+    CLIP_YIELD,
     COMMAND,
     COUNTS,
     STATUS,
@@ -319,7 +320,7 @@ class InstrumentLoop:
                 self.incidents.notice("commands were late")
             self.counts.latency.add(latency_ns, info.k)
             self.counts.commands += 1
-            self.counts.clipped += bool(clipped != 0 or self._frame[CLIP] != 0)
+            self.counts.clipped += bool(clipped != 0 or int(self._frame[CLIP]) & ~CLIP_YIELD)
         elif self.supervisor.step():
             self._note_safe()
 

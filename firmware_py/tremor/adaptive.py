@@ -7,6 +7,10 @@ recursive is inverted, the matrix is positive definite by construction, and the 
 stable filters, so it cannot run away. What sensor noise adds to the regression is known and taken out.
 
 Learning is on signals that pass a filter which lifts the tremor band: an error there costs more.
+
+Near the sensor's noise the best filter is a cautious one, far above it a bold one, and hands go from one to the other
+within a tenth of a second. So two filters are learned, and mixed by a gate: the power of the samples in a wide band,
+over that of what is no tremor. Each row of the regression counts for the two levels as its own gate says.
 """
 
 from __future__ import annotations
@@ -18,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record, new_record
-from firmware_py.tremor.adaptive_design import OUTPUTS, AdaptiveDesign, design_adaptive
+from firmware_py.tremor.adaptive_design import LEVELS, OUTPUTS, AdaptiveDesign, design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from hal.compiled import kernel
 
@@ -36,18 +40,21 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("slow", "f8", (slow,)),
             ("taps", "f8", (OUTPUTS, taps)),
             ("weight", "f8", (5,)),
-            ("tremor", "f8", (m, m)),
+            ("gate", "f8", (5,)),
+            ("gate_power", "f8"),
+            ("gate_smoothing", "f8"),
+            ("tremor", "f8", (LEVELS, m, m)),
             ("rest", "f8", (m, m)),
-            ("cross", "f8", (OUTPUTS, m)),
+            ("cross", "f8", (LEVELS, OUTPUTS, m)),
             ("noise_cross", "f8", (OUTPUTS, m)),
             ("noise_power", "f8"),
-            ("weighted_power", "f8"),
+            ("weighted_power", "f8", (LEVELS,)),
             ("least_power", "f8"),
-            ("start", "f8", (OUTPUTS, m)),
+            ("start", "f8", (LEVELS, OUTPUTS, m)),
             ("onward", "f8", (m,)),
             ("block_ticks", "i8"),
             ("keep", "f8"),
-            ("prior_blocks", "f8"),
+            ("prior_blocks", "f8", (LEVELS,)),
             ("share", "f8"),
             ("outlier", "f8"),
         ]
@@ -63,18 +70,23 @@ def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("running", "i8"),
             ("weigh", "f8", (AXES, 2)),
             ("weighted", "f8", (AXES, m)),
+            ("gate", "f8", (AXES, 2)),
+            ("gate_power", "f8", (AXES,)),
+            ("burst", "f8", (AXES,)),  # share of the burst's filter
             ("sum", "f8", (AXES,)),
             ("in_block", "i8"),
             ("blocks", "f8", (AXES, taps)),  # ring of block means
             ("snapshots", "f8", (AXES, taps // 2 + 1, m)),  # ring of bank states at the ends of blocks
+            ("bursts", "f8", (AXES, taps // 2 + 1)),  # ring of ``burst`` at the ends of blocks
             ("n_blocks", "i8"),
-            ("normal", "f8", (AXES, m, m)),  # lower triangles
-            ("right", "f8", (AXES, OUTPUTS, m)),
-            ("power", "f8", (AXES,)),
-            ("count", "f8", (AXES,)),
-            ("filter", "f8", (AXES, OUTPUTS, m)),
+            ("normal", "f8", (AXES, LEVELS, m, m)),  # lower triangles
+            ("right", "f8", (AXES, LEVELS, OUTPUTS, m)),
+            ("power", "f8", (AXES, LEVELS)),
+            ("count", "f8", (AXES, LEVELS)),
+            ("filter", "f8", (AXES, LEVELS, OUTPUTS, m)),
             ("work", "f8", (m, m)),
             ("scale", "f8", (m,)),
+            ("target", "f8", (OUTPUTS,)),
             ("solution", "f8", (OUTPUTS, m)),
         ]
     )
@@ -93,6 +105,9 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         slow=d.bank.slow,
         taps=d.taps,
         weight=d.weight,
+        gate=d.gate,
+        gate_power=d.gate_power,
+        gate_smoothing=1.0 - exp(-1.0 / (a.gate_s * config.tick_hz)),
         tremor=d.tremor,
         rest=d.rest,
         cross=d.cross,
@@ -104,15 +119,15 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         onward=d.onward,
         block_ticks=d.block_ticks,
         keep=exp(-block_s / a.memory_s),
-        prior_blocks=a.prior_s / block_s,
+        prior_blocks=np.array([a.prior_s, a.burst_prior_s]) / block_s,
         share=a.share,
         outlier=a.outlier,
     )
 
 
 def adaptive_state(design: AdaptiveDesign) -> Record:
-    """The prior hand's filter, nothing seen."""
-    return new_record(adaptive_state_dtype(design), filter=np.tile(design.start, (AXES, 1, 1)))
+    """The prior hands' filters, nothing seen."""
+    return new_record(adaptive_state_dtype(design), filter=np.tile(design.start, (AXES, 1, 1, 1)))
 
 
 @kernel
@@ -165,25 +180,36 @@ def adaptive_correct(state: Record, axis: int, sample: float, params: Record) ->
 
 @kernel
 def adaptive_output(state: Record, axis: int, output: int) -> float:
-    """Tremor m: ``output`` 0 now, 1 over the loop's delay."""
-    total = 0.0
-    for j in range(state.bank.shape[1]):
-        total += state.filter[axis, output, j] * state.bank[axis, j]
-    return total
+    """Tremor m: ``output`` 0 now, 1 over the loop's delay, 2 of that the core band's part."""
+    calm, burst = 0.0, 0.0
+    bank = state.bank[axis]
+    for j in range(len(bank)):
+        calm += state.filter[axis, 0, output, j] * bank[j]
+        burst += state.filter[axis, 1, output, j] * bank[j]
+    return calm + state.burst[axis] * (burst - calm)
+
+
+@kernel
+def biquad_step(sample: float, memory: Array, c: Array) -> float:
+    """One sample through b0 b1 b2 a1 a2; ``memory`` (2,), transposed direct form II."""
+    out = c[0] * sample + memory[0]
+    memory[0] = c[1] * sample - c[3] * out + memory[1]
+    memory[1] = c[2] * sample - c[4] * out
+    return out
 
 
 @kernel
 def _learn(state: Record, params: Record) -> None:
     """Weighted bank and block sums take the last sample; at the end of a block the regression takes its row."""
-    w = params.weight
     for i in range(AXES):
         sample = state.pending[i]
-        lifted = w[0] * sample + state.weigh[i, 0]
-        state.weigh[i, 0] = w[1] * sample - w[3] * lifted + state.weigh[i, 1]
-        state.weigh[i, 1] = w[2] * sample - w[4] * lifted
+        lifted = biquad_step(sample, state.weigh[i], params.weight)
         bank_turn(state.weighted[i], params)
         bank_add(state.weighted[i], lifted, params)
         state.sum[i] += lifted
+        gated = biquad_step(sample, state.gate[i], params.gate)
+        state.gate_power[i] += params.gate_smoothing * (gated * gated - state.gate_power[i])
+        state.burst[i] = state.gate_power[i] / (state.gate_power[i] + params.gate_power)
     state.in_block += 1
     if state.in_block < params.block_ticks:
         return
@@ -196,12 +222,13 @@ def _learn(state: Record, params: Record) -> None:
         state.blocks[i, at % n_taps] = state.sum[i] / params.block_ticks
         state.sum[i] = 0.0
         state.snapshots[i, at % (lag + 1), :] = state.weighted[i]
+        state.bursts[i, at % (lag + 1)] = state.burst[i]
         # the bank must have forgotten its start: a target's length more than the target itself
         if at >= 2 * n_taps:
             _regress(state, i, at, params)
-    axis = at % AXES  # one axis a block, so that no tick has to solve more than one system
-    if state.count[axis] > 0.0:
-        _solve(state, axis, params)
+    axis = at % AXES  # one system a block: no tick has to solve more
+    if at >= 2 * n_taps:
+        _solve(state, axis, (at // AXES) % LEVELS, params)
 
 
 @kernel
@@ -209,54 +236,71 @@ def _regress(state: Record, axis: int, at: int, params: Record) -> None:
     """One row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
     n_taps = state.blocks.shape[1]
     lag = n_taps // 2
-    now, ahead = 0.0, 0.0
+    target = state.target
+    for o in range(OUTPUTS):
+        target[o] = 0.0
     for j in range(n_taps):
         block = state.blocks[axis, (at - j) % n_taps]
-        now += params.taps[0, j] * block
-        ahead += params.taps[1, j] * block
-    known = params.prior_blocks * params.weighted_power + state.power[axis]
-    typical = known / (params.prior_blocks + state.count[axis])
-    weight = min(1.0, params.outlier * typical / max(now * now, 1e-300))  # a jerk must not outvote the tremor
+        for o in range(OUTPUTS):
+            target[o] += params.taps[o, j] * block
+    now2 = target[0] * target[0]
     phi = state.snapshots[axis, (at - lag) % (lag + 1)]
+    burst = state.bursts[axis, (at - lag) % (lag + 1)]
     keep = params.keep
-    state.count[axis] = keep * state.count[axis] + weight
-    state.power[axis] = keep * state.power[axis] + weight * now * now
-    normal = state.normal[axis]
-    right = state.right[axis]
-    for i in range(len(phi)):
-        scaled = weight * phi[i]
-        for j in range(i + 1):
-            normal[i, j] = keep * normal[i, j] + scaled * phi[j]
-        right[0, i] = keep * right[0, i] + scaled * now
-        right[1, i] = keep * right[1, i] + scaled * ahead
+    for level in range(LEVELS):
+        n0 = params.prior_blocks[level]
+        known = n0 * params.weighted_power[level] + state.power[axis, level]
+        typical = known / (n0 + state.count[axis, level])
+        weight = burst if level else 1.0 - burst
+        weight *= min(1.0, params.outlier * typical / max(now2, 1e-300))  # a jerk must not outvote the tremor
+        state.count[axis, level] = keep * state.count[axis, level] + weight
+        state.power[axis, level] = keep * state.power[axis, level] + weight * now2
+        normal = state.normal[axis, level]
+        right = state.right[axis, level]
+        for i in range(len(phi)):
+            scaled = weight * phi[i]
+            for j in range(i + 1):
+                normal[i, j] = keep * normal[i, j] + scaled * phi[j]
+            for o in range(OUTPUTS):
+                right[o, i] = keep * right[o, i] + scaled * target[o]
 
 
 @kernel
-def _solve(state: Record, axis: int, params: Record) -> None:
+def _take(state: Record, axis: int, level: int, share: float, own: float, params: Record) -> None:
+    """Add ``share`` of the rows of (``axis``, ``level``) to the system, scaled down to the power ``own`` (m^2) a row.
+
+    What is scaled down has too little noise in it for the smaller tremor: the rest is put back.
+    """
+    count, power = state.count[axis, level], state.power[axis, level]
+    if count <= 0.0 or power <= 0.0:
+        return
+    ratio = min(1.0, own * count / power)
+    normal, right = state.normal[axis, level], state.right[axis, level]
+    factor, back = share * ratio, share * (1.0 - ratio) * count
+    for i in range(state.work.shape[0]):
+        for j in range(i + 1):
+            state.work[i, j] += factor * normal[i, j] + back * params.rest[i, j]
+        for o in range(OUTPUTS):
+            state.solution[o, i] += factor * (right[o, i] - count * params.noise_cross[o, i])
+
+
+@kernel
+def _solve(state: Record, axis: int, level: int, params: Record) -> None:
     """(data + prior) filter = (data + prior) cross: Cholesky of the scaled matrix, in place."""
-    a = state.work
+    a, right = state.work, state.solution
     m = len(a)
-    count = state.count[axis]
-    n0 = params.prior_blocks
-    power = (state.power[axis] + n0 * params.weighted_power) / (count + n0) - params.noise_power * count / (count + n0)
-    power = max(power, params.least_power)
+    count = state.count[axis, level]
+    n0 = params.prior_blocks[level]
+    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power * count
+    power = max(known / (count + n0), params.least_power)
     for i in range(m):
         for j in range(i + 1):
-            a[i, j] = state.normal[axis, i, j] + n0 * (power * params.tremor[i, j] + params.rest[i, j])
-    right = state.solution
-    for i in range(m):
+            a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[i, j])
         for o in range(OUTPUTS):
-            from_data = state.right[axis, o, i] - count * params.noise_cross[o, i]
-            right[o, i] = from_data + n0 * power * params.cross[o, i]
+            right[o, i] = n0 * power * params.cross[level, o, i]
     for other in range(AXES):
-        if other == axis or state.power[other] <= 0.0:
-            continue
-        share = params.share * min(1.0, state.power[axis] / state.power[other])
-        for i in range(m):
-            for j in range(i + 1):
-                a[i, j] += share * state.normal[other, i, j]
-            for o in range(OUTPUTS):
-                right[o, i] += share * (state.right[other, o, i] - state.count[other] * params.noise_cross[o, i])
+        share = 1.0 if other == axis else params.share
+        _take(state, other, level, share, 1e300 if other == axis else power, params)
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])
@@ -287,4 +331,4 @@ def _solve(state: Record, axis: int, params: Record) -> None:
                 total -= a[k, i] * x[k]
             x[i] = total / a[i, i]
         for i in range(m):
-            state.filter[axis, o, i] = x[i] * scale[i]
+            state.filter[axis, level, o, i] = x[i] * scale[i]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal
 
@@ -99,7 +100,10 @@ class AdaptiveConfig(_Table):
     """Causal linear filter learned from the hand itself (firmware_py/tremor/adaptive.py).
 
     ``memory_s`` is how long the hand is remembered, ``prior_s`` how many seconds of data the prior counts for.
-    ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out.
+    ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out; ``core_hz``: the part of it that
+    does not yield when the manipulator runs out of stroke. Two filters are learned, for a calm hand and for a burst,
+    and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
+    all that is no tremor. ``share``: what an axis takes from the others.
     """
 
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
@@ -107,20 +111,29 @@ class AdaptiveConfig(_Table):
     slow_hz: tuple[Positive, ...] = (0.5, 2.0, 20.0)
     cancel_from_hz: Edge = (2.0, 4.0)
     cancel_to_hz: Edge = (16.0, 20.0)
+    core_hz: tuple[Positive, Positive, Positive, Positive] = (5.5, 7.5, 13.0, 16.0)
     emphasis: Annotated[float, Field(ge=1.0, le=20.0)] = 4.0
     emphasis_hz: Positive = 9.8
     emphasis_q: Positive = 1.5
     block_s: Positive = 0.01
-    half_width_s: Positive = 0.4
+    half_width_s: Positive = 0.5
     memory_s: Positive = 15.0
-    prior_s: Positive = 3.0
+    prior_s: Positive = 2.0
+    burst_prior_s: Positive = 0.1
     share: Share = 0.3
     outlier: Positive = 16.0
+    gate_hz: Positive = 6.3
+    gate_q: Positive = 0.5
+    gate_s: Positive = 0.1
+    gate_ratio: Positive = 300.0
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
     least_rms_m: Positive = 2e-6
     tremor_hz: Positive = 10.0
     tremor_half_width_hz: Positive = 1.7
+    burst_rms_m: Positive = 100e-6
+    burst_hz: Positive = 2.0
+    burst_share: Share = 0.3
     voluntary_m: Positive = 300e-6
     voluntary_hz: Positive = 0.6
     unsteadiness_m: Positive = 4e-6
@@ -135,6 +148,8 @@ class AdaptiveConfig(_Table):
         (a, b), (c, d) = self.cancel_from_hz, self.cancel_to_hz
         if not a < b < c < d:
             raise ValueError("adaptive: cancel_from_hz and cancel_to_hz must rise: from low to high")
+        if any(low >= high for low, high in pairwise(self.core_hz)):
+            raise ValueError("adaptive: core_hz must rise: from low to high")
         return self
 
 

@@ -77,7 +77,8 @@ FAMILY = {
     "bmflc_kalman": COMB,
     "ar_kalman": AUTOREGRESSIVE,
 }
-NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST = range(5)
+NOW, AHEAD, FREQUENCY, AMPLITUDE, TRUST, CORE = range(6)
+ROWS = 6
 """Rows of what a step gives, each for three axes."""
 
 
@@ -137,7 +138,7 @@ def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
             ("ticks", "f8"),  # since the start
             ("last_tick", "f8"),  # of the stage that reads frames
             ("samples", "f8", (AXES,)),
-            ("out", "f8", (5, AXES)),
+            ("out", "f8", (ROWS, AXES)),
         ]
     )
     return new_record(
@@ -218,6 +219,8 @@ def estimator_output(state: Record, param: Record) -> None:
         state.miss[i] += param.smoothing * (missed * missed - state.miss[i])
         out[NOW, i] = now
         out[AHEAD, i] = ahead
+        # the other methods know no band but the tremor's
+        out[CORE, i] = adaptive_output(state.adaptive, i, 2) if param.family == ADAPTIVE else ahead
         out[FREQUENCY, i] = state.combiner[i].wflc.omega * combiner.seen.tick_hz / (2.0 * pi)
         out[AMPLITUDE, i] = sqrt(2.0 * state.power[i])
         trust = 0.0
@@ -229,7 +232,7 @@ def estimator_output(state: Record, param: Record) -> None:
 
 @kernel
 def run_estimator(samples: Array, out: Array, states: Record, params: Record) -> None:
-    """``samples`` (n, 3), one a tick, into ``out`` (n, 5, 3). A sample that is not finite is coasted over."""
+    """``samples`` (n, 3), one a tick, into ``out`` (n, 6, 3). A sample that is not finite is coasted over."""
     state, param = states[0], params[0]
     for k in range(len(samples)):
         good = True
@@ -283,7 +286,7 @@ class Estimator:
     def _run(self, samples: Array) -> Array:
         whole = np.zeros((len(samples), AXES))
         whole[:, : self.axes] = samples
-        out = np.empty((len(samples), 5, AXES))
+        out = np.empty((len(samples), ROWS, AXES))
         run_estimator(whole, out, self.state, self.params)
         return out[:, :, : self.axes]
 

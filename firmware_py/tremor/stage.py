@@ -18,6 +18,7 @@ from firmware_py.frame import (
     TREMOR,
     TREMOR_AHEAD,
     TREMOR_AMPLITUDE,
+    TREMOR_CORE,
     TREMOR_FREQUENCY,
 )
 from firmware_py.records import Record, copy_record
@@ -26,6 +27,7 @@ from firmware_py.tremor.estimator import (
     AHEAD,
     AMPLITUDE,
     AXES,
+    CORE,
     FREQUENCY,
     NOW,
     TRUST,
@@ -69,6 +71,7 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
     for i in range(AXES):
         frame[TREMOR + i] = state.out[NOW, i]
         frame[TREMOR_AHEAD + i] = state.out[AHEAD, i]
+        frame[TREMOR_CORE + i] = state.out[CORE, i]
         frame[TREMOR_AMPLITUDE + i] = state.out[AMPLITUDE, i]
         frame[TREMOR_FREQUENCY + i] = state.out[FREQUENCY, i]
         frame[CONFIDENCE + i] = state.out[TRUST, i]

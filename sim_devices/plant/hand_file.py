@@ -16,9 +16,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from hal.errors import BenchError
+from hal.even_samples import evenly
 from hal.npz import open_npz
 
 Array = NDArray[np.float64]
@@ -280,27 +280,13 @@ def _uniform(
 
 
 def _even(path: Path, signals: dict[str, Array], t: Array, notes: list[str]) -> tuple[dict[str, Array], float]:
-    """Signals on a uniform time base and its rate: repeated stamps left out, the longest stretch without a gap."""
-    step = np.diff(t)
-    if len(t) < 2 or not np.all(np.isfinite(t)) or np.any(step < 0.0):
-        at = int(np.argmin(step)) + 1 if len(t) > 1 else 0
-        raise HandFileError(f"{path}: time runs backwards or is no number at sample {at}")
-    keep = np.concatenate([[True], step > 0.0])
-    if not keep.all():
-        notes.append(f"{np.count_nonzero(~keep)} samples with a repeated time stamp left out")
-    t = t[keep] - t[0]
-    signals = {k: v[keep] for k, v in signals.items()}
-    if len(t) < 2:
-        raise HandFileError(f"{path}: all samples have the same time")
-    gap_s = max(0.1, 5.0 * float(np.median(np.diff(t))))
-    edges = np.concatenate([[0], np.flatnonzero(np.diff(t) > gap_s) + 1, [len(t)]])
-    if len(edges) > 2:
-        longest = int(np.argmax(np.diff(edges)))
-        first, last = int(edges[longest]), int(edges[longest + 1])
-        notes.append(f"{len(edges) - 2} gap(s): used {t[first]:.2f} s to {t[last - 1]:.2f} s")
-        t, signals = t[first:last] - t[first], {k: v[first:last] for k, v in signals.items()}
-    rate_hz = (len(t) - 1) / float(t[-1]) if len(t) > 1 else 0.0
-    grid = np.arange(len(t)) / max(rate_hz, 1e-9)
-    if np.max(np.abs(t - grid)) * rate_hz > 1e-3:
-        signals = {k: CubicSpline(t, v, axis=0)(np.minimum(grid, t[-1])) for k, v in signals.items()}
-    return signals, rate_hz
+    """Signals on a uniform time base and its rate; jittering stamps are judged by what sees the fastest changes."""
+    judge = next(signals[k] for k in ("angular rate", "acceleration", "displacement") if k in signals)
+    names = list(signals)
+    together = np.concatenate([signals[name] for name in names], axis=1)
+    try:
+        even, rate_hz, _, mended = evenly(t, together, judge)
+    except ValueError as error:
+        raise HandFileError(f"{path}: {error}") from None
+    notes += mended
+    return {name: even[:, 3 * n : 3 * n + 3] for n, name in enumerate(names)}, rate_hz

@@ -26,6 +26,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json
 from tools.cli.common import write_text_atomic as write_text
+from tools.cli.tremor_evaluate import estimator_name
 from tools.reports.run_report import html_page, picture, print_report, save_picture
 from tools.reports.tremor_figures import tremor_figures
 
@@ -49,6 +50,9 @@ def run(
         bool, typer.Option("--sense-only", help="Arm nothing: to record poses turned by hand, or raw sensors.")
     ] = False,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Another tremor estimator than the bench file's.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
@@ -73,9 +77,12 @@ def run(
             record=record,
             seed=seed,
             sense_only=sense_only,
+            method=None if method is None else estimator_name(method),
         )
         if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None or sense_only):
             raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
+        if is_endoscope(load_bench(request.bench).description) and method is not None:
+            raise InputError("--method belongs to the instrument; an endoscope bench estimates no tremor")
         outcome, truth = _run_virtual(request) if virtual else _run_real(request)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)

@@ -30,16 +30,22 @@ def evaluate(
     ] = False,
     with_manners: Annotated[bool, typer.Option("--manners", help="Also onset, frequency jump, growing bias.")] = False,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Error against horizon as a picture.")] = None,
+    series: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Motion and what each method leaves of it, in time: the first recording."),
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Residual, band, delay, frequency error and time per sample of each method at each horizon, beside the limit.
 
     Example: micron tremor evaluate ../shared/data/tremor_mouse_lsm9ds1#23/gyro hand:1 hand:2 --method adaptive
+
+    Example: micron tremor evaluate hand:3 --method adaptive --method wflc_flc --manners --series out/left.png
     """
     from tools.tremor.cases import cases_from
     from tools.tremor.evaluate import Summary, summarise
     from tools.tremor.evaluate import evaluate as evaluate_cases
-    from tools.tremor.evaluate_picture import save_horizon_picture
+    from tools.tremor.evaluate_picture import LOOP_MS, save_horizon_picture, save_series_picture
     from tools.tremor.manners import manners
 
     def table(group: str, lines: list[Summary]) -> Table:
@@ -58,7 +64,7 @@ def evaluate(
         return shown
 
     with clear_errors():
-        check_writable(json_file, png)
+        check_writable(json_file, png, series)
         methods = _methods(method)
         horizons = _horizons(horizons_ms)
         cases = [c for source in recordings for c in cases_from(source, not as_recorded, not as_recorded)]
@@ -75,6 +81,8 @@ def evaluate(
         lines = summarise(results)
         if png is not None:
             save_horizon_picture(lines, png)
+        if series is not None:
+            save_series_picture(cases[0], methods, min(horizons, key=lambda h: abs(h - LOOP_MS)), series)
         if json_file != "-":
             for group in dict.fromkeys(line.group for line in lines):
                 data_console().print(table(group, [line for line in lines if line.group == group]))
@@ -98,11 +106,21 @@ def evaluate(
 
 
 def _methods(names: list[str] | None) -> list[Method]:
-    chosen: list[Method] = [m for m in METHODS if not names or m in names]
-    unknown = [n for n in names or [] if n not in METHODS]
-    if unknown:
-        raise InputError(f"'{unknown[0]}' is no estimator; there are: {', '.join(METHODS)}")
-    return chosen
+    wanted = [estimator_name(name) for name in names or METHODS]
+    return [m for m in METHODS if m in wanted]
+
+
+def estimator_name(name: str) -> Method:
+    """Raises InputError for a name that is no estimator of the instrument."""
+    for method in METHODS:
+        if name == method:
+            return method
+    if name in ("nn", "cascade"):
+        raise InputError(
+            f"'{name}': the cascade network takes the tip's displacement, steady part and all, and this instrument "
+            "senses acceleration, which has none; `micron tremor train` shows what it does on displacement"
+        )
+    raise InputError(f"'{name}' is no estimator; there are: {', '.join(METHODS)}")
 
 
 def _horizons(text: str) -> list[int]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
-from tools.cli.common import check_writable, clear_errors, console, write_text_atomic
+from tools.cli.common import InputError, check_writable, clear_errors, console, write_text_atomic
 
 
 def report(
@@ -15,18 +15,31 @@ def report(
         "../shared/data"
     ),
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
+    section: Annotated[
+        Literal["inspect", "evaluate", "cascade", "detectors"] | None,
+        typer.Option(help="Make this section of --out again and keep the others."),
+    ] = None,
 ) -> None:
     """Everything that is measured on recorded hands, as one page; minutes of computing.
 
     Example: micron tremor report --out docs/tremor-on-real-hands.md
+
+    Example: micron tremor report --section evaluate --out docs/tremor-on-real-hands.md
     """
     from firmware_py.recording.revision import git_revision
+    from tools.tremor.report import renewed
     from tools.tremor.report import report as make
 
     with clear_errors():
         check_writable(out)
         with console().status("starting") as status:
-            page = make(data, git_revision() or "unknown", lambda text: status.update(text))
+            revision = git_revision() or "unknown"
+            if section is None:
+                page = make(data, revision, status.update)
+            elif out is None or not out.is_file():
+                raise InputError("--section makes a part of a page again: name the page with --out FILE")
+            else:
+                page = renewed(out.read_text(encoding="utf-8"), section, data, revision, status.update)
         if out is None:
             typer.echo(page, nl=False)
         else:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.frame import COMMAND, CONFIDENCE, LAYOUT, TREMOR_AHEAD
+from firmware_py.frame import COMMAND, CONFIDENCE, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.manipulator import tip_displacement
@@ -67,6 +67,7 @@ def drive_tip(actuation: Actuation, config: EmulationConfig, path_m: Array) -> A
     frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
     for axis in range(3):
         frames[:, TREMOR_AHEAD + axis] = -np.interp(t + actuation.config.preview_s, t, path_m[:, axis])
+        frames[:, TREMOR_CORE + axis] = frames[:, TREMOR_AHEAD + axis]
     actuation.reset()
     for frame in frames:
         actuation.step(frame)

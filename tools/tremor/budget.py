@@ -16,18 +16,19 @@ from typing import Any
 
 from firmware_py.app import RunRequest, run_in_process
 from tools.reports.tremor_figures import tremor_figures
+from tools.tremor.bench_variant import write_variant
 
 SETTLE_S = 5.0
-SOURCES: dict[str, str] = {
-    "everything on": "",
-    "accelerometer noise": "[emulation.sensors]\nnoise_ug_per_rtHz = 0.0\n",
-    "converter noise": "[emulation.sensors]\ndaq_noise_uV = 0.0\n",
-    "supply and magnetometer noise": "[emulation.sensors]\nsupply_wander_mV = 0.0\nmagnetometer_noise_uG = 0.0\n",
-    "creep of the stacks": "[emulation.stack]\ncreep_per_decade = 0.0\n",
-    "warm-up and room temperature": "[emulation.environment]\nambient_wander_K = 0.0\nwarm_up_K = 0.0\n",
-    "jerks of the hand": "[emulation.hand]\njerk_um = 0.0\n",
-    "unsteadiness of the hand": "[emulation.hand]\nunsteadiness_rms_um = 0.0\n",
-    "reaches and drift of the hand": "[emulation.hand]\nvoluntary_range_um = 0.0\nvoluntary_angle_deg = 0.0\n",
+SOURCES: dict[str, dict[str, dict[str, float]]] = {
+    "everything on": {},
+    "accelerometer noise": {"sensors": {"noise_ug_per_rtHz": 0.0}},
+    "converter noise": {"sensors": {"daq_noise_uV": 0.0}},
+    "supply and magnetometer noise": {"sensors": {"supply_wander_mV": 0.0, "magnetometer_noise_uG": 0.0}},
+    "creep of the stacks": {"stack": {"creep_per_decade": 0.0}},
+    "warm-up and room temperature": {"environment": {"ambient_wander_K": 0.0, "warm_up_K": 0.0}},
+    "jerks of the hand": {"hand": {"jerk_um": 0.0}},
+    "unsteadiness of the hand": {"hand": {"unsteadiness_rms_um": 0.0}},
+    "reaches and drift of the hand": {"hand": {"voluntary_range_um": 0.0, "voluntary_angle_deg": 0.0}},
 }
 
 
@@ -47,13 +48,11 @@ class BudgetRow:
 
 def budget(bench: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[BudgetRow]:
     """One virtual run per source; the first row is the instrument as it is."""
-    text = bench.read_text(encoding="utf-8").replace('"calibration/', f'"{bench.parent.resolve() / "calibration"}/')
     whole = math.nan
     with tempfile.TemporaryDirectory(prefix="micron-budget-") as folder:
-        for n, (source, override) in enumerate(SOURCES.items()):
+        for n, (source, changes) in enumerate(SOURCES.items()):
             progress(f"without {source}" if n else source)
-            file = Path(folder) / f"{bench.stem}-{n}.toml"
-            file.write_text(f"{text}\n{override}", encoding="utf-8")
+            file = write_variant(bench, {"emulation": changes}, Path(folder), f"{bench.stem}-{n}")
             outcome, truth = run_in_process(RunRequest(file, seconds, virtual=True))
             assert truth is not None  # virtual runs are emulated
             figures = tremor_figures(

@@ -161,10 +161,10 @@ def involuntary_band(hz: Array) -> Array:
 
 def sensor_noise(shape: tuple[int, ...], seed: int) -> Array:
     """m/s^2: white noise of the tip's acceleration behind the RC filter, and quantisation after it."""
-    a, config = TremorConfig().adaptive, TremorConfig()
+    a = TremorConfig().adaptive
     rng = np.random.default_rng(seed)
     white = a.sensor_noise_m_s2_rtHz * np.sqrt(0.5 * RATE_HZ) * rng.standard_normal(shape)
-    behind = _first_order(white, np.exp(-config.filter_cutoff_rad_s / RATE_HZ))
+    behind = rc_filter(white)
     return behind + a.reading_noise_m_s2 * rng.standard_normal(shape)
 
 
@@ -177,8 +177,7 @@ def emulated_hand(seed: int, seconds: float = 30.0) -> Case:
     n = round(seconds * RATE_HZ)
     pose, parts = np.zeros((n, 18)), np.zeros((n, 6))
     hand.fill(pose, parts)
-    lag = TremorConfig().filter_cutoff_rad_s / RATE_HZ
-    acceleration = _first_order(pose[:, 12:15], np.exp(-lag)) + sensor_noise((n, 3), seed + 1000)
+    acceleration = rc_filter(pose[:, 12:15]) + sensor_noise((n, 3), seed + 1000)
     return Case(
         f"emulated hand {seed}",
         "emulated hands",
@@ -191,8 +190,9 @@ def emulated_hand(seed: int, seconds: float = 30.0) -> Case:
     )
 
 
-def _first_order(x: Array, keep: float) -> Array:
-    """The RC filter by the trapezoidal rule: no time of its own beyond the filter's."""
+def rc_filter(x: Array) -> Array:
+    """(n, k) through the sensors' RC filter, by the trapezoidal rule: no time of its own beyond the filter's."""
+    keep = np.exp(-TremorConfig().filter_cutoff_rad_s / RATE_HZ)
     centred = 0.5 * (1.0 - keep)
     return np.asarray(lfilter([centred, centred], [1.0, -keep], x, axis=0))
 

@@ -1,4 +1,4 @@
-"""What a recording's sampling clock really does: from known frequencies, or from time stamps that jitter."""
+"""What a recording's sampling clock really does, from known frequencies; time stamps: ``hal.even_samples``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-SMOOTH_S = 2.0  # a crystal does not change its rate within this; a transport jitters far faster
 
 
 @dataclass(frozen=True)
@@ -58,31 +56,3 @@ def rate_from_known(known_hz: Sequence[float], seen_cycles: Sequence[float], sta
     low = max(0, (n - 1) // 2 - reach)
     high = min(n - 1, n // 2 + reach)
     return ClockEstimate(float(np.median(ratio)), float(ratio[low]), float(ratio[high]), stated_hz, n)
-
-
-def stamp_share(stamps_s: Array, values: Array) -> float:
-    """How much of the time stamps' scatter is real: 1 if samples were taken then, 0 if evenly and stamped late.
-
-    Between two samples a signal changes by slope x elapsed time. The slope is taken over three steps, so the change
-    over the middle step regressed on slope x (deviation of that step from the mean) is 1 for true stamps, 0 for an
-    even clock behind a jittering transport. ``values`` (n, k).
-    """
-    step = np.diff(stamps_s)
-    deviation = (step[1:-1] / step.mean() - 1.0)[:, None]
-    slope = (values[3:] - values[:-3]) / 3.0
-    change = values[2:-1] - values[1:-2]
-    expected = slope * deviation
-    power = float(np.sum(expected**2))
-    return float(np.sum((change - slope) * expected)) / power if power > 0.0 else 1.0
-
-
-def steady_stamps(stamps_s: Array) -> Array:
-    """Time of each sample of an even clock from jittering host stamps: a straight line in every ``SMOOTH_S``."""
-    from scipy.signal import savgol_filter
-
-    rate_hz = (len(stamps_s) - 1) / (stamps_s[-1] - stamps_s[0])
-    length = min(2 * int(0.5 * SMOOTH_S * rate_hz) + 1, len(stamps_s) - (len(stamps_s) + 1) % 2)
-    smooth = np.asarray(savgol_filter(stamps_s, length, 1))
-    # late stamps that are caught up with can bend the line backwards by less than a sample
-    least = 0.05 / rate_hz
-    return np.maximum.accumulate(smooth - least * np.arange(len(smooth))) + least * np.arange(len(smooth))

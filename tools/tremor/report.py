@@ -14,27 +14,49 @@ Progress = Callable[[str], None]
 Section = Callable[[list[TremorSignal], Progress], list[str]]
 """Markdown lines, from '## heading' on."""
 
-SECTIONS = (
-    "tools.tremor.report_inspect",
-    "tools.tremor.report_evaluate",
-    "tools.tremor.report_cascade",
-    "tools.tremor.report_detectors",
-)
+SECTIONS = {
+    "inspect": "tools.tremor.report_inspect",
+    "evaluate": "tools.tremor.report_evaluate",
+    "cascade": "tools.tremor.report_cascade",
+    "detectors": "tools.tremor.report_detectors",
+}
 """Modules whose ``section(signals, progress)`` writes a part of the page, in order."""
+
+
+def _signals(data: Path) -> list[TremorSignal]:
+    signals = load_data_sets(data) if data.is_dir() else []
+    if not signals:
+        raise InputError(f"{data}: no tremor recordings there; name the folder with --data FOLDER")
+    return signals
+
+
+def renewed(page: str, name: str, data: Path, revision: str, progress: Progress) -> str:
+    """``page`` with the section ``name`` (of ``SECTIONS``) made again, and said so. Raises InputError.
+
+    A section goes from its ``##`` heading to the next one.
+    """
+    signals = _signals(data)
+    section: Section = import_module(SECTIONS[name]).section
+    made = filled(section(signals, progress))
+    made[1:1] = ["", f"This section: revision {revision}."]
+    before = page.split("\n")
+    if made[0] not in before:
+        raise InputError(f"the page has no section '{made[0]}'; make it whole, without --section")
+    start = before.index(made[0])
+    stop = next((n for n in range(start + 1, len(before)) if before[n].startswith("## ")), len(before))
+    return "\n".join([*before[:start], *made, "", *before[stop:]]).rstrip() + "\n"
 
 
 def report(data: Path, revision: str, progress: Progress) -> str:
     """The page. Raises InputError when the recordings are not in ``data``."""
-    signals = load_data_sets(data) if data.is_dir() else []
-    if not signals:
-        raise InputError(f"{data}: no tremor recordings there; name the folder with --data FOLDER")
+    signals = _signals(data)
     lines = [
         "# Tremor on real hands",
         "",
         f"Made by `micron tremor report --out docs/tremor-on-real-hands.md`, revision {revision}.",
         "",
     ]
-    for name in SECTIONS:
+    for name in SECTIONS.values():
         section: Section = import_module(name).section
         lines += [*filled(section(signals, progress)), ""]
     return "\n".join(lines).rstrip() + "\n"

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.even_samples import evenly
 from tools.errors import InputError
 from tools.mismatch import units
-from tools.tremor.signal_sets import evenly
 from tools.tremor.signals import TremorSignal
 
 Array = NDArray[np.float64]
@@ -99,8 +99,8 @@ def _signals(
         rate_hz, start_s, notes = stated_hz or 0.0, 0.0, ()
         if stamps is not None:
             try:
-                values, rate_hz, start_s, notes = evenly(stamps, values, values)
-            except InputError as error:
+                values, rate_hz, start_s, notes = evenly(stamps, values)
+            except ValueError as error:
                 raise InputError(f"{path}: {error}") from None
             if stated_hz is not None and abs(stated_hz / rate_hz - 1.0) > 2e-3:
                 notes = (*notes, f"the time stamps say {rate_hz:.2f} Hz, not the stated {stated_hz:g} Hz")

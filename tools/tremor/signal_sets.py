@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.even_samples import evenly
 from tools.errors import InputError
 from tools.mismatch.units import STANDARD_GRAVITY
-from tools.tremor.clock import rate_from_known, stamp_share, steady_stamps
+from tools.tremor.clock import rate_from_known
 from tools.tremor.signals import Reference, TremorSignal, Windows
 from tools.tremor.spectrum import highest_line, periodogram
 
@@ -137,7 +138,10 @@ def _mouse(folder: Path) -> Iterator[TremorSignal]:
             ("cursor", "screen position", "pixel", ("x", "y"), cursor["t_s"] - first_click_s, path),
         ):
             # whether the stamps are to be believed is asked of the gyroscope: it sees the fastest changes
-            even, rate_hz, start_s, notes = evenly(stamps_s, values, gyro if kind != "cursor" else path)
+            try:
+                even, rate_hz, start_s, notes = evenly(stamps_s, values, gyro if kind != "cursor" else path)
+            except ValueError as error:
+                raise InputError(f"{folder}, person {person}, {kind}: {error}") from None
             yield TremorSignal(
                 name=f"mouse/{person}/{kind}",
                 data_set=folder.name,
@@ -155,44 +159,3 @@ def _mouse(folder: Path) -> Iterator[TremorSignal]:
 
 
 _SENSORS = (("acc", "g"), ("gyro", "deg_s"))
-
-
-def evenly(stamps_s: Array, values: Array, judge: Array) -> tuple[Array, float, float, tuple[str, ...]]:
-    """``values`` (n, k) on an even time base: samples, rate, time of the first, what was done.
-
-    The longest stretch without a gap is used. ``judge`` (n, j) is the signal by which the stamps are believed or taken
-    as jitter of the transport (``stamp_share``).
-    """
-    from scipy.interpolate import CubicSpline
-
-    notes: list[str] = []
-    step = np.diff(stamps_s)
-    if not np.all(np.isfinite(stamps_s)) or np.any(step < 0.0):
-        raise InputError(f"time runs backwards or is no number at sample {int(np.argmin(step)) + 1}; sort the rows")
-    gap_s = max(0.1, 5.0 * float(np.median(step)))
-    edges = np.concatenate([[0], np.flatnonzero(step > gap_s) + 1, [len(stamps_s)]])
-    longest = int(np.argmax(np.diff(edges)))
-    first, last = int(edges[longest]), int(edges[longest + 1])
-    if len(edges) > 2:
-        notes.append(f"{len(edges) - 2} gap(s): used {stamps_s[first]:.2f} s to {stamps_s[last - 1]:.2f} s")
-    stamps, kept, seen = stamps_s[first:last], values[first:last], judge[first:last]
-    steps = np.diff(stamps)
-    if float(np.std(steps)) < 0.02 * float(np.mean(steps)):
-        times = stamps
-    elif (share := stamp_share(stamps, seen)) < 0.5:
-        times = steady_stamps(stamps)
-        late_ms = 1e3 * float(np.std(stamps - times))
-        notes.append(
-            f"time stamps jitter by {late_ms:.1f} ms rms, the samples do not (share {share:.2f}): "
-            "taken as an even clock"
-        )
-    else:
-        apart = np.concatenate([[True], steps > 0.0])
-        if not apart.all():
-            notes.append(f"{np.count_nonzero(~apart)} samples with a repeated time stamp left out")
-        times, kept = stamps[apart], kept[apart]
-    rate_hz = (len(times) - 1) / float(times[-1] - times[0])
-    grid = times[0] + np.arange(len(times)) / rate_hz
-    if float(np.max(np.abs(times - grid))) * rate_hz > 1e-3:
-        kept = np.asarray(CubicSpline(times, kept, axis=0)(np.minimum(grid, times[-1])))
-    return kept, rate_hz, float(times[0]), tuple(notes)

@@ -34,6 +34,7 @@ def trembling(n: int, size: float = 25e-6) -> np.ndarray:
     frames = np.zeros((n, LAYOUT.size))
     frames[:, CONFIDENCE : CONFIDENCE + 3] = 0.9
     frames[:, LAYOUT["tremor_ahead"]] = size * np.sin(2 * np.pi * np.array([9.0, 10.0, 11.0]) * t[:, None])
+    frames[:, LAYOUT["tremor_core"]] = frames[:, LAYOUT["tremor_ahead"]]
     return frames
 
 
@@ -82,7 +83,7 @@ def test_mounting_turns_the_wish_into_the_manipulators_frame() -> None:
 
 def test_compensation_fades_in_and_out_with_trust() -> None:
     frames = trembling(2500)
-    frames[:, LAYOUT["tremor_ahead"]] = 10e-6
+    frames[:, LAYOUT["tremor_ahead"]] = frames[:, LAYOUT["tremor_core"]] = 10e-6
     frames[:100, STATUS] = SETTLING
     frames[1500:, CONFIDENCE + 1] = 0.05
     run(ActuationConfig(ramp_s=0.5), frames)
@@ -125,6 +126,7 @@ def test_too_fast_for_the_model_is_limited_and_flagged() -> None:
         # all three stacks: 12.5 um p-p of stroke along the shaft
         frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 2] = 0.0
         frames[:, TREMOR_AHEAD + 2] = 8.0 * 5.5e-6 * np.sin(2 * np.pi * frequency_hz * t)
+        frames[:, LAYOUT["tremor_core"]] = frames[:, LAYOUT["tremor_ahead"]]
         run(config, frames)
         # peak rate of this sine: 2 pi f 5.5 um/s, so 36 Hz for 12.5 um p-p is 40.9 Hz here
         assert np.any(frames[:, CLIP].astype(int) & CLIP_SINGULAR) == beyond

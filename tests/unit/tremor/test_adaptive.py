@@ -7,11 +7,13 @@ import pytest
 from scipy.signal import lfilter
 
 from firmware_py.tremor.adaptive_design import (
+    band,
     bank_of,
     block_response,
     design_adaptive,
     sensor_response,
     solve_scaled,
+    spectra,
     target_taps,
 )
 from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
@@ -40,27 +42,39 @@ def test_bank_response_is_what_the_recursion_does() -> None:
     np.testing.assert_allclose(turning @ state.imag, response[9], atol=1e-6)
 
 
-@pytest.mark.parametrize(("hz", "error"), [(6.0, 0.07), (8.0, 0.04), (9.3, 0.025), (12.0, 0.015)])
-def test_the_target_is_the_displacement_some_blocks_ago(hz: float, error: float) -> None:
-    """Gain 1 and no phase at the centre tap, for a tone in the band, sensor and double integration undone.
+CONFIG = TremorConfig()
+WHOLE = (*CONFIG.adaptive.cancel_from_hz, *CONFIG.adaptive.cancel_to_hz)
 
-    ``error`` is what the window leaves (docstring of ``target_taps``), not what one would wish.
-    """
-    config = TremorConfig()
-    taps = target_taps(config, 10, 0.002)
+
+def through_target(hz: float, advance_s: float, edges_hz: tuple[float, float, float, float]) -> complex:
+    """What the target makes of a tone of displacement, as seen by the sensor, against the tone itself."""
+    taps = target_taps(CONFIG, 10, advance_s, edges_hz)
     f = np.array([hz])
-    half = len(taps) // 2
-    delays = np.exp(-2j * np.pi * hz * 0.01 * (np.arange(len(taps)) - half))
-    total = (taps @ delays) * block_response(f, 10, RATE_HZ)[0] * sensor_response(config, f)[0]
-    assert abs(total * np.exp(-2j * np.pi * hz * 0.002) - 1.0) < error
+    delays = np.exp(-2j * np.pi * hz * 0.01 * (np.arange(len(taps)) - len(taps) // 2))
+    seen = block_response(f, 10, RATE_HZ)[0] * sensor_response(CONFIG, f)[0]
+    return complex(taps @ delays * seen * np.exp(-2j * np.pi * hz * advance_s))
+
+
+@pytest.mark.parametrize("hz", [4.9, 6.0, 7.0, 8.0, 9.3, 10.7, 12.0, 14.0, 15.9])
+def test_the_target_is_the_displacement_some_blocks_ago(hz: float) -> None:
+    """Gain 1 and no phase at the centre tap, for a tone in the band, sensor and double integration undone."""
+    for advance_s in (0.0, 0.002):
+        assert abs(through_target(hz, advance_s, WHOLE) - 1.0) < 0.02
+
+
+@pytest.mark.parametrize("hz", [8.0, 9.3, 10.7, 12.0])
+def test_the_core_is_eight_to_twelve_hertz(hz: float) -> None:
+    core = CONFIG.adaptive.core_hz
+    assert abs(through_target(hz, 0.002, core) - 1.0) < 0.02
+    for outside in (3.0, 4.5, 18.0):
+        assert abs(through_target(outside, 0.002, core)) < 0.02
 
 
 def test_voluntary_motion_and_bias_are_outside_the_target() -> None:
-    config = TremorConfig()
-    taps = target_taps(config, 10, 0.0)
     for hz in (0.01, 0.3, 1.0):
-        delays = np.exp(-2j * np.pi * hz * 0.01 * np.arange(len(taps)))
-        assert abs(taps @ delays * sensor_response(config, np.array([hz]))[0]) < 0.003
+        assert abs(through_target(hz, 0.0, WHOLE)) < 0.003
+    # a bias of 0.2 m/s^2 for the length of the target
+    assert abs(np.sum(target_taps(CONFIG, 10, 0.0, WHOLE))) * 0.2 < 1e-6
 
 
 def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
@@ -72,10 +86,64 @@ def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
     right = rng.standard_normal((2, 6))
     np.testing.assert_allclose(solve_scaled(spd, right) @ spd, right, rtol=1e-4, atol=1e-6)
     assert np.all(np.linalg.eigvalsh(d.rest) > -1e-12 * np.linalg.norm(d.rest))
-    # a steady tone in the middle of the band comes out nearly whole and in phase
+    # the mean square error written out as an integral over frequency: every step away from the filter makes it larger
+    config = TremorConfig()
+    hand = spectra(config)
+    phi = d.bank.response(np.exp(2j * np.pi * hand.hz / RATE_HZ).astype(np.complex128))
+    wanted = band(hand.hz, WHOLE)
+
+    def error(row: np.ndarray, level: int, rms_m: float) -> float:
+        through = row @ phi
+        missed = np.abs(through * hand.seen - wanted) ** 2 * hand.tremor[level] * rms_m**2
+        return float(np.sum(missed + np.abs(through) ** 2 * hand.rest))
+
+    for level, rms_m in enumerate((config.adaptive.tremor_rms_m, config.adaptive.burst_rms_m)):
+        row = d.start[level, 0]
+        best = error(row, level, rms_m)
+        assert best < 0.5 * error(0.0 * row, level, rms_m)
+        for step in (1e-2, -1e-2):
+            for j in range(len(row)):
+                moved = row.copy()
+                moved[j] *= 1.0 + step
+                assert error(moved, level, rms_m) > best * (1.0 - 1e-6)
+    # the calm hand's filter lets a steady tone in the middle of the band through nearly whole and in phase
     z = np.array([np.exp(2j * np.pi * 10.0 / RATE_HZ)])
-    through = d.start[0] @ d.bank.response(z)[:, 0] * sensor_response(TremorConfig(), np.array([10.0]))[0]
+    through = d.start[0, 0] @ d.bank.response(z)[:, 0] * sensor_response(TremorConfig(), np.array([10.0]))[0]
     assert abs(through - 1.0) < 0.15
+
+
+def test_the_gate_tells_a_burst_from_a_calm_hand_within_a_tenth_of_a_second() -> None:
+    """A burst after nothing but sensor noise; the share stands for a power ratio of ``gate_ratio`` to one."""
+    rng = np.random.default_rng(3)
+    samples = 0.01 * rng.standard_normal(6000)
+    samples[4000:] += tone_acceleration(8.0, 300e-6, 2000)
+    estimator = Estimator(TremorConfig(), axes=1)
+    estimator.run(samples[:4000, None])
+    assert peek(estimator.state).adaptive.burst[0] < 0.1
+    estimator.run(samples[4000:4100, None])
+    assert peek(estimator.state).adaptive.burst[0] > 0.8
+    assert peek(estimator.state).adaptive.burst[1] == 0.0  # each axis by itself
+
+
+def test_a_first_burst_is_met_by_a_bold_filter() -> None:
+    """After ten calm seconds, a swing of 300 um at 10 Hz: a fifth of its first half second is left at most.
+
+    One filter, learned from the calm hand alone, is cautious and leaves more.
+    """
+    n, at = 10_500, 10_000
+    t = np.arange(n) / RATE_HZ
+    rise = np.clip((t - at / RATE_HZ) / 0.1, 0.0, 1.0)
+    swing = 300e-6 * (rise**2 * (3.0 - 2.0 * rise)) * np.sin(2.0 * np.pi * 10.0 * (t - at / RATE_HZ))
+    acceleration = np.zeros(n)
+    acceleration[1:-1] = np.diff(swing, 2) * RATE_HZ**2
+    seen = rc_filter(acceleration) + 0.01 * np.random.default_rng(4).standard_normal(n)
+    left: list[float] = []
+    for adaptive in (AdaptiveConfig(), AdaptiveConfig(gate_ratio=1e12)):
+        config = TremorConfig(adaptive=adaptive, loop_delay_s=0.002)
+        ahead = Estimator(config, axes=1).run(seen[:, None]).ahead_m[:, 0]
+        left.append(float(np.std((swing[2:] - ahead[:-2])[at:]) / np.std(swing[at:])))
+    assert left[0] < 0.2
+    assert left[0] < 0.6 * left[1]
 
 
 @pytest.mark.parametrize("kind", ["one tone", "two tones", "band noise"])
@@ -127,23 +195,28 @@ def test_voluntary_motion_below_one_hertz_is_kept() -> None:
 
 
 def test_learning_is_least_squares_with_the_prior() -> None:
-    """After a run the filter of an axis solves the normal equations that the state holds."""
+    """After a run the filter of an axis and level solves the normal equations that the state holds."""
     config = TremorConfig(adaptive=AdaptiveConfig(share=0.0))
     record = make_record(3, "one tone", 6.0)
     estimator = Estimator(config, axes=1)
     estimator.run(record.acceleration[:, None])
     state, param = peek(estimator.state).adaptive, peek(estimator.params).adaptive
-    before = np.array(state.filter[0])
-    count, n0 = state.count[0], param.prior_blocks
-    power = (state.power[0] + n0 * param.weighted_power - count * param.noise_power) / (count + n0)
-    normal = np.tril(state.normal[0]) + np.tril(state.normal[0], -1).T
-    matrix = normal + n0 * (power * param.tremor + param.rest)
-    right = state.right[0] - count * param.noise_cross + n0 * power * param.cross
-    direct = solve_scaled(matrix, np.asarray(right))
-    # the last solution is at most two blocks old
-    np.testing.assert_allclose(before @ matrix, direct @ matrix, rtol=0.05, atol=0.02 * np.abs(right).max())
+    for level in range(2):
+        count, n0 = state.count[0, level], param.prior_blocks[level]
+        assert count > 10.0
+        known = state.power[0, level] + n0 * param.weighted_power[level] - count * param.noise_power
+        power = known / (count + n0)
+        normal = np.tril(state.normal[0, level]) + np.tril(state.normal[0, level], -1).T
+        matrix = normal + n0 * (power * param.tremor[level] + param.rest)
+        right = state.right[0, level] - count * param.noise_cross + n0 * power * param.cross[level]
+        direct = solve_scaled(matrix, np.asarray(right))
+        found = np.array(state.filter[0, level])
+        # the last solution is a few blocks old
+        np.testing.assert_allclose(found @ matrix, direct @ matrix, rtol=0.05, atol=0.02 * np.abs(right).max())
 
 
 def test_edges_out_of_order_are_refused() -> None:
     with pytest.raises(BenchError, match="cancel_from_hz"):
         TremorConfig.from_dict({"adaptive": {"cancel_from_hz": [6.0, 4.0]}})
+    with pytest.raises(BenchError, match="core_hz"):
+        TremorConfig.from_dict({"adaptive": {"core_hz": [6.0, 8.0, 7.0, 16.0]}})

@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from firmware_py.tremor.cascade import Cascade
 from firmware_py.tremor.cascade_file import load_network
 from tools.cli.main import app
+from tools.errors import InputError
 from tools.reproduce.tremor_hands import PUBLISHED_CROSS
 from tools.tremor.cascade_data import RATE_HZ, Making, learning_paths, subjects, voluntary
 from tools.tremor.report import filled, report, table
@@ -115,3 +116,21 @@ def test_train_command_refuses(tmp_path: Path, extra: list[str]) -> None:
     result = CliRunner().invoke(app, ["tremor", "train", str(file), "--out", str(tmp_path / "net.json"), *extra])
     assert result.exit_code == 2, result.output
     assert not (tmp_path / "net.json").exists()
+
+
+def test_a_section_is_made_again_and_the_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tools.tremor import report as pages
+    from tools.tremor import report_inspect
+
+    monkeypatch.setattr(pages, "_signals", lambda data: [hand()])
+    monkeypatch.setattr(report_inspect, "section", lambda signals, progress: ["## Two", "", "new"])
+    page = "# Page\n\n## One\n\nkept\n\n## Two\n\nold\n\n### Part\n\nold\n\n## Three\n\nkept too\n"
+    made = pages.renewed(page, "inspect", tmp_path, "abc", lambda _: None)
+    assert made == (
+        "# Page\n\n## One\n\nkept\n\n## Two\n\nThis section: revision abc.\n\nnew\n\n## Three\n\nkept too\n"
+    )
+    with pytest.raises(InputError, match="no section '## Two'"):
+        pages.renewed("# Page\n", "inspect", tmp_path, "abc", lambda _: None)
+    done = CliRunner().invoke(app, ["tremor", "report", "--section", "inspect", "--out", str(tmp_path / "no.md")])
+    assert done.exit_code == 2
+    assert "--out FILE" in done.output

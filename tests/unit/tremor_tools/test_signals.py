@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hal.even_samples import stamp_share, steady_stamps
 from tools.errors import InputError
-from tools.tremor.clock import rate_from_known, stamp_share, steady_stamps
+from tools.tremor.clock import rate_from_known
 from tools.tremor.signals import load_signals
 from tools.tremor.spectrum import highest_line, periodogram
 

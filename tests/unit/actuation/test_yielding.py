@@ -1,0 +1,108 @@
+"""Slow motion yields to tremor: against what the stroke allows, and against what clipping would do to 8 to 12 Hz."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import butter, sosfiltfilt
+
+from firmware_py.actuation import yielding
+from firmware_py.actuation.config import ActuationConfig
+from firmware_py.actuation.stage import Actuation
+from firmware_py.actuation.yielding import YIELD_STATE, yield_rest
+from firmware_py.frame import CLIP, CLIP_WORKSPACE, CLIP_YIELD, CONFIDENCE, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
+from firmware_py.records import attributes
+from tests.unit.pure_python import without_compiler
+
+LOW, HIGH = np.full(3, -7e-6), np.full(3, 7e-6)
+KEEP = float(np.exp(-1.0 / 2000.0))
+BAND = butter(4, [8.0, 12.0], btype="band", fs=1000.0, output="sos")
+
+
+def hand(n: int, slow_m: float, core_m: float = 15e-6) -> np.ndarray:
+    """Frames that want a swing of ``slow_m`` at 4 Hz and a tremor of ``core_m`` at 9.5 Hz along the shaft."""
+    t = np.arange(n) / 1000.0
+    frames = np.zeros((n, LAYOUT.size))
+    frames[:, CONFIDENCE : CONFIDENCE + 3] = 0.9
+    frames[:, TREMOR_CORE + 2] = core_m * np.sin(2 * np.pi * 9.5 * t)
+    frames[:, TREMOR_AHEAD + 2] = frames[:, TREMOR_CORE + 2] + slow_m * np.sin(2 * np.pi * 4.0 * t)
+    return frames
+
+
+def run(frames: np.ndarray) -> np.ndarray:
+    """Wanted tip along the shaft, m."""
+    actuation = Actuation(ActuationConfig())
+    for frame in frames:
+        actuation.step(frame)
+    return frames[:, LAYOUT["desired_tip"]][:, 2]
+
+
+def in_band_error(frames: np.ndarray, tip: np.ndarray) -> float:
+    """Error against minus the core in 8 to 12 Hz over the core's rms, the first second left out."""
+    error = sosfiltfilt(BAND, tip + frames[:, TREMOR_CORE + 2])[1000:-500]
+    return float(np.std(error) / np.std(frames[1000:-500, TREMOR_CORE + 2]))
+
+
+def test_within_the_stroke_nothing_yields() -> None:
+    frames = hand(1500, slow_m=20e-6)
+    tip = run(frames)
+    assert np.all(frames[:, CLIP] == 0.0)
+    np.testing.assert_allclose(tip[600:], -frames[600:, TREMOR_AHEAD + 2], atol=1e-18)
+
+
+def test_a_swing_beyond_the_stroke_leaves_the_tremor_its_own() -> None:
+    """Clipped instead, the same wish leaves a quarter of the tremor and more."""
+    frames = hand(4000, slow_m=150e-6)
+    tip = run(frames)
+    flags = frames[1500:, CLIP].astype(int)
+    assert np.all(flags & CLIP_YIELD)
+    assert not np.any(flags & CLIP_WORKSPACE)
+    assert in_band_error(frames, tip) < 0.05
+    clipped = hand(4000, slow_m=150e-6)
+    clipped[:, TREMOR_CORE + 2] = clipped[:, TREMOR_AHEAD + 2]
+    reached = run(clipped)
+    assert in_band_error(frames, reached) > 0.25
+    # most of the stroke is still used
+    assert np.max(np.abs(tip[1500:])) > 0.75 * np.max(np.abs(reached[1500:]))
+
+
+def test_the_wish_has_no_jump_when_the_swing_begins() -> None:
+    frames = hand(3000, slow_m=150e-6)
+    onset = np.clip((np.arange(3000) - 1500) / 20.0, 0.0, 1.0)
+    frames[:, TREMOR_AHEAD + 2] = frames[:, TREMOR_CORE + 2] + onset * (
+        frames[:, TREMOR_AHEAD + 2] - frames[:, TREMOR_CORE + 2]
+    )
+    tip = run(frames)
+    assert np.max(np.abs(np.diff(tip[600:]))) <= 1.05 * np.max(np.abs(np.diff(frames[600:, TREMOR_AHEAD + 2])))
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_what_is_let_through_fits_whatever_comes(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    state = np.zeros(1, YIELD_STATE)
+    for _ in range(400):
+        core = rng.uniform(-3e-6, 3e-6, 3)
+        stroke = core + rng.standard_normal(3) * 10.0 ** rng.uniform(-6.5, -4.0)
+        wanted = stroke.copy()
+        held = yield_rest(stroke, core, LOW, HIGH, KEEP, state[0])
+        assert np.all((stroke >= LOW - 1e-18) & (stroke <= HIGH + 1e-18))
+        assert held == bool(np.any(stroke != wanted))
+
+
+def test_what_has_no_inverse_is_left_alone_and_not_remembered() -> None:
+    state = np.zeros(1, YIELD_STATE)
+    stroke = np.array([np.nan, 0.0, 0.0])
+    assert not yield_rest(stroke, np.zeros(3), LOW, HIGH, KEEP, state[0])
+    assert state[0].tobytes() == np.zeros(1, YIELD_STATE)[0].tobytes()
+
+
+def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    rows = [(c + rng.standard_normal(3) * 1e-5, c) for c in rng.uniform(-3e-6, 3e-6, (50, 3))]
+    fast, slow = np.zeros(1, YIELD_STATE), np.zeros(1, YIELD_STATE)
+    compiled = [row[0].copy() for row in rows]
+    flags = [yield_rest(s, r[1], LOW, HIGH, KEEP, fast[0]) for s, r in zip(compiled, rows, strict=True)]
+    without_compiler(monkeypatch)
+    for (stroke, core), found, flag in zip(rows, compiled, flags, strict=True):
+        assert yielding.yield_rest(stroke, core, LOW, HIGH, KEEP, attributes(slow)[0]) == flag
+        np.testing.assert_allclose(stroke, found, atol=1e-18)
