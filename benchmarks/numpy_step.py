@@ -211,7 +211,8 @@ class NumpyStep:
         a.pending[:] = sample
         e.samples[:] = sample
         self.combine(sample)
-        now, ahead = np.einsum("aom,am->oa", a.filter, a.bank)
+        calm, burst = np.einsum("alom,am->loa", a.filter, a.bank)
+        now, ahead, core = calm + a.burst * (burst - calm)
         missed = now - e.predicted[:, (e.at - p.delay_ticks) % e.predicted.shape[1]]
         e.predicted[:, e.at] = ahead
         e.power += p.smoothing * (now**2 - e.power)
@@ -219,9 +220,9 @@ class NumpyStep:
         frequency = e.combiner["wflc"]["omega"] * p.combiner.seen.tick_hz / (2.0 * np.pi)
         settled = e.ticks > p.settle_ticks
         trust = np.maximum(0.0, 1.0 - np.sqrt((e.miss + p.floor2) / (e.power + p.floor2))) if settled else np.zeros(3)
-        out = np.stack([now, ahead, frequency, np.sqrt(2.0 * e.power), trust])
+        out = np.stack([now, ahead, frequency, np.sqrt(2.0 * e.power), trust, core])
         e.out[:] = out
-        names = ("tremor", "tremor_ahead", "tremor_frequency", "tremor_amplitude", "confidence")
+        names = ("tremor", "tremor_ahead", "tremor_frequency", "tremor_amplitude", "confidence", "tremor_core")
         for name, values in zip(names, out, strict=True):
             f[AT[name]] = values
 
@@ -230,6 +231,9 @@ class NumpyStep:
         lifted = biquads(a.pending, a.weigh[:, None, :], q.weight[None, :])
         a.weighted[:] = self.turned(a.weighted, lifted)
         a["sum"] += lifted
+        gated = biquads(a.pending, a.gate[:, None, :], q.gate[None, :])
+        a.gate_power += q.gate_smoothing * (gated**2 - a.gate_power)
+        a.burst[:] = a.gate_power / (a.gate_power + q.gate_power)
         a.in_block += 1
         if a.in_block < q.block_ticks:
             return
@@ -241,40 +245,43 @@ class NumpyStep:
         a.blocks[:, at % taps] = a["sum"] / q.block_ticks
         a["sum"][:] = 0.0
         a.snapshots[:, at % (lag + 1)] = a.weighted
+        a.bursts[:, at % (lag + 1)] = a.burst
         if at >= 2 * taps:
             self.regress(at, taps, lag)
-        if a.count[at % 3] > 0.0:
-            self.solve(at % 3)
+            self.solve(at % 3, at // 3 % 2)
 
     def regress(self, at: int, taps: int, lag: int) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
-        targets = a.blocks[:, (at - np.arange(taps)) % taps] @ q.taps.T  # (3, 2)
-        now = targets[:, 0]
-        typical = (q.prior_blocks * q.weighted_power + a.power) / (q.prior_blocks + a.count)
-        weight = np.minimum(1.0, q.outlier * typical / np.maximum(now**2, 1e-300))
+        targets = a.blocks[:, (at - np.arange(taps)) % taps] @ q.taps.T  # (3, 3)
+        now2 = targets[:, :1] ** 2
+        typical = (q.prior_blocks * q.weighted_power + a.power) / (q.prior_blocks + a.count)  # (axis, level)
+        burst = a.bursts[:, (at - lag) % (lag + 1), None]
+        weight = np.minimum(1.0, q.outlier * typical / np.maximum(now2, 1e-300)) * np.hstack([1.0 - burst, burst])
         phi = a.snapshots[:, (at - lag) % (lag + 1)]
         a.count[:] = q.keep * a.count + weight
-        a.power[:] = q.keep * a.power + weight * now**2
-        scaled = weight[:, None] * phi
-        a.normal[:] = q.keep * a.normal + np.tril(scaled[:, :, None] * phi[:, None, :])
-        a.right[:] = q.keep * a.right + targets[:, :, None] * scaled[:, None, :]
+        a.power[:] = q.keep * a.power + weight * now2
+        scaled = weight[:, :, None] * phi[:, None, :]  # (axis, level, m)
+        a.normal[:] = q.keep * a.normal + np.tril(scaled[..., :, None] * phi[:, None, None, :])
+        a.right[:] = q.keep * a.right + targets[:, None, :, None] * scaled[:, :, None, :]
 
-    def solve(self, axis: int) -> None:
+    def solve(self, axis: int, level: int) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
-        count, n0 = a.count[axis], q.prior_blocks
-        power = (a.power[axis] + n0 * q.weighted_power - q.noise_power * count) / (count + n0)
-        power = max(power, q.least_power)
-        matrix = a.normal[axis] + n0 * (power * q.tremor + q.rest)
-        right = a.right[axis] - count * q.noise_cross + n0 * power * q.cross
-        for other in {0, 1, 2} - {axis}:
-            if a.power[other] > 0.0:
-                share = q.share * min(1.0, a.power[axis] / a.power[other])
-                matrix = matrix + share * a.normal[other]
-                right = right + share * (a.right[other] - a.count[other] * q.noise_cross)
+        count, n0 = a.count[axis, level], q.prior_blocks[level]
+        known = a.power[axis, level] + n0 * q.weighted_power[level] - q.noise_power * count
+        power = max(known / (count + n0), q.least_power)
+        matrix = n0 * (power * q.tremor[level] + q.rest)
+        right = n0 * power * q.cross[level]
+        for other in range(3):
+            rows, seen = a.count[other, level], a.power[other, level]
+            if rows > 0.0 and seen > 0.0:
+                share = 1.0 if other == axis else q.share
+                ratio = 1.0 if other == axis else min(1.0, power * rows / seen)
+                matrix = matrix + share * (ratio * a.normal[other, level] + (1.0 - ratio) * rows * q.rest)
+                right = right + share * ratio * (a.right[other, level] - rows * q.noise_cross)
         scale = 1.0 / np.sqrt(np.diag(matrix))
         lower = np.tril(matrix) * np.outer(scale, scale)
         whole = lower + np.tril(lower, -1).T + 1e-9 * np.eye(len(scale))
-        a.filter[axis] = np.linalg.solve(whole, (right * scale).T).T * scale
+        a.filter[axis, level] = np.linalg.solve(whole, (right * scale).T).T * scale
 
     def combine(self, sample: Array) -> None:
         c, p = self.e.combiner.view(np.recarray), self.ep.combiner
@@ -327,7 +334,9 @@ class NumpyStep:
         a.on[:] = np.clip(a.on + np.where(trusted, p.ramp_step, -p.ramp_step), 0.0, 1.0)
         tip = p.mounting @ (-p.gain * a.on * ahead)
         f[AT["desired_tip"]] = tip
-        stroke = self.strokes(tip)
+        stroke = self.strokes(tip, a.tilt)
+        core = self.strokes(p.mounting @ (-p.gain * a.on * f[AT["tremor_core"]]), a.yielding.tilt)
+        self.watch_yielding(stroke, core)
         f[AT["stroke"]] = stroke
         a.strokes[:, 1:] = a.strokes[:, :-1].copy()
         a.strokes[:, 0] = stroke
@@ -365,11 +374,24 @@ class NumpyStep:
     def zones(y: Array, d: Array, s: Array) -> Array:
         return s[:, 0] * y + (s[:, 1:] * np.maximum(y[:, None] - d[:, 1:], 0.0)).sum(axis=1)
 
-    def strokes(self, tip: Array) -> Array:
+    def watch_yielding(self, stroke: Array, core: Array) -> None:
+        """Peaks as the firmware remembers them; that nothing has to yield is the regular way of this yardstick."""
+        p, y = self.ap, self.a.yielding
+        rest = stroke - core
+        mean = rest.mean()
+        half = np.minimum(p.stroke_high, -p.stroke_low)
+        y.core_peak[:] = np.maximum(p.yield_keep * y.core_peak, np.abs(core))
+        room = np.maximum(0.1 * half, half - y.core_peak)
+        y.side_over = max(p.yield_keep * y.side_over, float(np.max(np.abs(rest - mean) / (0.9 * room))))
+        y.side_peak[:] = np.maximum(p.yield_keep * y.side_peak, np.abs(rest - mean))
+        axial = np.abs(mean) / (room - np.minimum(y.side_peak, 0.9 * room))
+        y.axial_over = max(p.yield_keep * y.axial_over, float(np.max(axial)))
+
+    def strokes(self, tip: Array, warm: Array) -> Array:
         g = self.ap.geometry
         r, length = g.circle_m, g.shaft_m
         wanted = tip[:2] + g.rest_tip[:2]
-        tilt = self.a.tilt.copy()
+        tilt = warm.copy()
         for _ in range(4):
             az = np.sqrt(1.0 - tilt @ tilt)
             k = 1.0 / (1.0 + az)
@@ -379,7 +401,7 @@ class NumpyStep:
                 break
             slope = np.array([[-tilt[0], tilt[1]], [tilt[1], tilt[0]]]) * k + np.outer(across, tilt) * (k * k / az)
             tilt = tilt + np.linalg.solve(length * np.eye(2) + r * slope, error)
-        self.a.tilt[:] = tilt
+        warm[:] = tilt
         flat = tilt @ tilt
         centre = tip[2] + g.rest_tip[2] + length * flat / (1.0 + np.sqrt(1.0 - flat))
         half = 0.5 * np.sqrt(3.0)

@@ -331,8 +331,10 @@ typedef estimate_state_adaptive Adaptive;
 #define BANK ((int)(sizeof(((Filter *)0)->onward) / sizeof(double)))
 #define POLES ((int)(sizeof(((Filter *)0)->pole_re) / sizeof(double)))
 #define SLOW ((int)(sizeof(((Filter *)0)->slow) / sizeof(double)))
-#define TAPS_ ((int)(sizeof(((Filter *)0)->taps) / sizeof(double) / 2))
+#define TAPS_ ((int)(sizeof(((Filter *)0)->taps) / sizeof(double) / OUTPUTS))
 #define LAG (TAPS_ / 2)
+#define OUTPUTS 3 /* now, ahead, core */
+#define LEVELS 2
 
 static void bank_turn(double *b, const Filter *p)
 {
@@ -354,42 +356,46 @@ static void bank_add(double *b, double sample, const Filter *p)
 
 static void regress(Adaptive *s, int axis, int at, const Filter *p)
 {
-    double now = 0.0, ahead = 0.0;
+    double target[OUTPUTS] = {0.0}, keep = p->keep;
     for (int j = 0; j < TAPS_; j++) {
         double block = s->blocks[axis][(at - j) % TAPS_];
-        now += p->taps[0][j] * block;
-        ahead += p->taps[1][j] * block;
+        for (int o = 0; o < OUTPUTS; o++) target[o] += p->taps[o][j] * block;
     }
-    double typical = (p->prior_blocks * p->weighted_power + s->power[axis]) / (p->prior_blocks + s->count[axis]);
-    double weight = p->outlier * typical / (now * now > 1e-300 ? now * now : 1e-300), keep = p->keep;
-    if (weight > 1.0) weight = 1.0;
+    double now2 = target[0] * target[0], burst = s->bursts[axis][(at - LAG) % (LAG + 1)];
     const double *phi = s->snapshots[axis][(at - LAG) % (LAG + 1)];
-    s->count[axis] = keep * s->count[axis] + weight;
-    s->power[axis] = keep * s->power[axis] + weight * now * now;
-    for (int i = 0; i < BANK; i++) {
-        double scaled = weight * phi[i];
-        for (int j = 0; j <= i; j++) s->normal[axis][i][j] = keep * s->normal[axis][i][j] + scaled * phi[j];
-        s->right[axis][0][i] = keep * s->right[axis][0][i] + scaled * now;
-        s->right[axis][1][i] = keep * s->right[axis][1][i] + scaled * ahead;
+    for (int l = 0; l < LEVELS; l++) {
+        double n0 = p->prior_blocks[l];
+        double typical = (n0 * p->weighted_power[l] + s->power[axis][l]) / (n0 + s->count[axis][l]);
+        double weight = p->outlier * typical / (now2 > 1e-300 ? now2 : 1e-300);
+        weight = (l ? burst : 1.0 - burst) * (weight < 1.0 ? weight : 1.0);
+        s->count[axis][l] = keep * s->count[axis][l] + weight;
+        s->power[axis][l] = keep * s->power[axis][l] + weight * now2;
+        for (int i = 0; i < BANK; i++) {
+            double scaled = weight * phi[i], *row = s->normal[axis][l][i];
+            for (int j = 0; j <= i; j++) row[j] = keep * row[j] + scaled * phi[j];
+            for (int o = 0; o < OUTPUTS; o++) s->right[axis][l][o][i] = keep * s->right[axis][l][o][i] + scaled * target[o];
+        }
     }
 }
 
-static void solve(Adaptive *s, int axis, const Filter *p)
+static void solve(Adaptive *s, int axis, int l, const Filter *p)
 {
-    double a[BANK][BANK], scale[BANK], count = s->count[axis], n0 = p->prior_blocks;
+    double a[BANK][BANK], scale[BANK], count = s->count[axis][l], n0 = p->prior_blocks[l];
     double(*x)[sizeof(((Filter *)0)->onward) / sizeof(double)] = s->solution;
-    double power = (s->power[axis] + n0 * p->weighted_power) / (count + n0) - p->noise_power * count / (count + n0);
+    double power = (s->power[axis][l] + n0 * p->weighted_power[l] - p->noise_power * count) / (count + n0);
     if (power < p->least_power) power = p->least_power;
     for (int i = 0; i < BANK; i++) {
-        for (int j = 0; j <= i; j++) a[i][j] = s->normal[axis][i][j] + n0 * (power * p->tremor[i][j] + p->rest[i][j]);
-        for (int o = 0; o < 2; o++) x[o][i] = s->right[axis][o][i] - count * p->noise_cross[o][i] + n0 * power * p->cross[o][i];
+        for (int j = 0; j <= i; j++) a[i][j] = n0 * (power * p->tremor[l][i][j] + p->rest[i][j]);
+        for (int o = 0; o < OUTPUTS; o++) x[o][i] = n0 * power * p->cross[l][o][i];
     }
     for (int other = 0; other < 3; other++) {
-        if (other == axis || s->power[other] <= 0.0) continue;
-        double ratio = s->power[axis] / s->power[other], share = p->share * (ratio < 1.0 ? ratio : 1.0);
+        double rows = s->count[other][l], seen = s->power[other][l], share = other == axis ? 1.0 : p->share;
+        if (rows <= 0.0 || seen <= 0.0) continue;
+        double ratio = other == axis || power * rows > seen ? 1.0 : power * rows / seen;
+        double factor = share * ratio, back = share * (1.0 - ratio) * rows;
         for (int i = 0; i < BANK; i++) {
-            for (int j = 0; j <= i; j++) a[i][j] += share * s->normal[other][i][j];
-            for (int o = 0; o < 2; o++) x[o][i] += share * (s->right[other][o][i] - s->count[other] * p->noise_cross[o][i]);
+            for (int j = 0; j <= i; j++) a[i][j] += factor * s->normal[other][l][i][j] + back * p->rest[i][j];
+            for (int o = 0; o < OUTPUTS; o++) x[o][i] += factor * (s->right[other][l][o][i] - rows * p->noise_cross[o][i]);
         }
     }
     for (int i = 0; i < BANK; i++) scale[i] = 1.0 / sqrt(a[i][i]);
@@ -401,7 +407,7 @@ static void solve(Adaptive *s, int axis, const Filter *p)
             else if (total > 0.0) a[i][i] = sqrt(total);
             else return;
         }
-    for (int o = 0; o < 2; o++) {
+    for (int o = 0; o < OUTPUTS; o++) {
         for (int i = 0; i < BANK; i++) {
             double total = x[o][i] * scale[i];
             for (int k = 0; k < i; k++) total -= a[i][k] * x[o][k];
@@ -412,31 +418,8 @@ static void solve(Adaptive *s, int axis, const Filter *p)
             for (int k = i + 1; k < BANK; k++) total -= a[k][i] * x[o][k];
             x[o][i] = total / a[i][i];
         }
-        for (int i = 0; i < BANK; i++) s->filter[axis][o][i] = x[o][i] * scale[i];
+        for (int i = 0; i < BANK; i++) s->filter[axis][l][o][i] = x[o][i] * scale[i];
     }
-}
-
-static void learn(Adaptive *s, const Filter *p)
-{
-    const double *w = p->weight;
-    for (int i = 0; i < 3; i++) {
-        double sample = s->pending[i], lifted = w[0] * sample + s->weigh[i][0];
-        s->weigh[i][0] = w[1] * sample - w[3] * lifted + s->weigh[i][1];
-        s->weigh[i][1] = w[2] * sample - w[4] * lifted;
-        bank_turn(s->weighted[i], p);
-        bank_add(s->weighted[i], lifted, p);
-        s->sum[i] += lifted;
-    }
-    if (++s->in_block < p->block_ticks) return;
-    s->in_block = 0;
-    int at = (int)s->n_blocks++;
-    for (int i = 0; i < 3; i++) {
-        s->blocks[i][at % TAPS_] = s->sum[i] / (double)p->block_ticks;
-        s->sum[i] = 0.0;
-        memcpy(s->snapshots[i][at % (LAG + 1)], s->weighted[i], BANK * sizeof(double));
-        if (at >= 2 * TAPS_) regress(s, i, at, p);
-    }
-    if (s->count[at % 3] > 0.0) solve(s, at % 3, p);
 }
 
 static double section(double x, double *memory, const double *b)
@@ -445,6 +428,30 @@ static double section(double x, double *memory, const double *b)
     memory[0] = b[1] * x - b[3] * y + memory[1];
     memory[1] = b[2] * x - b[4] * y;
     return y;
+}
+
+static void learn(Adaptive *s, const Filter *p)
+{
+    for (int i = 0; i < 3; i++) {
+        double sample = s->pending[i], lifted = section(sample, s->weigh[i], p->weight);
+        bank_turn(s->weighted[i], p);
+        bank_add(s->weighted[i], lifted, p);
+        s->sum[i] += lifted;
+        double gated = section(sample, s->gate[i], p->gate);
+        s->gate_power[i] += p->gate_smoothing * (gated * gated - s->gate_power[i]);
+        s->burst[i] = s->gate_power[i] / (s->gate_power[i] + p->gate_power);
+    }
+    if (++s->in_block < p->block_ticks) return;
+    s->in_block = 0;
+    int at = (int)s->n_blocks++;
+    for (int i = 0; i < 3; i++) {
+        s->blocks[i][at % TAPS_] = s->sum[i] / (double)p->block_ticks;
+        s->sum[i] = 0.0;
+        memcpy(s->snapshots[i][at % (LAG + 1)], s->weighted[i], BANK * sizeof(double));
+        s->bursts[i][at % (LAG + 1)] = s->burst[i];
+        if (at >= 2 * TAPS_) regress(s, i, at, p);
+    }
+    if (at >= 2 * TAPS_) solve(s, at % 3, at / 3 % LEVELS, p);
 }
 
 static double wrap(double phase) /* as the language of the firmware: into [0, 2 pi) */
@@ -502,17 +509,19 @@ static int estimate(double *f, estimate_state *s, const estimate_params *p)
         a->pending[i] = sample;
     }
     for (int i = 0; i < 3; i++) {
-        double now = 0.0, ahead = 0.0;
-        for (int j = 0; j < BANK; j++) {
-            now += a->filter[i][0][j] * a->bank[i][j];
-            ahead += a->filter[i][1][j] * a->bank[i][j];
-        }
+        double sum[LEVELS][OUTPUTS] = {{0.0}}, out[OUTPUTS];
+        for (int j = 0; j < BANK; j++)
+            for (int l = 0; l < LEVELS; l++)
+                for (int o = 0; o < OUTPUTS; o++) sum[l][o] += a->filter[i][l][o][j] * a->bank[i][j];
+        for (int o = 0; o < OUTPUTS; o++) out[o] = sum[0][o] + a->burst[i] * (sum[1][o] - sum[0][o]);
+        double now = out[0], ahead = out[1];
         double missed = now - s->predicted[i][(s->at - p->delay_ticks + 64) % 64];
         s->predicted[i][s->at] = ahead;
         s->power[i] += p->smoothing * (now * now - s->power[i]);
         s->miss[i] += p->smoothing * (missed * missed - s->miss[i]);
         f[TREMOR + i] = s->out[0][i] = now;
         f[TREMOR_AHEAD + i] = s->out[1][i] = ahead;
+        f[TREMOR_CORE + i] = s->out[5][i] = out[2];
         f[TREMOR_FREQUENCY + i] = s->out[2][i] = s->combiner[i].wflc.omega * p->combiner.seen.tick_hz / (2.0 * PI);
         f[TREMOR_AMPLITUDE + i] = s->out[3][i] = sqrt(2.0 * s->power[i]);
         double trust = 0.0;
@@ -601,19 +610,47 @@ static int strokes(const double *tip, const actuate_params_geometry *g, double *
     return 0;
 }
 
+/* Nothing may be held back: that would leave the regular way. */
+static int yields(const double *stroke, const double *core, const actuate_params *p, actuate_state_yielding *s)
+{
+    double mean = 0.0, room[3], over = 0.0, keep = p->yield_keep;
+    for (int i = 0; i < 3; i++) mean += (stroke[i] - core[i]) / 3.0;
+    for (int i = 0; i < 3; i++) {
+        double half = p->stroke_high[i] < -p->stroke_low[i] ? p->stroke_high[i] : -p->stroke_low[i];
+        s->core_peak[i] = fmax(keep * s->core_peak[i], fabs(core[i]));
+        room[i] = fmax(0.1 * half, half - s->core_peak[i]);
+        over = fmax(over, fabs(stroke[i] - core[i] - mean) / (0.9 * room[i]));
+    }
+    s->side_over = fmax(keep * s->side_over, over);
+    over = 0.0;
+    for (int i = 0; i < 3; i++) {
+        s->side_peak[i] = fmax(keep * s->side_peak[i], fabs(stroke[i] - core[i] - mean));
+        over = fmax(over, fabs(mean) / (room[i] - fmin(s->side_peak[i], 0.9 * room[i])));
+    }
+    s->axial_over = fmax(keep * s->axial_over, over);
+    return s->side_over > 1.0 || s->axial_over > 1.0;
+}
+
 static int actuate(double *f, actuate_state *s, const actuate_params *p)
 {
-    double wish[3];
+    double wish[3], least[3], core_tip[3], core_stroke[3];
     int ready = !((int)f[STATUS] & (ALIGNING | SETTLING)), clip = 0;
     for (int i = 0; i < 3; i++) {
-        double ahead = f[TREMOR_AHEAD + i];
+        double ahead = f[TREMOR_AHEAD + i], core = f[TREMOR_CORE + i];
         int trusted = ready && f[CONFIDENCE + i] >= p->min_confidence && isfinite(ahead);
         s->on[i] = between(s->on[i] + (trusted ? p->ramp_step : -p->ramp_step), 0.0, 1.0);
         wish[i] = isfinite(ahead) ? -p->gain * s->on[i] * ahead : 0.0;
+        least[i] = isfinite(ahead) && isfinite(core) ? -p->gain * s->on[i] * core : 0.0;
     }
     double *tip = f + DESIRED_TIP, *stroke = f + STROKE;
-    for (int i = 0; i < 3; i++) tip[i] = p->mounting[i][0] * wish[0] + p->mounting[i][1] * wish[1] + p->mounting[i][2] * wish[2];
+    for (int i = 0; i < 3; i++) {
+        const double *row = p->mounting[i];
+        tip[i] = row[0] * wish[0] + row[1] * wish[1] + row[2] * wish[2];
+        core_tip[i] = row[0] * least[0] + row[1] * least[1] + row[2] * least[2];
+    }
     if (strokes(tip, &p->geometry, s->tilt, stroke)) return 1;
+    if (strokes(core_tip, &p->geometry, s->yielding.tilt, core_stroke)) return 1;
+    if (yields(stroke, core_stroke, p, &s->yielding)) return 1;
     for (int i = 0; i < 3; i++)
         if (!(p->stroke_low[i] <= stroke[i] && stroke[i] <= p->stroke_high[i])) return 1;
     for (int i = 0; i < 3; i++) {

@@ -11,7 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.chain import COMMANDED, step_kernel
-from firmware_py.frame import CLIP, COMMAND, COUNTS, MAGNETOMETER_FRESH, MAGNETOMETER_RAW, STATUS, TICK, TIME
+from firmware_py.frame import (
+    CLIP,
+    CLIP_YIELD,
+    COMMAND,
+    COUNTS,
+    MAGNETOMETER_FRESH,
+    MAGNETOMETER_RAW,
+    STATUS,
+    TICK,
+    TIME,
+)
 from firmware_py.records import Record
 from hal.compiled import kernel
 from sim_devices.plant.kernel import STEPS_PER_MS, advance
@@ -101,7 +111,7 @@ def closed_loop(
         row = advance(plant, state, nodes, parts, noise, slow, first, arrives, truth, row)
         if wires.tick >= wires.armed_tick:
             command(s, wires, frame)
-            if frame[CLIP] != 0.0:
+            if int(frame[CLIP]) & ~CLIP_YIELD:
                 wires.clipped += 1
         row = advance(plant, state, nodes, parts, noise, slow, arrives, first + STEPS_PER_MS, truth, row)
         wires.tick += 1
