@@ -6,7 +6,7 @@ BIN    := $(VENV)/bin
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 
-.PHONY: run test test-all lint bench docs wheel coverage setup clean
+.PHONY: run test test-all lint bench docs pictures wheel coverage setup clean
 
 run: setup
 	$(BIN)/micron run
@@ -44,6 +44,10 @@ bench: setup
 docs: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
+
+# the pictures of the documents, of a running page; needs Chromium
+pictures: setup
+	$(BIN)/python -m tools.bench.pictures docs/pictures
 
 # the built package in an empty environment, away from the sources
 wheel: setup

@@ -18,7 +18,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out tests that disturb more than allowed; say so in the count, not silently."""
+    """Leave out tests that disturb more than allowed (they are counted); what needs the bench page comes last."""
     chosen = config.getoption("--bench")
     limit = config.getoption("--max-effect")
     limit = limit if limit is not None else (4 if chosen is None else 1)
@@ -29,6 +29,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = kept
+    # the bench page's server and its firmware run from the first test that needs them to the end: last, not beside others
+    items.sort(key=lambda item: "server" in getattr(item, "fixturenames", ()))
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,4 @@
-"""``python -m tools.bench.pictures [FOLDER]``: screenshots of every view of a running bench page, for the documents.
+"""``make pictures``: screenshots of every view of a running bench page and of a mismatch report, for the documents.
 
 Needs the package ``playwright`` and Debian's Chromium; starts its own server on a free port.
 """
@@ -19,6 +19,7 @@ from rich.console import Console
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 SETTLE_MS = {"scope": 9000, "tremor": 8000}
+SIZE = {"width": 1280, "height": 720}
 
 
 def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
@@ -29,6 +30,16 @@ def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
         page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
         page.wait_for_timeout(SETTLE_MS.get(view, 3000))
         page.screenshot(path=folder / f"{view}.png", timeout=90_000)
+
+
+def report(folder: Path) -> Path:
+    """The report on the recording of docs/tutorial-mismatch.md: an emulated stack against one that only multiplies."""
+    lab = ["sim_devices.plant.lab", "piezo", "--profile", "loops", "--seconds", "20", "--out", str(folder / "stack")]
+    page = folder / "report.html"
+    diagnose = ["tools.cli.main", "mismatch", "diagnose", str(folder / "stack"), "--html", str(page)]
+    for command in (lab, diagnose):
+        subprocess.run([sys.executable, "-m", *command], check=True, stdout=subprocess.DEVNULL)
+    return page
 
 
 def main(arguments: list[str]) -> int:
@@ -60,14 +71,23 @@ def main(arguments: list[str]) -> int:
                 browser = playwright.chromium.launch(
                     executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
                 )
-                page = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True).new_page()
+                page = browser.new_context(viewport=SIZE, bypass_csp=True).new_page()
                 page.goto(address)
                 page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
                 take(page, address.partition("/#")[0], folder, VIEWS)
+                page.keyboard.press("t")
+                page.wait_for_timeout(1000)
+                page.screenshot(path=folder / "dark.png", timeout=90_000)
+                server.send_signal(signal.SIGTERM)  # nothing else runs beside the diagnosis
+                server.wait(60)
+                page.goto(report(Path(recordings)).as_uri())
+                page.wait_for_timeout(1000)
+                page.screenshot(path=folder / "report.png", timeout=90_000)
                 browser.close()
         finally:
-            server.send_signal(signal.SIGTERM)
-            server.wait(60)
+            if server.poll() is None:
+                server.send_signal(signal.SIGTERM)
+                server.wait(60)
     people.print(f"pictures: {folder}")
     return 0
 
