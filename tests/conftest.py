@@ -29,7 +29,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = kept
-    # the bench page's server and its firmware run from the first test that needs them to the end: last, not beside others
+    # the bench page's server and its firmware run from the first test that needs them to the end: not beside others
     items.sort(key=lambda item: "server" in getattr(item, "fixturenames", ()))
 
 

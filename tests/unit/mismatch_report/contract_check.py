@@ -2,45 +2,10 @@
 
 import math
 
+from tests.unit.vocabulary import NAMES
+
 VERDICTS = ("agrees", "recalibrate", "missing_physics", "unexplained")
 STAGES = ("actuator", "amplifier", "sensor", "mounting", "acquisition", "environment", "mechanics")
-NAMES = [  # section 3
-    "hysteresis",
-    "rate_dependent_hysteresis",
-    "creep",
-    "backlash",
-    "dead_zone",
-    "saturation",
-    "static_nonlinearity",
-    "slew_limit",
-    "first_order_lag",
-    "ac_coupling",
-    "resonance",
-    "dead_time",
-    "misalignment",
-    "cross_axis_nonlinearity",
-    "scale_factor_variation",
-    "thermal_drift",
-    "temperature_sensitivity",
-    "supply_sensitivity",
-    "current_coupling",
-    "soft_iron",
-    "mains_interference",
-    "vibration",
-    "spikes",
-    "step_shift",
-    "random_walk",
-    "clock_skew",
-    "dropped_samples",
-    "quantization",
-    "coulomb_friction",
-    "stribeck_friction",
-    "cubic_stiffness",
-    "cogging",
-    "centripetal_acceleration",
-    "sensor_position_error",
-    "channel_delay",
-]
 TOP = {
     "format": int,
     "recording": str,

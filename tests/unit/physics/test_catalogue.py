@@ -9,44 +9,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import STAGES, Context, Effect
+from tests.unit.vocabulary import NAMES
 
-NAMES = (
-    "hysteresis",
-    "rate_dependent_hysteresis",
-    "creep",
-    "backlash",
-    "dead_zone",
-    "saturation",
-    "static_nonlinearity",
-    "slew_limit",
-    "first_order_lag",
-    "ac_coupling",
-    "resonance",
-    "dead_time",
-    "misalignment",
-    "cross_axis_nonlinearity",
-    "scale_factor_variation",
-    "thermal_drift",
-    "temperature_sensitivity",
-    "supply_sensitivity",
-    "current_coupling",
-    "soft_iron",
-    "mains_interference",
-    "vibration",
-    "spikes",
-    "step_shift",
-    "random_walk",
-    "clock_skew",
-    "dropped_samples",
-    "quantization",
-    "coulomb_friction",
-    "stribeck_friction",
-    "cubic_stiffness",
-    "cogging",
-    "centripetal_acceleration",
-    "sensor_position_error",
-    "channel_delay",
-)
 ALL = [(e.name + "/" + e.kind, e) for one in EFFECTS.values() for e in (one, *one.variants)]
 
 
