@@ -19,7 +19,6 @@ from rich.console import Console
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 SETTLE_MS = {"scope": 9000, "tremor": 8000}
-SIZE = {"width": 1280, "height": 720}
 
 
 def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
@@ -71,7 +70,7 @@ def main(arguments: list[str]) -> int:
                 browser = playwright.chromium.launch(
                     executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
                 )
-                page = browser.new_context(viewport=SIZE, bypass_csp=True).new_page()
+                page = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True).new_page()
                 page.goto(address)
                 page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
                 take(page, address.partition("/#")[0], folder, VIEWS)
