@@ -4,13 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pydantic import AfterValidator, BaseModel, ConfigDict
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 
 class Options(BaseModel):
     """A driver's own keys; unknown ones are refused."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class DaqOptions(Options):
+    """What every DAQ's entry says; a driver may narrow it. ``channels`` in the order of a scan."""
+
+    rate_hz: float = Field(gt=0)
+    channels: tuple[int, ...] = Field(min_length=1)
+    range_V: float = Field(gt=0)
 
 
 def one_of(*allowed: float) -> AfterValidator:

@@ -11,16 +11,17 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
+from drivers.added import added_driver, added_load, added_names
 from drivers.imu.bench import IMU_OPTIONS, ImuOptions, address_problems, bus_load
 from drivers.motion_card_protocol import LINE_BYTES
-from drivers.options import BusLoad, Options, one_of
+from drivers.options import BusLoad, DaqOptions, Options, one_of
 from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec, validate_table
 from hal.errors import BenchError
 
 Channel = Annotated[int, Field(ge=0, le=7)]
 
 
-class Di4108Options(Options):
+class Di4108Options(DaqOptions):
     """DATAQ DI-4108. ``rate_hz`` per channel must divide 60 MHz/375 (protocol manual, ``srate``)."""
 
     rate_hz: float = Field(gt=0, le=160_000)
@@ -28,7 +29,7 @@ class Di4108Options(Options):
     range_V: Annotated[float, one_of(10.0, 5.0, 2.0, 1.0, 0.5, 0.2)]
 
 
-class NiDaqOptions(Options):
+class NiDaqOptions(DaqOptions):
     """National Instruments analog input through the ``nidaqmx`` package."""
 
     device: str
@@ -151,7 +152,7 @@ OPTIONS: dict[str, type[Options]] = {
     "motion_card": MotionCardOptions,
     "ble_motion_card": BleMotionCardOptions,
 }
-"""Drivers by the name used in a bench file. Adding a driver adds one line here."""
+"""Our drivers by the name used in a bench file; those of other packages come beside (``drivers.added``)."""
 
 MONITOR_LOOKS = 0.4
 """Conversions per tick that an amplifier monitor makes, whatever its ADC's ``rate_hz``: a fault must be seen soon."""
@@ -177,14 +178,16 @@ NEEDS = {
 def device_options(description: BenchDescription, name: str, where: str) -> Any:
     """The checked options of device ``name``. Raises ``BenchError`` naming file and key."""
     spec = description.device[name]
-    if spec.driver not in OPTIONS:
-        raise BenchError(
-            f"{where}: [device.{name}.driver] there is no driver '{spec.driver}'; drivers are {', '.join(OPTIONS)}"
-        )
-    needed = NEEDS.get(spec.driver)
+    added = None if spec.driver in OPTIONS else added_driver(spec.driver)
+    if spec.driver not in OPTIONS and added is None:
+        known = ", ".join((*OPTIONS, *added_names()))
+        raise BenchError(f"{where}: [device.{name}.driver] there is no driver '{spec.driver}'; drivers are {known}")
+    needed = NEEDS.get(spec.driver) if added is None else added.needs
     if needed and getattr(spec, needed) is None:
         raise BenchError(f"{where}: [device.{name}] driver '{spec.driver}' needs '{needed} = ...'")
-    return validate_table(OPTIONS[spec.driver], spec.options(), f"{where}: device.{name}")
+    return validate_table(
+        OPTIONS[spec.driver] if added is None else added.options, spec.options(), f"{where}: device.{name}"
+    )
 
 
 def check_devices(description: BenchDescription, where: str) -> dict[str, Any]:
@@ -215,7 +218,8 @@ def _channel_claims(description: BenchDescription, options: dict[str, Any]) -> l
             case Hmc2003Options(channels=adc_channels) | AmplifierMonitorOptions(channels=adc_channels):
                 claims = adc_channels
             case _:
-                continue
+                added = None if spec.driver in OPTIONS else added_driver(spec.driver)
+                claims = () if added is None else added.inputs(options[name])
         if parent is None:
             continue
         offered: tuple[int, ...] = getattr(options[parent], "channels", (0, 1, 2, 3))
@@ -234,7 +238,7 @@ def _rates(description: BenchDescription, options: dict[str, Any]) -> list[str]:
     problems: list[str] = []
     tick_hz = description.clock.tick_hz
     for name, option in options.items():
-        if isinstance(option, Di4108Options | NiDaqOptions) and option.rate_hz != tick_hz:
+        if isinstance(option, DaqOptions) and option.rate_hz != tick_hz:
             problems.append(
                 f"[device.{name}.rate_hz] {option.rate_hz:g} Hz, but the scans drive the tick of {tick_hz} Hz; "
                 "make them equal"
@@ -269,7 +273,10 @@ def bus_loads(description: BenchDescription, options: dict[str, Any]) -> list[Bu
     loads: list[BusLoad] = []
     for name, spec in description.device.items():
         bus = description.bus.get(spec.bus or "")
-        if isinstance(bus, I2cSpec):
+        if spec.driver not in OPTIONS:
+            foreign = added_load(description, name, options[name])
+            loads += [] if foreign is None else [foreign]
+        elif isinstance(bus, I2cSpec):
             # DAC: four times address + 3 bytes, each after a START of its own (AD5696R knows one word per
             # address byte). ADC, per conversion: write 4 bytes, read 1 + 1 + 1 + 2 bytes.
             if isinstance(options[name], ImuOptions):

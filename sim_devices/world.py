@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import BenchError
+from sim_devices.added import Surroundings, added_device
 from sim_devices.config import ImuConfig
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.devices.ads1115 import Ads1115
@@ -82,6 +83,7 @@ class World:
         self._timed: list[TimedFace] = []
         self._adc_wiring = np.zeros(4, dtype=np.intp)
         self._adc_volts = np.zeros(4)
+        self._added_V: dict[int, Callable[[int], float]] = {}  # analog sensors of other packages, by input
         self._spike_channel: int | None = None
         self._spike_until_ns: int | None = None
         self._build(description)
@@ -133,7 +135,13 @@ class World:
 
     def _analog_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
-        volts = self.plant.analog_V if self._spike_channel is None else self._spiked(self.plant.analog_V, t_ns)
+        volts = self.plant.analog_V
+        if self._added_V:
+            volts = np.array(volts, dtype=np.float64)
+            for channel, source in self._added_V.items():
+                volts[channel] = source(t_ns)
+        if self._spike_channel is not None:
+            volts = self._spiked(volts, t_ns)
         return self.faults.inputs(volts, t_ns)
 
     def spike(self, channel: int) -> None:
@@ -229,20 +237,38 @@ class World:
                 self.buses.can[name] = CanHub(bus.get("bitrate", 500_000))
                 self._timed.append(self.buses.can[name])
         for name, device in description["device"].items():
+            if device.get("daq") is not None:
+                self._add_added(name, device, "daq")
             bus = description["bus"].get(device.get("bus") or "", {})
             if not str(bus.get("uri", "")).startswith(SIM_SCHEME):
                 continue
-            if device["driver"] not in makers:
+            if device["driver"] in makers:
+                makers[device["driver"]](name, device)
+            elif not self._add_added(name, device, bus["kind"]):
                 raise BenchError(
                     f"[device.{name}.driver] there is no emulated '{device['driver']}'; "
                     f"emulated are {', '.join(makers)}, or give its bus a real URI"
                 )
-            makers[device["driver"]](name, device)
             if device["driver"] == "ads1115":
                 self._wire_magnetometer(name, description)
         for name, bus in description["bus"].items():
             if bus["kind"] == "serial" and str(bus["uri"]).startswith(SIM_SCHEME) and name not in self.buses.serial:
                 raise BenchError(f"[bus.{name}] is emulated but no device is on it; remove it or add a device")
+
+    def _add_added(self, name: str, device: Mapping[str, Any], kind: str) -> bool:
+        """A device of another package; False if none has it. A driver on a DAQ without one shows the plant's volts."""
+        added = added_device(device["driver"])
+        if added is None:
+            return False
+        made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, self._motion, self._analog_V))
+        if kind == "daq":
+            self._added_V.update(made)
+        else:
+            {"serial": self._put_serial, "i2c": self._add_chip, "can": self._add_can}[kind](name, device, made)
+        return True
+
+    def _put_serial(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        self._add_serial(name, device["bus"], face)
 
     def _add_serial(self, name: str, bus: str, face: Any) -> None:
         if bus in self.buses.serial:

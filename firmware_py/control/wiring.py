@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from drivers.adc.ads1115 import Ads1115
+from drivers.added import open_added
 from drivers.amplifier_monitor import AmplifierMonitor
 from drivers.base import wait_s
 from drivers.can_frames import HostHeartbeat
@@ -14,10 +15,12 @@ from drivers.can_telemetry import CanTelemetry
 from drivers.daq.di4108 import Di4108
 from drivers.dbc import load_database
 from drivers.hmc2003 import Hmc2003
+from drivers.options import DaqOptions
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
 from drivers.specs import (
+    OPTIONS,
     Ads1115Options,
     Adxl203Options,
     AmplifierMonitorOptions,
@@ -82,7 +85,8 @@ def open_devices(bench: OpenBench) -> Devices:
     where = str(bench.file.path)
     description = bench.file.description
     options = check_devices(description, where)
-    daq_name = _only(description.devices_with("di4108", "nidaqmx"), "DAQ (driver di4108 or nidaqmx)", where)
+    daqs = {name: spec for name, spec in description.device.items() if isinstance(options[name], DaqOptions)}
+    daq_name = _only(daqs, "DAQ (driver di4108 or nidaqmx)", where)
     piezo_name = _only(
         description.devices_with("dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"), "piezo output", where
     )
@@ -95,7 +99,7 @@ def open_devices(bench: OpenBench) -> Devices:
         except HalError as error:
             failures.append(error)
 
-    daq, identify = _daq(bench, daq_name, options[daq_name])
+    daq, identify = open_daq(bench, daq_name, options[daq_name])
     probe(daq_name, identify)
     can = _CanBuses(bench)
     amplifier, identify = _amplifier(bench, can, piezo_name, options[piezo_name])
@@ -122,9 +126,12 @@ def open_devices(bench: OpenBench) -> Devices:
         telemetry = CanTelemetry(
             can.view(bus, CanTelemetry.receives()), bench.clock, heartbeat=can.heartbeat(bus), name=name
         )
+    for name, spec in description.device.items():
+        if spec.bus is not None and spec.driver not in OPTIONS and name != daq_name:
+            probe(name, lambda name=name: open_added(bench, name, options[name], _no_inputs).probe())
     if failures:
         raise failures[0] if len(failures) == 1 else OpenFailed(failures)
-    daq_options: Di4108Options | NiDaqOptions = options[daq_name]
+    daq_options: DaqOptions = options[daq_name]
     scan = daq.configure(
         ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
     )
@@ -191,13 +198,21 @@ class _CanBuses:
 Identify = Callable[[], str]
 
 
-def _daq(bench: OpenBench, name: str, options: Any) -> tuple[Daq, Identify]:
+def open_daq(bench: OpenBench, name: str, options: DaqOptions) -> tuple[Daq, Identify]:
+    """The DAQ ``name``, nothing sent yet, and what asks who it is."""
     if isinstance(options, NiDaqOptions):
         from hal.backends.nidaqmx_ai import NidaqmxScan  # the package and its driver are optional
 
         return NidaqmxScan(options.device, bench.clock, name=name), lambda: f"NI {options.device}"
-    daq = Di4108(bench.serial(_bus(bench.file.description.device[name])), bench.clock, name=name)
-    return daq, daq.probe
+    if isinstance(options, Di4108Options):
+        daq = Di4108(bench.serial(_bus(bench.file.description.device[name])), bench.clock, name=name)
+        return daq, daq.probe
+    added = open_added(bench, name, options, _no_inputs)
+    return added, added.probe
+
+
+def _no_inputs(channel: int) -> float:
+    raise BenchError(f"input {channel} belongs to no DAQ")
 
 
 def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tuple[AnalogOutput, Identify]:

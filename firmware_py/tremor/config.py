@@ -7,16 +7,18 @@ from itertools import pairwise
 from math import inf
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from firmware_py.tremor.detector_config import DetectorConfig
 from hal.bench import validate_table
+from hal.plugins import ESTIMATORS, offered
 
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Edge = tuple[Positive, Positive]
 
-Method = Literal["adaptive", "kalman", "wflc_flc", "flc", "wflc", "bmflc", "ebmflc", "bmflc_kalman", "ar_kalman"]
+Method = str
+"""One of ``METHODS``, or a name that an installed package offers (``firmware_py.tremor.own``)."""
 METHODS: tuple[Method, ...] = (
     "adaptive",
     "kalman",
@@ -28,6 +30,11 @@ METHODS: tuple[Method, ...] = (
     "bmflc_kalman",
     "ar_kalman",
 )
+
+
+def all_methods() -> tuple[Method, ...]:
+    """Those that are built in, then those of installed packages."""
+    return (*METHODS, *sorted(set(offered(ESTIMATORS)) - set(METHODS)))
 
 
 class _Table(BaseModel):
@@ -177,7 +184,16 @@ class TremorConfig(_Table):
     bmflc: BmflcConfig = BmflcConfig()
     ar: ArConfig = ArConfig()
     adaptive: AdaptiveConfig = AdaptiveConfig()
+    own: dict[str, float] = Field(default_factory=dict[str, float])
+    """Options of a method that an installed package offers."""
     detectors: DetectorConfig = DetectorConfig()
+
+    @field_validator("method")
+    @classmethod
+    def _known(cls, method: str) -> str:
+        if method not in METHODS and method not in offered(ESTIMATORS):
+            raise ValueError(f"'{method}' is no estimator; there are {', '.join(all_methods())}")
+        return method
 
     @model_validator(mode="after")
     def _check(self) -> TremorConfig:

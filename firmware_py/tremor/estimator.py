@@ -60,12 +60,13 @@ from firmware_py.tremor.oscillator_kalman import (
     kalman_params,
     kalman_predict,
 )
+from firmware_py.tremor.own import OWN, OWN_STATE, own_params, own_step
 from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 AXES = 3
 HISTORY = 64  # ticks of predictions kept for the confidence: the longest loop delay and some
-ADAPTIVE, KALMAN, COMBINERS, COMB, AUTOREGRESSIVE = range(5)
+ADAPTIVE, KALMAN, COMBINERS, COMB, AUTOREGRESSIVE, FOREIGN = range(6)
 FAMILY = {
     "adaptive": ADAPTIVE,
     "kalman": KALMAN,
@@ -94,6 +95,7 @@ def estimator_params(config: TremorConfig) -> Record:
             ("combiner", COMBINER),
             ("comb", comb.dtype),
             ("ar", AR),
+            ("own", OWN),
             ("fresh", fresh.dtype),
             ("family", "i8"),
             ("needs_lock", "i8"),
@@ -112,8 +114,9 @@ def estimator_params(config: TremorConfig) -> Record:
         combiner=combiner_params(config),
         comb=comb,
         ar=ar_params(config),
+        own=own_params(config),
         fresh=fresh,
-        family=FAMILY[config.method],
+        family=FAMILY.get(config.method, FOREIGN),
         needs_lock=int(config.method in ("wflc", "wflc_flc")),
         delay_ticks=min(HISTORY - 1, round(config.loop_delay_s * config.tick_hz)),
         settle_ticks=config.settle_s * config.tick_hz,
@@ -131,6 +134,7 @@ def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
             ("combiner", COMBINER_STATE, (AXES,)),
             ("comb", bmflc_state_dtype(comb_size(config))),
             ("ar", ar_state_dtype(config)),
+            ("own", OWN_STATE),
             ("predicted", "f8", (AXES, HISTORY)),  # ring of past predictions
             ("at", "i8"),
             ("power", "f8", (AXES,)),  # smoothed x^2
@@ -157,6 +161,13 @@ def estimator_state(params: Record) -> Record:
 
 
 @kernel
+def _foreign(state: Record, i: int, have: bool, param: Record) -> None:
+    """One tick of an estimator from another package."""
+    memory, numbers, out = state.own.memory[i], param.own.numbers, state.own.out[i]
+    own_step(param.own.address, memory.ctypes.data, numbers.ctypes.data, state.samples[i], int(have), out.ctypes.data)
+
+
+@kernel
 def estimator_ticks(state: Record, steps: int, coast: bool, param: Record) -> None:
     """``steps`` ticks of time; the last one has a sample to come unless ``coast``."""
     state.ticks += steps
@@ -171,6 +182,8 @@ def estimator_ticks(state: Record, steps: int, coast: bool, param: Record) -> No
         for i in range(AXES):
             if param.family == KALMAN:
                 kalman_predict(state.kalman[i], param.kalman)
+            elif param.family == FOREIGN and (coast or n < steps - 1):
+                _foreign(state, i, False, param)
             if coast or n < steps - 1:
                 combiner_coast(state.combiner[i], param.combiner)
 
@@ -187,6 +200,8 @@ def estimator_samples(state: Record, param: Record) -> None:
             kalman_correct(state.kalman[i], sample, param.kalman)
         elif param.family == AUTOREGRESSIVE:
             ar_correct(state.ar, i, sample, param.ar)
+        elif param.family == FOREIGN:
+            _foreign(state, i, True, param)
     if param.family == COMB:
         bmflc_correct(state.comb, state.samples, param.comb)
 
@@ -209,6 +224,9 @@ def estimator_output(state: Record, param: Record) -> None:
         elif param.family == AUTOREGRESSIVE:
             now = ar_output(state.ar, i, 0, param.ar)
             ahead = ar_output(state.ar, i, 1, param.ar)
+        elif param.family == FOREIGN:
+            now = state.own.out[i, 0]
+            ahead = state.own.out[i, 1]
         else:
             now = combiner_displacement(state.combiner[i], combiner, 0.0)
             ahead = combiner_displacement(state.combiner[i], combiner, combiner.seen.delay_s)

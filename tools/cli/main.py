@@ -20,6 +20,7 @@ from tools.cli import (
     mismatch,
     noise,
     placement,
+    read,
     recordings,
     replay,
     reproduce,
@@ -65,6 +66,7 @@ app.command("placement")(placement.placement)
 app.command("recover")(recordings.recover)
 app.command("export")(recordings.export)
 app.command("scan")(diagnose.scan)
+app.command("read")(read.read)
 app.command("scope")(diagnose.scope)
 app.command("latency")(diagnose.latency)
 app.command("ramp")(diagnose.ramp)

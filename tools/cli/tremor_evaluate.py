@@ -9,7 +9,7 @@ import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from firmware_py.tremor.config import METHODS, Method
+from firmware_py.tremor.config import METHODS, Method, all_methods
 from tools.cli.common import InputError, JsonOption, check_writable, clear_errors, console, data_console, write_json
 
 
@@ -107,20 +107,20 @@ def evaluate(
 
 def _methods(names: list[str] | None) -> list[Method]:
     wanted = [estimator_name(name) for name in names or METHODS]
-    return [m for m in METHODS if m in wanted]
+    return [m for m in all_methods() if m in wanted]
 
 
 def estimator_name(name: str) -> Method:
     """Raises InputError for a name that is no estimator of the instrument."""
-    for method in METHODS:
-        if name == method:
-            return method
+    known = all_methods()
+    if name in known:
+        return name
     if name in ("nn", "cascade"):
         raise InputError(
             f"'{name}': the cascade network takes the tip's displacement, steady part and all, and this instrument "
             "senses acceleration, which has none; `micron tremor train` shows what it does on displacement"
         )
-    raise InputError(f"'{name}' is no estimator; there are: {', '.join(METHODS)}")
+    raise InputError(f"'{name}' is no estimator; there are: {', '.join(known)}")
 
 
 def _horizons(text: str) -> list[int]:

@@ -1,0 +1,42 @@
+"""Emulated devices from other packages: entry points of group ``micron.devices``, named like their drivers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from hal.plugins import DEVICES, load
+from sim_devices.devices.faces import VoltageSource
+from sim_devices.plant.body_motion import BodyMotion
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What a device may know of the world: truth at bench times in ns, its entry in the bench file, a seed.
+
+    ``motion`` of the body, with the temperature; ``analog_V`` all voltages at the DAQ's inputs.
+    """
+
+    name: str
+    entry: Mapping[str, Any]
+    seed: int
+    start_ns: int
+    motion: Callable[[int], BodyMotion]
+    analog_V: VoltageSource
+
+
+@dataclass(frozen=True)
+class AddedDevice:
+    """What the entry point names.
+
+    ``make(surroundings)`` gives the wire face that its bus asks for (``devices.faces``); for a device on a DAQ it gives
+    functions from bench time in ns to volts, by input.
+    """
+
+    make: Callable[[Surroundings], Any]
+
+
+def added_device(driver: str) -> AddedDevice | None:
+    """``BenchError`` when its package is broken."""
+    return load(DEVICES, driver, AddedDevice)

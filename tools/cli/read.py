@@ -1,0 +1,31 @@
+"""``micron read``: what the sensors of other packages say."""
+
+from __future__ import annotations
+
+from rich.table import Table
+
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import JsonOption, check_writable, clear_errors, data_console, write_json
+from tools.cli.diagnose import VirtualOption
+
+
+def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: JsonOption = None) -> None:
+    """One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.
+
+    Example: micron read --bench benches/lab.toml
+    """
+    from tools.diagnose.opened import opened_bench
+    from tools.diagnose.read import read_sensors
+
+    with clear_errors():
+        check_writable(json_file)
+        with opened_bench(bench_path(bench), virtual=virtual) as opened:
+            values = read_sensors(opened)
+        if json_file != "-":
+            table = Table()
+            for heading in ("device", "identity", "quantity", "value", "unit"):
+                table.add_column(heading, overflow="fold")
+            for v in values:
+                table.add_row(v.device, v.identity, v.quantity, f"{v.value:.6g}", v.unit)
+            data_console().print(table)
+        write_json({"format": 1, "values": [v.as_dict() for v in values]}, json_file)
