@@ -216,7 +216,7 @@ def test_apply_needs_a_folder_that_exists(tmp_path: Path, stack: Path):
 def test_physics_names_the_contract_s_vocabulary():
     result = run("physics", "--json", "-")
     assert result.exit_code == 0
-    assert [p["name"] for p in json.loads(result.stdout)["physics"]] == NAMES
+    assert [p["name"] for p in json.loads(result.stdout)["physics"]] == list(NAMES)
     assert "hysteresis  rate-independent memory" in run("physics").stdout
 
 

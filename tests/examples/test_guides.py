@@ -1,0 +1,24 @@
+"""What docs/adding promises of the examples: all of their code is shown, and how much it is."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+HERE = Path(__file__).parent
+DOCS = HERE.parents[1] / "docs" / "adding"
+GUIDES = {folder.name: DOCS / f"{folder.name.replace('_', '-')}.md" for folder in HERE.iterdir() if folder.is_dir()}
+GUIDES.pop("__pycache__", None)
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_the_guide_shows_every_file(name: str):
+    shown = re.findall(rf'--8<-- "tests/examples/{name}/(.+)"', GUIDES[name].read_text(encoding="utf-8"))
+    assert sorted(shown) == sorted(p.name for p in (HERE / name).iterdir() if p.is_file())
+
+
+@pytest.mark.parametrize("name", GUIDES)
+def test_it_takes_fewer_than_120_lines_of_code_tests_included(name: str):
+    assert sum(len(p.read_text(encoding="utf-8").splitlines()) for p in (HERE / name).glob("*.py")) < 120
