@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from firmware_py.records import new_record
+from firmware_py.records import Record, new_record
 from firmware_py.sensing.fusion_filters import (
     COMPLEMENTARY,
     FUSION,
@@ -20,6 +20,7 @@ from firmware_py.sensing.fusion_filters import (
     TILT,
     begin_fusion,
     run_fusion,
+    step_fusion,
 )
 from hal.compiled import kernel
 from hal.errors import BenchError
@@ -55,6 +56,25 @@ class FusionConfig(BaseModel):
     """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
 
 
+MEMORY = np.dtype(
+    [
+        ("state", FUSION_STATE, (1,)),
+        ("params", FUSION, (1,)),
+        ("rate", "f8", (3,)),
+        ("force", "f8", (3,)),
+        ("field", "f8", (3,)),
+        ("dt_s", "f8", (1,)),
+    ]
+)
+"""The filter and one sample: each array handed to a kernel costs about 0.35 us a call, so a sample hands over one."""
+
+
+@kernel
+def _step_one(memory: Record) -> None:
+    m = memory[0]
+    step_fusion(m.state[0], m.params[0], m.rate, m.force, m.field, m.dt_s[0])
+
+
 @kernel
 def _begin(state: NDArray[np.void], params: NDArray[np.void]) -> None:
     begin_fusion(state[0], params[0])
@@ -73,7 +93,7 @@ class Fusion:
         self.config = config
         self.rate_hz = rate_hz
         self._vqf: Any = _open_vqf(rate_hz) if config.method == "vqf" else None
-        self._params = new_record(
+        params = new_record(
             FUSION,
             method=NATIVE.get(config.method, MAHONY),
             tau_s=config.tau_s,
@@ -83,9 +103,13 @@ class Fusion:
             ki=config.ki,
             align_samples=round(config.align_s * rate_hz),
         )
-        self._state = np.zeros(1, FUSION_STATE)
-        self._one = (np.zeros((1, 3)), np.zeros((1, 3)), np.full((1, 3), np.nan), np.zeros(1), np.zeros((1, 4)))
-        self.quaternion = np.array([1.0, 0.0, 0.0, 0.0])
+        self._memory = new_record(MEMORY, params=params)
+        self._state, self._params = (self._memory[name][0] for name in ("state", "params"))
+        self._rate, self._force, self._field, self._dt_s = (
+            self._memory[name][0] for name in ("rate", "force", "field", "dt_s")
+        )
+        self._period_s = 1.0 / rate_hz
+        self.quaternion: Array = self._state["quaternion"][0]
         self.restart()
 
     @property
@@ -95,21 +119,23 @@ class Fusion:
     def restart(self, start: Array | None = None) -> None:
         """Forget everything; the next samples align anew, or ``start`` (4,) is the attitude (not with "vqf")."""
         _begin(self._state, self._params)
-        self.quaternion[:] = (1.0, 0.0, 0.0, 0.0)
         if self._vqf is not None:
             self._vqf.resetState()
         elif start is not None:
             self.quaternion[:] = np.asarray(start) / np.linalg.norm(start)
-            self._state["quaternion"][0] = self.quaternion
             self._state["aligned"] = 1
 
     def step(self, rate: Array, force: Array, field: Array | None = None, dt_s: float | None = None) -> Array:
         """One sample: rate rad/s, specific force and field of any unit, (3,) body frame; the attitude after it."""
-        w, f, b, dt, q = self._one
-        w[0], f[0] = rate, force
-        b[0] = np.nan if field is None else field
-        dt[0] = 1.0 / self.rate_hz if dt_s is None else dt_s
-        self._go(w, f, b, dt, q)
+        self._rate[:] = rate
+        self._force[:] = force
+        self._field[:] = np.nan if field is None else field
+        self._dt_s[0] = self._period_s if dt_s is None else dt_s
+        if self._vqf is None:
+            _step_one(self._memory)
+        else:
+            self._state["aligned"] = 1
+            self.quaternion[:] = self._vqf_step()
         return self.quaternion
 
     def run(self, rate: Array, force: Array, field: Array | None = None, dt_s: Array | None = None) -> Array:
@@ -121,23 +147,20 @@ class Fusion:
             raise ValueError(f"rate, force, field, dt have {n}, {len(force)}, {len(b)}, {len(dt)} rows")
         out = np.empty((n, 4))
         if n:
-            arrays = [np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, b, dt)]
-            self._go(arrays[0], arrays[1], arrays[2], arrays[3], out)
+            w, f, b, dt = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, b, dt))
+            if self._vqf is None:
+                run_fusion(self._state, self._params, w, f, b, dt, out)
+            else:
+                for k in range(n):
+                    out[k] = self.step(w[k], f[k], b[k])
         return out
 
-    def _go(self, rate: Array, force: Array, field: Array, dt_s: Array, out: Array) -> None:
-        if self._vqf is None:
-            run_fusion(self._state, self._params, rate, force, field, dt_s, out)
-        else:
-            self._state["aligned"] = 1
-            for k in range(len(rate)):
-                if np.isfinite(field[k, 0]):
-                    self._vqf.update(rate[k], force[k], field[k])
-                    out[k] = _north(self._vqf.getQuat9D())
-                else:
-                    self._vqf.update(rate[k], force[k])
-                    out[k] = self._vqf.getQuat6D()
-        self.quaternion[:] = out[-1]
+    def _vqf_step(self) -> Array:
+        if np.isfinite(self._field[0]):
+            self._vqf.update(self._rate, self._force, self._field)
+            return _north(self._vqf.getQuat9D())
+        self._vqf.update(self._rate, self._force)
+        return self._vqf.getQuat6D()
 
 
 def _north(east_north_up: Array) -> Array:
