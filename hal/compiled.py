@@ -21,7 +21,11 @@ import numba
 from numba.core import config as numba_config
 from numba.core.caching import UserProvidedCacheLocator
 
+from hal.compile_notice import CompileNotice
+
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+
+CompileNotice().listen()
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("hal", "drivers", "sim_devices", "firmware_py", "tools")
@@ -67,10 +71,14 @@ def source_fingerprint(file: Path, root: Path = ROOT) -> str:
     return digest.hexdigest()[:16]
 
 
+def user_cache() -> Path:
+    """Where this user's compiled kernels and filter designs are kept; every clone shares it."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "micron-bench"
+
+
 def cache_folder(file: Path) -> Path:
     """Where the compiled kernels of this version of ``file`` are kept."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return cache / "micron-bench" / f"kernels-{source_fingerprint(file)}"
+    return user_cache() / f"kernels-{source_fingerprint(file)}"
 
 
 class AnyClone(UserProvidedCacheLocator):

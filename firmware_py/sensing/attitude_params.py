@@ -6,8 +6,8 @@ from math import radians
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import iirnotch
 
+from firmware_py.designs import design
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import DRIFT_S, STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.error_state import ERROR_STATE
@@ -66,7 +66,7 @@ def tremor_notch(tick_hz: float, middle_hz: float, width_hz: float) -> NDArray[n
     """(5,) b0 b1 b2 a1 a2 of a band stop, -3 dB ``width_hz`` apart; none where the band is beyond the sampling."""
     if width_hz == 0.0 or middle_hz >= 0.45 * tick_hz:
         return np.array([1.0, 0.0, 0.0, 0.0, 0.0])
-    b, a = iirnotch(middle_hz, middle_hz / width_hz, tick_hz)
+    b, a = design("iirnotch", middle_hz, middle_hz / width_hz, tick_hz)
     return np.array([*b, a[1], a[2]])
 
 

@@ -11,8 +11,8 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import bilinear_zpk
 
+from firmware_py.designs import design
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
 from hal.compiled import kernel
@@ -40,8 +40,8 @@ def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray
     poles = w * np.array([-DAMPING + 1j * (1 - DAMPING**2) ** 0.5, -DAMPING - 1j * (1 - DAMPING**2) ** 0.5])
     rows = []
     for zeros in (np.zeros(2), np.zeros(0)):
-        z, p, k = bilinear_zpk(zeros, poles, 1.0, tick_hz)
-        b, a = np.real(k * np.poly(np.asarray(z))), np.real(np.poly(np.asarray(p)))
+        z, p, k = design("bilinear_zpk", zeros, poles, 1.0, tick_hz)
+        b, a = np.real(float(k) * np.poly(z)), np.real(np.poly(p))
         rows.append([*b, a[1], a[2]])
     return np.array(rows)
 

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import iirpeak
 
+from firmware_py.designs import design
 from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
 
 Array = NDArray[np.float64]
@@ -196,8 +196,8 @@ def _polynomial(coefficients: Array, x: Complex) -> Complex:
 
 
 def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
-    b, denominator = iirpeak(hz, q, fs=tick_hz)
-    return np.asarray(b, dtype=np.float64), np.asarray(denominator, dtype=np.float64)
+    b, denominator = design("iirpeak", hz, q, fs=tick_hz)
+    return b, denominator
 
 
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:

@@ -15,8 +15,8 @@ from math import exp, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import ellip
 
+from firmware_py.designs import design
 from firmware_py.frame import ALIGNING, DRIFT, INVALID, JERK, RESTARTED, STALE, STATUS, TIP_ACCELERATION
 from firmware_py.records import Record, copy_record, new_record
 from firmware_py.tremor.detector_config import DetectorConfig
@@ -58,9 +58,9 @@ def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
     """The kernel's numbers."""
     sections = np.stack(
         [
-            np.asarray(
-                ellip(SECTIONS, config.ripple_dB, config.attenuation_dB, band, "bandpass", output="sos", fs=tick_hz)
-            )
+            design(
+                "ellip", SECTIONS, config.ripple_dB, config.attenuation_dB, band, "bandpass", output="sos", fs=tick_hz
+            )[0]
             for band in (config.slow_hz, config.brisk_hz)
         ]
     )

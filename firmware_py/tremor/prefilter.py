@@ -11,8 +11,8 @@ from math import pi
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import ellip
 
+from firmware_py.designs import design
 from firmware_py.tremor.config import WflcConfig
 from hal.compiled import kernel
 
@@ -21,16 +21,15 @@ PROTOTYPE_ORDER = 3  # a band-pass doubles it
 
 def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64]:
     """Three second-order sections (3, 5): b0 b1 b2 a1 a2."""
-    sos = np.asarray(
-        ellip(
-            PROTOTYPE_ORDER,
-            config.ripple_dB,
-            config.attenuation_dB,
-            [config.low_hz, config.high_hz],
-            btype="bandpass",
-            output="sos",
-            fs=tick_hz,
-        )
+    (sos,) = design(
+        "ellip",
+        PROTOTYPE_ORDER,
+        config.ripple_dB,
+        config.attenuation_dB,
+        [config.low_hz, config.high_hz],
+        btype="bandpass",
+        output="sos",
+        fs=tick_hz,
     )
     return np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
 

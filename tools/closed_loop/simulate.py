@@ -15,6 +15,7 @@ from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import sensing_table
 from firmware_py.frame import LAYOUT
 from firmware_py.records import Record, new_record
+from firmware_py.sensing.config import SensingConfig
 from hal.bench import BenchFile
 from sim_devices.plant.blocks import PlantBlocks
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, advance, outputs_later
@@ -129,8 +130,8 @@ def simulate(
     world = PlantBlocks(emulation, hand, ticks + 2 * ms)
     world.next_block()
     offset_V, before = _measure_offset(world)
-    sensing = configs.sensing.model_copy(
-        update={**sensing_table_of(bench), "magnetometer_bias_V": tuple(offset_V.tolist())}
+    sensing = SensingConfig.model_validate(
+        {**configs.sensing.model_dump(), **sensing_table_of(bench), "magnetometer_bias_V": offset_V.tolist()}
     )
     stages = Stages(StageConfigs(sensing, configs.tremor, configs.actuation))
     _advance(world, before, ms)  # scans begin with a block

@@ -1,0 +1,82 @@
+"""Filters that scipy.signal designs, kept on disk: importing it takes longer than all else that a start does.
+
+The first start on a machine calls scipy; later ones read the same bits from a file named by what was asked and by the
+version of scipy. A file that cannot be read or written costs time, never the design.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import json
+import os
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hal.compiled import user_cache
+
+Array = NDArray[Any]
+
+
+def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
+    """What ``scipy.signal.FUNCTION`` returns, as a tuple of arrays; arguments are numbers, words and arrays."""
+    plain = [_plain(argument) for argument in arguments], {name: _plain(value) for name, value in options.items()}
+    asked = json.dumps([function, version("scipy"), *plain], sort_keys=True)
+    file = user_cache() / "designs" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.json"
+    known = _read(file, asked)
+    if known is not None:
+        return known
+    found = getattr(importlib.import_module("scipy.signal"), function)(*arguments, **options)
+    arrays = tuple(np.asarray(part) for part in (found if isinstance(found, tuple) else (found,)))
+    _write(file, asked, arrays)
+    return arrays
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray | list | tuple):
+        numbers: Any = np.asarray(value)
+        if np.iscomplexobj(numbers):
+            return {"real": numbers.real.tolist(), "imag": numbers.imag.tolist()}
+        return numbers.tolist()
+    return value
+
+
+def _read(file: Path, asked: str) -> tuple[Array, ...] | None:
+    try:
+        table = json.loads(file.read_text())
+        if table["asked"] != asked:
+            return None
+        return tuple(_array(part) for part in table["arrays"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
+def _array(part: dict[str, Any]) -> Array:
+    real = np.array(part["real"], dtype=np.float64).reshape(part["shape"])
+    if part["imag"] is None:
+        return real
+    whole = real.astype(np.complex128)
+    whole.imag = np.array(part["imag"]).reshape(part["shape"])
+    return whole
+
+
+def _write(file: Path, asked: str, arrays: tuple[Array, ...]) -> None:
+    parts = [
+        {
+            "shape": array.shape,
+            "real": np.real(array).ravel().tolist(),
+            "imag": np.imag(array).ravel().tolist() if np.iscomplexobj(array) else None,
+        }
+        for array in arrays
+    ]
+    beside = file.with_name(f"{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        beside.write_text(json.dumps({"asked": asked, "arrays": parts}))
+        beside.replace(file)
+    except OSError:
+        beside.unlink(missing_ok=True)
