@@ -26,6 +26,7 @@ from tools.cli import (
     reproduce,
     run,
     sensing,
+    simulate,
     tremor,
 )
 
@@ -55,6 +56,7 @@ def options(
 
 
 app.command("run")(run.run)
+app.command("simulate")(simulate.simulate_command)
 app.command("bench")(bench.bench)
 app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
