@@ -10,6 +10,7 @@ import hashlib
 import importlib
 import json
 import os
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -79,4 +80,5 @@ def _write(file: Path, asked: str, arrays: tuple[Array, ...]) -> None:
         beside.write_text(json.dumps({"asked": asked, "arrays": parts}))
         beside.replace(file)
     except OSError:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            beside.unlink()
