@@ -8,7 +8,7 @@ from types import MappingProxyType
 from sim_devices.physics.axes import CROSS_AXIS_NONLINEARITY, MISALIGNMENT, SCALE_FACTOR_VARIATION, SOFT_IRON
 from sim_devices.physics.backlash import BACKLASH
 from sim_devices.physics.creep import CREEP
-from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT, THERMAL_DRIFT
+from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
 from sim_devices.physics.friction import COULOMB_FRICTION, STRIBECK_FRICTION
@@ -23,6 +23,7 @@ from sim_devices.physics.saturation import SATURATION
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.spring import COGGING_FORCE, CUBIC_STIFFNESS
 from sim_devices.physics.timebase import CHANNEL_DELAY, CLOCK_SKEW, DEAD_TIME, DROPPED_SAMPLES
+from sim_devices.physics.warm_up import THERMAL_DRIFT
 
 _ALL = (
     HYSTERESIS,

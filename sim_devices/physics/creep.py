@@ -98,4 +98,6 @@ CREEP = Effect(
     guess=_guess,
     basis=_basis,
     report=_report,
+    # minus one is a mean that is lost (ac_coupling), several times the response at once is a lag
+    limits={"total_fraction": (-0.8, 1.5)},
 )

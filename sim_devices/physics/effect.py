@@ -206,3 +206,5 @@ class Effect:
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
     """Its course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""
+    limits: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
+    """Human parameters (``report``) outside of which it is other physics in disguise; checked before it is named."""

@@ -10,7 +10,7 @@ import numpy as np
 
 from hal.compiled import kernel
 
-FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, unused
+FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness
 SPRING = 2  # cubic, quadratic
 COGGING = 5  # period, sin1, cos1, sin2, cos2
 
@@ -26,6 +26,23 @@ def friction_limit(v, sign, row):
         r = v / row[3]
         f += row[2] * np.exp(-r * r)
     return f
+
+
+@kernel
+def bristle_after(z, v, step_s, row):
+    """Deflection of the bristles after ``step_s`` at the speed v: z' = v - sigma |v| z / g(v), exact for constant v.
+
+    C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4; g is
+    ``friction_limit`` and sigma ``row[5]``.
+    """
+    if v == 0.0:
+        return z
+    sign = 1.0 if v > 0.0 else -1.0
+    limit = friction_limit(v, sign, row)
+    if limit <= 0.0:
+        return 0.0
+    settled = sign * limit / row[5]
+    return settled + (z - settled) * np.exp(-row[5] * abs(v) * step_s / limit)
 
 
 @kernel

@@ -8,7 +8,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import FRICTION
-from sim_devices.physics.hysteresis import stops
+from sim_devices.physics.hysteresis import dahl
 from sim_devices.physics.statistics import least_squares, smooth, thin
 
 
@@ -42,7 +42,7 @@ def _coulomb_parts(settings: Settings) -> Parts:
     return Parts(
         (),
         (
-            Parameter("level", _UNIT),
+            Parameter("level", _UNIT, 0.0),
             Parameter("asymmetry", _UNIT),
             Parameter("viscous_asymmetry", "1/s"),
         ),
@@ -71,55 +71,86 @@ def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Huma
     )
 
 
-PRESLIDING = (0.001, 0.004, 0.015)
-"""Distances over which bristles yield, relative to half the travel: LuGre and Dahl friction before it slides."""
+def _travel_of(x: Array, ctx: Context) -> Array:
+    """Displacement that friction sees: the smoothed position, or the integral of what is recorded as velocity."""
+    v = ctx.signals.get("velocity")
+    return np.cumsum(v) * ctx.dt if v is not None and v is x else smooth(x, 5)
 
 
-def _presliding_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    half = 0.5 * float(np.ptp(x)) or 1.0
-    return {"presliding": tuple(float(half * f) for f in PRESLIDING)}
+def _bristle_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    travel = float(np.ptp(_travel_of(x, ctx)[ctx.keep])) or 1.0
+    return {**_no_settings(x, residual, ctx), "travel": (travel,)}
 
 
-def _presliding_parts(settings: Settings) -> Parts:
-    n = len(settings.get("presliding", PRESLIDING))
-    return Parts((), tuple(Parameter(f"bristle{i + 1}", "{out}/s^2/{out}") for i in range(n)), 0.05 * np.eye(n))
+def _bristle_distance(settings: Settings) -> Parameter:
+    travel = settings.get("travel", (1.0,))[0]
+    return Parameter("presliding", "{out}", 2e-5 * travel, 0.05 * travel, log=True, scale=1e-3 * travel)
 
 
-def _presliding_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    r = np.array(settings.get("presliding", PRESLIDING))
-    return -stops(x, r, float(x[0]), np.array(ctx.starts, np.int64))
+def _bent(x: Array, ctx: Context, distance: float) -> Array:
+    """Bristles -1..1 along the recorded travel, (n,)."""
+    at = np.array(ctx.starts, np.int64)
+    u = _travel_of(x, ctx)
+    return dahl(u, np.array([distance]), np.zeros(1), float(u[0]), at)[:, 0] / distance
 
 
-def _presliding_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    return {"thresholds": np.array(settings["presliding"]), "memory": np.asarray(w)}
+def _lugre_parts(settings: Settings) -> Parts:
+    return Parts((_bristle_distance(settings),), (Parameter("level", _UNIT, 0.0),))
 
 
-def _presliding_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+def _lugre_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return -_bent(x, ctx, q[0])[:, None]
+
+
+def _lugre_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0] = w[0]
+    row[5] = max(w[0], 0.0) / q[0]
+    return {"friction": row}
+
+
+def _lugre_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    grid = settings["travel"][0] * np.geomspace(5e-4, 0.02, 5)
+    return tuple((r,) for r in _best_bristles(x, residual, ctx, grid)[:2])
+
+
+def _best_bristles(x: Array, residual: Array, ctx: Context, grid: Array) -> list[float]:
+    """Presliding distances of ``grid``, the one whose force meets the residual best first."""
+    k = thin(ctx.keep, 8000)
+    tried: list[tuple[float, float]] = []
+    for r in grid.tolist():
+        column = ctx.to_output(np.ascontiguousarray(-_bent(x, ctx, r)))[k]
+        tried.append((least_squares(np.column_stack([np.ones(k.size), column]), residual[k])[1], r))
+    return [r for _, r in sorted(tried)]
+
+
+def _lugre_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
-    level = float(p @ np.array(settings["presliding"]))
-    stiffness = float(p.sum())
     return (
-        Human("coulomb_forward", level / g, "{in}"),
-        Human("coulomb_backward", level / g, "{in}"),
-        Human("presliding_distance", level / stiffness if stiffness else 0.0, "{out}"),
+        Human("coulomb_forward", float(p[1]) / g, "{in}"),
+        Human("coulomb_backward", float(p[1]) / g, "{in}"),
+        Human("presliding_distance", float(p[0]), "{out}"),
     )
 
 
 _FRICTION_SOURCE = "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, eqs. 1-3"
+
+_LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"
 
 _BRISTLES = Effect(
     name="coulomb_friction",
     summary="constant force against the motion, behind bristles that give way over a small distance",
     kind="feedback",
     stages=("mechanics",),
-    parts=_presliding_parts,
-    equation=r"m\ddot x = F - \sum_i \sigma_i\,(x - P_{r_i}[x]),\; r_i \ll \text{travel}",
-    source="P. R. Dahl, AIAA J. 14 (1976) 1675; F. Al-Bender et al., IEEE Trans. AC 50 (2005) 1883, eq. 3",
+    parts=_lugre_parts,
+    equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z / F_c",
+    source=_LUGRE_SOURCE + "; P. R. Dahl, AIAA J. 14 (1976) 1675",
     excitation="reversals of motion, at speeds that differ",
-    prepare=_presliding_settings,
-    basis=_presliding_basis,
-    fill=_presliding_fill,
-    report=_presliding_report,
+    prepare=_bristle_settings,
+    guess=_lugre_guess,
+    basis=_lugre_basis,
+    fill=_lugre_fill,
+    report=_lugre_report,
 )
 
 COULOMB_FRICTION = Effect(
@@ -145,10 +176,10 @@ def _stribeck_parts(settings: Settings) -> Parts:
     return Parts(
         (Parameter("stribeck_speed", "{out}/s", 1e-3 * speed, 2 * speed, log=True, scale=0.05 * speed),),
         (
-            Parameter("level", _UNIT),
+            Parameter("level", _UNIT, 0.0),
             Parameter("asymmetry", _UNIT),
             Parameter("viscous_asymmetry", "1/s"),
-            Parameter("extra", _UNIT),
+            Parameter("extra", _UNIT, 0.0),
         ),
         np.diag([0.0, 0.05, 0.05, 0.0]),
     )
@@ -192,6 +223,58 @@ def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Hum
     )
 
 
+def _stribeck_bristle_parts(settings: Settings) -> Parts:
+    speed = _stribeck_parts(settings).nonlinear[0]
+    return Parts((speed, _bristle_distance(settings)), (Parameter("level", _UNIT, 0.0), Parameter("extra", _UNIT, 0.0)))
+
+
+def _stribeck_bristle_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    bent = _bent(x, ctx, q[1])
+    v = velocity_of(x, ctx)
+    return -np.stack([bent, bent * np.exp(-((v / q[0]) ** 2))], axis=1)
+
+
+def _stribeck_bristle_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0], row[2], row[3] = w[0], w[1], q[0]
+    row[5] = max(w[0], 0.0) / q[1]
+    return {"friction": row}
+
+
+def _stribeck_bristle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    travel = settings["travel"][0]
+    near = _best_bristles(x, residual, ctx, travel * np.geomspace(5e-4, 0.02, 5))[0]
+    return tuple((vs[0], near) for vs in _stribeck_guess(x, residual, ctx, settings))
+
+
+def _stribeck_bristle_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("coulomb_forward", float(p[2]) / g, "{in}"),
+        Human("coulomb_backward", float(p[2]) / g, "{in}"),
+        Human("breakaway_extra", float(p[3]) / g, "{in}"),
+        Human("stribeck_speed", float(p[0]), "{out}/s"),
+        Human("presliding_distance", float(p[1]), "{out}"),
+    )
+
+
+_STRIBECK_BRISTLES = Effect(
+    name="stribeck_friction",
+    summary="friction that falls as motion starts, behind bristles that give way over a small distance",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_stribeck_bristle_parts,
+    equation=r"m\ddot x = F - \sigma z,\; \dot z = \dot x - \sigma |\dot x| z /"
+    r" (F_c + F_s e^{-(\dot x/v_s)^2})",
+    source=_LUGRE_SOURCE,
+    excitation="slow motion and reversals, beside fast motion",
+    prepare=_bristle_settings,
+    guess=_stribeck_bristle_guess,
+    basis=_stribeck_bristle_basis,
+    fill=_stribeck_bristle_fill,
+    report=_stribeck_bristle_report,
+)
+
 STRIBECK_FRICTION = Effect(
     name="stribeck_friction",
     summary="friction that falls as motion starts",
@@ -207,4 +290,5 @@ STRIBECK_FRICTION = Effect(
     basis=_stribeck_basis,
     fill=_stribeck_fill,
     report=_stribeck_report,
+    variants=(_STRIBECK_BRISTLES,),
 )

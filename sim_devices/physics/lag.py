@@ -87,7 +87,7 @@ def _ac_parts(settings: Settings) -> Parts:
     dt, span = settings.get("time", (1e-3, 1.0))
     return Parts(
         (
-            Parameter("time_constant_s", "s", 2 * dt, 3 * span, log=True, scale=dt),
+            Parameter("time_constant_s", "s", 2 * dt, 30 * span, log=True, scale=dt),
             Parameter("settled_share", "1", 0.0, 1.0, scale=0.1),
         )
     )
@@ -103,7 +103,7 @@ def _ac_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
-    grid: list[tuple[float, ...]] = [(float(t), s) for t in np.geomspace(5 * dt, 2.5 * span, 20) for s in (1.0, 0.0)]
+    grid: list[tuple[float, ...]] = [(float(t), s) for t in np.geomspace(5 * dt, 20 * span, 24) for s in (1.0, 0.0)]
     return rank_starts(
         grid,
         lambda q: ctx.to_output(_ac_apply(x, ctx, np.array(q), settings)),

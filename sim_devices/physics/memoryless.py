@@ -285,12 +285,16 @@ def find_step(y: Array) -> float:
     if values.size < 2 or values.size > 0.5 * y.size:
         return 0.0
     d = np.sort(np.diff(values))
+    # from the middle, where values are dense
+    middle = values[values.size // 2]
+    outward = values[np.argsort(np.abs(values - middle))] - middle
     for step in (float(np.median(d)), float(d[0])):
-        # refine: the step that makes every value a whole number of steps
-        whole = np.round((values - values[0]) / step)
-        step = float((values - values[0]) @ whole / (whole @ whole))
-        off = np.abs((values - values[0]) / step - np.round((values - values[0]) / step))
-        if np.max(off) < GRID_TOLERANCE and span / step < 1e5:
+        # refined over more and more values: the step that makes every one a whole number of steps
+        for count in (4, 8, 16, 32, 64, 128, 256, 512, values.size):
+            whole = np.round(outward[:count] / step)
+            step = float(outward[:count] @ whole / (whole @ whole)) if whole.any() else step
+        places = outward / step
+        if np.max(np.abs(places - np.round(places))) < GRID_TOLERANCE and span / step < 1e5:
             return step
     return 0.0
 

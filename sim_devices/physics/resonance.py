@@ -124,4 +124,6 @@ RESONANCE = Effect(
     guess=_guess,
     apply=_apply,
     report=_report,
+    # more damping makes a lag
+    limits={"damping_ratio": (0.0, 0.5)},
 )

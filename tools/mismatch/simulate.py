@@ -180,6 +180,8 @@ class Model:
             a, b = self._slices[k]
             p = np.concatenate([theta[a], theta[b]])
             g = self.twin.sensitivity(pl.outputs[0], theta[: self.n_base])
+            if pl.site == "output" and not self.twin.static:
+                g = 1.0  # driven by the output itself
             if pl.effect.report is not None:
                 out[pl.label] = list(pl.effect.report(p, pl.settings, g))
             else:

@@ -61,7 +61,9 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         return []
     stage = _stage(twin, effect)
     if effect.kind == "feedback":
-        return [Placed(effect, "feedback", twin.feedback_on, stage, (twin.feedback_on,))]
+        # a force moves every output of its equation of motion
+        others = tuple(o for o in twin.outputs if o != twin.feedback_on)
+        return [Placed(effect, "feedback", twin.feedback_on, stage, (twin.feedback_on, *others))]
     usable = tuple(o for o in twin.outputs if not _here(effect, recording, o))
     if effect.shared:
         return [Placed(effect, "output", "+".join(g), stage, g) for g in _groups(twin, effect, usable)]

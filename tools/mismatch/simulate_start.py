@@ -8,9 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Settings
-from sim_devices.physics.statistics import least_squares, thin
+from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.simulate import Model, Placed, make_context
 from tools.mismatch.simulate_view import View, view_run
+from tools.mismatch.twins.base import remember
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
@@ -94,7 +95,30 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
 def full_residual(model: Model, view: View, theta: Array, output: str) -> Array:
     """Measured minus simulated over the whole recording (n,), zero outside the view."""
     full = view.recording.outputs[output] - model.whole(view, theta)[output]
-    return np.where(view.mask, full, 0.0)
+    return np.where(view.mask, _bounded(full, view.recording.outputs[output]), 0.0)
+
+
+def _seen(model: Model, view: View, theta: Array, output: str) -> Array:
+    """Measured minus simulated everywhere (n,), what lies outside the view included: in one run, or started afresh in
+    every gap of the view for a twin that does so.
+    """
+    residual = view.recording.outputs[output] - model.whole(view, theta)[output]
+    gaps = tuple((a, b) for a, b in runs(~view.mask) if b - a > 2 * view.init + 16)
+    if model.twin.restart and gaps:
+        rest = View(view.recording, gaps, view.init)
+        key = ("gaps", model.key, theta.tobytes(), output)
+        there = remember(view.memo, key, lambda: model.residual(rest, theta, (output,))[output])
+        residual = np.where(view.mask, residual, 0.0)
+        residual[rest.index] = there
+    return residual
+
+
+def _bounded(residual: Array, measured: Array) -> Array:
+    """``residual`` (n,) where the simulation stayed within reach of the recording, else zero: one that ran away (a
+    softening spring beyond its top) has nothing to say.
+    """
+    most = 1e3 * float(np.max(np.abs(measured)))
+    return np.where(np.abs(residual) <= most, residual, 0.0)
 
 
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
@@ -104,9 +128,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
     run = view_run(twin, view)
     ctx = make_context(twin, run, pl.target if pl.site == "input" else output, output)
     measured = run.measured[output]
-    everywhere = None
-    if not twin.restart or view.mask.all():
-        everywhere = measured - model.whole(view, theta)[output]
+    everywhere = _bounded(_seen(model, view, theta, output), measured)
     signals = ctx.signals
     if pl.site == "feedback" and "velocity" in run.measured:
         signals = {**signals, "velocity": run.measured["velocity"]}

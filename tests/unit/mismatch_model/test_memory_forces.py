@@ -17,7 +17,7 @@ def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, 
     # linear input over a step: exact weights of the values before and after
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
     x = run_feedback(
-        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, np.array([x0]),
+        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.array([x0]),
         np.zeros(1, np.int64), np.array([u.size]), NONE6, NONE2, NONE5, np.array([radius]), np.array([stiffness]),
         False,
     )  # fmt: skip
@@ -39,10 +39,42 @@ def test_a_bristle_that_slides_is_a_constant_force() -> None:
     assert np.diff(v) / dt == pytest.approx(np.full(99, 1.0 - level), rel=1e-6)
 
 
+def lugre(u: np.ndarray, dt: float, row: np.ndarray) -> np.ndarray:
+    """Position and velocity (n, 2) of a unit mass at rest with friction behind bristles under the force u."""
+    ad = np.array([[1.0, dt], [0.0, 1.0]])
+    g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
+    return run_feedback(
+        ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.zeros((1, 2)),
+        np.zeros(1, np.int64), np.array([u.size]), row, NONE2, NONE5, np.zeros(0), np.zeros(0), False,
+    )  # fmt: skip
+
+
+def test_friction_behind_bristles_is_its_level_while_it_slides() -> None:
+    dt, level = 1e-3, 0.3
+    x = lugre(np.full(2000, 1.0), dt, np.array([level, 0.0, 0.0, 0.0, 0.0, level / 1e-5]))
+    assert np.diff(x[-200:, 1]) / dt == pytest.approx(np.full(199, 1.0 - level), rel=1e-6)
+
+
+def test_friction_behind_bristles_is_a_spring_below_its_level() -> None:
+    dt, level, stiffness = 1e-4, 1.0, 400.0
+    x = lugre(np.full(600, 0.02), dt, np.array([level, 0.0, 0.0, 0.0, 0.0, stiffness]))
+    t = dt * np.arange(600)
+    spring = 0.02 / stiffness * (1 - np.cos(np.sqrt(stiffness) * t))  # z = x while |z| is far below level / stiffness
+    assert x[:, 0] == pytest.approx(spring, abs=0.02 * np.ptp(spring))
+
+
+def test_the_stribeck_extra_holds_what_the_level_alone_would_let_go() -> None:
+    dt, stiffness = 1e-3, 2e4
+    push = np.linspace(0.0, 1.2, 1500)
+    held = lugre(push, dt, np.array([1.0, 0.0, 0.5, 0.05, 0.0, stiffness]))
+    gone = lugre(push, dt, np.array([1.0, 0.0, 0.0, 0.05, 0.0, stiffness]))
+    assert abs(held[-1, 0]) < 2e-4
+    assert gone[-1, 0] > 2e-3
+
+
 def test_presliding_friction_reports_level_and_distance() -> None:
     bristles = EFFECTS["coulomb_friction"].variants[0]
-    settings = {"presliding": (1e-5, 4e-5)}
     assert bristles.report is not None
-    found = {h.name: h.value for h in bristles.report(np.array([2e4, 1e4]), settings, 2.0)}
-    assert found["coulomb_forward"] == pytest.approx((0.2 + 0.4) / 2.0)
-    assert found["presliding_distance"] == pytest.approx(0.6 / 3e4)
+    found = {h.name: h.value for h in bristles.report(np.array([3e-5, 0.6]), {"travel": (0.01,)}, 2.0)}
+    assert found["coulomb_forward"] == pytest.approx(0.3)
+    assert found["presliding_distance"] == pytest.approx(3e-5)

@@ -241,8 +241,10 @@ def test_linear_kernels_equal_python() -> None:
     rows = (np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]), np.array([3.0, 0.5]), np.array([0.1, 0.2, 0.1, 0.0, 0.05]))
     more = (np.array([0.01]), np.array([2.0]))
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
-    args = (d.ad, d.g0, d.g1, cp, cv, u, False, 2, x0, starts, np.array([40, 80]), *rows, *more, True)
-    np.testing.assert_allclose(run_feedback(*args), run_feedback.py_func(*args), atol=1e-13)
+    for dry, stiff in ((True, 0.0), (False, 60.0)):
+        rows[0][5] = stiff
+        args = (d.ad, d.g0, d.g1, cp, cv, u, False, 2, 0.005, x0, starts, np.array([40, 80]), *rows, *more, dry)
+        np.testing.assert_allclose(run_feedback(*args), run_feedback.py_func(*args), atol=1e-13)
 
 
 def test_free_responses_are_kept_while_they_are_felt() -> None:

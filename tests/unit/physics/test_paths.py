@@ -127,6 +127,8 @@ def test_grid_is_found_and_noise_has_none() -> None:
     x = np.cumsum(rng.standard_normal(4000))
     assert find_step(0.25 * np.round(x / 0.25) + 0.1) == pytest.approx(0.25, rel=1e-9)
     assert find_step(x) == 0.0
+    coarse = np.round(200 * x / np.ptp(x))
+    assert find_step(0.07 * np.round(coarse / 0.07)) == pytest.approx(1.0, rel=1e-4)  # a finer grid over it
 
 
 def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:

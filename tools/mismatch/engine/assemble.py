@@ -14,6 +14,7 @@ from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.fit import Fit, covariance, residuals
 from tools.mismatch.engine.identifiability import detection, experiment
 from tools.mismatch.engine.locate import follow, regime, windows
+from tools.mismatch.engine.parsimony import Rule, as_good
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import (
     Alternative,
@@ -32,10 +33,10 @@ from tools.mismatch.engine.report import (
 )
 from tools.mismatch.engine.revise import reduced
 from tools.mismatch.engine.score import compare, held_rms, misfits, paired_t
-from tools.mismatch.engine.select import Rule, Selection, as_good
+from tools.mismatch.engine.select import Selection
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, about
-from tools.mismatch.report.wording import scaled
+from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model, Placed
 
 Array = NDArray[np.float64]
@@ -97,6 +98,8 @@ def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
         small = reduced(problem, fitted, k)
         c = compare(problem, small, fitted)
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
+        if placed.site == "feedback":
+            worst = placed.target  # whose unit its parameters have
         step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
         sure = float(norm.cdf(min(c.z, 8.0)))
         if step is not None:
@@ -417,7 +420,7 @@ def summary(
         factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o])
         return (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
-            f" from {factor * a[o]:.3g} to {factor * b[o]:.3g} {unit}."
+            f" from {number(factor * a[o])} to {number(factor * b[o])} {unit}."
         )
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
     return f"Something is left in {outputs} that no known effect explains{what}."

@@ -16,10 +16,11 @@ from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.fit import Fit, fit_base, residuals
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
+from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
 from tools.mismatch.engine.report import Report
-from tools.mismatch.engine.select import Rule, search
+from tools.mismatch.engine.select import search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
 from tools.mismatch.engine.unexplained import about, lead, leftover, stranger
 from tools.mismatch.recording import Recording
@@ -149,7 +150,7 @@ def _diagnose(
     twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
-    strange = selection.strange
+    problem, strange = selection.problem, selection.strange
     if strange is None:
         said = {t.name for t in selection.steps}
         known = {s for t in selection.first for s in about(t.placed.effect)}

@@ -59,6 +59,7 @@ class Ground:
 
 
 ROWS = 12_000  # of the fit, that a screen looks at
+OWN_SHARE = 0.05  # of what the engineer's base leaves: an effect that takes less there has only the base to thank
 
 
 def bend(problem: Problem, current: Fit) -> Ground:
@@ -121,6 +122,11 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
     moved = model.simulate(problem.view, theta, outputs) if model.nonlinear else None
+    # a start on another base: what that base does without the effect is not the effect's share
+    base = current.theta.copy()
+    base[: model.n_base] = theta[: model.n_base]
+    elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
+    without = current.model.simulate(problem.view, base, outputs) if elsewhere_based else None
     pushed: list[dict[str, Array]] = []
     for j in new_weights:
         other = theta.copy()
@@ -132,6 +138,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     target: list[Array] = []
     old: list[Array] = []
     new: list[Array] = []
+    shift: list[Array] = []
     for o in outputs:
         s = problem.sigma(o)
         target.append(current.residual[o][rows] / s)
@@ -144,11 +151,12 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
                     block[:, c] = design.columns[o][:, at[j]] / s
             return block
 
+        here = problem.measured[o][rows] - current.residual[o][rows]
+        shift.append((without[o][rows] - here) / s if without is not None else np.zeros(rows.size))
         old.append(np.column_stack([columns(old_linear), ground.bends[o] / s]))
         extra = [columns(new_linear)]
         if moved is not None:
-            before = problem.measured[o][rows] - current.residual[o][rows]
-            extra.append(((moved[o][rows] - before) / s)[:, None])
+            extra.append(((moved[o][rows] - here) / s)[:, None])
             extra += [((p[o][rows] - moved[o][rows]) / s)[:, None] for p in pushed]
         new.append(np.column_stack(extra))
     e, base, more = np.concatenate(target), np.concatenate(old), np.concatenate(new)
@@ -163,11 +171,20 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     before_ = float(e0 @ e0) + idle
     if before_ <= 0 or more.shape[1] == 0:
         return 0.0, 1.0
+    null = before_
+    if without is not None:
+        moved_base = np.concatenate(shift)
+        moved_base = (moved_base - base_q @ (base_q.T @ moved_base))[:, None]
+        alone, _ = _without(e0, moved_base)
+        null = float(alone @ alone) + idle
+        more = np.column_stack([more, moved_base])
     left, _ = _without(e0, more)
     after = float(left @ left) + idle
     dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - base.shape[1], 1)
-    f = (before_ - after) / more.shape[1] / max(after / dof, 1e-300)
-    return max(0.0, 1 - after / before_), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
+    f = (null - after) / more.shape[1] / max(after / dof, 1e-300)
+    # what another base does by itself is not the effect's
+    share = 1 - after / (before_ if null - after > OWN_SHARE * null else null)
+    return max(0.0, share), float(f_distribution.sf(max(f, 0.0), more.shape[1], dof))
 
 
 def _is_weight(model: Model, j: int) -> bool:

@@ -2,46 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.parsimony import Rule, choose, fewest, refine
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.revise import added, pair_search, prune, simplify_pass, size, swap_pass, total
-from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
+from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
 from tools.mismatch.engine.unexplained import Stranger, about, stranger
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.simulate import Placed
 
-FAR = 100.0  # noise variances above which the best is a poor model: then blocks say nothing about which is simpler
-MOST_TIE = 0.3  # noise variances, besides what the form of a model may cost
 MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
-
-
-@dataclass(frozen=True)
-class Rule:
-    """The margins of a decision; calibrated on null simulations (docs/mismatch-calibration.md).
-
-    ``z`` whitened held-out correlation in standard deviations, over all candidates and places; ``gain`` least
-    share of the mean square; ``excess`` least share of what stands above the noise; ``form`` times
-    ``own_form`` the share of what is explained below which a leftover counts as the accepted effect's own; ``tie``
-    excess of a rival relative to the best at which fewer parameters win, ``shape`` share of what is explained that
-    the form of a model may cost on top; ``p_tested`` for effects with a test of their own.
-    """
-
-    z: float = 5.5
-    gain: float = 0.04
-    excess: float = 0.25
-    form: float = 1.0
-    tie: float = 1.3
-    shape: float = 0.004
-    p_tested: float = 1e-7
-    most: int = 4
 
 
 EXACT = frozenset(
@@ -62,10 +40,12 @@ def own_form(names: Iterable[str]) -> float:
 
 @dataclass(frozen=True)
 class Selection:
-    """``fitted`` the model with everything accepted, ``steps`` the accepted trials in order, ``rivals`` per step
-    the other acceptable trials, best first; ``first`` all trials against the recalibrated base.
+    """``problem`` with the noise floors as they were found on the way, ``fitted`` the model with everything accepted,
+    ``steps`` the accepted trials in order, ``rivals`` per step the other acceptable trials, best first; ``first`` all
+    trials against the recalibrated base.
     """
 
+    problem: Problem
     base: Fit
     fitted: Fit
     steps: tuple[Trial, ...]
@@ -73,11 +53,6 @@ class Selection:
     first: tuple[Trial, ...] = field(default=())
     strange: Stranger | None = None
     """A context signal whose free curve does better than the next effect would have done: the search ended there."""
-
-
-def moved_by(placed: Placed, problem: Problem) -> tuple[str, ...]:
-    """Outputs that an effect moves: a force moves every output of its equation of motion."""
-    return problem.twin.outputs if placed.site == "feedback" else placed.outputs
 
 
 def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
@@ -94,14 +69,27 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
         taken = sum(settings.get("stops", ())) - sum(settings.get("starts", ()))
         if taken > MOST_EXCUSED * trial.fitted.residual[trial.placed.outputs[0]].size:
             return False
-        return (p < rule.p_tested and share > 0.2) or (share > 0.6 and c.z > 7.0 and c.gain > 0.08)
+        loud = max(c.before.values(), default=0.0) > 1.3
+        return (p < rule.p_tested and share > 0.2) or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
-    if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess:
+    if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess or in_disguise(trial):
         return False
     # what the form of an earlier effect leaves over, no other effect explains down to the noise
-    clean = max(c.after.values(), default=np.inf) < 1.25 and c.gain > 0.4 and c.z > 2 * rule.z
-    return c.improvement > taken or (clean and trial.name not in LOOSE)
+    after = max(c.after.values(), default=np.inf)
+    clean = after < 1.25 and c.gain > 0.4 and c.z > 2 * rule.z
+    # nor does one number take most of it, far beyond doubt, unless that is the physics
+    sharp = after < 2.0 and c.excess_gain > 0.5 and c.z > 3 * rule.z and size(trial.placed) <= 2
+    return c.improvement > taken or ((clean or sharp) and trial.name not in LOOSE)
+
+
+def in_disguise(trial: Trial) -> bool:
+    """Whether a report figure of the fitted effect is beyond what its physics can be."""
+    limits = trial.placed.effect.limits
+    if not limits or trial.fitted is None:
+        return False
+    found = trial.fitted.model.human(trial.fitted.theta)[trial.label]
+    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
 
 
 def search(
@@ -123,12 +111,13 @@ def search(
     rivals: list[tuple[Trial, ...]] = []
     first: tuple[Trial, ...] = ()
     known: dict[tuple[str, ...], Trial] = {}
+    passed: list[tuple[Trial, ...]] = []
     strange: Stranger | None = None
     decoupled = bool(getattr(problem.twin, "static", False))
     while len(steps) < rule.most * len(problem.twin.outputs):
         now = misfits(problem, current)
         form = {
-            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in moved_by(p, problem))
+            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in p.outputs)
             * max(start[o] - now[o], 0.0)
             for o in now
         }  # fmt: skip
@@ -149,7 +138,8 @@ def search(
         trials = [known[_key(p)] for p in pool]
         if not steps:
             first = tuple(trials)
-        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in moved_by(t.placed, problem)))]
+        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in t.placed.outputs))]
+        passed += [(*steps, t) for t in good]
         if not good and not steps and max(now.values()) > WORTH_A_PAIR:
             pair = pair_search(problem, current, trials, z=rule.z + 1, gain=rule.gain)
             if pair is None:
@@ -184,6 +174,11 @@ def search(
         shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
         rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))
         current = refined.fitted
+        quieter = problem.quieter(current.residual)
+        if quieter is not problem:
+            problem, start = quieter, misfits(quieter, base)
+            current = fit(problem, current.model, [current.theta], iterations=6)
+            steps[-1] = replace(refined, fitted=current, misfits=misfits(problem, current))
         touched = set(best.placed.outputs)
         known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
     if steps and steps[0].name in FLEXIBLE:
@@ -194,7 +189,12 @@ def search(
                 current, steps, rivals = fitted, list(two), [(steps[0], *rivals[0]), ()]
     if len(steps) > 1:
         current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, first, rule)
-    return Selection(base, current, tuple(steps), tuple(rivals), first, strange)
+    if len(steps) > 1:
+        fewer = fewest(problem, base, current, steps, passed)
+        if fewer is not None:
+            current, steps = fewer[0], list(fewer[1])
+            rivals = [*rivals[: len(steps) - 1], ()]
+    return Selection(problem, base, current, tuple(steps), tuple(rivals), first, strange)
 
 
 FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
@@ -282,100 +282,3 @@ def _left(rival: Trial, best: Trial) -> float:
 
 def _key(p: Placed) -> tuple[str, ...]:
     return (p.effect.name, p.effect.kind, p.site, p.target, p.effect.equation)
-
-
-def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: frozenset[str]) -> Trial:
-    """On the output that is worst off: the best on held-out data, or a simpler one that is as good.
-
-    ``now``: mean square over noise variance per output before this step; ``named``: effects accepted so far, which
-    are preferred among equals (the same physics on another output).
-    """
-    touched = sorted({o for t in good for o in t.placed.outputs})
-    output = max(touched, key=lambda o: now[o])
-    here = sorted((t for t in good if output in t.placed.outputs), key=lambda t: (t.misfits[output], t.label))
-    best = here[0]
-    near = [t for t in here if t is best or as_good(t, best, rule, output, now[output])]
-    names = {t.name for t in near}
-    # as good here within a trifle: then what it does for the other outputs counts
-    close = best.misfits[output] + 0.05 + 0.001 * max(now[output] - best.misfits[output], 0.0)
-    return min(
-        near,
-        key=lambda t: (
-            t.name not in named, complexity(t), less_plain(t.name, names), t.misfits[output] > close, -t.improvement,
-            t.label,
-        ),
-    )  # fmt: skip
-
-
-ORDER = (
-    ("saturation", "dead_zone"),
-    ("coulomb_friction", "stribeck_friction"),
-    ("mains_interference", "vibration"),
-    ("dead_time", "clock_skew"),
-    ("dead_time", "channel_delay"),
-)
-"""Where two effects serve equally well with equal freedom, the first is the plainer statement."""
-
-FREEDOM = {
-    "static_nonlinearity": 4,
-    "creep": 5,
-    "hysteresis": 8,
-    "rate_dependent_hysteresis": 20,
-    "random_walk": 12,
-}
-"""What a family counts as at most: its weights are smoothed, and how many columns its data asked for is no physics."""
-
-
-def less_plain(name: str, among: Collection[str]) -> bool:
-    """Is a plainer statement of the same freedom among those that serve equally well."""
-    return any(name == second and first in among for first, second in ORDER)
-
-
-def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -> bool:
-    """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model
-    may cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
-
-    A tenth of the blocks may be left out: what a start transient costs says nothing about the physics. A best effect
-    without shape allows for no form of its own.
-    """
-    if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
-        return False
-    a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
-    form = 0.02 + rule.shape * max(before - best.misfits[output], 0.0)
-    shapeless = best.placed.effect.stochastic
-    # far above the noise a share of the excess is no trifle
-    slack = form if shapeless else form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
-    if b <= a + slack:
-        return True
-    if shapeless or a > FAR or b > 2.0 * a + 0.1 + 5.0 * form:
-        return False
-    column = best.outputs.index(output)
-    mine, his = best.energy[:, column], rival.energy[:, column]
-    if paired_t(his[:, None], mine[:, None]) < 2.0 and b <= 2.0 * a + 0.1:
-        return True
-    usual = np.argsort(his - mine)[: his.size - his.size // 10]
-    a, b = max(float(mine[usual].mean()) - 1.0, 0.0), max(float(his[usual].mean()) - 1.0, 0.0)
-    return b <= a + form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
-
-
-def complexity(trial: Trial) -> float:
-    """How much freedom an effect has, per output that it serves but at least one; events read off the data count as
-    parameters.
-    """
-    most = FREEDOM.get(trial.name, np.inf)
-    return max(min(size(trial.placed), most) / max(len(trial.placed.outputs), 1), 1.0)
-
-
-def refine(problem: Problem, current: Fit, trial: Trial) -> Trial:
-    """The effect added to the current model and everything fitted on every row."""
-    assert trial.fitted is not None
-    model = Model(problem.twin, (*current.model.placed, trial.placed))
-    theta = model.carry(current.model, current.theta, problem.recording)
-    k = len(model.placed) - 1
-    for mine, theirs in zip(
-        model.slices(k), trial.fitted.model.slices(len(trial.fitted.model.placed) - 1), strict=True
-    ):
-        theta[mine] = trial.fitted.theta[theirs]
-    fitted = fit(problem, model, [theta], iterations=15, keep=current, touched=trial.placed.outputs)
-    energy = block_energy(problem, fitted, problem.held_blocks)
-    return replace(trial, fitted=fitted, misfits=misfits(problem, fitted), energy=energy)

@@ -272,6 +272,9 @@ def axis(force, dt, p, x0, v0):
             z += h / 6.0 * (z1 + 2 * z2 + 2 * z3 + z4)
             w += h / 6.0 * (w1 + 2 * w2 + 2 * w3 + w4)
         if kind == 2 and v * last < 0.0:
-            v = 0.0
-            stuck = True
+            # at rest only where the other forces cannot break it loose: else it passes through zero
+            a0, _, _ = _rates(x, 0.0, z, w, force[i + 1], p)
+            if abs(a0 * p[0]) <= p[11]:
+                v = 0.0
+                stuck = True
     return xs, vs

@@ -19,8 +19,8 @@ SHOWABLE = 1.05  # residual over noise floor below which nothing is left to be e
 
 
 def number(value: float | None) -> str:
-    """Three significant digits; '-' for what is not known."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.3g}"
+    """Three significant digits, without a power of ten up to a million; '-' for what is not known."""
+    return "-" if value is None or not math.isfinite(value) else f"{float(f'{value:.3g}'):g}"
 
 
 def chance(p: float) -> str:

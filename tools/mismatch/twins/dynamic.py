@@ -226,7 +226,8 @@ class DynamicTwin:
         cogging.
         """
         sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
-        stiff = run.dt * np.sqrt(abs(push) * float(np.sum(np.abs(packed.memory)))) / 0.5
+        springs = float(np.sum(np.abs(packed.memory))) + max(float(packed.friction[5]), 0.0)
+        stiff = run.dt * np.sqrt(abs(push) * springs) / 0.5
         if stiff > sub:
             sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
         if packed.cogging[0] > 0:
@@ -271,7 +272,10 @@ class DynamicTwin:
         cp = rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
         sub = 1
         if forces and self.hold != "discrete":
-            sub = self._substeps(run, packed, float(cp @ plant.a @ plant.b))
+            push = float(cp @ plant.a @ plant.b) or 1.0
+            # bristles stiffer than the finest step can carry are as good as rigid
+            packed.friction[5] = min(packed.friction[5], (0.7 * MOST_SUBSTEPS / run.dt) ** 2 / abs(push))
+            sub = self._substeps(run, packed, push)
         d = discretise(plant.a, plant.b, run.dt / sub, self.hold)
         if self.hold == "discrete":
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
@@ -282,11 +286,11 @@ class DynamicTwin:
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
         held = self.hold != "linear"
-        dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0
+        dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
 
         def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
             return run_feedback(
-                d.ad, d.g0, d.g1, cp, cv, drive, held, sub, x0, first, stop,
+                d.ad, d.g0, d.g1, cp, cv, drive, held, sub, run.dt / sub, x0, first, stop,
                 packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,
             )  # fmt: skip
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
-from sim_devices.physics.forces import COGGING, FRICTION, SPRING, friction_limit, smooth_force
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, friction_limit, smooth_force
 from tools.mismatch.twins.base import Force
 
 
@@ -61,14 +61,16 @@ def pack(forces: Sequence[Force]) -> Rows:
 
 @kernel
 def run_feedback(
-    ad, g0, g1, cp, cv, u, held, sub, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
+    ad, g0, g1, cp, cv, u, held, sub, step_s, x0, starts, stop, friction, spring, cogging, thresholds, memory, dry
 ):
     """States (n, s) with forces added to the input u (n,), ``sub`` steps per sample, from x0 (starts, s).
 
     The linear part is exact over a step (ad, g0, g1 are those of dt/sub). Smooth forces and memory run linearly over
     the step, predicted and corrected once (second order). Dry friction is set-valued and implicit: it takes from the
     velocity what its limit allows, and no more than brings it to rest (time stepping; Acary, Brogliato, Numerical
-    Methods for Nonsmooth Dynamical Systems, 2008, section 1.4). ``cp``, ``cv``: rows of position and velocity.
+    Methods for Nonsmooth Dynamical Systems, 2008, section 1.4). Behind bristles (``friction[5]`` > 0) it is the LuGre
+    model instead, its state exact at the mean speed of a step of ``step_s``. ``cp``, ``cv``: rows of position and
+    velocity.
     ``stop`` (starts,) ends each stretch early (the rest keeps the last state).
     """
     n, s = u.size, ad.shape[0]
@@ -80,6 +82,9 @@ def run_feedback(
     for i in range(s):
         gv += cv[i] * (g0[i] + g1[i])
     any_smooth = np.any(spring != 0.0) or np.any(cogging != 0.0) or friction[4] != 0.0
+    stiff = friction[5]
+    bristle = 0.0
+    bent = 0.0
     at = 0
     end = n
     for k in range(n):
@@ -90,6 +95,7 @@ def run_feedback(
                 p += cp[i] * x[i]
             for j in range(e.size):
                 e[j] = p
+            bristle = 0.0
             end = stop[at]
             at += 1
         elif k < end:
@@ -113,8 +119,9 @@ def run_feedback(
                     elif e[j] > p + r:
                         e[j] = p + r
                     f0 -= memory[j] * (p - e[j])
+                f0 -= stiff * bristle
                 f1 = f0
-                passes = 2 if any_smooth or e.size > 0 else 1
+                passes = 2 if any_smooth or e.size > 0 or stiff > 0.0 else 1
                 for turn in range(passes):
                     for i in range(s):
                         a = g0[i] * (w0 + f0) + g1[i] * (w1 + f1)
@@ -133,6 +140,14 @@ def run_feedback(
                         for j in range(e.size):
                             r = thresholds[j]
                             f1 -= memory[j] * min(max(pn - e[j], -r), r)
+                        if stiff > 0.0:
+                            bent = bristle_after(bristle, 0.5 * (v + vn), step_s, friction)
+                            f1 -= stiff * bent
+                if stiff > 0.0:
+                    vn = 0.0
+                    for i in range(s):
+                        vn += cv[i] * z[i]
+                    bristle = bristle_after(bristle, 0.5 * (v + vn), step_s, friction)
                 if dry:
                     vn = 0.0
                     for i in range(s):

@@ -1,0 +1,134 @@
+"""Warm-up: slow change with time alone, at once as a machine is switched on, or late as heat soaks through."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import least_squares, thin
+
+
+def _span(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {"time": (ctx.dt, ctx.dt * ctx.t.size)}
+
+
+def _warm_parts(settings: Settings) -> Parts:
+    dt, span = settings.get("time", (1e-3, 1.0))
+    return Parts(
+        (
+            Parameter("time_constant_s", "s", max(20 * dt, 2e-3 * span), 3 * span, log=True, scale=0.1 * span),
+            Parameter("ratio", "1", 0.02, 0.5, log=True, scale=0.1),
+        ),
+        (Parameter("slow", "{out}"), Parameter("fast", "{out}")),
+        np.diag([0.01, 0.05]),
+    )
+
+
+def _warm_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.stack([np.exp(-ctx.t / q[0]), np.exp(-ctx.t / (q[0] * q[1]))], axis=1)
+
+
+def _warm_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    p = _warm_parts(settings).nonlinear[0]
+    k = thin(ctx.keep, 4000)
+    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    tried: list[tuple[float, float, float]] = []
+    for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
+        for ratio in (0.05, 0.2):
+            cols = _warm_basis(x, ctx, np.array([tau, ratio]), settings)[k]
+            tried.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(tau), ratio))
+    tried.sort()
+    return tuple((tau, ratio) for _, tau, ratio in tried[:3])
+
+
+def _warm_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    span = settings["time"][1]
+    t = np.array([0.0, span])
+    change = _exponentials(t, p)
+    return (
+        Human("drift_over_record", float(change[1] - change[0]), "{out}"),
+        Human("time_constant_s", float(p[0] if abs(p[2]) >= abs(p[3]) else p[0] * p[1]), "s"),
+        Human("slow_amplitude", float(-p[2]), "{out}"),
+        Human("fast_amplitude", float(-p[3]), "{out}"),
+    )
+
+
+def _exponentials(t: Array, p: Array) -> Array:
+    return p[2] * np.exp(-t / p[0]) + p[3] * np.exp(-t / (p[0] * p[1]))
+
+
+def _late_parts(settings: Settings) -> Parts:
+    span = settings.get("time", (1e-3, 1.0))[1]
+    return Parts(
+        (
+            Parameter("middle_s", "s", -0.2 * span, 1.2 * span, scale=0.1 * span),
+            Parameter("width_s", "s", 0.025 * span, 0.5 * span, log=True, scale=0.05 * span),
+        ),
+        (Parameter("rise", "{out}"),),
+    )
+
+
+def _late_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return 0.5 * (1.0 + np.tanh(0.5 * (ctx.t - q[0]) / q[1]))[:, None]
+
+
+def _late_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    span = settings["time"][1]
+    k = thin(ctx.keep, 4000)
+    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    tried: list[tuple[float, float, float]] = []
+    for middle in np.linspace(0.0, 1.0, 11) * span:
+        for width in (0.04 * span, 0.12 * span):
+            column = _late_basis(x, ctx, np.array([middle, width]), settings)[k]
+            tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(middle), width))
+    tried.sort()
+    return tuple((middle, width) for _, middle, width in tried[:2])
+
+
+def _late_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("drift_over_record", float(p[2]), "{out}"),
+        Human("middle_s", float(p[0]), "s"),
+        Human("time_constant_s", float(p[1]), "s"),
+    )
+
+
+_LATE = Effect(
+    name="thermal_drift",
+    summary="warm-up that sets in late: slow, then faster, then settled (logistic)",
+    kind="add",
+    stages=("environment", "sensor", "acquisition"),
+    parts=_late_parts,
+    equation=r"y = x + a / (1 + e^{-(t - t_0)/w})",
+    source="H. S. Carslaw, J. C. Jaeger, Conduction of Heat in Solids, 2nd ed., section 3.4 (heat that soaks through a"
+    " slab sets in late), with the logistic curve for its shape",
+    excitation="none; a record several times as long as the warm-up",
+    confusable_with=("step_shift", "random_walk"),
+    prepare=_span,
+    guess=_late_guess,
+    basis=_late_basis,
+    report=_late_report,
+    driven=False,
+    sites=("output",),
+)
+
+THERMAL_DRIFT = Effect(
+    name="thermal_drift",
+    summary="warm-up: slow, exponential-like, no temperature recorded",
+    kind="add",
+    stages=("environment", "sensor", "acquisition"),
+    parts=_warm_parts,
+    equation=r"y = x + a\,e^{-t/\tau} + b\,e^{-t/(r\tau)}",
+    source="F. P. Incropera et al., Fundamentals of Heat and Mass Transfer, 6th ed., eq. 5.6 (lumped capacitances)",
+    excitation="a record of a time constant or more, from switch-on",
+    confusable_with=("creep", "random_walk", "temperature_sensitivity"),
+    prepare=_span,
+    guess=_warm_guess,
+    basis=_warm_basis,
+    report=_warm_report,
+    driven=False,
+    sites=("output",),
+    variants=(_LATE,),
+)
