@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from types import MappingProxyType
 
 from sim_devices.physics.axes import CROSS_AXIS_NONLINEARITY, MISALIGNMENT, SCALE_FACTOR_VARIATION, SOFT_IRON
@@ -11,7 +12,7 @@ from sim_devices.physics.creep import CREEP
 from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
-from sim_devices.physics.friction import COULOMB_FRICTION, STRIBECK_FRICTION
+from sim_devices.physics.friction import COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
@@ -26,7 +27,8 @@ from sim_devices.physics.timebase import CHANNEL_DELAY, CLOCK_SKEW, DEAD_TIME, D
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
 _ALL = (
-    HYSTERESIS,
+    # its smooth spring is friction's bristles over a larger distance
+    replace(HYSTERESIS, variants=(*HYSTERESIS.variants, SMOOTH_SPRING)),
     RATE_DEPENDENT_HYSTERESIS,
     CREEP,
     BACKLASH,

@@ -84,7 +84,8 @@ def _bristle_settings(x: Array, residual: Array, ctx: Context) -> Settings:
 
 def _bristle_distance(settings: Settings) -> Parameter:
     travel = settings.get("travel", (1.0,))[0]
-    return Parameter("presliding", "{out}", 2e-5 * travel, 0.05 * travel, log=True, scale=1e-3 * travel)
+    # what yields over more than that is a spring with memory: hysteresis
+    return Parameter("presliding", "{out}", 2e-5 * travel, 0.02 * travel, log=True, scale=1e-3 * travel)
 
 
 def _bent(x: Array, ctx: Context, distance: float) -> Array:
@@ -110,7 +111,7 @@ def _lugre_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
 
 
 def _lugre_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    grid = settings["travel"][0] * np.geomspace(5e-4, 0.02, 5)
+    grid = settings["travel"][0] * np.geomspace(5e-4, 0.015, 5)
     return tuple((r,) for r in _best_bristles(x, residual, ctx, grid)[:2])
 
 
@@ -134,6 +135,42 @@ def _lugre_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]
 
 
 _FRICTION_SOURCE = "B. Armstrong-Helouvry, P. Dupont, C. Canudas de Wit, Automatica 30 (1994) 1083, eqs. 1-3"
+
+
+def _spring_parts(settings: Settings) -> Parts:
+    travel = settings.get("travel", (1.0,))[0]
+    yielding = Parameter("yield_distance", "{out}", 0.02 * travel, 1.5 * travel, log=True, scale=0.05 * travel)
+    return Parts((yielding,), (Parameter("level", _UNIT, 0.0),))
+
+
+def _spring_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    grid = settings["travel"][0] * np.geomspace(0.03, 0.8, 6)
+    return tuple((r,) for r in _best_bristles(x, residual, ctx, grid)[:2])
+
+
+def _spring_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("force_loop_half_height", float(p[1]) / g, "{in}"),
+        Human("presliding_stiffness", float(p[1] / p[0]) / g, "{in}/{out}"),
+    )
+
+
+SMOOTH_SPRING = Effect(
+    name="hysteresis",
+    summary="one smooth elastic-plastic element on the position (Bouc-Wen)",
+    kind="feedback",
+    stages=("mechanics", "actuator"),
+    parts=_spring_parts,
+    equation=r"m\ddot x + c\dot x + k x = F - a z,\; \dot z = \dot x / r - |\dot x| z / r",
+    source="Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1 and gamma = 0; P. R. Dahl 1976",
+    excitation="reversals of motion at several amplitudes",
+    prepare=_bristle_settings,
+    guess=_spring_guess,
+    basis=_lugre_basis,
+    fill=_lugre_fill,
+    report=_spring_report,
+)
 
 _LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"
 
@@ -243,7 +280,7 @@ def _stribeck_bristle_fill(q: Array, w: Array, settings: Settings) -> dict[str, 
 
 def _stribeck_bristle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     travel = settings["travel"][0]
-    near = _best_bristles(x, residual, ctx, travel * np.geomspace(5e-4, 0.02, 5))[0]
+    near = _best_bristles(x, residual, ctx, travel * np.geomspace(5e-4, 0.015, 5))[0]
     return tuple((vs[0], near) for vs in _stribeck_guess(x, residual, ctx, settings))
 
 

@@ -11,7 +11,7 @@ from tools.mismatch.report.vocabulary import entries, print_vocabulary, to_json
 
 def test_every_name_of_the_contract_with_all_that_is_known():
     body = json.loads(json.dumps(to_json(entries()), allow_nan=False))
-    assert [p["name"] for p in body["physics"]] == NAMES
+    assert tuple(p["name"] for p in body["physics"]) == NAMES
     for p in body["physics"]:
         for key in ("summary", "formula", "equations", "source", "excitation", "stages", "acts"):
             assert p[key], (p["name"], key)
