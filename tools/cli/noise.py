@@ -28,8 +28,9 @@ def noise(
     rate_hz: Annotated[float | None, typer.Option(min=1e-6, help="Sampling rate, if the file does not say.")] = None,
     scale: Annotated[float, typer.Option(help="Factor from counts to a unit.")] = 1.0,
     shortest_s: Annotated[
-        float, typer.Option(min=0.0, help="Shortest averaging time of the fit: above a filter's time constant.")
-    ] = 0.0,
+        float | None,
+        typer.Option(min=0.0, help="Shortest averaging time of the fit; default: where the noise terms explain it."),
+    ] = None,
     bench: Annotated[
         Path | None, typer.Option(metavar="BENCH", help="The log is of this instrument: its calibrated axes instead.")
     ] = None,
@@ -72,7 +73,7 @@ def noise(
                     raise
                 raise InputError(f"{log.path}: '{name}': {error}") from error
         table = Table(title=f"{log.path}, {rate:g} Hz", title_justify="left")
-        for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)"):
+        for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)", "fit from (s)"):
             table.add_column(heading, no_wrap=heading == "column")
         for name, (_, model) in found.items():
             cells = []
@@ -80,7 +81,8 @@ def noise(
                 c = getattr(model, term)
                 seen = f"{c.value:.3g} [{c.low:.2g}, {c.high:.2g}]"
                 cells.append(seen.replace("[", r"\[") if c.value > 0.0 else f"< {c.high:.2g}")
-            table.add_row(name, *cells)
+            missed = f", off by {100.0 * model.excess:.0f} %" if model.excess > 0.0 else ""
+            table.add_row(name, *cells, f"{model.shortest_s:g}{missed}")
         data_console().print(table)
         save_allan_picture(found, image)
         console().print(f"picture: {image}")
@@ -89,7 +91,7 @@ def noise(
                 "format": 1,
                 "rate_hz": rate,
                 "scale": scale,
-                "shortest_s": shortest_s,
+                "shortest_s": min(model.shortest_s for _, model in found.values()),
                 "columns": {n: {"curve": asdict(c), "model": asdict(m)} for n, (c, m) in found.items()},
             },
             json_file,

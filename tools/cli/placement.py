@@ -32,7 +32,7 @@ def placement(
     from tools.placement.configurations import cube_004, micron_004, micron_004_turned, proposed_004
     from tools.placement.optimise import optimise
     from tools.placement.picture import save_placement_picture
-    from tools.placement.propositions import check_pairs
+    from tools.placement.propositions import check_pairs, verdicts
     from tools.placement.space import load_space
     from tools.placement.variance import angular_noise, point_noise
 
@@ -60,8 +60,9 @@ def placement(
                 f"direction ({s[0]:.3f}, {s[1]:.3f}, {s[2]:.3f})"
             )
         checks = check_pairs(best.placement)
-        for check in checks:
-            data_console().print(check.text)
+        for p in rows:
+            for line in verdicts(p):
+                data_console().print(line, highlight=False)
         save_placement_picture(best.placement, space, image)
         console().print(f"picture: {image}")
         write_json(

@@ -80,6 +80,7 @@ def variance(
     from tools.placement.analysis import BAND_HZ, DOWN_40, Analysis, Conditions, all_accelerometers, conventional
     from tools.placement.analysis_picture import save_analysis_picture
     from tools.placement.configuration_file import STANDARD_GRAVITY, load_configuration
+    from tools.placement.propositions import verdicts
 
     def cells(values: object, factor: float) -> str:
         return "-" if values is None else ", ".join(f"{factor * v:.3g}" for v in np.asarray(values)[:3])
@@ -93,10 +94,12 @@ def variance(
             np.radians(_vector(turning_deg_s, "--turning-deg-s")),
         )
         found: list[Analysis] = []
+        judged: list[str] = []
         for given in configurations:
             placement, noise = load_configuration(given, noise_mg)
             try:
                 found.append(all_accelerometers(placement, noise, conditions))
+                judged += verdicts(placement)
             except ValueError as error:
                 raise error if isinstance(error, InputError) else InputError(f"{given}: {error}") from error
         found.append(conventional(np.zeros(3), noise_mg * 1e-3 * STANDARD_GRAVITY, conditions))
@@ -117,6 +120,8 @@ def variance(
         for name, values in rows:
             table.add_row(name, *values)
         data_console().print(table)
+        for line in judged:
+            data_console().print(line, highlight=False)
         console().print(
             "an increment of the rate is not its error: that is a random walk (ERRATA 20), compare the bands"
         )
@@ -129,6 +134,7 @@ def variance(
                 "noise_mg": noise_mg,
                 "gyroscope_deg_s": gyroscope_deg_s,
                 "configurations": [asdict(a) for a in found],
+                "propositions": judged,
             },
             json_file,
         )

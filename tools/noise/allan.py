@@ -19,6 +19,12 @@ from hal.compiled import kernel
 Array = NDArray[np.float64]
 TERMS = ("white", "flicker", "walk", "ramp")
 FLAT = 2.0 * log(2.0) / pi
+EXCESS = (0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5)
+"""Relative errors of the variance that are granted to the four terms themselves: no real sensor is made of them."""
+EXCESS_AT_START = 0.02
+"""A start of the fit that needs more than this is too early: a filter or the converter's steps bend the curve there."""
+MISFIT = 2.0
+"""Chi-square for each degree of freedom up to which a fit counts as one."""
 REPEATS = 100
 SIMULATED = 8192
 """Samples of a simulated recording, at most twice that."""
@@ -115,12 +121,17 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """N (unit sqrt s: the one-sided density over sqrt 2), B (unit), K (unit / sqrt s), R (unit / s)."""
+    """N (unit sqrt s: the one-sided density over sqrt 2), B (unit), K (unit / sqrt s), R (unit / s).
+
+    Fitted to averages of ``shortest_s`` and more, in which the four terms are wrong by ``excess`` of the variance.
+    """
 
     white: Coefficient
     flicker: Coefficient
     walk: Coefficient
     ramp: Coefficient
+    shortest_s: float
+    excess: float
 
     def variance(self, tau_s: Array) -> Array:
         """Allan variance of the model."""
@@ -131,39 +142,92 @@ def _terms(tau_s: Array) -> Array:
     return np.stack([1.0 / tau_s, np.full_like(tau_s, FLAT), tau_s / 3.0, tau_s**2 / 2.0], axis=1)
 
 
-def identify(curve: AllanCurve, shortest_s: float = 0.0) -> NoiseModel:
-    """N, B, K, R by non-negative least squares on the relative error of the variance; averages shorter than
-    ``shortest_s`` are left out (a filter or quantisation in front of the converter bends them).
+def identify(curve: AllanCurve, shortest_s: float | None = None) -> NoiseModel:
+    """N, B, K, R by non-negative least squares on the relative error of the variance.
+
+    Averages shorter than ``shortest_s`` are left out; without it the fit starts where the four terms begin to explain
+    the curve (a filter or quantisation in front of the converter bends it before). Short averages are so many that
+    their own chance is nothing beside what the terms miss: that is found as ``excess`` and counts in weights and
+    intervals.
 
     Intervals: the fit repeated on ``REPEATS`` simulated recordings of the model, as long as this one (neighbouring
     octaves share their data, so that intervals from each point's own chi-square would be too narrow).
     """
-    keep = (curve.tau_s >= shortest_s) & (curve.freedom >= 2.0)
+    keep = (curve.tau_s >= (shortest_s or 0.0)) & (curve.freedom >= 2.0)
     tau, variance, freedom = curve.tau_s[keep], curve.deviation[keep] ** 2, curve.freedom[keep]
     if len(tau) < 4:
         raise ValueError(f"{len(tau)} usable averaging times: four are needed to tell the noise terms apart")
-    terms = _terms(tau)
-    value = _fit(terms, variance, freedom)
+    start, excess = _start(tau, variance, freedom, given=shortest_s is not None)
+    tau, variance, freedom = tau[start:], variance[start:], freedom[start:]
+    terms, weight = _terms(tau), _weight(freedom, excess)
+    value = _fit(terms, variance, weight)
     fitted = np.maximum(terms @ value, 1e-300)
     rng = np.random.default_rng(0)
-    drawn = np.sqrt([_fit(terms, fitted * _luck(curve, value, tau, freedom, rng), freedom) for _ in range(REPEATS)])
+
+    def luck() -> Array:
+        missed = np.exp(excess * rng.standard_normal(len(tau)))
+        return missed * _luck(curve, value, tau, freedom, rng)
+
+    drawn = np.sqrt([_fit(terms, fitted * luck(), weight) for _ in range(REPEATS)])
     best = np.sqrt(value)
     # around the estimate: best^2 / quantile for what was seen, so that a low draw means the truth may be higher
     low, high = np.quantile(drawn, 0.025, axis=0), np.quantile(drawn, 0.975, axis=0)
     lower = np.maximum(0.0, 2.0 * best - high)
     upper = np.where(best > 0.0, np.maximum(2.0 * best - low, high), high)
-    return NoiseModel(*(Coefficient(float(best[i]), float(lower[i]), float(upper[i])) for i in range(4)))
+    found = [Coefficient(float(best[i]), float(lower[i]), float(upper[i])) for i in range(4)]
+    return NoiseModel(*found, shortest_s=float(tau[0]), excess=excess)
+
+
+def _start(tau: Array, variance: Array, freedom: Array, *, given: bool) -> tuple[int, float]:
+    """First average and ``excess`` with which the terms explain the curve; the best there is if nothing does."""
+    best, least = (0, EXCESS[-1]), np.inf
+    last = 1 if given else max(1, len(tau) - 5)
+    for start in range(last):
+        for excess in EXCESS:
+            if not given and excess > EXCESS_AT_START:
+                break
+            terms, weight = _terms(tau[start:]), _weight(freedom[start:], excess)
+            seen = variance[start:]
+            fitted = np.maximum(terms @ _fit(terms, seen, weight), 1e-300)
+            misfit = float(np.mean((weight * (seen / fitted - 1.0)) ** 2))
+            if misfit <= MISFIT:
+                return start, excess
+            if misfit < least:
+                best, least = (start, excess), misfit
+    return best
+
+
+def _weight(freedom: Array, excess: float) -> Array:
+    """One over the relative standard deviation of each variance."""
+    return 1.0 / np.sqrt(2.0 / freedom + excess**2)
 
 
 def _luck(curve: AllanCurve, value: Array, tau: Array, freedom: Array, rng: np.random.Generator) -> Array:
     """Estimated over true variance at each ``tau`` in one simulated recording of the model ``value`` (4,).
 
-    The slow end is simulated as a recording of the same length with fewer samples; short averages have so many
-    degrees of freedom that their own chi-square law is enough.
+    The slow end is simulated as a recording of the same length with fewer samples, the fast end as a piece of it at the
+    full rate, whose chance is then scaled down to that of the whole length.
     """
     ratio = rng.chisquare(freedom) / freedom
     thinned = max(1, 2 ** max(0, (curve.samples // SIMULATED).bit_length()))
-    n, dt_s = curve.samples // thinned, curve.dt_s * thinned
+    n = curve.samples // thinned
+    piece = min(curve.samples, SIMULATED)
+    for samples, dt_s, share in ((piece, curve.dt_s, piece / curve.samples), (n, curve.dt_s * thinned, 1.0)):
+        factors = np.round(tau / dt_s).astype(np.int64)
+        there = (factors >= (1 if share < 1.0 or thinned == 1 else 4)) & (2 * factors + 1 < samples)
+        if share < 1.0:
+            there &= factors < 4 * thinned
+        if np.any(there):
+            phase = np.concatenate([[0.0], np.cumsum(_simulated(value, samples, dt_s, rng))]) * dt_s
+            found = np.empty(int(there.sum()))
+            overlapping_variance(phase, factors[there], dt_s, found)
+            chance = found / np.maximum(_terms(tau[there]) @ value, 1e-300)
+            ratio[there] = np.maximum(1.0 + (chance - 1.0) * np.sqrt(share), 1e-3)
+    return ratio
+
+
+def _simulated(value: Array, n: int, dt_s: float, rng: np.random.Generator) -> Array:
+    """(n,) samples of the model ``value`` (4,), every ``dt_s``, mean taken off."""
     white, flicker, walk, ramp = np.sqrt(value)
     signal = white / np.sqrt(dt_s) * rng.standard_normal(n) + walk * np.sqrt(dt_s) * np.cumsum(rng.standard_normal(n))
     if flicker > 0.0:
@@ -172,25 +236,18 @@ def _luck(curve: AllanCurve, value: Array, tau: Array, freedom: Array, rng: np.r
         shape[1:] = flicker / np.sqrt(2.0 * np.pi * f[1:])  # two-sided density B^2 / (2 pi f)
         signal += np.fft.irfft(shape * np.fft.rfft(rng.standard_normal(4 * n)) * np.sqrt(1.0 / dt_s), 4 * n)[:n]
     signal += ramp * dt_s * np.arange(n)
-    factors = np.round(tau / dt_s).astype(np.int64)
-    slow = (factors >= 4) & (2 * factors + 1 < n)
-    if np.any(slow):
-        phase = np.concatenate([[0.0], np.cumsum(signal - signal.mean())]) * dt_s
-        found = np.empty(int(slow.sum()))
-        overlapping_variance(phase, factors[slow], dt_s, found)
-        ratio[slow] = found / np.maximum(_terms(tau[slow]) @ value, 1e-300)
-    return ratio
+    return signal - signal.mean()
 
 
-def _fit(terms: Array, variance: Array, freedom: Array) -> Array:
+def _fit(terms: Array, variance: Array, relative: Array) -> Array:
     """Two passes: weights from the data, then from the first fit, so that low points do not attract it."""
-    weight = np.sqrt(freedom / 2.0) / variance
+    weight = relative / variance
     value = np.zeros(terms.shape[1])
     for _ in range(2):
         scale = np.linalg.norm(terms * weight[:, None], axis=0)
         solution, _ = nnls(terms * weight[:, None] / scale, variance * weight)
         value = solution / scale
-        weight = np.sqrt(freedom / 2.0) / np.maximum(terms @ value, 1e-3 * variance)
+        weight = relative / np.maximum(terms @ value, 1e-3 * variance)
     return value
 
 

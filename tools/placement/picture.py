@@ -33,6 +33,8 @@ def save_placement_picture(placement: Placement, space: Space, path: Path) -> No
                 arrowprops={"arrowstyle": "->", "color": f"C{i}"},
             )
             axes.plot(r[a], r[b], "o", ms=4, color=f"C{i}", label=f"axis {i + 1}" if axes is side else None)
+            # an arrow does not count for the limits of the picture
+            axes.plot(r[a] + 10.0 * s[a], r[b] + 10.0 * s[b], ".", ms=0.0)
         axes.plot(space.tip_mm[a], space.tip_mm[b], "k^", ms=6)
         axes.set(xlabel=labels[0], ylabel=labels[1])
         axes.set_aspect("equal", adjustable="datalim")

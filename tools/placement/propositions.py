@@ -38,23 +38,30 @@ def check_pairs(placement: Placement) -> list[PairCheck]:
             distance = float(np.linalg.norm(across))
             if distance < 1e-6:
                 continue
-            pairs.append((i, j, distance, across, np.cross(across / distance, s)))
+            pairs.append((i, j, distance, np.cross(across / distance, s)))
     checks = []
-    for i, j, distance, across, normal in pairs:
-        largest = max(d for a, b, d, _, _ in pairs if abs(placement.axes[a] @ placement.axes[i]) > PARALLEL)
+    for i, j, distance, normal in pairs:
+        largest = max(d for a, b, d, _ in pairs if abs(placement.axes[a] @ placement.axes[i]) > PARALLEL)
         first = distance > 0.999 * largest
         principal = int(np.argmax(np.abs(normal)))
         offset = 1e3 * float(np.sqrt(max(0.0, 1.0 - normal[principal] ** 2))) * distance
         second = offset < 0.05 * 1e3 * distance
         text = f"axes {i + 1} and {j + 1}, {1e3 * distance:.1f} mm apart, sense alpha_{'xyz'[principal]}"
         if not first:
-            text += f"; breaks proposition i: another pair of this direction is {1e3 * largest:.1f} mm apart"
+            text += f"; breaks proposition i because another pair of this direction is {1e3 * largest:.1f} mm apart"
         if not second:
             others = [f"alpha_{'xyz'[k]}" for k in range(3) if k != principal and abs(normal[k]) > 0.05]
             text += (
-                f"; breaks proposition ii: the plane of the two is {offset:.1f} mm off the one perpendicular to "
+                f"; breaks proposition ii because the plane of the two is {offset:.1f} mm off the one perpendicular to "
                 f"{'xyz'[principal]}, so {' and '.join(others)} must be known"
             )
-        del across
         checks.append(PairCheck(i + 1, j + 1, 1e3 * distance, first, second, text))
     return checks
+
+
+def verdicts(placement: Placement) -> list[str]:
+    """What ``check_pairs`` found, a line a pair, or that there is no pair to judge."""
+    checks = check_pairs(placement)
+    if not checks:
+        return [f"{placement.name}: no two axes are parallel, so the propositions of 004 say nothing of it"]
+    return [f"{placement.name}: {check.text}" for check in checks]

@@ -6,6 +6,7 @@ import warnings
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from tools.noise.allan import FLAT, allan_curve, identify, octave_factors, overlapping_variance, slope
 
@@ -64,6 +65,22 @@ def test_the_coefficients_come_back_inside_their_intervals() -> None:
         assert model.walk.value == pytest.approx(0.005, rel=0.4)
         assert model.ramp.high < 2e-3
     assert inside >= 3
+
+
+def test_averages_that_a_filter_bends_are_left_out() -> None:
+    """White noise behind a low-pass of 30 ms: short averages have less of it than N / sqrt(tau)."""
+    n = 60_000
+    smooth = np.exp(-1.0 / (0.03 * RATE))
+    noise = processes(n)["white"]
+    signal = lfilter([1.0 - smooth], [1.0, -smooth], noise)
+    model = identify(allan_curve(signal, RATE))
+    assert model.shortest_s >= 0.15
+    assert model.white.value == pytest.approx(0.02, rel=0.03)
+    forced = identify(allan_curve(signal, RATE), 0.0)
+    assert forced.shortest_s == 0.01
+    assert forced.excess > 0.02
+    # what the terms miss is in the interval
+    assert forced.white.high - forced.white.low > 0.1 * forced.white.value
 
 
 def test_the_flat_part_is_read_over_0_664() -> None:

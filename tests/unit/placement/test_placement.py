@@ -80,7 +80,7 @@ def test_three_packages_in_the_papers_space() -> None:
 
 def test_the_propositions_are_named() -> None:
     text = "\n".join(check.text for check in check_pairs(micron_004()))
-    assert "breaks proposition ii" in text
+    assert "breaks proposition ii because the plane of the two is" in text
     fine = [check for check in check_pairs(proposed_004()) if check.keeps_first and check.keeps_second]
     assert any("alpha_y" in check.text for check in fine)
 
