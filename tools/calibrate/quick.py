@@ -11,6 +11,11 @@ from tools.calibrate.multi_position import Estimate
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
+LARGEST_TURN_RESIDUAL = 0.15
+LEAST_TURN_STEPS = 20.0
+"""Range of an axis over the rms change from sample to sample: 600 for a slow turn, 7 for noise."""
+LARGEST_FLAT_SPREAD_G = 0.05
+LARGEST_FLAT_BIAS_G = 0.5
 
 
 @dataclass(frozen=True)
@@ -52,7 +57,16 @@ def turn(raw: Array) -> QuickResult:
             missing.append(f"{axis} up and down")
     bias = np.array([parameters[f"bias_{a}"].value for a in "xyz"])
     scale = np.array([parameters[f"scale_{a}"].value for a in "xyz"])
-    residual = float(np.std(np.linalg.norm((raw - bias) / scale, axis=1)))
+    steps = np.std(np.diff(raw, axis=0), axis=0)
+    if np.sum(np.ptp(raw, axis=0) > LEAST_TURN_STEPS * steps) < 2:
+        raise InputError("it does not turn: readings go no further than their noise on two axes or all three")
+    size = np.linalg.norm((raw - bias) / np.maximum(scale, 1e-300), axis=1)
+    residual = float(np.std(size))
+    if not missing and max(residual, abs(float(size.mean()) - 1.0)) > LARGEST_TURN_RESIDUAL:
+        raise InputError(
+            f"|a| is {size.mean():.2f} +- {residual:.2f} g with what the extremes say: no slow turn through 360 "
+            "degrees about two axes"
+        )
     return QuickResult("turn", parameters, len(raw), residual, tuple(missing))
 
 
@@ -90,6 +104,16 @@ def flat(raw: Array, counts_per_g: float, up: str) -> QuickResult:
     level = np.zeros(3)
     level[axis] = -counts_per_g if up[0] == "-" else counts_per_g
     part = raw - level
+    moving = float(part.std(axis=0).max()) / counts_per_g
+    if moving > LARGEST_FLAT_SPREAD_G:
+        raise InputError(f"the readings spread by {moving:.2g} g: it moves; let it lie still")
+    off = part.mean(axis=0) / counts_per_g
+    worst = int(np.argmax(np.abs(off)))
+    if abs(off[worst]) > LARGEST_FLAT_BIAS_G:
+        raise InputError(
+            f"axis {'xyz'[worst]} would have an offset of {off[worst]:.2f} g: is {up} the axis that points up, and are "
+            f"{counts_per_g:g} counts one g?"
+        )
     return QuickResult(
         "flat",
         {f"bias_{name}": _mean(part[:, i]) for i, name in enumerate("xyz")},

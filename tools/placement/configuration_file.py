@@ -75,7 +75,10 @@ def load_configuration(given: str, noise_mg: float) -> tuple[Placement, NDArray[
         file = ConfigurationFile.model_validate(table)
     except ValidationError as error:
         first = error.errors()[0]
-        raise InputError(f"{path}: {'.'.join(str(v) for v in first['loc'])}: {first['msg']}") from error
+        where = ".".join(str(v) for v in first["loc"])
+        raise InputError(
+            f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
+        ) from error
     places = np.array(file.positions_mm) * 1e-3 if file.positions_mm else np.array(file.positions_m)
     own = np.full(len(file.axes), noise)
     if file.noise_mg is not None:

@@ -60,7 +60,10 @@ def load_space(path: Path) -> Space:
         raise InputError(f"{path}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]
-        raise InputError(f"{path}: {'.'.join(str(v) for v in first['loc'])}: {first['msg']}") from error
+        where = ".".join(str(v) for v in first["loc"])
+        raise InputError(
+            f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
+        ) from error
 
 
 def space_004(packages: int = 3, axes_per_package: int = 2) -> Space:

@@ -36,6 +36,20 @@ def posed_log(poses: int, seed: int = 1) -> np.ndarray:
     return (force @ turn_in.T) * TRUE_SCALE + TRUE_BIAS + 8.0 * rng.standard_normal(force.shape)
 
 
+def test_quick_methods_refuse_a_log_of_something_else() -> None:
+    rng = np.random.default_rng(0)
+    resting = np.tile([0, 0, 16384.0], (400, 1)) + TRUE_BIAS + 5.0 * rng.standard_normal((400, 3))
+    with pytest.raises(InputError, match="does not turn"):
+        turn(resting)
+    slope = np.linspace(-1.0, 1.0, 400)[:, None] * [16000.0, 16000.0, 16000.0]
+    with pytest.raises(InputError, match="no slow turn"):
+        turn(slope + TRUE_BIAS)
+    with pytest.raises(InputError, match="is -z the axis that points up"):
+        flat(resting, 16384.0, "-z")
+    with pytest.raises(InputError, match="it moves"):
+        flat(resting + np.linspace(0.0, 8000.0, 400)[:, None], 16384.0, "z")
+
+
 def test_poses_give_bias_and_scale_inside_their_intervals() -> None:
     result = identify_poses(posed_log(40), RATE_HZ, G)
     assert result.poses >= 35
