@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
-from types import MappingProxyType
 
+from hal import plugins
 from sim_devices.physics.axes import CROSS_AXIS_NONLINEARITY, MISALIGNMENT, SCALE_FACTOR_VARIATION, SOFT_IRON
 from sim_devices.physics.backlash import BACKLASH
 from sim_devices.physics.creep import CREEP
@@ -64,4 +64,28 @@ _ALL = (
     SENSOR_POSITION_ERROR,
     CHANNEL_DELAY,
 )
-EFFECTS: Mapping[str, Effect] = MappingProxyType({e.name: e for e in _ALL})
+
+
+class _Vocabulary(Mapping[str, Effect]):
+    """Ours, then those of installed packages (entry points of group ``micron.effects``), looked up when asked."""
+
+    def __init__(self) -> None:
+        self._ours = {e.name: e for e in _ALL}
+
+    def _added(self) -> list[str]:
+        return sorted(set(plugins.offered(plugins.EFFECTS)) - set(self._ours))
+
+    def __getitem__(self, name: str) -> Effect:
+        effect = self._ours.get(name) or plugins.load(plugins.EFFECTS, name, Effect)
+        if effect is None:
+            raise KeyError(name)
+        return effect
+
+    def __iter__(self) -> Iterator[str]:
+        return iter((*self._ours, *self._added()))
+
+    def __len__(self) -> int:
+        return len(self._ours) + len(self._added())
+
+
+EFFECTS: Mapping[str, Effect] = _Vocabulary()

@@ -24,36 +24,12 @@ def blocks() -> dict[str, str]:
 
 @pytest.fixture
 def on_path(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The example files in a folder that Python imports from, as an installed package."""
+    """The example files in a folder that Python imports from."""
     for name, text in blocks().items():
         (tmp_path / name).write_text(text)
-    info = tmp_path / "heated_stage-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: heated-stage\nVersion: 1.0\n")
-    entry = re.search(r'(heated_stage) = "(.*?)"', blocks()["pyproject.toml"])
-    assert entry
-    (info / "entry_points.txt").write_text(f"[micron.twins]\n{entry[1]} = {entry[2]}\n")
     monkeypatch.syspath_prepend(str(tmp_path))
     yield tmp_path
-    for name in ("heated_stage", "humidity"):
-        sys.modules.pop(name, None)
-
-
-def test_the_twin_of_the_example_is_diagnosed(on_path: Path):
-    rng = np.random.default_rng(0)
-    t = np.arange(1200) * 0.1
-    power = np.repeat(rng.uniform(0, 10, 24), 50)
-    warm = np.zeros_like(power)
-    for i in range(1, power.size):
-        warm[i] = warm[i - 1] + 0.1 / 4.0 * (power[i - 1] - warm[i - 1])
-    position = 2.1 * warm + rng.normal(0, 0.01, t.size)
-    np.savez(on_path / "data.npz", p=power, z=position)
-    few = [EFFECTS["saturation"], EFFECTS["dead_zone"]]
-    report = diagnose(load(on_path), jobs=1, effects=few)
-    assert report.verdict == "recalibrate"
-    assert report.corrected_base["um_per_W"] == pytest.approx(2.1, rel=0.01)
-    # the data were made with Euler's rule: 1 - 0.1/4 = exp(-0.1/tau)
-    assert report.corrected_base["time_constant_s"] == pytest.approx(-0.1 / np.log(1 - 0.1 / 4.0), rel=0.01)
+    sys.modules.pop("humidity", None)
 
 
 def test_the_effect_of_the_example_is_found(on_path: Path):

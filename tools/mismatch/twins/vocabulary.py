@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from types import MappingProxyType
 from typing import Literal
 
+from hal import plugins
+
 Role = Literal["input", "output", "context"]
-ENTRY_POINTS = "micron.twins"
 _AXES = ("x", "y", "z")
 
 
@@ -67,9 +68,9 @@ KINDS = MappingProxyType(
 )
 
 
-def user_kinds() -> dict[str, object]:
+def user_kinds() -> Mapping[str, object]:
     """Twins that installed packages offer: kind -> entry point (not loaded)."""
-    return {e.name: e for e in entry_points(group=ENTRY_POINTS)}
+    return plugins.offered(plugins.TWINS)
 
 
 def vocabulary(kind: str) -> Vocabulary | None:
