@@ -97,3 +97,7 @@ def test_a_residual_far_above_the_noise_is_said_whatever_the_verdict():
 def test_no_probability_is_believed_beyond_what_a_tail_can_say():
     assert wording.chance(8e-207) == "p < 1e-12"
     assert wording.chance(1e-9) == "p = 1e-09"
+
+
+def test_two_figures_side_by_side_need_no_power_of_ten() -> None:
+    assert [wording.number(v) for v in (7064.2, 890.1, 0.0123456, 2.5e7)] == ["7060", "890", "0.0123", "2.5e+07"]
