@@ -15,7 +15,8 @@ from sim_devices.plant.body_motion import BodyMotion
 class Surroundings:
     """What a device may know of the world: truth at bench times in ns, its entry in the bench file, a seed.
 
-    ``motion`` of the body, with the temperature; ``analog_V`` all voltages at the DAQ's inputs.
+    ``motion`` of the body, with the temperature; ``analog_V`` all voltages at the DAQ's inputs; ``switch(bits, t_ns)``
+    sets the DAQ's digital outputs, which fire the magnetometer's strap.
     """
 
     name: str
@@ -24,6 +25,7 @@ class Surroundings:
     start_ns: int
     motion: Callable[[int], BodyMotion]
     analog_V: VoltageSource
+    switch: Callable[[int, int], None] = lambda bits, t_ns: None
 
 
 @dataclass(frozen=True)

@@ -260,7 +260,8 @@ class World:
         added = added_device(device["driver"])
         if added is None:
             return False
-        made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, self._motion, self._analog_V))
+        senses = self._motion, self._analog_V, self._strap_switch
+        made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, *senses))
         if kind == "daq":
             self._added_V.update(made)
         else:

@@ -13,7 +13,7 @@ import pytest
 def installed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """What ``pip install -e .`` does with the example's ``pyproject.toml``: modules and entry points are found."""
     folder = request.path.parent
-    if not (folder / "pyproject.toml").exists():
+    if not (folder / "pyproject.toml").exists():  # nothing to install
         yield folder
         return
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]

@@ -1,0 +1,56 @@
+"""Devices on a serial line that take commands and speak in lines of text: what one has to say is what each line does.
+
+Model limits
+- What it says is there at once; the carrier makes it as slow as the line. Nothing overflows.
+"""
+
+from __future__ import annotations
+
+from sim_devices.added import Surroundings
+
+
+class LineFace:
+    """Wire face of one device. ``due_ns``: when it acts by itself next. ``frozen`` is a hook for faults."""
+
+    def __init__(self, around: Surroundings) -> None:
+        self.around = around
+        self.unread = 0
+        self.frozen = False
+        self.due_ns: int | None = None
+        self._heard, self._said = b"", bytearray()
+
+    # ------------------------------------------------------------------ for the device to override
+
+    def hear(self, words: list[str], t_ns: int) -> None:
+        """One line of the host, its words; never empty."""
+
+    def act(self, t_ns: int) -> None:
+        """What it does at ``due_ns``, which is now; sets the next one."""
+
+    # ------------------------------------------------------------------
+
+    def say(self, text: str) -> None:
+        """One line for the host."""
+        self._said += text.encode() + b"\n"
+
+    def receive(self, data: bytes, t_ns: int) -> None:
+        if self.frozen:
+            return
+        self.advance_to(t_ns)
+        *lines, self._heard = (self._heard + data).split(b"\n")
+        for line in lines:
+            if words := line.decode("latin-1").split():
+                self.hear(words, t_ns)
+
+    def take(self, max_bytes: int) -> bytes:
+        said = bytes(self._said[:max_bytes])
+        del self._said[:max_bytes]
+        return said
+
+    def next_event_ns(self) -> int | None:
+        return None if self.frozen else self.due_ns
+
+    def advance_to(self, t_ns: int) -> None:
+        while self.due_ns is not None and self.due_ns <= t_ns and not self.frozen:
+            now_ns, self.due_ns = self.due_ns, None
+            self.act(now_ns)

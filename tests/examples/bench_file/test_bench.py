@@ -1,0 +1,31 @@
+"""It is a bench, the instrument works on it in virtual time, and a slip in it is named before anything is opened."""
+
+import pytest
+
+from drivers.specs import check_devices
+from firmware_py.app import RunRequest, run_in_process
+from hal.bench import load_bench
+from hal.errors import BenchError
+
+
+def test_the_instrument_runs_on_it(installed):
+    outcome, truth = run_in_process(RunRequest(installed / "bench.toml", 2.0, virtual=True))
+    assert set(outcome["devices"]) == {"daq", "piezo"}
+    assert outcome["samples"]["lost"] == 0
+    assert outcome["safe_state"]["normal"]
+    assert abs(truth["stroke_m"]).max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong", "message"),
+    [
+        ("z = 1", "z = 2", r"\[device\.acc2\] channel 2 of 'daq' is taken by 'acc1'"),
+        ("rate_hz = 1000", "rate_hz = 500", r"the scans drive the tick of 1000 Hz; make them equal"),
+        ('bus = "i2c0"', 'bus = "i2c1"', r"\[device\.piezo\.bus\] no bus named 'i2c1'"),
+        ("address = 0x0C", "adress = 0x0C", r"adress\] unknown key; check the spelling"),
+    ],
+)
+def test_a_slip_is_named(installed, tmp_path, right, wrong, message):
+    (tmp_path / "bench.toml").write_text((installed / "bench.toml").read_text().replace(right, wrong))
+    with pytest.raises(BenchError, match=message):
+        check_devices(load_bench(tmp_path / "bench.toml").description, "bench.toml")
