@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -22,3 +23,10 @@ def test_the_guide_shows_every_file(name: str):
 @pytest.mark.parametrize("name", GUIDES)
 def test_it_takes_fewer_than_120_lines_of_code_tests_included(name: str):
     assert sum(len(p.read_text(encoding="utf-8").splitlines()) for p in (HERE / name).glob("*.py")) < 120
+
+
+@pytest.mark.parametrize("file", sorted(HERE.glob("*/pyproject.toml")), ids=lambda file: file.parent.name)
+def test_all_of_its_modules_are_installed(file: Path):
+    """Without the list, setuptools refuses a folder that holds more than one module, tests included."""
+    listed = tomllib.loads(file.read_text(encoding="utf-8"))["tool"]["setuptools"]["py-modules"]
+    assert sorted(listed) == sorted(p.stem for p in file.parent.glob("*.py") if not p.stem.startswith("test_"))
