@@ -28,11 +28,11 @@ def hands(
     data: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the real recordings.")] = Path(
         "../shared/data"
     ),
-    seconds: Annotated[float, typer.Option(min=4.0, max=600.0)] = 15.0,
+    seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Run the instrument in every recorded hand, with each estimator, in virtual time.
+    """Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.
 
     Example: micron hands --out docs/first-results.md
     """
@@ -40,15 +40,13 @@ def hands(
         check_writable(json_file, out)
         if not data.is_dir():
             raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
-        load_bench(bench_path(bench))
+        file = load_bench(bench_path(bench))
         rows: list[HandRow] = []
         with Progress(
             SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(), transient=True
         ) as progress:
             task = progress.add_task("starting")
-            rows.extend(
-                run_hands(bench_path(bench), data, seconds, lambda text: progress.update(task, description=text))
-            )
+            rows.extend(run_hands(file, data, seconds, lambda text: progress.update(task, description=text)))
         page = markdown(rows, seconds, git_revision() or "unknown")
         if out is not None:
             write_text_atomic(out, page)

@@ -16,7 +16,7 @@ def report(
     ),
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
     section: Annotated[
-        Literal["inspect", "evaluate", "cascade", "detectors"] | None,
+        Literal["inspect", "evaluate", "published", "cascade", "detectors"] | None,
         typer.Option(help="Make this section of --out again and keep the others."),
     ] = None,
 ) -> None:

@@ -108,10 +108,11 @@ def simulate(
     hand_file: str | None = None,
     hand_scale: float | None = None,
     delay_s: float = COMMAND_DELAY_S,
+    method: str | None = None,
     keep_frames: bool = False,
     on_time: Callable[[float], None] | None = None,
 ) -> SimulatedRun:
-    """``seconds`` in closed loop after arming. Same arguments, same bits.
+    """``seconds`` in closed loop after arming. Same arguments, same bits. ``method``: another tremor estimator.
 
     Raises ``BenchError`` or ``InputError`` for a bench that is not this instrument. ``on_time`` hears the seconds done.
     """
@@ -121,7 +122,7 @@ def simulate(
     emulation = emulation_config(table)
     if emulation.endoscope is not None:
         raise InputError(f"{bench.path}: an endoscope bench has no closed loop")
-    config, configs = load_firmware_config(bench, {})
+    config, configs = load_firmware_config(bench, {}, method)
     watch = round(config.self_test.watch_ms)
     wire = wires_of(bench, watch, delay_s)
     ticks = watch + round(1000.0 * seconds)

@@ -1,21 +1,28 @@
-"""The instrument in real hands: closed loop on recorded tremor, for both estimators, as a table.
+"""The instrument in real hands: closed loop on recorded tremor, for three estimators, beside the limits, as a table.
 
-Recorded hands give the tremor; voluntary path and drift stay synthetic, all sensor and actuator errors are on.
+Recorded hands give the tremor; voluntary path and drift stay synthetic, all sensor and actuator errors are on. Runs are
+those without wires (``tools.closed_loop``), which leave the same tremor as runs over the wire.
 """
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_py.app import RunRequest, run_in_process
+import numpy as np
+
+from hal.bench import BenchFile
+from sim_devices.plant.recorded_hand import make_hand
+from sim_devices.plant_factory import emulation_config
+from tools.closed_loop.simulate import SimulatedRun, simulate
+from tools.reports.hand_limits import causal_um, known_tremor_um
 from tools.reports.tremor_figures import TremorFigures, tremor_figures
 
 METHODS = ("adaptive", "kalman", "wflc_flc")
-SETTLE_S = 2.0
+SETTLE_S = 5.0
+GOAL_PERCENT = 70.0
 HANDS = (
     ("physiological tremor of a stretched arm", "tremor_duke_adxl345/data.npz#arm_extended_no_tremor"),
     ("wrist, imitated tremor", "tremor_duke_adxl345/data.npz#on_wrist_simulated_tremor1"),
@@ -35,6 +42,10 @@ class HandRow:
     method: str
     figures: TremorFigures
     limited_percent: float
+    stroke_limit_um: float
+    """Left in 8 to 12 Hz if the tremor were known: what the strokes take."""
+    causal_limit_um: float
+    """Left there by the best causal linear filter fitted to this hand, without any stroke's end."""
 
     def as_dict(self) -> dict[str, Any]:
         """JSON values."""
@@ -43,39 +54,38 @@ class HandRow:
             "source": self.source,
             "method": self.method,
             "limited_percent": self.limited_percent,
+            "stroke_limit_um": self.stroke_limit_um,
+            "causal_limit_um": self.causal_limit_um,
             **self.figures.to_json(),
         }
 
 
-def bench_with_method(bench: Path, method: str, folder: Path) -> Path:
-    """A copy of ``bench`` whose estimator is ``method``; calibration paths stay those of the original."""
-    text = bench.read_text(encoding="utf-8")
-    copy = folder / f"{bench.stem}-{method}.toml"
-    calibration = bench.parent.resolve() / "calibration"
-    text = text.replace('"calibration/', f'"{calibration}/')
-    text = text.replace("[firmware.tremor]\n", f'[firmware.tremor]\nmethod = "{method}"\n')
-    copy.write_text(text, encoding="utf-8")
-    return copy
-
-
-def run_hands(bench: Path, data: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[HandRow]:
-    """Virtual runs of every hand that is there, with every estimator."""
+def run_hands(bench: BenchFile, data: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[HandRow]:
+    """Every hand that is there, with every estimator."""
     cases: list[tuple[str, str | None]] = [("synthetic hand, seed 1", None)]
     cases += [(name, str(data / source)) for name, source in HANDS if (data / source.split("#")[0]).exists()]
-    with tempfile.TemporaryDirectory(prefix="micron-hands-") as folder:
-        benches = {method: bench_with_method(bench, method, Path(folder)) for method in METHODS}
-        for name, source in cases:
-            for method, file in benches.items():
-                progress(f"{name}, {method}")
-                outcome, truth = run_in_process(RunRequest(file, seconds, virtual=True, hand_file=source))
-                assert truth is not None  # virtual runs are emulated
-                figures = tremor_figures(
-                    truth, from_ns=outcome["armed_ns"] + round(SETTLE_S * 1e9), to_ns=outcome["safe_ns"]
-                )
-                if figures is not None:
-                    commands = outcome["commands"]
-                    limited = 100.0 * commands["clipped"] / max(1, commands["sent"])
-                    yield HandRow(name, Path(source).name if source else "-", method, figures, limited)
+    for name, source in cases:
+        limits: tuple[float, float] | None = None
+        for method in METHODS:
+            progress(f"{name}, {method}")
+            run = simulate(bench, seconds, hand_file=source, method=method)
+            from_ns = run.armed_ns + round(SETTLE_S * 1e9)
+            figures = tremor_figures(run.truth, from_ns=from_ns, to_ns=run.safe_ns)
+            if figures is None:
+                continue
+            if limits is None:
+                progress(f"{name}, limits")
+                limits = _limits(bench, source, run, from_ns)
+            limited = 100.0 * run.clipped / (1000.0 * seconds)
+            yield HandRow(name, Path(source).name if source else "-", method, figures, limited, *limits)
+
+
+def _limits(bench: BenchFile, source: str | None, run: SimulatedRun, from_ns: int) -> tuple[float, float]:
+    emulation = emulation_config(bench.description.model_dump())
+    body = make_hand(emulation.hand, emulation.seed, source).frame
+    t_ns = np.asarray(run.truth["t_ns"])
+    keep = (t_ns >= from_ns) & (t_ns < run.safe_ns - 500_000_000)  # zero-phase bands are not trusted at the end
+    return known_tremor_um(run.truth, keep, np.asarray(body), run.configs.actuation), causal_um(run.truth, keep)
 
 
 def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
@@ -84,32 +94,47 @@ def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
         "# First results: the closed loop in real hands",
         "",
         f"Made by `micron hands --out docs/first-results.md`, firmware revision {revision}; {seconds:g} s of virtual",
-        "time each, scored from 2 s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the physical truth,",
-        "manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p in 8-12 Hz over",
-        "the whole part that was chosen; the emulated instrument has all its sensor and actuator errors on.",
+        f"time each, scored from {SETTLE_S:g} s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the",
+        "physical truth, manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p",
+        "in 8-12 Hz over the whole part that was chosen; the emulated instrument has all its sensor and actuator",
+        "errors on.",
         "",
-        "| hand | estimator | without (um rms) | with (um rms) | less (%) | at a limit (% of ticks) "
-        "| all bands, without -> with (um rms) |",
-        "|---|---|---|---|---|---|---|",
+        "| hand | estimator | without (um rms) | with (um rms) | less (%) | limits: stroke, causal (%) "
+        "| at a limit (% of ticks) | all bands, without -> with (um rms) |",
+        "|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
-        band, whole = row.figures.vector, row.figures.whole_band
+        vector, whole = row.figures.vector, row.figures.whole_band
+        before = vector.uncompensated_rms_um
+        stroke, causal = (100.0 * (1.0 - left / before) for left in (row.stroke_limit_um, row.causal_limit_um))
         cells = (
             row.hand,
             row.method,
-            f"{band.uncompensated_rms_um:.2f}",
-            f"{band.compensated_rms_um:.2f}",
-            f"{band.reduction_percent:.1f}",
+            f"{before:.2f}",
+            f"{vector.compensated_rms_um:.2f}",
+            f"{vector.reduction_percent:.1f}",
+            f"{stroke:.1f}, {causal:.1f}",
             f"{row.limited_percent:.1f}",
             f"{whole.uncompensated_rms_um:.1f} -> {whole.compensated_rms_um:.1f}",
         )
         lines.append(f"| {' | '.join(cells)} |")
+    best = {row.hand: row.figures.vector.reduction_percent for row in rows if row.method == METHODS[0]}
+    short = [f"{hand} ({less:.1f} %)" for hand, less in best.items() if less < GOAL_PERCENT]
     lines += [
+        "",
+        f"Goal: {GOAL_PERCENT:g} % with the default estimator, `{METHODS[0]}`: reached in {len(best) - len(short)} of "
+        f"{len(best)} hands" + (f"; not in: {', '.join(short)}." if short else "."),
+        "",
+        "Limits: what the stroke alone would leave if the tremor were known beforehand, and what the best causal",
+        "linear filter leaves, fitted to this very hand and with sensor noise, if no stroke ended. Both at once leave",
+        "more. Participant 5's hand trembles hardly more than the sensors' noise but for one swing of 0.5 mm rms, 14",
+        "to 17 s after the start: in a long run it decides the whole figure, drives the manipulator to its ends, and",
+        "the estimator meets it unprepared (the causal limit has seen it).",
         "",
         "Published for comparison: 69 % with WFLC alone in one dimension, sensing excluded (000, section 5.2).",
         "All bands: error against the intended path. It holds what the instrument does not try to cancel: drift, jerks",
-        "and everything below the tremor band. At a limit: the wanted displacement was out of the manipulator's reach",
-        "or the amplifier's range; a hand whose motion just below the band is large (participant 5) drives it there.",
+        "and everything below 2 Hz. At a limit: the wanted displacement was out of the manipulator's reach or the",
+        "amplifier's range. Motion below the tremor band yields its stroke to the band, so its error can stay large.",
         "",
     ]
     return "\n".join(lines)

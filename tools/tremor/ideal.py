@@ -11,6 +11,7 @@ filter (and noise), at the loop's delay. It knows no instrument: what it leaves 
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from math import ceil
 from pathlib import Path
@@ -103,11 +104,23 @@ def ideal_run(bench: Path, seconds: float, noise: bool, seed: int | None = None)
     return IdealRow(what, figures.vector.reduction_percent, 1e6 * loop, 1e6 * bound)
 
 
-def residuals(truth: dict[str, Array], keep: NDArray[np.bool_], noise: bool) -> tuple[float, float]:
+def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> tuple[float, float]:
     """Lifted residual (m rms) of the run and of the bound over the rows ``keep`` of ``truth``."""
-    rigid, tip, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "tip_m", "intended_m"))
     design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
-    wanted, left = (lift(_involuntary(x - intended), design) for x in (rigid, tip))
+    left = involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"]))
+    lifted = [lift(x, design)[keep] for x in (left, bound_residual(truth, keep, noise))]
+    loop, bound = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in lifted)
+    return loop, bound
+
+
+def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> Array:
+    """(n, 3) m: what the best fixed causal linear filter of this very record leaves of the involuntary motion.
+
+    Fitted over the rows ``keep``, lifted, at ``LOOP_DELAY_S``, to the tip's acceleration behind the sensor's filter.
+    """
+    rigid, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "intended_m"))
+    design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
+    wanted = involuntary(rigid - intended)
     samples = np.zeros_like(rigid)
     samples[1:-1] = np.diff(rigid, 2, axis=0) * RATE_HZ**2
     samples = rc_filter(samples)
@@ -115,16 +128,17 @@ def residuals(truth: dict[str, Array], keep: NDArray[np.bool_], noise: bool) -> 
         samples = samples + sensor_noise(samples.shape, 99)
     ticks = ceil(LOOP_DELAY_S * RATE_HZ)
     rows = np.flatnonzero(keep)[::EVERY]
-    total = 0.0
+    left = wanted.copy()
     for i in range(3):
-        features = lift(bank_features(samples[:, i], design), design)[rows - ticks]
-        goal = wanted[rows, i]
+        plain = bank_features(samples[:, i], design)
+        features = lift(plain, design)[rows - ticks]
+        goal = lift(wanted[:, i], design)[rows]
         best = solve_scaled(features.T @ features, (features.T @ goal)[None, :])[0]
-        total += float(np.mean((goal - features @ best) ** 2))
-    return float(np.sqrt(np.mean(np.sum(left[keep] ** 2, axis=1)))), float(np.sqrt(total))
+        left[ticks:, i] -= (plain @ best)[:-ticks]
+    return left
 
 
-def _involuntary(x: Array) -> Array:
+def involuntary(x: Array) -> Array:
     """(n, 3) between the edges of ``INVOLUNTARY_HZ``, without phase."""
     hz = np.asarray(np.fft.rfftfreq(len(x), 1.0 / RATE_HZ), dtype=np.float64)
     band = involuntary_band(hz)

@@ -17,6 +17,7 @@ Section = Callable[[list[TremorSignal], Progress], list[str]]
 SECTIONS = {
     "inspect": "tools.tremor.report_inspect",
     "evaluate": "tools.tremor.report_evaluate",
+    "published": "tools.tremor.report_published",
     "cascade": "tools.tremor.report_cascade",
     "detectors": "tools.tremor.report_detectors",
 }

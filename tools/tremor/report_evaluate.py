@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from firmware_py.tremor.config import Method
 from tools.errors import InputError
-from tools.tremor.cases import Case, case_of
+from tools.tremor.adapting import AT_S, LEADS_S, WINDOW_S, adapting
+from tools.tremor.cases import Case, case_of, emulated_hand
 from tools.tremor.evaluate import ORACLE, OTHERS, evaluate, summarise
 from tools.tremor.report import table
 from tools.tremor.signals import TremorSignal
 
 METHODS: tuple[Method, ...] = ("adaptive", "kalman", "wflc_flc", "bmflc_kalman")
-HORIZONS_MS = (2, 20)
+HORIZONS_MS = (0, 2, 8, 20)
+LOOP_MS = 2
+GOAL = 1.15
+EMULATED = (101, 102, 103)
 PART_S = (20.0, 50.0)
 
 
@@ -34,7 +40,8 @@ def chosen(signals: Sequence[TremorSignal]) -> list[Case]:
 
 def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> list[str]:
     """Markdown lines."""
-    results = evaluate(chosen(signals), METHODS, HORIZONS_MS, progress=progress)
+    cases = [*chosen(signals), *(emulated_hand(seed) for seed in EMULATED)]
+    results = evaluate(cases, METHODS, HORIZONS_MS, progress=progress)
     lines = summarise(results)
     out = [
         "## Estimators beside the limit",
@@ -42,7 +49,8 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         "Each hand is scaled to the instrument's 50 um peak to peak, the instrument's sensor noise is added, and what",
         "each method leaves of the motion between 2 and 20 Hz is counted from 5 s on, in percent of its rms. Lifted:",
         "an error in 8 to 12 Hz counts four times, as the loop is asked to weigh it; the limits are the best causal",
-        "linear filters (fixed) in that measure, trained on other people's records or on the very record.",
+        "linear filters (fixed) in that measure, trained on other people's records or on the very record. Emulated",
+        "hands: three seeds that nothing was tuned on.",
         "Settings of the adaptive method were chosen on other parts of the recordings (80 to 110 s) and on emulated",
         "hands. Where one burst outweighs the whole record (wrist, mouse 03 and 05), the oracle has seen it before and",
         "pays for it in every calm second; a filter that learns meets it with its prior.",
@@ -65,10 +73,35 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         ]
         head = ["set, method", "records", "2-20 Hz", "8-12 Hz", "lifted", "/ others", "/ oracle", "late (ms)"]
         out += [f"{h} ms ahead:", "", *table(head, rows), ""]
-    people = [r for r in results if r.horizon_ms == HORIZONS_MS[0]]
+    people = [r for r in results if r.horizon_ms == LOOP_MS]
     names = (*METHODS, OTHERS, ORACLE)
     rows = []
     for case in dict.fromkeys(r.case for r in people):
         by_method = {r.method: r.score.lifted_percent for r in people if r.case == case}
-        rows.append([case, *(f"{by_method[m]:.1f}" if m in by_method else "-" for m in names)])
-    return [*out, f"Per record, {HORIZONS_MS[0]} ms ahead, lifted (%):", "", *table(["record", *names], rows)]
+        ratio = by_method[METHODS[0]] / by_method[ORACLE]
+        rows.append([case, *(f"{by_method[m]:.1f}" if m in by_method else "-" for m in names), f"{ratio:.2f}"])
+    near = sum(float(row[-1]) <= GOAL for row in rows)
+    out += [
+        f"Per record, {LOOP_MS} ms ahead, lifted (%); the last column is adaptive / oracle, goal {GOAL:g}: "
+        f"{near} of {len(rows)} records.",
+        "",
+        *table(["record", *names, "ratio"], rows),
+        "",
+    ]
+    progress("adaptation")
+    known = adapting(cases, LOOP_MS)
+    mean = [float(np.mean([row[n] for row in known.values()])) for n in range(len(LEADS_S))]
+    worst = [max(row[n] for row in known.values()) for n in range(len(LEADS_S))]
+    return [
+        *out,
+        "### A new hand",
+        "",
+        f"The stretch from {AT_S:g} s to {AT_S + WINDOW_S:g} s of each of {len(known)} records, met by an estimator",
+        f"that was started some time before it: what it leaves, lifted, {LOOP_MS} ms ahead, over what an estimator",
+        f"leaves that has known the hand for {LEADS_S[-1]:g} s.",
+        "",
+        *table(
+            ["records", *(f"{lead:g} s" for lead in LEADS_S)],
+            [["mean", *(f"{x:.2f}" for x in mean)], ["worst", *(f"{x:.2f}" for x in worst)]],
+        ),
+    ]

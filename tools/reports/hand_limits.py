@@ -1,0 +1,53 @@
+"""What no instrument of this kind could better in one hand: the manipulator's stroke, and causal estimation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.actuation.config import ActuationConfig
+from firmware_py.actuation.stage import Actuation
+from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
+from firmware_py.tremor.adaptive_design import band
+from firmware_py.tremor.config import AdaptiveConfig
+from tools.reports.tremor_figures import TREMOR_BAND_HZ, band_pass
+from tools.tremor.cases import RATE_HZ
+from tools.tremor.ideal import bound_residual
+
+Array = NDArray[np.float64]
+
+
+def band_rms_um(x: Array, keep: NDArray[np.bool_]) -> float:
+    """``x`` (n, 3) m in 8 to 12 Hz over the rows ``keep``, as a vector, um."""
+    return float(1e6 * np.sqrt(np.mean(np.sum(band_pass(x, RATE_HZ, TREMOR_BAND_HZ)[keep] ** 2, axis=1))))
+
+
+def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: Array, config: ActuationConfig) -> float:
+    """um rms left in 8 to 12 Hz if the tremor were known: only the strokes and the way slow motion yields to it.
+
+    ``body`` (3, 3): axes of the body as columns, in the world.
+    """
+    moved = (np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"])) @ body
+    moved = moved - moved.mean(axis=0)
+    hz = np.asarray(np.fft.rfftfreq(len(moved), 1.0 / RATE_HZ), dtype=np.float64)
+    lines = np.fft.rfft(moved, axis=0)
+    a = AdaptiveConfig()
+    whole, core = (
+        np.asarray(np.fft.irfft(lines * band(hz, edges)[:, None], len(moved), axis=0))
+        for edges in ((*a.cancel_from_hz, *a.cancel_to_hz), a.core_hz)
+    )
+    frames = np.zeros((len(moved), LAYOUT.size))
+    frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
+    frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = whole
+    frames[:, TREMOR_CORE : TREMOR_CORE + 3] = core
+    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3)))}))
+    for frame in frames:
+        stage.step(frame)
+    return band_rms_um(moved + frames[:, DESIRED_TIP : DESIRED_TIP + 3], keep)
+
+
+def causal_um(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> float:
+    """um rms left in 8 to 12 Hz by the best causal linear filter, fitted to this very hand; no stroke ends."""
+    return band_rms_um(bound_residual(truth, keep, noise=True), keep)
