@@ -20,9 +20,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.app import RunRequest, run_in_process
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
 from firmware_py.tremor.config import TremorConfig
+from hal.bench import load_bench
+from tools.closed_loop.simulate import simulate
 from tools.reports.tremor_figures import tremor_figures
 from tools.tremor.bench_variant import merged, write_variant
 from tools.tremor.bound import bank_features, lift
@@ -87,12 +88,12 @@ def ideal_changes(noise: bool) -> dict[str, Any]:
 
 
 def ideal_run(bench: Path, seconds: float, noise: bool, seed: int | None = None) -> IdealRow:
-    """One virtual run on the ideal instrument and its bound. Raises ValueError when nothing is left to score."""
+    """One run without wires on the ideal instrument and its bound. Raises ValueError when nothing is left to score."""
     with tempfile.TemporaryDirectory(prefix="micron-ideal-") as folder:
         file = write_variant(bench, ideal_changes(noise), Path(folder), "ideal")
-        outcome, truth = run_in_process(RunRequest(file, seconds, virtual=True, seed=seed))
-    assert truth is not None  # virtual runs are emulated
-    from_ns, to_ns = outcome["armed_ns"] + round(SETTLE_S * 1e9), outcome["safe_ns"]
+        run = simulate(load_bench(file), seconds, seed=seed)
+    truth = run.truth
+    from_ns, to_ns = run.armed_ns + round(SETTLE_S * 1e9), run.safe_ns
     figures = tremor_figures(truth, from_ns=from_ns, to_ns=to_ns)
     if figures is None:
         raise ValueError(f"{seconds:g} s is too short: {SETTLE_S:g} s of adaptation are not scored")

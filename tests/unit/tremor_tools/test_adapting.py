@@ -1,0 +1,24 @@
+"""What an estimator leaves of a stretch after more or less time with the hand."""
+
+from __future__ import annotations
+
+import pytest
+
+from firmware_py.tremor.config import TremorConfig
+from tools.tremor.adapting import LEADS_S, adapting
+from tools.tremor.cases import emulated_hand, shorter
+
+
+def test_a_hand_is_known_better_after_a_while_and_short_records_are_left_out() -> None:
+    hand = emulated_hand(31, 26.0)
+    found = adapting([hand, shorter(hand, 20.0)], 2)
+    (ratios,) = found.values()
+    assert len(ratios) == len(LEADS_S)
+    assert ratios[-1] == 1.0
+    assert ratios[0] > 1.0
+    # without learning every lead beyond the run-in leaves the same
+    still = TremorConfig().model_copy(
+        update={"adaptive": TremorConfig().adaptive.model_copy(update={"prior_s": 1e9, "burst_prior_s": 1e9})}
+    )
+    (same,) = adapting([hand], 2, still).values()
+    assert same[2] == pytest.approx(1.0, abs=1e-3)
