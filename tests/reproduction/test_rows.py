@@ -12,7 +12,8 @@ from tools.cli.common import InputError
 from tools.reproduce import real_sensors
 from tools.reproduce.names import MODULES, expand
 from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
-from tools.reproduce.rows import Row, build
+from tools.reproduce.page import markdown
+from tools.reproduce.rows import Row, Table, build
 from tools.reproduce.sensing_drift import rows as drift_rows
 from tools.reproduce.sensing_variance import placement_tables, table_2_4
 
@@ -29,6 +30,15 @@ def test_meets_is_computed() -> None:
     assert row(1.0, 1.1, "higher").meets
     assert not row(1.0, 0.9, "higher").meets
     assert not row(1.0, math.nan, "lower").meets
+
+
+def test_the_page_says_what_is_not_met_and_why() -> None:
+    missed = Row("000", "rms | x", "um", "at rest", 5.0, 5.2, "lower", "not reproducible", why="not printed")
+    page = markdown([Table("sensing", (row(1.0, 1.0, "equal"), missed), 0.0)], "micron reproduce sensing", "abc")
+    assert "1 of 2 met" in page
+    assert "- rms \\| x (000): 5.2, published at most 5 um; cannot be reproduced: not printed" in page
+    assert page.count("\n| ") == 3
+    assert "**no**" in page.splitlines()[-1]
 
 
 def test_the_json_has_the_keys_of_the_contract() -> None:

@@ -3,24 +3,38 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from tools.cli.common import JsonOption, check_writable, clear_errors, console, data_console, write_json
+from firmware_py.recording.revision import git_revision
+from tools.cli.common import (
+    JsonOption,
+    check_writable,
+    clear_errors,
+    console,
+    data_console,
+    write_json,
+    write_text_atomic,
+)
 
 
 def reproduce(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="sensing, real-sensors, ... or all.")],
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the tables as a page (Markdown).")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Compute published figures again and print them beside ours.
 
     Example: micron reproduce sensing --json out/sensing.json
+
+    A page: micron reproduce sensing real-sensors --out docs/sensing-tables.md
     """
     from tools.reproduce.names import expand, reproduce_table
+    from tools.reproduce.page import markdown
     from tools.reproduce.rows import Table
 
     def show(table: Table) -> None:
@@ -52,10 +66,13 @@ def reproduce(
             console().print(note, soft_wrap=True)
 
     with clear_errors():
-        check_writable(json_file)
+        check_writable(json_file, out)
         tables: list[Table] = []
         for name in expand(names):
             tables.append(reproduce_table(name))
             show(tables[-1])
+        if out is not None:
+            command = f"micron reproduce {' '.join(names)} --out {out}"
+            write_text_atomic(out, markdown(tables, command, git_revision() or "unknown"))
         results = [table.as_dict() for table in tables]
         write_json(results[0] if len(results) == 1 else {"format": 1, "tables": results}, json_file)
