@@ -17,6 +17,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -97,8 +98,9 @@ def page(rows: list[Row], failed: list[Failure], about: dict[str, object]) -> st
 
 
 def plain(row: Row) -> dict[str, object]:
-    """JSON has no nan."""
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in asdict(row).items()}
+    """JSON has no nan, and numpy's numbers are none of its own."""
+    table = {k: v.item() if isinstance(v, np.generic) else v for k, v in asdict(row).items()}
+    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in table.items()}
 
 
 def row_of(found: dict[str, object]) -> Row:
