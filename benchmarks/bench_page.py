@@ -119,7 +119,10 @@ def measure() -> dict[str, float]:
             )  # fmt: skip
             used_s = cpu_s(server.pid) - used_s
             watched = counts(url)
-            skipped = state(url)["status"]["skipped"] - skipped
+            ended = state(url)
+            if ended["phase"] == "safe":
+                raise RuntimeError(f"the firmware went to its safe state, nothing to measure: {ended['reason']}")
+            skipped = ended["status"]["skipped"] - skipped
         finally:
             server.send_signal(signal.SIGTERM)
             server.communicate(timeout=60)

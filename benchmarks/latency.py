@@ -67,6 +67,8 @@ def rows() -> Iterator[Row]:
     echo = echo_us()
     run_in_process(RunRequest(bench_path(None), 0.5))  # kernels compiled or read, here and in the emulated world
     outcome, _ = run_in_process(RunRequest(bench_path(None), SECONDS))
+    if not outcome["safe_state"]["normal"]:
+        raise RuntimeError(f"the run ended early, nothing to measure: {outcome['safe_state']['reason']}")
     latency = outcome["latency"]["sample_to_command_us"]
     for name, share, must in (("p50", 50.0, True), ("p99", 99.0, False), ("p99_9", 99.9, False)):
         ours, peer = latency[name] - BUS_US, float(np.percentile(echo, share))
