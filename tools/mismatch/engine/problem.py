@@ -127,7 +127,10 @@ class Problem:
             sizes = [float(b - a) for a, b in spans if b - a >= 128]
             if not found:
                 continue
-            rms = max(float(np.sqrt(np.average([f[0] ** 2 for f in found], weights=sizes))), old.step / np.sqrt(12.0))
+            rms = float(np.sqrt(np.average([f[0] ** 2 for f in found], weights=sizes)))
+            if old.step > 0:
+                # readings on a grid: noise shows as the readings that fell on the other side of an edge
+                rms = max(rms, min(old.step / np.sqrt(12.0), float(np.std(residual[o][self.held_rows]))))
             if rms < 0.95 * old.rms:
                 floors[o] = replace(old, rms=rms, white_rms=min(old.white_rms, rms))
         return self.with_floors(floors) if floors != dict(self.floors) else self
