@@ -246,8 +246,8 @@ def triad_alone(result: SceneResult) -> tuple[Array, Array]:
 
 WHY_TILT = "what noise alone does is a row of its own; the rest is what calibration leaves"
 WHY_HEADING = (
-    "the filter takes slow errors of the field (0.3 deg over 3 s) for possible and follows it no closer; TRIAD "
-    "believes the field at once, which pays here, where none is near"
+    "the filter takes slow errors of the field (0.3 deg over 3 s) for possible and follows it no closer, TRIAD "
+    "believes it at once; here no magnet is near"
 )
 
 
