@@ -7,7 +7,11 @@ from tools.faults.fault import Fault, InWorld, OnBus, OnHost
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
-ONE_BYTE = "one transfer in a thousand is wrong for 1 ms; registers are read back at 100 Hz only"
+ONE_BYTE = (
+    "each wrong command stands for 1 ms; reading back every command takes 0.21 ms more, which beside the magnetometer "
+    "and the monitor does not fit a tick at 400 kHz, the fastest that the DAC allows; registers are read back at 100 Hz, "
+    "outputs measured at 400 Hz; a link with checksums (E-727, CAN amplifier) sees each"
+)
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
@@ -106,8 +110,8 @@ def output_bus() -> tuple[Fault, ...]:
         Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", ("piezo",)),
         piezo("one transfer in a hundred refused", "safe state", watch_s=0.6, nack=0.01),
         piezo("half of the transfers lost", "safe state", loss=0.5),
-        piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0),
-        piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1),
+        piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0, why=ONE_BYTE),
+        piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1, why=ONE_BYTE),
         piezo("a bit wrong in one transfer of a thousand", "cannot be seen", write_corruption=0.001, why=ONE_BYTE),
         piezo("transfers 1 ms late", "noticed", delay=1.0, delay_s=0.001),
         piezo("transfers sent twice", "noticed", duplication=1.0),
