@@ -9,8 +9,8 @@ DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
 ONE_BYTE = (
     "each wrong command stands for 1 ms; reading back every command takes 0.21 ms more, which beside the magnetometer "
-    "and the monitor does not fit a tick at 400 kHz, the fastest that the DAC allows; registers are read back at 100 Hz, "
-    "outputs measured at 400 Hz; a link with checksums (E-727, CAN amplifier) sees each"
+    "and the monitor does not fit a tick at 400 kHz, the fastest that the DAC allows; registers are read back at "
+    "100 Hz, outputs measured at 400 Hz; a link with checksums (E-727, CAN amplifier) sees each"
 )
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"

@@ -22,13 +22,12 @@ random instant, or is there when the bench is opened ("at start").
 | answers as expected below | all | {as_expected} of {runs} |
 
 How it is measured. Known: the firmware tripped, or counted it under a name (`noticed` in the run's JSON), or refused
-to start; within 20 ms of the instant at which the tip is 5 um astray. The tip's error is its distance from the same run
-without the fault (same hand, same noise, bit for bit the same until the strike), until the decision; that is all that the
-fault does to the tip, and 5 um of it are less than what is left of the tremor in a healthy run. Faults that also shift
-when samples are taken are given what other noise would do. Unsafe: a demand that arrives at the amplifier beyond
-0..100 V or faster than 20 V/ms, or a channel that is not neutral 21 ms after the decision although the report says that
-it is; a report that says "neutral NOT confirmed" makes no such claim. Uncounted: scans that the device took and that are
-neither received, nor reported lost, nor unread at the end.
+to start; within 20 ms of the instant at which the tip is 5 um astray. The tip's error is its distance from the same
+run without the fault (same hand, same noise, bit for bit the same until the strike), until the decision. Faults that
+also shift when samples are taken are given what other noise would do. Unsafe: a demand that arrives at the amplifier
+beyond 0..100 V or faster than 20 V/ms, or a channel that is not neutral 21 ms after the decision although the report
+says that it is; a report that says "neutral NOT confirmed" makes no such claim. Uncounted: scans that the device took
+and that are neither received, nor reported lost, nor unread at the end.
 
 ## What is not seen, or too late
 
@@ -43,28 +42,29 @@ Death: ramp at once, 16 steps of a millisecond, read back, then watched for 50 m
 way. Silence: noticed after 8 ms, taken over after 41 ms.
 
 The outputs belong to one of the two at any time. Every command of the firmware renews a lease of 40 ms; immediately
-before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs or
-its lease is over, and only then sends. A lease that is over stays over: the firmware goes to its safe state, says so, and
-sends nothing more. The guardian waits until the lease has certainly expired, takes the outputs, and a step later looks
-whether a command was going out: none, or one that the DAC holds already, and it ramps; one that is still to come (the
-firmware stands still between its look and the wire), and it ends the firmware's process first and waits for the kernel to
-confirm that. Where it may not end it (firmware inside another program) it waits 100 ms, and its report says that a command
-may have come afterwards. The other way round the firmware ends a guardian that has not reached neutral 22 ms after it took
-the outputs, and then ramps itself. Heartbeats go both ways: a guardian that is not heard for 100 ms is noticed.
-`tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at seven phases of a tick, in virtual time, exactly.
+before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs
+or its lease is over, and only then sends. A lease that is over stays over: the firmware goes to its safe state, says
+so, and sends nothing more. The guardian waits until the lease has certainly expired, takes the outputs, and a step
+later looks whether a command was going out: none, or one that the DAC holds already, and it ramps; one that is still
+to come (the firmware stands still between its look and the wire), and it ends the firmware's process first and waits
+for the kernel to confirm that. Where it may not end it (firmware inside another program) it waits 100 ms, and its
+report says that a command may have come afterwards. The other way round the firmware ends a guardian that has not
+reached neutral 22 ms after it took the outputs, and then ramps itself. Heartbeats go both ways: a guardian that is
+not heard for 100 ms is noticed. `tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at seven
+phases of a tick, in virtual time, exactly.
 
 `tests/unit/guardian` asserts neutral within 20 ms of death in virtual time, also with half of the transfers lost;
-`tests/hil/test_guardian_process.py` kills and stops the real processes. Limits: it runs on the same host, so it does not
-help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier (the CAN
-node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with more work
-than processors, the ramp begins when the guardian is given the processor.
+`tests/hil/test_guardian_process.py` kills and stops the real processes. Limits: it runs on the same host, so it does
+not help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier (the
+CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with more
+work than processors, the ramp begins when the guardian is given the processor.
 
 ## What measures the amplifier
 
-`[device.monitor]` reads the voltages at the stacks through an ADS1115, each output every 7.5 ms, and compares with the
-mean of the commands that may have been in force during the conversion: within `tolerance_V`, and within `change_V` of
-what is usual for that output (`drivers/amplifier_monitor.py`). A bench without it does not see open, shorted, stuck, slow
-or weak amplifiers.
+`[device.monitor]` reads the voltages at the stacks through an ADS1115, each output every 7.5 ms, and compares with
+the mean of the commands that may have been in force during the conversion: within `tolerance_V`, and within
+`change_V` of what is usual for that output (`drivers/amplifier_monitor.py`). A bench without it does not see open,
+shorted, stuck, slow or weak amplifiers.
 
 ## Recording
 
