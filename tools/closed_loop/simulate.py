@@ -111,10 +111,13 @@ def simulate(
     method: str | None = None,
     keep_frames: bool = False,
     on_time: Callable[[float], None] | None = None,
+    on_block: Callable[[Array, Array], None] | None = None,
 ) -> SimulatedRun:
     """``seconds`` in closed loop after arming. Same arguments, same bits. ``method``: another tremor estimator.
 
     Raises ``BenchError`` or ``InputError`` for a bench that is not this instrument. ``on_time`` hears the seconds done.
+    ``on_block`` gets the truth (n, TRUTH_COLUMNS) and the frames (n, Layout.size) of n ticks at a time; then nothing is
+    kept, and a run may take as long as it likes.
     """
     table = bench.description.model_dump()
     if seed is not None:
@@ -128,7 +131,7 @@ def simulate(
     ticks = watch + round(1000.0 * seconds)
     hand = make_hand(emulation.hand, emulation.seed, hand_file, hand_scale)
     ms = 256
-    world = PlantBlocks(emulation, hand, ticks + 2 * ms)
+    world = PlantBlocks(emulation, hand, (ticks if on_block is None else 0) + 2 * ms)
     world.next_block()
     offset_V, before = _measure_offset(world)
     sensing = SensingConfig.model_validate(
@@ -137,17 +140,20 @@ def simulate(
     stages = Stages(StageConfigs(sensing, configs.tremor, configs.actuation))
     _advance(world, before, ms)  # scans begin with a block
     size = LAYOUT.size
-    frames = np.zeros((ticks if keep_frames else 0, size))
+    frames = np.zeros((ms if on_block is not None else ticks if keep_frames else 0, size))
     row, done = ms + 1, 0
     while done < ticks:
         world.next_block()
         n = min(ms, ticks - done)
-        part = frames[done : done + n]
+        part = frames[:n] if on_block is not None else frames[done : done + n]
         row = closed_loop(
             n, world.plant, world.state, world.nodes, world.parts, world.noise, world.slow, world.truth, row,
             wire, part, stages.memory,
         )  # fmt: skip
         done += n
+        if on_block is not None:
+            on_block(world.truth[ms + 1 : row], part)
+            row = ms + 1
         if on_time is not None:
             on_time(done * 1e-3)
     start_ns = ms * 1_000_000

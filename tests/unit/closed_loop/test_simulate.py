@@ -68,3 +68,20 @@ def test_a_delay_beyond_the_tick_is_refused(delay_s: float) -> None:
 def test_a_bench_with_another_output_is_refused(name: str) -> None:
     with pytest.raises(InputError, match="exactly one dac_amplifier"):
         simulate(load_bench(BENCH.with_name(name)), 1.0)
+
+
+def test_block_by_block_is_the_same_run() -> None:
+    bench = load_bench(BENCH)
+    whole = simulate(bench, 0.6, keep_frames=True)
+    assert whole.frames is not None
+    frames, tips = [], []
+
+    def keep(truth: np.ndarray, rows: np.ndarray) -> None:
+        tips.append(truth[:, :3].copy())
+        frames.append(rows.copy())
+
+    run = simulate(bench, 0.6, on_block=keep)
+    assert run.frames is None
+    np.testing.assert_array_equal(np.concatenate(frames).view(np.uint64), whole.frames.view(np.uint64))
+    first = np.flatnonzero(whole.truth["t_ns"] == whole.started_ns)[0] + 1
+    np.testing.assert_array_equal(np.concatenate(tips), whole.truth["tip_m"][first:])
