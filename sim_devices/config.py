@@ -239,6 +239,17 @@ class ImuConfig(_Table):
     noise: NotNegative = 1.0
 
 
+class MoreAxis(_Table):
+    """``[[emulation.more_axes]]``: an accelerometer axis beyond the six, in place of supply or temperature."""
+
+    input: Literal[6, 7]
+    """Of the DAQ."""
+    position_mm: Vector
+    direction: Vector
+    bias_V: float = 0.0
+    scale_V_per_g: float = 1.0
+
+
 class EndoscopeConfig(_Table):
     """``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
 
@@ -291,5 +302,6 @@ class EmulationConfig(_Table):
     environment: EnvironmentConfig = EnvironmentConfig()
     endoscope: EndoscopeConfig | None = None
     imu: dict[str, ImuConfig] = Field(default_factory=dict)
+    more_axes: tuple[MoreAxis, ...] = Field(default=(), max_length=2)
     twin: str | tuple[str, str, str] | None = None
     """Corrected twin (``micron mismatch apply``) in place of the stacks, or one for each; relative to the bench."""

@@ -18,6 +18,7 @@ from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
 from firmware_py.control.plausibility import ScanCheck
+from firmware_py.control.redundancy import Redundancy
 from firmware_py.control.safety import FINISHED, State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.tasks import Works, task_table
@@ -103,6 +104,7 @@ class InstrumentLoop:
         self._check = ScanCheck(
             config.plausibility, wired["lsb_V"], columns, devices.scan_labels, sensors=len(wired["channels"])
         )
+        self._redundancy = Redundancy(stages, self._check, self.supervisor, self.incidents, devices.scan_labels)
         self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
         if live is not None:
@@ -281,7 +283,8 @@ class InstrumentLoop:
             frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
             scan = self._rows[row]
             frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
-            if impossible := self._check.scan(scan, info.k):
+            impossible = self._check.scan(scan, info.k)
+            if impossible and (impossible := self._redundancy.impossible(self._check.channel, impossible)):
                 self.incidents.doubt("an input read something impossible", impossible)
         if self._field is not None:
             self._field.fill(frame)
@@ -297,7 +300,10 @@ class InstrumentLoop:
         self.stages.step()
         bits = int(self._frame[STATUS])
         # before the command goes out: a sensor that contradicts its twin must not move anything
-        if not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
+        if self._redundancy.there:
+            if unclear := self._redundancy.agree(self._frame):
+                self.incidents.doubt("axes contradict each other", unclear)
+        elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
             self.incidents.doubt("parallel axes disagree", apart)
         status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:

@@ -185,6 +185,9 @@ class ScanCheck:
         *,
         sensors: int = SENSORS,
     ) -> None:
+        self.channel = -1
+        """Which input the last finding was of."""
+        self._ignored: list[int] = []
         self._sensors = sensors
         self._supply = sensors if len(columns) > sensors else None
         self.limits = limits
@@ -210,6 +213,8 @@ class ScanCheck:
         steps = tick - self._tick if self._tick >= 0 else 1
         self._tick = tick
         np.take(row, self._order, out=self._counts)
+        for channel in self._ignored:
+            self._counts[channel] = self._quiet(tick)
         supply = self._supply
         supply_before = 0 if supply is None else int(self._last[supply])
         found = check_counts(
@@ -219,10 +224,19 @@ class ScanCheck:
         if not found:
             return ""
         channel, finding = divmod(found, 16)
+        self.channel = channel
         if supply is not None and supply_before and abs(int(self._counts[supply]) - supply_before) > self._jump // 2:
             # the sensors are ratiometric: all of them follow their supply
             return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
         return f"{self._labels[channel]} {WORDS[Finding(finding)].format(n=self.limits.stuck_ticks)}"
+
+    def ignore(self, channel: int) -> None:
+        """Whatever ``channel`` reads from now on: it counts as healthy."""
+        self._ignored.append(channel)
+        self._last[channel], self._slope[channel] = self._quiet(self._tick), NO_SLOPE
+
+    def _quiet(self, tick: int) -> int:
+        return (self._lo + self._hi) // 2 + tick % 2
 
     def odd(self) -> str:
         """Which input has been out of line since the last call: nothing that ends a run, but somebody should know."""

@@ -129,6 +129,9 @@ class SensingConfig(BaseModel):
         table = dict(data)
         for name in PER_AXIS:
             table.setdefault(name, (cls.model_fields[name].default[0],) * n)
+        for name in ("supply_channel", "temperature_channel"):
+            if cls.model_fields[name].default in data["channels"]:  # an axis has that input
+                table.setdefault(name, None)
         more = range(LEAST_AXES, n)
         table.setdefault("in_plane", cls.model_fields["in_plane"].default + tuple(i - 1 for i in more))
         table.setdefault("out_of_plane", cls.model_fields["out_of_plane"].default + tuple(i - 2 for i in more))

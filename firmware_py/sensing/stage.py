@@ -42,6 +42,7 @@ from firmware_py.sensing.calibration import (
 )
 from firmware_py.sensing.config import MOST_AXES, STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
+from firmware_py.sensing.leave_out import leave_out
 from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
     TRANSLATION,
@@ -229,6 +230,10 @@ class Sensing:
 
     def step(self, frame: NDArray[np.float64]) -> None:
         sense_kernel(frame, self.state, self.params)
+
+    def leave_out(self, axis: int, usual: NDArray[np.float64]) -> float:
+        """Go on without ``axis``; see ``leave_out.leave_out``."""
+        return leave_out(axis, usual, self.params, self.config)
 
     def reset(self) -> None:
         """As before the first sample."""

@@ -24,6 +24,7 @@ from sim_devices.plant.kernel import (
     outputs_later,
     truth_row,
 )
+from sim_devices.plant.more_axes import MoreAxes
 from sim_devices.plant.stack_twin import StackTwins, move_tips
 from sim_devices.plant.streams import stream
 from sim_devices.plant.unit import build_unit, plant_arrays
@@ -70,6 +71,7 @@ class Instrument:
         self._chunk, self._row = np.zeros((_CHUNK_ROWS, TRUTH_COLUMNS)), 1
         hand.start(self._nodes[-1], self._part)
         begin(self._plant, self._state, self._nodes[-1], self._part, self._chunk[0])
+        self._more = MoreAxes(config.more_axes, config.sensors, seed) if config.more_axes else None
         self._steps, self._in_block = 0, _BLOCK_STEPS
         self._t_ns = 0
         s = self._state[0]
@@ -125,7 +127,7 @@ class Instrument:
     def analog_V(self) -> Array:
         """(8,) at the DAQ inputs now: a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36. Changes as time goes on."""
         self._now()
-        return self._daq_V
+        return self._daq_V if self._more is None else self._more.volts(self._daq_V, self.motion(), self._t_ns)
 
     @property
     def magnetometer_V(self) -> Array:

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.bench import load_bench
 from tools.faults.fault import Fault
 from tools.faults.judge import Observation
 from tools.faults.points import POINTS, Point, write_bench
@@ -123,6 +124,8 @@ def run_campaign(
     progress: Callable[[str], None],
 ) -> list[FaultRow]:
     """Every fault at every point with every seed, in virtual time, in ``jobs`` processes. Deterministic."""
+    if has_redundancy(bench):
+        faults = [fault.with_redundancy() for fault in faults]
     folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
     try:
         benches = {point.name: write_bench(bench, point, folder) for point in points}
@@ -139,6 +142,12 @@ def run_campaign(
         ]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+def has_redundancy(bench: Path) -> bool:
+    """Whether the instrument of ``bench`` has more than six accelerometer axes."""
+    devices = load_bench(bench).description.devices_with("adxl203").values()
+    return sum(len(device.options().get("channels", ())) for device in devices) > 6
 
 
 def _one(bench: Path, point: str, faults: Sequence[Fault], seed: int) -> list[Observation]:

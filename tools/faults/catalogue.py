@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from tools.faults.fault import Fault, InWorld, OnBus, OnHost
+from dataclasses import replace
+
+from tools.faults.fault import Expected, Fault, InWorld, OnBus, OnHost
 
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
@@ -60,7 +62,14 @@ def daq_device() -> tuple[Fault, ...]:
 def sensors() -> tuple[Fault, ...]:
     def one(name: str, fault: str, expected: str, channel: int = 1, why: str = "", watch_s: float = 0.15) -> Fault:
         words = ("acc", "DAQ input")
-        return Fault(f"sensor: {name}", InWorld(fault, str(channel)), expected, words, watch_s, why=why)  # type: ignore[arg-type]
+        how = InWorld(fault, str(channel))
+        return Fault(f"sensor: {name}", how, expected, words, watch_s, why=why, redundant="noticed")  # type: ignore[arg-type]
+
+    def plain(
+        name: str, fault: str, target: str, expected: Expected, names: tuple[str, ...] = (), why: str = ""
+    ) -> Fault:
+        """Of the two inputs that are axes where there are eight."""
+        return Fault(f"sensor: {name}", InWorld(fault, target), expected, names, why=why, redundant="noticed")
 
     noise = (
         "six axes have no parity in motion (ERRATA 15): a few mV move the tip as far as they would if they were true; "
@@ -78,17 +87,19 @@ def sensors() -> tuple[Fault, ...]:
         one("50 mV of noise", "sensor_noise", "safe state"),
         one("half the sensitivity", "sensor_gain", "safe state"),
         one("sign turned round", "sensor_sign", "safe state"),
-        one("exchanged with its neighbour", "sensor_swap", "safe state", 2),
-        Fault("sensor: supply sags to 4.25 V", InWorld("supply=0.85", ""), "safe state", ("supply",), 0.3),
+        replace(one("exchanged with its neighbour", "sensor_swap", "safe state", 2), redundant=None),
+        Fault("sensor: supply sags to 4.25 V", InWorld("supply=0.85", ""), "safe state", ("supply", "acc"), 0.3),
         Fault(
             "sensor: supply sags by 1 %",
             InWorld("supply=0.99", ""),
             "noticed",
+            ("acc",),
+            redundant="safe state",
             why="ratiometric: it cancels but for the spread of the sensors' filters",
         ),
-        Fault("sensor: temperature wire broken", InWorld("sensor_open", "7"), "safe state", ("temperature",)),
-        Fault("sensor: supply wire broken", InWorld("sensor_open", "6"), "safe state", ("supply",)),
-        Fault("sensor: supply reading stuck", InWorld("sensor_stuck", "6"), "harmless", why="the supply moves slowly"),
+        plain("temperature wire broken", "sensor_open", "7", "safe state", ("temperature",)),
+        plain("supply wire broken", "sensor_open", "6", "safe state", ("supply",)),
+        plain("supply reading stuck", "sensor_stuck", "6", "harmless", why="the supply moves slowly"),
         Fault("sensor: stuck at start", InWorld("sensor_stuck", "1"), "refused", ("acc", "DAQ input"), at_start=True),
         Fault("sensor: wire broken at start", InWorld("sensor_open", "1"), "refused", ("acc", "DAQ"), at_start=True),
         Fault("sensor: exchanged at start", InWorld("sensor_swap", "2"), "refused", ("acc", "DAQ"), at_start=True),

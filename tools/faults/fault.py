@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 Expected = Literal["safe state", "noticed", "harmless", "refused", "cannot be seen"]
+LEFT_OUT = "the axis is left out once the others contradict it by seven deviations of their noise"
 
 
 @dataclass(frozen=True)
@@ -45,7 +46,8 @@ class Fault:
     ``redraws``: the fault also shifts when samples are taken, so they carry other noise; the tip may then stray as
     far as it would with other noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
     ``effect``: how much it disturbs a real bench, by the scale of the HIL tests (0 reads .. 4 motion); 9 is for the
-    emulated world only. ``why``: for what cannot be seen, comes late or is harmless.
+    emulated world only. ``why``: for what cannot be seen, comes late or is harmless. ``redundant``: what is expected of
+    a bench with more than six axes, where that is something else.
     """
 
     name: str
@@ -58,3 +60,8 @@ class Fault:
     own_output: bool = False
     effect: int = 9
     why: str = ""
+    redundant: Expected | None = None
+
+    def with_redundancy(self) -> Fault:
+        """The same on a bench that can do without an axis."""
+        return self if self.redundant is None else replace(self, expected=self.redundant, why=LEFT_OUT)

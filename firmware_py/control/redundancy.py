@@ -1,0 +1,80 @@
+"""What a failing accelerometer axis means: with six axes the end of the run, with more it is left out.
+
+Joins the detectors of single inputs (``plausibility``) and of contradiction (``parity``) to the stage that can do
+without an axis (``sensing/leave_out``).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.control.incidents import Incidents
+from firmware_py.control.parity import Parity, Verdict
+from firmware_py.control.plausibility import ScanCheck
+from firmware_py.control.safety import Supervisor
+from firmware_py.control.stages import Stages
+from firmware_py.frame import PARITIES, PARITY, STATUS, FrameStatus
+
+UNBELIEVED = FrameStatus.INVALID | FrameStatus.STALE | FrameStatus.ALIGNING
+
+
+class Redundancy:
+    """``labels`` names the axes. An axis is left out only while the outputs may move: a self-test refuses it."""
+
+    def __init__(
+        self, stages: Stages, check: ScanCheck, supervisor: Supervisor, incidents: Incidents, labels: tuple[str, ...]
+    ) -> None:
+        self._sensing = stages.sensing
+        self._check = check
+        self._supervisor = supervisor
+        self._incidents = incidents
+        self._labels = labels
+        self._parity = Parity(self._null()) if self._parities() else None
+
+    @property
+    def there(self) -> bool:
+        """Whether there were more than six axes to begin with."""
+        return self._parity is not None
+
+    def _parities(self) -> int:
+        return int(self._sensing.params["parities"][0])
+
+    def _null(self) -> NDArray[np.float64]:
+        return self._sensing.params["null"][0]
+
+    def impossible(self, channel: int, text: str) -> str:
+        """An input read something impossible: ``text`` to trip for, or empty when sensing goes on without it."""
+        axes = len(self._sensing.config.channels)
+        if self._parity is None or channel >= axes or not self._parities() or not self._supervisor.may_move:
+            return text
+        self._leave_out(channel, text)
+        return ""
+
+    def agree(self, frame: NDArray[np.float64]) -> str:
+        """Every tick, after the step: empty, or why the run must end."""
+        parity = self._parity
+        if parity is None or not self._parities() or int(frame[STATUS]) & UNBELIEVED:
+            return ""
+        verdict = parity.step(frame[PARITY : PARITY + len(PARITIES)])
+        if verdict is Verdict.AGREED:
+            return ""
+        if not self._supervisor.may_move:
+            return "the accelerometer axes (acc) contradict each other" if verdict is Verdict.UNCLEAR else ""
+        if verdict is Verdict.FOUND:
+            self._leave_out(parity.axis, f"{self._labels[parity.axis]} contradicts the other axes")
+            return ""
+        self._incidents.notice("the accelerometer axes contradict each other")
+        if verdict is Verdict.UNCLEAR:
+            return "the accelerometer axes (acc) contradict each other, and it cannot be told which one is wrong"
+        return ""
+
+    def _leave_out(self, axis: int, why: str) -> None:
+        parity = self._parity
+        assert parity is not None
+        louder = self._sensing.leave_out(axis, parity.usual)
+        self._check.ignore(axis)
+        parity.restart(self._null())
+        text = f"{why}: left out, sensing goes on without it; noise of the tip's acceleration times {louder:.2f}"
+        self._incidents.notice(text)
+        self._incidents.note({"event": "axis left out", "reason": text})
