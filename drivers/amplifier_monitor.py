@@ -34,8 +34,6 @@ class Window(NamedTuple):
 
 LEARN = 60
 """Readings of an output before what is usual counts as known; its memory is four times as long."""
-INSIDE = 0.3
-"""Of the width of what is expected: where in it a healthy amplifier's mean lies hardly changes."""
 
 
 class Usual:
@@ -173,12 +171,12 @@ class AmplifierMonitor:
         if not span[0] - self._tolerance_V <= measured_V <= span[1] + self._tolerance_V:
             return True
         usual, middle_V = self._usual[output], 0.5 * (span[0] + span[1])
-        off_V = measured_V - middle_V
         if usual.count >= LEARN:
-            allowed_V = self._change_V + INSIDE * (span[1] - span[0])
-            if abs(off_V - usual.at(middle_V)) > allowed_V:
+            # what is uncertain of the commands stays uncertain; only gain and offset are known better
+            healthy_V = measured_V - usual.at(middle_V)
+            if not span[0] - self._change_V <= healthy_V <= span[1] + self._change_V:
                 return True
-        usual.learn(middle_V, off_V)
+        usual.learn(middle_V, measured_V - middle_V)
         return False
 
 
