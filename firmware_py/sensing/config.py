@@ -107,7 +107,7 @@ class SensingConfig(BaseModel):
     velocity_gate: Annotated[float, Field(ge=0.0)] = 4.0  # standard deviations; 0: no gate
     hand_acceleration_m_s2: Positive = 0.05  # rms below the tremor band: quaternion filter
     alpha_drift_rad_s2: Positive = 0.003  # rms of the slow drift of the solved angular acceleration over 100 s
-    heading_noise_rad: Positive = 0.002  # per square root of a second: the surroundings' own fluctuation
+    heading_noise_rad: Positive = 0.003  # per square root of a second: the surroundings' own fluctuation
     heading_disturbance_deg: Positive = 0.3  # rms of what turns the field slowly, over some seconds
     magnetometer_noise_uT: NotNegative = 0.0  # white, per square root of a second
     horizontal_field_uT: Positive = 20.0

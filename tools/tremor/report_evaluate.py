@@ -51,8 +51,9 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         "an error in 8 to 12 Hz counts four times, as the loop is asked to weigh it; the limits are the best causal",
         "linear filters (fixed) in that measure, trained on other people's records or on the very record. Emulated",
         "hands: three seeds that nothing was tuned on.",
-        "Settings of the adaptive method were chosen on other parts of the recordings (80 to 110 s) and on emulated",
-        "hands. Where one burst outweighs the whole record (wrist, mouse 03 and 05), the oracle has seen it before and",
+        "Most settings of the adaptive method come from other parts of the recordings (80 to 110 s) and on emulated",
+        "hands; three (gate, prior, share of a burst) with the figures of this page in view, so they are not held out.",
+        "Where one burst outweighs the whole record (wrist, mouse 03 and 05), the oracle has seen it before and",
         "pays for it in every calm second; a filter that learns meets it with its prior.",
         "",
     ]
