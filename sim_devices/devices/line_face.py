@@ -1,5 +1,7 @@
 """Devices on a serial line that take commands and speak in lines of text: what one has to say is what each line does.
 
+Source: none of its own; the manual of the device that overrides it.
+
 Model limits
 - What it says is there at once; the carrier makes it as slow as the line. Nothing overflows.
 """
