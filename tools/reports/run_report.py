@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 def headline(result: Mapping[str, Any]) -> str:
     """The main job in one sentence."""
     tremor = result["tremor"]
+    if result["armed_ns"] is None:
+        return "Nothing was armed, so there is nothing to compare."
     if tremor["reduction_percent"] is None:
         return "No truth to compare with: see the estimates in the recording."
     return (
@@ -86,8 +88,11 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
             for name, key in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p99_9"), ("max", "max"))
         ),
         f"samples: {samples['received']} of {samples['expected']} received, {samples['lost']} lost; "
-        f"{result['ticks']['skipped']} ticks skipped, {result['commands']['clipped']} commands clipped",
+        f"{result['ticks']['skipped']} ticks skipped, {result['ticks']['caught_up']} caught up without a command of "
+        f"their own, {result['commands']['clipped']} commands clipped",
     ]
+    if result["noticed"]:
+        lines.append("noticed: " + ", ".join(result["noticed"]))
     if voluntary["gain"] is not None:
         lines.append(f"voluntary motion below 1 Hz: gain {voluntary['gain']:.4f}, delay {voluntary['delay_ms']:.2f} ms")
     if any(result.get("warnings", {}).values()):
