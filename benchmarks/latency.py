@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.row import Row
-from firmware_py.app import LOOP_PRIORITY, RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from tools.cli.bench_option import bench_path
 

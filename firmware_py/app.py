@@ -12,15 +12,12 @@ import json
 import os
 import signal
 import sys
-import tempfile
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from drivers.specs import check_devices
 from firmware_py.control.config import FirmwareConfig, load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.stages import StageConfigs, Stages
@@ -32,45 +29,13 @@ from firmware_py.guardian.start import guarded
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
-from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
-from hal.bench import BenchFile, OpenBench, Port, load_bench, open_bench
+from firmware_py.run_request import RunRequest, describe_scheduling, open_requested, scheduling, truth_of
+from firmware_py.scheduler.realtime import RealtimeReport
+from hal.bench import BenchFile, OpenBench, Port, load_bench
 from hal.contracts import Clock
-from hal.errors import Disconnected, HalError
+from hal.errors import HalError
 
 StatusSink = Callable[[dict[str, Any]], None]
-LOOP_PRIORITY = 80
-
-
-@dataclass(frozen=True)
-class RunRequest:
-    """What to run. ``hand_file`` may carry a part (``FILE#id``), which is why it is text."""
-
-    bench: Path
-    seconds: float
-    virtual: bool = False
-    hand_file: str | None = None
-    hand_scale: float | None = None
-    record: Path | None = None
-    seed: int | None = None
-    live_fds: tuple[int, int] | None = None
-    """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
-    stale_ms: float | None = None
-    """Another limit for missing or belated scans than the bench file's."""
-    realtime: bool = True
-    """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
-    sense_only: bool = False
-    """Nothing is armed; readings that would end a run are noticed."""
-    method: str | None = None
-    """Another tremor estimator than the bench file's."""
-    truth_s: float | None = None
-    """How much truth an emulated world keeps; None: all of it."""
-    clock_start_ns: int = 0
-    """Where the virtual clock begins: marks of time are crossed without waiting for them."""
-
-    def to_json(self, runtime_dir: Path) -> str:
-        """For the firmware's own process."""
-        table = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
-        return json.dumps({**table, "runtime_dir": str(runtime_dir)})
 
 
 def run_in_process(
@@ -140,54 +105,6 @@ def run_in_process(
             loop.counts.noticed.setdefault("no command for a while (guardian)", heart.noticed_ns)
         outcome = make_outcome(request, bench, devices, loop, config, report, summary)
         return outcome, truth_of(opened)
-
-
-@contextlib.contextmanager
-def open_requested(
-    request: RunRequest,
-    bench: BenchFile,
-    runtime_dir: Path | None,
-    wrap: Callable[[str, Port, Clock], Port] | None = None,
-) -> Iterator[OpenBench]:
-    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own.
-
-    ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
-    """
-    check_devices(bench.description, str(bench.path))
-    with contextlib.ExitStack() as stack:
-        folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
-        yield stack.enter_context(
-            open_bench(
-                bench,
-                virtual=request.virtual,
-                runtime_dir=folder,
-                hand_file=Path(request.hand_file) if request.hand_file else None,
-                hand_scale=request.hand_scale,
-                seed=request.seed,
-                truth_s=request.truth_s,
-                start_ns=request.clock_start_ns,
-                wrap=wrap,
-            )
-        )
-
-
-def truth_of(opened: OpenBench) -> dict[str, Any] | None:
-    """Stops the emulated world; its truth, or None where nothing is emulated or the world died."""
-    if opened.world is None:
-        return None
-    opened.world.stop()
-    with contextlib.suppress(Disconnected):
-        return opened.world.truth()
-    return None
-
-
-@contextlib.contextmanager
-def scheduling(plain: bool) -> Iterator[RealtimeReport]:
-    if plain:
-        yield RealtimeReport()
-        return
-    with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
-        yield report
 
 
 def _recorder(
@@ -276,15 +193,6 @@ def make_outcome(
             "dropped": recording.dropped if recording is not None else 0,
         },
     }
-
-
-def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
-    """Which real-time settings the loop ran with, in words."""
-    if virtual:
-        return "virtual time"
-    if not report.settings:
-        return "no real-time settings asked for"
-    return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
 
 
 # -- own process ------------------------------------------------------------------------------------------

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.app import RunRequest, describe_scheduling, open_requested, scheduling, truth_of
 from firmware_py.endoscope.config import EndoscopeConfig, load_endoscope_config
 from firmware_py.endoscope.loop import FRAME, EndoscopeLoop
 from firmware_py.endoscope.report import experiment
@@ -16,6 +15,7 @@ from firmware_py.endoscope.targets import GameState
 from firmware_py.endoscope.wiring import open_sensors
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
+from firmware_py.run_request import RunRequest, describe_scheduling, open_requested, scheduling, truth_of
 from firmware_py.sensing.fusion import Fusion
 from hal.bench import BenchFile, OpenBench, Port
 from hal.contracts import Clock

@@ -38,8 +38,9 @@ from tools.bench.viewer import Nonsense
 from tools.bench.viewer import _parse as parse_message
 from tools.cli.mismatch import _report as read_report
 from tools.errors import InputError
-from tools.mismatch import recording as twin_recording
+from tools.mismatch.recording import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
+from tools.mismatch.recording_load import load
 from tools.mismatch.twins.fmu import check_archive
 
 MS = 1_000_000
@@ -119,25 +120,25 @@ def own_recording(data: bytes) -> None:
 
 
 def columns_csv(data: bytes) -> None:
-    _file(data, ".csv", lambda p: read_columns(p, ["t", "x"]), twin_recording.RecordingError)
-    _file(data, ".csv", column_names, twin_recording.RecordingError)
+    _file(data, ".csv", lambda p: read_columns(p, ["t", "x"]), TwinRecordingError)
+    _file(data, ".csv", column_names, TwinRecordingError)
 
 
 def columns_npz(data: bytes) -> None:
-    _file(data, ".npz", lambda p: read_columns(p, ["t", "x"]), twin_recording.RecordingError)
+    _file(data, ".npz", lambda p: read_columns(p, ["t", "x"]), TwinRecordingError)
 
 
 def columns_mcap(data: bytes) -> None:
-    _file(data, ".mcap", lambda p: read_columns(p, ["log.x", "log.y"]), twin_recording.RecordingError)
-    _file(data, ".mcap", column_names, twin_recording.RecordingError)
+    _file(data, ".mcap", lambda p: read_columns(p, ["log.x", "log.y"]), TwinRecordingError)
+    _file(data, ".mcap", column_names, TwinRecordingError)
 
 
 def descriptor_toml(data: bytes) -> None:
     def read(path: Path) -> None:
         (path.parent / "data.csv").write_text("t,x,y\n" + "".join(f"{k},{k % 7},{k % 5}\n" for k in range(80)))
-        twin_recording.load(path)
+        load(path)
 
-    _file(data, ".toml", read, twin_recording.RecordingError)
+    _file(data, ".toml", read, TwinRecordingError)
 
 
 def hand_csv(data: bytes) -> None:
@@ -149,7 +150,7 @@ def hand_npz(data: bytes) -> None:
 
 
 def fmu_archive(data: bytes) -> None:
-    _file(data, ".fmu", check_archive, twin_recording.RecordingError)
+    _file(data, ".fmu", check_archive, TwinRecordingError)
 
 
 def di4108_stream(data: bytes) -> None:

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest
 from firmware_py.guardian.process import REPORT, describe
+from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 
 pytestmark = pytest.mark.realtime

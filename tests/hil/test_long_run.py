@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 
 SECONDS = float(os.environ.get("MICRON_LONG_S", "1800"))

@@ -18,7 +18,8 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
 from sim_devices.register import ProcessWorld
 from tests.conftest import DEFAULT_BENCH

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 
 BEFORE_NS = 1_000_000_000  # the mark falls into the run proper

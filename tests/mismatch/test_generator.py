@@ -14,7 +14,7 @@ from tools.mismatch.prove.catalog import TABLE, TWINS
 from tools.mismatch.prove.disk import write
 from tools.mismatch.prove.plants import Scene, simulate
 from tools.mismatch.prove.proof import generate
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 
 def _case(twin: str, effects: tuple[str, ...], severity: float, seed: int = 3, kind: str = "single") -> draw.Case:

@@ -14,7 +14,7 @@ from tools.mismatch.prove import draw, page, prove, real, seal
 from tools.mismatch.prove.nulls import clopper_pearson, document, nulls
 from tools.mismatch.prove.score import coverage, score
 from tools.mismatch.prove.table import failures, show
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 QUIET = {"max_samples": 2500, "progress": lambda text: None}
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.reproduce import real_sensors
 from tools.reproduce.names import MODULES, expand
 from tools.reproduce.orientation_error import east_north_up, rms_errors_deg

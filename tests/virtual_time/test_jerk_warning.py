@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from tools.reports.run_report import summary_lines
 
 BENCH = Path(__file__).parents[2] / "benches" / "micron.toml"

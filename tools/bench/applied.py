@@ -9,8 +9,8 @@ from pathlib import Path
 from hal.bench import BenchFile, load_bench
 from tools.bench.bench_copy import with_calibration, with_twin
 from tools.bench.session import Session
-from tools.cli.common import write_text_atomic
 from tools.errors import InputError
+from tools.output import write_text_atomic
 
 TWIN = "corrected twin"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
 from sim_devices.plant_factory import emulation_config, stack_twins
-from tools.cli.common import write_text_atomic
+from tools.output import write_text_atomic
 
 _LIST = re.compile(r"^calibration\s*=\s*\[.*?\][^\n]*$", re.MULTILINE | re.DOTALL)
 _TABLE = re.compile(r"^\[firmware\][^\n]*$", re.MULTILINE)

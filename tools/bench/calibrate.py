@@ -20,8 +20,8 @@ from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.still import warm_up
-from tools.cli.common import write_text_atomic
 from tools.errors import InputError
+from tools.output import write_text_atomic
 
 TEMPERATURE_TOLERANCE_K = 0.2
 WARM_UP_ROWS = 600_000

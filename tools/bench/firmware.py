@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_py.app import RunRequest
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
+from firmware_py.run_request import RunRequest
 
 FOREVER_S = 30 * 86_400.0
 TRUTH_S = 5.0

@@ -17,8 +17,8 @@ from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveRows
 from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.recorder import RecorderProcess
-from tools.cli.common import write_text_atomic
 from tools.errors import InputError
+from tools.output import write_text_atomic
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._ -]{0,79}")
 SUFFIX = ".mcap"

@@ -19,8 +19,8 @@ from firmware_py.endoscope.report import experiment, report_csv
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
 from hal.bench import load_bench
 from tools.bench.recorder import check_name
-from tools.cli.common import write_text_atomic
 from tools.errors import InputError
+from tools.output import write_text_atomic
 
 Source = Literal["mouse", "card"]
 MAX_ANGLE_DEG = 180.0

@@ -8,22 +8,22 @@ is held, creep) predict recordings that were left out; all parameters by one bou
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import minimize_scalar
 
-from firmware_py.actuation.config import StackConfig
 from tools.calibrate.calibration_file import calibration_toml
 from tools.calibrate.piezo_dynamics import MAX_LAG_S, Dynamics, delayed, fit_dynamics
 from tools.calibrate.piezo_excitation import determined_from, missing, one_loop
 from tools.calibrate.piezo_feedforward import Answers, Feedforward, for_tip
+from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import simulate
 from tools.calibrate.piezo_regression import Axes, Piece, Shape, Solution, axes_of, fit, play_states, residual, stack_of
 from tools.calibrate.piezo_steps import fit_steps, is_steps
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.mismatch.recording import Recording
 
 Array = NDArray[np.float64]
@@ -39,49 +39,6 @@ ZONES = ((0.35, 0.6, 0.8), (0.5, 0.7, 0.85), (0.2, 0.35, 0.5, 0.65, 0.8), (0.15,
 CREEP_TIMES_S = (0.1, 1.0, 10.0)
 LEAST_GAIN = 0.99  # a part stays when it brings the unseen error below this share
 FIT_SHARE = 0.7
-
-
-@dataclass(frozen=True)
-class PiezoFit:
-    """One identified stack. Errors in um. ``held_out``: of recordings that the fit had not seen (leave one out), or of
-    the last 30 % of a single one; ``unseen`` by recording, ``parts`` what was tried and what it left."""
-
-    stack: StackConfig
-    dynamics: Dynamics
-    lag_s: float
-    rms_um: float
-    held_out_rms_um: float
-    held_out_max_um: float
-    linear_rms_um: float
-    range_um: float
-    top_rate_um_s: float
-    unseen_um: dict[str, float]
-    parts: tuple[tuple[str, float, bool], ...]
-    warnings: tuple[str, ...]
-    others: tuple[StackConfig, ...]
-    """Models that lack one recording each."""
-    tick_hz: float
-    low_V: float
-    high_V: float
-    span_um: tuple[float, float]
-    answer: Answers
-    """What the taps undo: lag and resonance, from steps when there were any, and as late as the model says."""
-
-    @property
-    def neutral_V(self) -> float:
-        """Middle of the drive."""
-        return 0.5 * (self.low_V + self.high_V)
-
-    @property
-    def singular_um_s(self) -> float:
-        """Rate at which a slope of the model reaches zero: beyond, it has no inverse. Infinite when none falls."""
-        sums = np.cumsum(self.stack.play_weights_um_per_V)
-        law = np.array(self.stack.slope_per_rate_s_per_V or (0.0,) * len(sums))
-        high = np.array(self.stack.rate_high_um_per_s or (np.inf,) * len(sums))
-        falling = law < 0.0
-        at = sums[falling] / -law[falling]
-        at = at[at < high[falling]]
-        return float(at.min()) if len(at) else float("inf")
 
 
 def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:

@@ -6,7 +6,6 @@ Both directions are the firmware's own kernels, one tick after the other.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,9 +15,7 @@ from firmware_py.actuation.hysteresis import drive, extension, operator_params, 
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.records import Record, attributes
 from hal.compiled import kernel
-
-if TYPE_CHECKING:
-    from tools.calibrate.piezo import PiezoFit
+from tools.calibrate.piezo_fit import PiezoFit
 
 Array = NDArray[np.float64]
 UM = 1e-6

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import InputError, clear_errors, console
+from tools.cli.common import clear_errors, console
+from tools.errors import InputError
 
 
 def bench(

@@ -10,7 +10,8 @@ from rich.table import Table
 
 from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
 from tools.cli.calibrate_axes import Model, OnDrift
-from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json, write_text_atomic
+from tools.cli.common import JsonOption, clear_errors, console
+from tools.output import check_writable, write_json, write_text_atomic
 
 calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks from calibration recordings.")
 

@@ -8,20 +8,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from tools.cli.common import (
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json, write_text_atomic
 
 if TYPE_CHECKING:
-    from tools.calibrate.piezo import PiezoFit
     from tools.calibrate.piezo_feedforward import Feedforward
+    from tools.calibrate.piezo_fit import PiezoFit
     from tools.calibrate.piezo_prediction import Prediction
 
 Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration file (TOML) that a bench can name.")]
@@ -58,7 +51,7 @@ def piezo(
 
     from tools.calibrate.piezo import feedforward_of, identify_stack, piezo_calibration
     from tools.calibrate.piezo_prediction import predict
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     with clear_errors():
         check_writable(json_file, out)

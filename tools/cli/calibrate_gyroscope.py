@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from tools.cli.calibrate_axes import STANDARD_GRAVITY, Columns, print_parameters, three
-from tools.cli.common import JsonOption, check_writable, clear_errors, write_json, write_text_atomic
+from tools.cli.common import JsonOption, clear_errors
+from tools.output import check_writable, write_json, write_text_atomic
 
 
 def gyroscope(

@@ -8,15 +8,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli.common import (
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.output import check_writable, write_json, write_text_atomic
 
 
 def positions(

@@ -6,19 +6,11 @@ Exit codes (contracts/commands.md): 0 done, 1 failed, 2 bad usage or input, 3 fi
 
 from __future__ import annotations
 
-import json
-import math
-import os
-import sys
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import numpy as np
 import typer
-from pydantic import BaseModel
 from rich.console import Console
 from rich.markup import escape
 
@@ -39,62 +31,6 @@ def console() -> Console:
 def data_console() -> Console:
     """For data: standard output."""
     return Console(highlight=False)
-
-
-def to_jsonable(value: Any) -> Any:
-    """Plain JSON values; numpy scalars and arrays become lists, NaN and infinities null."""
-    if isinstance(value, dict):
-        return {str(k): to_jsonable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_jsonable(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return to_jsonable(value.tolist())
-    if isinstance(value, np.generic):
-        return to_jsonable(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    return value
-
-
-def write_text_atomic(path: Path, text: str) -> None:
-    """All of the file or nothing of it."""
-    try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); name a folder that exists") from error
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def write_json(result: Any, destination: str | None) -> None:
-    """Write ``result`` where ``--json`` said."""
-    if destination is None:
-        return
-    text = json.dumps(to_jsonable(result), indent=2) + "\n"
-    if destination == "-":
-        sys.stdout.write(text)
-    else:
-        write_text_atomic(Path(destination), text)
-
-
-def check_writable(*destinations: str | Path | None) -> None:
-    """Refuse a result file in a folder that is not there before any work is done."""
-    for destination in destinations:
-        if destination is None or str(destination) == "-":
-            continue
-        parent = Path(destination).absolute().parent
-        if not parent.is_dir():
-            raise InputError(f"{destination}: the folder {parent} does not exist; create it first")
 
 
 @contextmanager

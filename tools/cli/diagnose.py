@@ -15,16 +15,9 @@ from rich.text import Text
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import (
-    Exit,
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-)
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json
 
 VirtualOption = Annotated[
     bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")

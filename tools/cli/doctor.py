@@ -18,7 +18,8 @@ from rich.table import Table
 from drivers.specs import bus_loads, check_devices
 from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, data_console, write_json
+from tools.cli.common import Exit, JsonOption, clear_errors, data_console
+from tools.output import check_writable, write_json
 
 Verdict = Literal["ok", "missing", "limited"]
 

@@ -9,17 +9,9 @@ import typer
 from rich.progress import track
 from rich.table import Table
 
-from tools.cli.common import (
-    Exit,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
+from tools.output import check_writable, write_json, write_text_atomic
 
 endoscope = typer.Typer(
     no_args_is_help=True, help="Steer a field of view with a motion card (document 002, chapter 6)."

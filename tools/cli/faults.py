@@ -13,20 +13,13 @@ from rich.table import Table
 from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import (
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
 from tools.faults.campaign import run_campaign, totals
 from tools.faults.catalogue import faults as catalogue
 from tools.faults.page import markdown
 from tools.faults.points import POINTS
+from tools.output import check_writable, write_json, write_text_atomic
 
 
 def faults(

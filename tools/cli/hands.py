@@ -11,15 +11,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import (
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console
+from tools.errors import InputError
+from tools.output import check_writable, write_json, write_text_atomic
 from tools.reports.hands import HandRow, markdown, run_hands
 
 

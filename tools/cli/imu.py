@@ -10,9 +10,10 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, console, data_console, write_json
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
+from tools.output import check_writable, write_json
 
 imu = typer.Typer(no_args_is_help=True, help="Inertial sensors: offsets, stability, drift, noise, temperature.")
 

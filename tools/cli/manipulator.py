@@ -9,7 +9,8 @@ import typer
 from rich.table import Table
 
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import JsonOption, check_writable, clear_errors, console, data_console, write_json
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.output import check_writable, write_json
 
 app = typer.Typer(no_args_is_help=True, help="The three-legged manipulator at the tip.")
 

@@ -11,17 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.markup import escape
 
-from tools.cli.common import (
-    Exit,
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json, write_text_atomic
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -113,7 +105,7 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from tools.mismatch.engine.diagnose import diagnose as engine
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     loaded = load(path)
     for note in loaded.warnings:

@@ -8,15 +8,9 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli.common import (
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json
 
 
 def noise(

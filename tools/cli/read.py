@@ -5,8 +5,9 @@ from __future__ import annotations
 from rich.table import Table
 
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import JsonOption, check_writable, clear_errors, data_console, write_json
+from tools.cli.common import JsonOption, clear_errors, data_console
 from tools.cli.diagnose import VirtualOption
+from tools.output import check_writable, write_json
 
 
 def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: JsonOption = None) -> None:

@@ -10,7 +10,8 @@ import typer
 from firmware_py.recording.export import export as export_recording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
-from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, console, write_json
+from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.output import check_writable, write_json
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the output file if it is there.")]
 

@@ -10,7 +10,8 @@ import typer
 
 from firmware_py.control.replay import replay_recording
 from firmware_py.recording.reader import Recording
-from tools.cli.common import Exit, JsonOption, check_writable, clear_errors, console, write_json
+from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.output import check_writable, write_json
 
 
 def replay(

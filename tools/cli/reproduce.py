@@ -11,15 +11,8 @@ from rich.markup import escape
 from rich.table import Table as RichTable
 
 from firmware_py.recording.revision import git_revision
-from tools.cli.common import (
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.output import check_writable, write_json, write_text_atomic
 
 
 def reproduce(

@@ -19,14 +19,17 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.spinner import Spinner
 from rich.table import Table
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import REPORT, describe
+from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import Exit, InputError, JsonOption, check_writable, clear_errors, console, write_json
-from tools.cli.common import write_text_atomic as write_text
+from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
+from tools.errors import InputError
+from tools.output import check_writable, write_json
+from tools.output import write_text_atomic as write_text
 from tools.reports.run_report import html_page, picture, print_report, save_picture
 from tools.reports.tremor_figures import tremor_figures
 

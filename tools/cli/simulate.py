@@ -11,10 +11,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import JsonOption, check_writable, clear_errors, console, write_json
+from tools.cli.common import JsonOption, clear_errors, console
 from tools.cli.run import complete_result
 from tools.closed_loop.simulate import COMMAND_DELAY_S, SimulatedRun, simulate
 from tools.errors import InputError
+from tools.output import check_writable, write_json
 from tools.reports.run_report import headline, picture, save_picture, tremor_table
 
 

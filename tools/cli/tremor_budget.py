@@ -12,7 +12,9 @@ from rich.table import Table
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import InputError, JsonOption, check_writable, clear_errors, console, data_console, write_json
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json
 
 
 def budget(

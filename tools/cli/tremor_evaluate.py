@@ -10,7 +10,9 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
-from tools.cli.common import InputError, JsonOption, check_writable, clear_errors, console, data_console, write_json
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json
 
 
 def evaluate(

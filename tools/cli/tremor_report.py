@@ -7,7 +7,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from tools.cli.common import InputError, check_writable, clear_errors, console, write_text_atomic
+from tools.cli.common import clear_errors, console
+from tools.errors import InputError
+from tools.output import check_writable, write_text_atomic
 
 
 def report(

@@ -17,9 +17,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from firmware_py.app import LOOP_PRIORITY, RunRequest
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
+from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from hal.clock import MonotonicClock

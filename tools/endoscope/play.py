@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.app import RunRequest, open_requested
 from firmware_py.endoscope.app import run_endoscope
 from firmware_py.endoscope.config import EndoscopeConfig, load_endoscope_config
 from firmware_py.endoscope.report import experiment
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
 from firmware_py.endoscope.wiring import is_endoscope
+from firmware_py.run_request import RunRequest, open_requested
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
 from tools.endoscope.user import SyntheticUser, Task, UserConfig

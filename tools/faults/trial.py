@@ -16,7 +16,8 @@ from typing import Any, NoReturn, cast
 
 import numpy as np
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, Port
 from hal.clock import VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
-from tools.cli.common import InputError
-from tools.mismatch.recording import Recording, RecordingError, TwinText, load
+from tools.errors import InputError
+from tools.mismatch.recording import Recording, RecordingError, TwinText
+from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.make import make

@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.report.wording import number, scaled, words
 
@@ -103,7 +103,7 @@ def jobs_for(recordings: dict[str, Path], out: Path | None, held_out: float, see
 def diagnose_one(job: Job) -> Row:
     """Diagnose one recording in this process and write its reports. Never raises: a bad recording is a row."""
     from tools.mismatch.engine.diagnose import diagnose
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     try:
         report = diagnose(load(job.path), held_out=job.held_out, seed=job.seed, jobs=1)
@@ -119,8 +119,8 @@ def diagnose_one(job: Job) -> Row:
 def write_reports(report: Report, folder: Path, page: str | None = None) -> None:
     """``report.json`` and ``report.html`` (``page`` if it is made already) in a folder, made if need be; both are
     complete before either is written."""
-    from tools.cli.common import write_json, write_text_atomic
     from tools.mismatch.report.page import html_page
+    from tools.output import write_json, write_text_atomic
 
     page = html_page(report) if page is None else page
     try:

@@ -70,13 +70,3 @@ class Recording:
     def signals(self) -> dict[str, Array]:
         """Inputs and context together: what an effect may look at."""
         return {**self.context, **self.inputs}
-
-
-def load(path: Path | str) -> Recording:
-    """The recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), checked and converted.
-
-    Raises RecordingError for everything that is wrong with it.
-    """
-    from tools.mismatch.recording_load import load_recording
-
-    return load_recording(Path(path))

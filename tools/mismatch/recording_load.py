@@ -36,8 +36,12 @@ class _Channel:
     step: float | None
 
 
-def load_recording(path: Path) -> Recording:
-    """See ``recording.load``."""
+def load(path: Path | str) -> Recording:
+    """The recording of a descriptor (a folder with ``recording.toml``, or any ``.toml``), checked and converted.
+
+    Raises RecordingError for everything that is wrong with it.
+    """
+    path = Path(path)
     if path.is_dir():
         path = path / "recording.toml"
     text = _toml(path)

@@ -12,7 +12,7 @@ from sim_devices.physics.effect import Array, Effect, Settings, Stage
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model, Placed
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.make import core
+from tools.mismatch.twins.core import core
 
 
 def describe(model: Model, theta: Array) -> dict[str, Any]:

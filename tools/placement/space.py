@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tools.cli.common import InputError
+from tools.errors import InputError
 
 Vector = tuple[float, float, float]
 

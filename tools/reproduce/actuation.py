@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
-from sim_devices.config import EmulationConfig
-from tools.reproduce.actuation_lab import Controller, Stand, Tracking, multi_frequency, stand, stationary, track
+from tools.reproduce.actuation_lab import Controller, Tracking, lab, multi_frequency, stationary, track
 from tools.reproduce.rows import Row, Table, build
 
-UNIT = 2
 FREQUENCIES_HZ = (1.0, 4.0, 7.0, 10.0, 13.0, 16.0, 19.0)
 NAMES = ("without model", "rate-independent", "rate-dependent", "ours")
 WHY = (
@@ -43,13 +40,6 @@ TABLE_7_1 = {
 }
 TABLE_7_2 = ((8.7, 15.5), (1.5, 5.5), (1.1, 4.0))
 TABLE_7_3 = ((8.3, 17.9), (2.7, 7.5), (1.4, 4.8))
-
-
-@cache
-def lab() -> tuple[EmulationConfig, tuple[Stand, ...]]:
-    """The unit and its three stacks with every way to command them."""
-    config = EmulationConfig(unit=UNIT, seed=UNIT)
-    return config, tuple(stand(config, axis) for axis in range(3))
 
 
 def ways(kind: int) -> list[Controller]:

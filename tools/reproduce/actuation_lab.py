@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -24,16 +25,18 @@ from sim_devices.plant.lab import (
     sample_rate_hz,
 )
 from sim_devices.plant.stack import drive_channel, stack_unit
-from tools.calibrate.piezo import PiezoFit, identify_stack, rates_of
+from tools.calibrate.piezo import identify_stack, rates_of
 from tools.calibrate.piezo_dynamics import delayed
 from tools.calibrate.piezo_excitation import determined_from
 from tools.calibrate.piezo_feedforward import for_instrument
+from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import command
 from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual, stack_of
 from tools.mismatch.recording import Recording, Split, TwinText
 
 Array = NDArray[np.float64]
 
+UNIT = 2  # of the emulated instrument
 DT_S = 1e-3
 NEUTRAL_V = 50.0
 SWING_V = 41.7  # half of peak to peak, about 12.5 um
@@ -160,6 +163,13 @@ def stand(config: EmulationConfig, axis: int) -> Stand:
         Controller(fit.stack, inverse.preview_s, taps=inverse.taps[0]),
         Controller(fit.stack),
     )
+
+
+@cache
+def lab() -> tuple[EmulationConfig, tuple[Stand, ...]]:
+    """The unit and its three stacks with every way to command them."""
+    config = EmulationConfig(unit=UNIT, seed=UNIT)
+    return config, tuple(stand(config, axis) for axis in range(3))
 
 
 def run(config: EmulationConfig, axis: int, volts: Array) -> Array:

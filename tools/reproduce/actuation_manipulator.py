@@ -15,11 +15,11 @@ from sim_devices.plant.lab_scan import measure_scan
 from sim_devices.plant.manipulator import tip_displacement
 from sim_devices.plant.unit import build_unit
 from tools.calibrate.manipulator import identify_manipulator
-from tools.calibrate.piezo import PiezoFit
 from tools.calibrate.piezo_feedforward import for_instrument
+from tools.calibrate.piezo_fit import PiezoFit
 from tools.manipulator.workspace import analyse
 from tools.reproduce.actuation_hand import present, recorded_tip_m
-from tools.reproduce.actuation_lab import DT_S, run
+from tools.reproduce.actuation_lab import DT_S, lab, run
 from tools.reproduce.rows import Row
 
 Array = NDArray[np.float64]
@@ -82,8 +82,6 @@ def drive_tip(actuation: Actuation, config: EmulationConfig, path_m: Array) -> A
 
 def three_axes() -> list[Row]:
     """Recorded tremor in all three axes, 50 um p-p in the liveliest; then each axis alone for the cross-coupling."""
-    from tools.reproduce.actuation import lab
-
     config, stands = lab()
     actuation = instrument(config, [s.fit for s in stands])
     source = "000, sec. 6.1.1 and 7.5, whole manipulator"

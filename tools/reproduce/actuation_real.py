@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tools.calibrate.piezo import identify_stack
 from tools.calibrate.piezo_prediction import simulate
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 from tools.reproduce.real_sensors import data_folder
 from tools.reproduce.rows import Row
 

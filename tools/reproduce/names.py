@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib import import_module
 
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.reproduce.rows import Table
 
 MODULES: dict[str, str] = {

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from tools.reproduce.rows import Row
-from tools.tremor.signals import TremorSignal, load_data_sets
+from tools.tremor.signal import TremorSignal
+from tools.tremor.signals import load_data_sets
 
 DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 

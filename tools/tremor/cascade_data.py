@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.tremor.cascade_training import Paths
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 from tools.tremor.spectrum import Spectrum, highest_line, line_spread_hz, mean_spectrum, periodogram, segments
 
 Array = NDArray[np.float64]

@@ -8,7 +8,8 @@ from pathlib import Path
 from textwrap import fill
 
 from tools.errors import InputError
-from tools.tremor.signals import TremorSignal, load_data_sets
+from tools.tremor.signal import TremorSignal
+from tools.tremor.signals import load_data_sets
 
 Progress = Callable[[str], None]
 Section = Callable[[list[TremorSignal], Progress], list[str]]

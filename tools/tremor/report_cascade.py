@@ -9,7 +9,7 @@ import numpy as np
 from tools.tremor.cascade_data import Making, subjects
 from tools.tremor.cascade_study import Study, study
 from tools.tremor.report import Progress, table
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 CONDITIONS: tuple[tuple[str, Making], ...] = (
     ("error above 2 Hz, low-pass of order 4", Making()),

@@ -12,7 +12,7 @@ from firmware_py.tremor.detector_config import DetectorConfig
 from firmware_py.tremor.detectors import Detectors
 from tools.tremor.cascade_data import integrated
 from tools.tremor.report import Progress, table
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from tools.tremor.adapting import AT_S, LEADS_S, WINDOW_S, adapting
 from tools.tremor.cases import Case, case_of, emulated_hand
 from tools.tremor.evaluate import ORACLE, OTHERS, evaluate, summarise
 from tools.tremor.report import table
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 METHODS: tuple[Method, ...] = ("adaptive", "kalman", "wflc_flc", "bmflc_kalman")
 HORIZONS_MS = (0, 2, 8, 20)

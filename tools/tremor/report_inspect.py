@@ -7,7 +7,7 @@ import numpy as np
 from tools.tremor.inspect import inspect
 from tools.tremor.report import Progress, table
 from tools.tremor.shaker import shaker_figures, wrist_figures
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 
 def section(signals: list[TremorSignal], progress: Progress) -> list[str]:

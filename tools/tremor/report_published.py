@@ -8,7 +8,7 @@ from firmware_py.tremor.config import Method, TremorConfig
 from tools.tremor.evaluate import OTHERS, Summary, evaluate, summarise
 from tools.tremor.published import published_case
 from tools.tremor.report import table
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 SEEDS = (201, 202, 203)
 ALONE_MS = (1, 4, 8, 16, 20)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.tremor.inspect import Inspection, Rule, inspect
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from hal.even_samples import evenly
 from tools.errors import InputError
 from tools.mismatch import units
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ def _csv(path: Path) -> dict[str, Array]:
 
 
 def _contract(path: Path) -> Iterator[TremorSignal]:
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     recording = load(path)
     columns = {**recording.inputs, **recording.outputs}

@@ -16,7 +16,7 @@ from hal.even_samples import evenly
 from tools.errors import InputError
 from tools.mismatch.units import STANDARD_GRAVITY
 from tools.tremor.clock import rate_from_known
-from tools.tremor.signals import Reference, TremorSignal, Windows
+from tools.tremor.signal import Reference, TremorSignal, Windows
 from tools.tremor.spectrum import highest_line, periodogram
 
 Array = NDArray[np.float64]

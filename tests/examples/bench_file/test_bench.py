@@ -3,7 +3,8 @@
 import pytest
 
 from drivers.specs import check_devices
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
 

@@ -8,7 +8,8 @@ import pytest
 
 import benches
 from drivers.added import Site, added_driver
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from hal.bench import DeviceSpec
 from hal.clock import VirtualClock
 from hal.errors import ProtocolError

@@ -7,7 +7,7 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 PERIOD_UM, OFFSET = 0.8, 0.5  # of the cosine signal, in its amplitude
 RIVALS = ("static_nonlinearity", "saturation", "backlash", "first_order_lag")

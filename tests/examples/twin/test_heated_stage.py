@@ -7,7 +7,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import RecordingError, load
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
 
 DT_S, SHARE = 0.1, 0.1 / 4.0  # Euler: of the way in one step
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.actuation.config import ActuationConfig
 from tests.unit.actuation.truth import tip_from_strokes
 from tools.calibrate.manipulator import identify_manipulator, load_scan, manipulator_calibration
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.manipulator.workspace import analyse
 
 BUILT = ActuationConfig(

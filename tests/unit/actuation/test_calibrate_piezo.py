@@ -13,7 +13,7 @@ from tools.calibrate.piezo import identify_stack, piezo_calibration
 from tools.calibrate.piezo_dynamics import Dynamics, delayed
 from tools.calibrate.piezo_excitation import excitation_V
 from tools.calibrate.piezo_prediction import simulate
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.mismatch.recording import Recording, Split, TwinText
 
 RATE_HZ = 1000.0

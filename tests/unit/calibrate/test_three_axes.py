@@ -13,7 +13,7 @@ from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.multi_position import fit_poses, identify_poses, missing_poses
 from tools.calibrate.quick import flat, free_fall, turn
 from tools.calibrate.still import remove_drift, warm_up
-from tools.cli.common import InputError
+from tools.errors import InputError
 
 G = 9.80665
 TRUE_BIAS = np.array([300.0, -500.0, 900.0])

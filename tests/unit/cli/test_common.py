@@ -8,7 +8,9 @@ import pytest
 import typer
 
 from hal.errors import BenchError, DeviceNotFound, HalTimeout
-from tools.cli.common import Exit, InputError, check_writable, clear_errors, write_json
+from tools.cli.common import Exit, clear_errors
+from tools.errors import InputError
+from tools.output import check_writable, write_json
 
 
 def test_json_is_plain_and_whole(tmp_path: Path):

@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
 from firmware_py.frame import COMMAND, LAYOUT
+from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.closed_loop.simulate import COMMAND_DELAY_S, simulate, wires_of
 from tools.errors import InputError

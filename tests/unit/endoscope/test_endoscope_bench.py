@@ -11,9 +11,10 @@ import pytest
 from typer.testing import CliRunner
 
 import benches
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.recording.reader import Recording
+from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, load_bench
 from hal.errors import BenchError
 from tools.cli.main import app

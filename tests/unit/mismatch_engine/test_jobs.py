@@ -11,7 +11,7 @@ import pytest
 from tests.unit.mismatch_report.systems import recording
 from tools.mismatch.engine import trial
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 
 @pytest.mark.slow

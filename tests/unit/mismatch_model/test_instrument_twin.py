@@ -15,7 +15,8 @@ from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.plant_factory import emulation_config
 from tests.conftest import DEFAULT_BENCH
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import RecordingError, load
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
 from tools.mismatch.twins.instrument import GivenHand, simulate_instrument
 from tools.mismatch.twins.make import make
 

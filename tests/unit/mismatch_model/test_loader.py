@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.recording import RecordingError, load
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
 
 GOOD = """
 format = 1

@@ -10,7 +10,8 @@ import pytest
 from tests.unit.mismatch_model.test_loader import GOOD
 from tools.mismatch.engine.diagnose import ranges_of
 from tools.mismatch.engine.join import joined
-from tools.mismatch.recording import RecordingError, load
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
 from tools.mismatch.twins.make import make
 
 PLANT = """

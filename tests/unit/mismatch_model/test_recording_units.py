@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 from tools.mismatch.recording_units import si_unit
 
 N, DT, POLE = 400, 0.01, 20.0

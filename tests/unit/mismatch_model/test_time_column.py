@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.recording import RecordingError, load
-from tools.mismatch.recording_load import on_grid
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load, on_grid
 
 TEXT = """format = 1
 data = "data.npz"

@@ -11,7 +11,7 @@ import pytest
 
 from tests.unit.mismatch_report.canned import missing_physics
 from tests.unit.mismatch_report.systems import recording
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.mismatch import batch
 from tools.mismatch.batch import Job, Row
 

@@ -11,7 +11,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_report.systems import CHANNELS, RATE_HZ, TWIN
 from tools.cli.mismatch import app
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 TEXT = (Path(__file__).parents[3] / "docs" / "mismatch.md").read_text(encoding="utf-8")
 

@@ -11,7 +11,7 @@ from tests.unit.mismatch_report.canned import all_verdicts
 from tests.unit.mismatch_report.contract_check import NAMES, faults
 from tests.unit.mismatch_report.systems import recording
 from tools.mismatch.engine.diagnose import diagnose
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 
 @pytest.mark.parametrize("verdict", ["agrees", "recalibrate", "missing_physics", "unexplained"])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tools.cli.common import InputError
+from tools.errors import InputError
 from tools.placement.configurations import cube_004, micron_000, micron_004, micron_004_turned, proposed_004
 from tools.placement.optimise import cost_and_gradient, optimise
 from tools.placement.propositions import check_pairs

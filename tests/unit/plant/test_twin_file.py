@@ -10,7 +10,7 @@ import pytest
 from hal.errors import BenchError
 from sim_devices.plant.lab import main
 from sim_devices.twin_file import load_twin
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make

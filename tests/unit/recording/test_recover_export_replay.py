@@ -21,7 +21,7 @@ from firmware_py.recording.recover import recover
 from firmware_py.recording.replay import Mismatch, replay
 from firmware_py.recording.writer import RecordingWriter
 from tests.unit.recording.samples import COLUMNS, METADATA, same_bits
-from tools.mismatch.recording import load
+from tools.mismatch.recording_load import load
 
 WriteFile = Callable[..., tuple[Path, np.ndarray]]
 NAMES = [name for name, _ in COLUMNS]

@@ -7,7 +7,8 @@ from typing import Any
 
 import pytest
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
+from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 from tools.cli.run import complete_result
 from tools.reports.run_report import headline, summary_lines

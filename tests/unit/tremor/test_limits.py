@@ -12,7 +12,7 @@ from tools.tremor.bound import lift, wiener_bounds
 from tools.tremor.cases import case_of, cases_from, emulated_hand
 from tools.tremor.published import published_case
 from tools.tremor.scores import score
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 CONFIG = TremorConfig(sees="displacement", filter_cutoff_rad_s=float("inf"))
 

@@ -11,7 +11,8 @@ from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.tremor.inspect import Rule, inspect
-from tools.tremor.signals import TremorSignal, load_signals
+from tools.tremor.signal import TremorSignal
+from tools.tremor.signals import load_signals
 from tools.tremor.spectrum import line_spread_hz, periodogram
 
 RATE_HZ = 100.0

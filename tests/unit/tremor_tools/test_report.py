@@ -18,7 +18,7 @@ from tools.tremor.cascade_data import RATE_HZ, Making, learning_paths, subjects,
 from tools.tremor.report import filled, report, table
 from tools.tremor.report_detectors import detection, jerk_acceleration
 from tools.tremor.shaker import _held_out
-from tools.tremor.signals import TremorSignal
+from tools.tremor.signal import TremorSignal
 
 
 def test_paragraphs_are_filled_and_tables_left_alone() -> None:

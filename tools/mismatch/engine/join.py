@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.mismatch.recording import Recording, RecordingError, Split, load
+from tools.mismatch.recording import Recording, RecordingError, Split
+from tools.mismatch.recording_load import load
 
 
 def joined(recording: Recording) -> tuple[Recording, bool]:

@@ -210,7 +210,7 @@ class RealRow:
 def tool_aloud(path: Path) -> dict[str, Any]:
     """As ``tool``; says on standard error every few seconds how far it is."""
     from tools.mismatch.engine.diagnose import diagnose
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     began = last = time.monotonic()
 

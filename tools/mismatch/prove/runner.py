@@ -21,7 +21,7 @@ B = TypeVar("B")
 def tool(path: Path) -> dict[str, Any]:
     """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
     from tools.mismatch.engine.diagnose import diagnose
-    from tools.mismatch.recording import load
+    from tools.mismatch.recording_load import load
 
     report = diagnose(load(path), jobs=1, seed=0)
     return as_plain(report)

@@ -1,16 +1,10 @@
-"""From the ``[twin]`` table to a twin."""
+"""From the ``[twin]`` table to a twin, effects included."""
 
 from __future__ import annotations
 
-from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.twins.axis import axis_twin
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.cluster import cluster_twin
-from tools.mismatch.twins.fmu import fmu_twin
-from tools.mismatch.twins.opaque import user_twin
-from tools.mismatch.twins.state_space import state_space_twin
-from tools.mismatch.twins.static import static_twin
-from tools.mismatch.twins.vocabulary import user_kinds
+from tools.mismatch.twins.core import core
 
 
 def make(recording: Recording) -> Twin:
@@ -23,28 +17,3 @@ def make(recording: Recording) -> Twin:
 
         return corrected_twin(recording)
     return core(recording)
-
-
-def core(recording: Recording) -> Twin:
-    """The twin without the effects of a corrected one (``simulate_text.restore`` adds those)."""
-    kind = recording.twin.kind
-    match kind:
-        case "piezo_stack" | "accelerometer" | "magnetometer":
-            return static_twin(recording)
-        case "accelerometer_cluster":
-            return cluster_twin(recording)
-        case "mechanical_axis":
-            return axis_twin(recording)
-        case "state_space":
-            return state_space_twin(recording)
-        case "fmu":
-            return fmu_twin(recording)
-        case "instrument":
-            from tools.mismatch.twins.instrument import instrument_twin
-
-            return instrument_twin(recording)
-        case _:
-            entry = user_kinds().get(kind)
-            if entry is None:
-                raise RecordingError(f"{recording.path}: [twin] kind '{kind}' is unknown")
-            return user_twin(recording, entry)

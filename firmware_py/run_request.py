@@ -1,0 +1,108 @@
+"""What to run, whichever instrument it is: the request, the bench opened for it, and how the loop is scheduled."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import tempfile
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from drivers.specs import check_devices
+from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
+from hal.bench import BenchFile, OpenBench, Port, open_bench
+from hal.contracts import Clock
+from hal.errors import Disconnected
+
+LOOP_PRIORITY = 80
+
+
+@dataclass(frozen=True)
+class RunRequest:
+    """What to run. ``hand_file`` may carry a part (``FILE#id``), which is why it is text."""
+
+    bench: Path
+    seconds: float
+    virtual: bool = False
+    hand_file: str | None = None
+    hand_scale: float | None = None
+    record: Path | None = None
+    seed: int | None = None
+    live_fds: tuple[int, int] | None = None
+    """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
+    stale_ms: float | None = None
+    """Another limit for missing or belated scans than the bench file's."""
+    realtime: bool = True
+    """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
+    sense_only: bool = False
+    """Nothing is armed; readings that would end a run are noticed."""
+    method: str | None = None
+    """Another tremor estimator than the bench file's."""
+    truth_s: float | None = None
+    """How much truth an emulated world keeps; None: all of it."""
+    clock_start_ns: int = 0
+    """Where the virtual clock begins: marks of time are crossed without waiting for them."""
+
+    def to_json(self, runtime_dir: Path) -> str:
+        """For the firmware's own process."""
+        table = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
+        return json.dumps({**table, "runtime_dir": str(runtime_dir)})
+
+
+@contextlib.contextmanager
+def open_requested(
+    request: RunRequest,
+    bench: BenchFile,
+    runtime_dir: Path | None,
+    wrap: Callable[[str, Port, Clock], Port] | None = None,
+) -> Iterator[OpenBench]:
+    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own.
+
+    ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
+    """
+    check_devices(bench.description, str(bench.path))
+    with contextlib.ExitStack() as stack:
+        folder = runtime_dir or Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="micron-")))
+        yield stack.enter_context(
+            open_bench(
+                bench,
+                virtual=request.virtual,
+                runtime_dir=folder,
+                hand_file=Path(request.hand_file) if request.hand_file else None,
+                hand_scale=request.hand_scale,
+                seed=request.seed,
+                truth_s=request.truth_s,
+                start_ns=request.clock_start_ns,
+                wrap=wrap,
+            )
+        )
+
+
+def truth_of(opened: OpenBench) -> dict[str, Any] | None:
+    """Stops the emulated world; its truth, or None where nothing is emulated or the world died."""
+    if opened.world is None:
+        return None
+    opened.world.stop()
+    with contextlib.suppress(Disconnected):
+        return opened.world.truth()
+    return None
+
+
+@contextlib.contextmanager
+def scheduling(plain: bool) -> Iterator[RealtimeReport]:
+    if plain:
+        yield RealtimeReport()
+        return
+    with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
+        yield report
+
+
+def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
+    """Which real-time settings the loop ran with, in words."""
+    if virtual:
+        return "virtual time"
+    if not report.settings:
+        return "no real-time settings asked for"
+    return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
