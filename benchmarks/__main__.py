@@ -27,7 +27,8 @@ from benchmarks.row import Row
 RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
 MODULES = (
-    "step", "latency", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder", "memory", "start",
+    "step", "kinematics", "latency", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder",
+    "memory", "start",
 )  # fmt: skip
 LIMIT_S = 600.0
 """A module that takes longer is stopped; the mismatch engine with 30 min of recording takes about half of it."""

@@ -87,7 +87,7 @@ def run_in_process(
             opened.clock,
             tick_hz=bench.description.clock.tick_hz,
             recorder=recorder,
-            on_status=on_status,
+            on_status=with_fallbacks(on_status, stages),
             live=live,
             sense_only=request.sense_only,
         )
@@ -107,6 +107,11 @@ def run_in_process(
         return outcome, truth_of(opened)
 
 
+def with_fallbacks(sink: StatusSink | None, stages: Stages) -> StatusSink | None:
+    """``sink``; with numeric kinematics it is also told how many ticks fell back to the analytic one."""
+    if sink is None or stages.configs.sensing.kinematics_method != "numeric":
+        return sink
+    return lambda status: sink({**status, "fallbacks": stages.sensing.fallbacks} if "t_s" in status else status)
 def _recorder(
     request: RunRequest, bench: BenchFile, configs: StageConfigs, opened: OpenBench
 ) -> RecorderProcess | None:
@@ -186,6 +191,10 @@ def make_outcome(
             "reached_ns": loop.safe_reached_ns,
         },
         "estimator": loop.stages.configs.tremor.method,
+        "kinematics": {
+            "method": loop.stages.configs.sensing.kinematics_method,
+            "fallbacks": loop.stages.sensing.fallbacks,
+        },
         "realtime": describe_scheduling(report, request.virtual),
         "recording": str(recording.path) if recording is not None else None,
         "recorder": {

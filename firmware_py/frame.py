@@ -91,6 +91,7 @@ class FrameStatus(IntFlag):
     MANUAL = 256  # the command was chosen by hand (bench page), not computed
     JERK = 512  # the hand twitches: a burst between voluntary motion and tremor
     DRIFT = 1024  # acceleration has stayed away from zero: bias or attitude drifts
+    FALLBACK = 2048  # the numeric kinematics did not converge: this tick is the analytic solution
 
 
 class Clip(IntFlag):
@@ -184,6 +185,7 @@ SETTLING = int(FrameStatus.SETTLING)
 RESTARTED = int(FrameStatus.RESTARTED)
 JERK = int(FrameStatus.JERK)
 DRIFT = int(FrameStatus.DRIFT)
+FALLBACK = int(FrameStatus.FALLBACK)
 CLIP_WORKSPACE = int(Clip.WORKSPACE)
 CLIP_VOLTAGE = int(Clip.VOLTAGE)
 CLIP_SLEW = int(Clip.SLEW)

@@ -98,6 +98,8 @@ class SensingConfig(BaseModel):
     magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
     magnetometer_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
+    # numeric: force and rate of the same instant, iterated (000 (2.6)); analytic: centripetal part of the tick before
+    kinematics_method: Literal["analytic", "numeric"] = "analytic"
     attitude_method: Literal["observer", "error-state", "quaternion-kalman"] = "error-state"
     # the slow part of the hand's velocity, rms, with its correlation time: error-state filter
     hand_velocity_m_s: Positive = 8e-5

@@ -15,9 +15,6 @@ from numpy.typing import NDArray
 from firmware_py.records import Record, new_record
 from hal.compiled import kernel
 
-MAX_ITERATIONS = 3
-RATE_TOLERANCE_RAD_S = 1e-9
-
 
 def kinematics_dtype(n: int) -> np.dtype[Any]:
     """``solve`` (6, n) maps readings to (f, alpha); ``axes`` and ``positions`` are (n, 3), m; ``weight`` 1 / noise."""
@@ -69,56 +66,3 @@ def solve_motion(
         tangential = readings[i] - centripetal
         for k in range(6):
             out[k] += params.solve[k, i] * tangential
-
-
-@kernel
-def solve_rate(
-    readings: NDArray[np.float64],
-    previous_rate: NDArray[np.float64],
-    dt_s: float,
-    params: Record,
-    out: NDArray[np.float64],
-) -> int:
-    """``out[:6]`` = (f m/s^2, rate rad/s) with alpha = (rate - previous_rate) / dt: 000 (2.6), corrected (ERRATA 4, 5).
-
-    Gauss-Newton with the analytic Jacobian, weighted by ``params.weight`` (N,). Returns the iterations it took;
-    -1 when three were not enough: ``out`` is then the solution with the centripetal part of the previous rate
-    (``solve_motion``), and the caller counts it.
-    """
-    n = len(readings)
-    jacobian = np.empty((n, 6))
-    residual = np.empty(n)
-    solve_motion(readings, previous_rate, params, out)
-    for k in range(3):
-        out[3 + k] = previous_rate[k] + out[3 + k] * dt_s
-    analytic = out[:6].copy()
-    for iteration in range(MAX_ITERATIONS):
-        wx, wy, wz = out[3], out[4], out[5]
-        ax, ay, az = (wx - previous_rate[0]) / dt_s, (wy - previous_rate[1]) / dt_s, (wz - previous_rate[2]) / dt_s
-        square = wx * wx + wy * wy + wz * wz
-        for i in range(n):
-            x, y, z = params.positions[i, 0], params.positions[i, 1], params.positions[i, 2]
-            sx, sy, sz = params.axes[i, 0], params.axes[i, 1], params.axes[i, 2]
-            tx, ty, tz = y * sz - z * sy, z * sx - x * sz, x * sy - y * sx  # r x s
-            along = wx * x + wy * y + wz * z
-            across = wx * sx + wy * sy + wz * sz
-            radial = sx * x + sy * y + sz * z
-            weight = params.weight[i]
-            predicted = sx * out[0] + sy * out[1] + sz * out[2] + ax * tx + ay * ty + az * tz
-            predicted += across * along - radial * square
-            residual[i] = weight * (readings[i] - predicted)
-            jacobian[i, 0], jacobian[i, 1], jacobian[i, 2] = weight * sx, weight * sy, weight * sz
-            jacobian[i, 3] = weight * (tx / dt_s + sx * along + across * x - 2.0 * radial * wx)
-            jacobian[i, 4] = weight * (ty / dt_s + sy * along + across * y - 2.0 * radial * wy)
-            jacobian[i, 5] = weight * (tz / dt_s + sz * along + across * z - 2.0 * radial * wz)
-        step = np.linalg.lstsq(jacobian, residual)[0]
-        size = 0.0
-        for k in range(6):
-            out[k] += step[k]
-        for k in range(3):
-            size = max(size, abs(step[3 + k]))
-        if size < RATE_TOLERANCE_RAD_S:
-            return iteration + 1
-    for k in range(6):
-        out[k] = analytic[k]
-    return -1

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from firmware_py.frame import (
     ALIGNING,
     ANGULAR_ACCELERATION,
+    FALLBACK,
     INVALID,
     MAGNETOMETER,
     MAGNETOMETER_FRESH,
@@ -43,6 +44,7 @@ from firmware_py.sensing.calibration import (
 from firmware_py.sensing.config import MOST_AXES, STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
 from firmware_py.sensing.leave_out import leave_out
+from firmware_py.sensing.numeric_kinematics import solve_numeric
 from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
     TRANSLATION,
@@ -72,6 +74,7 @@ def sense_dtype(n: int) -> np.dtype[Any]:
             ("quiet_point", "f8", (3,)),  # where gravity is felt with the least noise
             ("lean_sections", "f8", (2, 5)),
             ("max_gap_ticks", "f8"),
+            ("numeric", "i8"),  # kinematics: 1 numeric, 0 analytic
             ("parities", "i8"),
             ("null", "f8", (len(PARITIES), n)),  # combinations of readings free of f and alpha; zeros beyond N - 6
         ]
@@ -90,6 +93,7 @@ def sense_state_dtype(n: int) -> np.dtype[Any]:
             ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
             ("turned", "f8", (3,)),  # correction of the last tick
             ("last_tick", "f8"),
+            ("fallbacks", "i8"),  # ticks that the numeric kinematics left to the analytic one
         ]
     )
 
@@ -112,6 +116,7 @@ def sense_params(config: SensingConfig) -> Record:
         quiet_point=quiet_point(config)[0],
         lean_sections=integrator_sections(config.tick_hz, LEAN_CORNER_HZ),
         max_gap_ticks=float(config.max_gap_ticks),
+        numeric=config.kinematics_method == "numeric",
     )
 
 
@@ -193,7 +198,11 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     motion = state.motion
     if param.parities > 0:
         _redundancy(state, param, frame)
-    solve_motion(readings, attitude.rate, param.kinematics, motion)
+    if param.numeric == 0 or attitude.aligned == 0:
+        solve_motion(readings, attitude.rate, param.kinematics, motion)
+    elif solve_numeric(readings, attitude.rate, steps * param.attitude.dt_s, param.kinematics, motion) < 0:
+        state.fallbacks += 1
+        status |= FALLBACK
     field = frame[MAGNETOMETER : MAGNETOMETER + 3]
     if attitude.aligned == 0.0:
         status |= ALIGNING
@@ -230,6 +239,11 @@ class Sensing:
 
     def step(self, frame: NDArray[np.float64]) -> None:
         sense_kernel(frame, self.state, self.params)
+
+    @property
+    def fallbacks(self) -> int:
+        """Ticks so far in which the numeric kinematics did not converge and the analytic one stood in."""
+        return int(np.atleast_1d(self.state)["fallbacks"][0])
 
     def leave_out(self, axis: int, usual: NDArray[np.float64]) -> float:
         """Go on without ``axis``; see ``leave_out.leave_out``."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.sensing.kinematics import kinematic_params, observation_matrix, solve_rate
+from firmware_py.sensing.kinematics import kinematic_params, observation_matrix
+from firmware_py.sensing.numeric_kinematics import solve_numeric
 from tools.placement.configurations import Placement
 
 Array = NDArray[np.float64]
@@ -72,9 +73,9 @@ def rate_covariance_unscented(
     out = np.empty(6)
 
     def solve(error: Array) -> Array:
-        if solve_rate(readings + error, before, dt_s, params[0], out) < 0:
+        if solve_numeric(readings + error, before, dt_s, params[0], out) < 0:
             raise ValueError(f"{placement.name}: the rate did not converge")
-        return out[3:].copy()
+        return before + dt_s * out[3:]
 
     return unscented(np.diag(sigma**2), solve)[1]
 

@@ -91,6 +91,9 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
         f"{result['ticks']['skipped']} ticks skipped, {result['ticks']['caught_up']} caught up without a command of "
         f"their own, {result['commands']['clipped']} commands clipped",
     ]
+    kinematics = result.get("kinematics", {})
+    if kinematics.get("method") == "numeric":
+        lines.append(f"numeric kinematics: {kinematics['fallbacks']} ticks fell back to the analytic solution")
     if result["noticed"]:
         lines.append("noticed: " + ", ".join(result["noticed"]))
     if voluntary["gain"] is not None:

@@ -1,15 +1,28 @@
-"""The numeric differential kinematics against a body moved through space (000 (2.6), ERRATA 4, 5)."""
+"""The numeric differential kinematics against a body moved through space (000 (2.6)), alone and in the step."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
+from firmware_py.frame import ACCELEROMETER, COUNTS, FALLBACK, LAYOUT, STATUS, TICK
 from firmware_py.records import attributes
-from firmware_py.sensing.kinematics import kinematic_params, solve_rate
-from tests.unit.sensing.rigid_body import AXES, POSITIONS
+from firmware_py.sensing import stage
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.kinematics import kinematic_params
+from firmware_py.sensing.numeric_kinematics import back_substitute, fold_row, solve_numeric
+from firmware_py.sensing.stage import Sensing
+from hal.errors import BenchError
+from tests.unit.allocations import allocations
+from tests.unit.pure_python import without_compiler
+from tests.unit.sensing.rigid_body import AXES, POSITIONS, RATE_HZ, frames_of, hand_motion
+
+Array = np.ndarray
+DT_S = 1e-3
+NUMERIC = SensingConfig(kinematics_method="numeric", align_s=0.02)
 
 
-def step_readings(rate: np.ndarray, before: np.ndarray, dt_s: float, positions: np.ndarray, axes: np.ndarray):
+def step_readings(rate: Array, before: Array, dt_s: float, positions: Array, axes: Array) -> tuple[Array, Array]:
     """Readings of a body whose rate went from ``before`` to ``rate``, by vector products."""
     alpha = (rate - before) / dt_s
     force = np.array([0.4, -1.0, 9.6])
@@ -27,23 +40,147 @@ def test_the_rate_comes_back_to_1e_9_in_three_iterations() -> None:
         for _ in range(50):
             before = rng.normal(0.0, 1.0, 3)
             rate = before + rng.normal(0.0, 0.02, 3)
-            y, force = step_readings(rate, before, 1e-3, positions, axes)
-            assert 1 <= solve_rate(y, before, 1e-3, params[0], out) <= 3
-            np.testing.assert_allclose(out[3:], rate, atol=1e-9)
+            y, force = step_readings(rate, before, DT_S, positions, axes)
+            assert 1 <= solve_numeric(y, before, DT_S, params[0], out) <= 3
+            np.testing.assert_allclose(before + DT_S * out[3:], rate, atol=1e-9)
             np.testing.assert_allclose(out[:3], force, atol=1e-6)
+
+
+def test_what_the_axes_contradict_is_weighed_by_their_noise() -> None:
+    """Nine axes with noise: the least weighted squares, found by scipy from the readings' equation alone."""
+    from scipy.optimize import least_squares
+
+    rng = np.random.default_rng(2)
+    positions = np.vstack([POSITIONS, [[0.01, 0.01, 0.05], [-0.01, 0.0, 0.08], [0.0, 0.02, 0.02]]])
+    axes = np.vstack([AXES, [[0.6, 0.8, 0.0], [0.0, 0.6, 0.8], [0.8, 0.0, 0.6]]])
+    noise = rng.uniform(0.5, 3.0, 9)
+    before = np.array([1.0, -2.0, 0.5])
+    y, _ = step_readings(before + 0.01, before, DT_S, positions, axes)
+    y += 0.05 * noise * rng.standard_normal(9)
+    out = np.empty(6)
+    assert solve_numeric(y, before, DT_S, kinematic_params(positions, axes, noise)[0], out) > 0
+
+    def left(unknown: Array) -> Array:
+        rate = before + DT_S * unknown[3:]
+        force = unknown[:3] + np.cross(unknown[3:], positions) + np.cross(rate, np.cross(rate, positions))
+        return (np.sum(axes * force, axis=1) - y) / noise
+
+    found = least_squares(left, np.zeros(6), xtol=1e-15, ftol=1e-15, gtol=1e-15, x_scale=(1, 1, 1, 20, 20, 20)).x
+    np.testing.assert_allclose(out, found, rtol=1e-6, atol=1e-6)
 
 
 def test_a_reading_that_cannot_be_solved_falls_back_to_the_analytic_solution() -> None:
     params = kinematic_params(POSITIONS, AXES, np.ones(6))
     out = np.empty(6)
     y = 1e9 * np.array([1.0, -1.0, 1.0, 1.0, -1.0, 1.0])
-    assert solve_rate(y, np.zeros(3), 1.0, params[0], out) == -1
+    assert solve_numeric(y, np.zeros(3), 1.0, params[0], out) == -1
     np.testing.assert_allclose(out, params["solve"][0] @ y, rtol=1e-12)
 
 
-def test_kernel_and_python_agree() -> None:
+def test_rows_folded_one_by_one_are_the_least_squares() -> None:
+    rng = np.random.default_rng(3)
+    matrix, value = rng.standard_normal((9, 6)) * np.logspace(0, 4, 6), rng.standard_normal(9)
+    triangle, right = np.zeros((6, 6)), np.zeros(6)
+    for row, one in zip(matrix, value, strict=True):
+        fold_row(row.copy(), one, triangle, right)
+    assert back_substitute(triangle, right)
+    np.testing.assert_allclose(right, np.linalg.lstsq(matrix, value)[0], rtol=1e-10)
+    assert not back_substitute(np.zeros((6, 6)), right)
+
+
+def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     params = kinematic_params(POSITIONS, AXES, np.ones(6))
     y, w = np.linspace(-3, 9, 6), np.array([0.3, -2.0, 1.0])
     a, b = np.empty(6), np.empty(6)
-    assert solve_rate(y, w, 1e-3, params[0], a) == solve_rate.py_func(y, w, 1e-3, attributes(params)[0], b)  # type: ignore[attr-defined]
+    took = solve_numeric(y, w, DT_S, params[0], a)
+    without_compiler(monkeypatch)
+    assert took == solve_numeric.py_func(y, w, DT_S, attributes(params)[0], b)  # type: ignore[attr-defined]
     np.testing.assert_allclose(a, b, rtol=1e-9)
+
+
+def wild(n: int) -> Array:
+    """Frames (n, Layout.size) of a body that turns at 3 rad/s with 60 rad/s^2 about its long axis."""
+    t = np.arange(n) / RATE_HZ
+    turn = np.stack([0.2 * np.sin(6.0 * t), np.zeros(n), 0.15 * np.cos(20.0 * t)], axis=1)
+    motion = hand_motion(3, n / RATE_HZ, np.zeros((n, 3)), turn)
+    return frames_of(motion.readings(), motion)
+
+
+def run(frames: Array, config: SensingConfig) -> Sensing:
+    sensing = Sensing(config)
+    for frame in frames:
+        sensing.step(frame)
+    return sensing
+
+
+@pytest.mark.parametrize("method", ["numeric", "analytic"])
+def test_in_the_step_force_and_rate_are_of_the_same_instant(method: str) -> None:
+    """The readings come back from (f, alpha) and the rate of their own tick, rate before + dt alpha; without iterating
+    they miss by what that tick changed in the centripetal part."""
+    config = NUMERIC.model_copy(update={"kinematics_method": method})
+    frames = wild(301)
+    sensing = run(frames[:300], config)
+    before = sensing.state["attitude"]["rate"][0].copy()
+    assert np.abs(before).max() > 1.0
+    sensing.step(frames[300])
+    assert sensing.fallbacks == 0
+    assert not int(frames[300, STATUS]) & FALLBACK
+    force, alpha = np.split(sensing.state["motion"][0], 2)
+    rate = before + DT_S * alpha
+
+    def centripetal(w: Array) -> Array:
+        return np.sum(AXES * np.cross(w, np.cross(w, POSITIONS)), axis=1)
+
+    seen = np.sum(AXES * (force + np.cross(alpha, POSITIONS)), axis=1) + centripetal(rate)
+    late = centripetal(rate) - centripetal(before)
+    assert np.abs(late).max() > 1e-5
+    miss = seen - frames[300, ACCELEROMETER : ACCELEROMETER + 6]
+    np.testing.assert_allclose(miss, late if method == "analytic" else 0.0, atol=1e-9)
+
+
+def test_both_ways_agree_for_a_hand_and_part_for_a_tumble() -> None:
+    """The analytic one is a tick late with the centripetal part: r |omega| |alpha| dt."""
+    frames = wild(400)
+    other = frames.copy()
+    run(frames, NUMERIC)
+    run(other, NUMERIC.model_copy(update={"kinematics_method": "analytic"}))
+    apart = np.abs(frames - other)[300:, LAYOUT["specific_force"]].max()
+    rate = np.abs(frames[300:, LAYOUT["rate"]]).max()
+    assert 1e-5 < apart < 10.0 * 0.116 * rate * 60.0 * DT_S
+
+
+def test_what_does_not_converge_is_counted_and_marked() -> None:
+    """After a gap of 40 ticks a blow of several g on one axis: three iterations are not enough."""
+    frames = wild(400)
+    frames[300:, TICK] += 40
+    frames[300, COUNTS] += 30_000.0
+    sensing = run(frames, NUMERIC)
+    assert sensing.fallbacks == 1
+    assert np.flatnonzero(frames[:, STATUS].astype(int) & FALLBACK).tolist() == [300]
+    sensing.reset()
+    assert sensing.fallbacks == 0
+
+
+def test_the_numeric_step_is_the_same_in_plain_python_and_allocates_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = wild(60)
+    twins = frames.copy()
+    sensing = Sensing(NUMERIC)
+    for frame in frames[:30]:
+        sensing.step(frame)
+    first = allocations()
+    sensing.step(frames[30])
+    one = allocations() - first
+    first = allocations()
+    for frame in frames[31:]:
+        sensing.step(frame)
+    assert allocations() - first == one * len(frames[31:])
+    without_compiler(monkeypatch)
+    twin = Sensing(NUMERIC)
+    for frame in twins:
+        stage.sense_kernel(frame, attributes(twin.state), attributes(twin.params))
+    np.testing.assert_allclose(twins, frames, rtol=1e-9, atol=1e-12)
+
+
+def test_another_name_is_refused() -> None:
+    with pytest.raises(BenchError, match="kinematics_method"):
+        SensingConfig.from_dict({"kinematics_method": "newton"})
