@@ -112,6 +112,8 @@ def with_fallbacks(sink: StatusSink | None, stages: Stages) -> StatusSink | None
     if sink is None or stages.configs.sensing.kinematics_method != "numeric":
         return sink
     return lambda status: sink({**status, "fallbacks": stages.sensing.fallbacks} if "t_s" in status else status)
+
+
 def _recorder(
     request: RunRequest, bench: BenchFile, configs: StageConfigs, opened: OpenBench
 ) -> RecorderProcess | None:
