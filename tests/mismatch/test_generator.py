@@ -9,9 +9,10 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lsim
 
-from tools.mismatch.prove import draw, kernels, noise
+from tools.mismatch.prove import draw, guests, kernels, noise
 from tools.mismatch.prove.catalog import TABLE, TWINS
 from tools.mismatch.prove.disk import write
+from tools.mismatch.prove.plans import plans as drawn_plans
 from tools.mismatch.prove.plants import Scene, simulate
 from tools.mismatch.prove.proof import generate
 from tools.mismatch.recording_load import load
@@ -78,12 +79,13 @@ def test_same_seed_same_bytes_and_another_seed_another_recording(tmp_path: Path)
 
 def test_recordings_hold_no_answer_and_load_as_the_contract_says(tmp_path: Path) -> None:
     names = sorted({n for t in TABLE.values() for n in t} | {"unknown", "severity", "agrees", "recalibrate"})
-    plans = draw.plans(5, 10)
+    plans = drawn_plans(5, 10)
     plans += [draw.Plan("agrees", t, (), 4.0) for t in TWINS] + [draw.Plan("unknown", "piezo_stack", (), 10.0)]
     paths, answers = generate(5, plans, tmp_path, max_samples=3000)
     assert len(answers) >= len(plans) - 2
     for name, path in paths.items():
-        rec = load(path)
+        with guests.installed(path):
+            rec = load(path)
         assert rec.twin.kind == answers[name]["twin"]
         assert set(rec.outputs) == set(answers[name]["noise_rms"])
         assert rec.n == answers[name]["samples"]
@@ -91,9 +93,10 @@ def test_recordings_hold_no_answer_and_load_as_the_contract_says(tmp_path: Path)
         csv = path.parent / "data.csv"
         if csv.exists():
             text += csv.read_text().splitlines()[0]
-        assert sorted(p.name for p in path.parent.iterdir()) in (
-            ["data.csv", "recording.toml"],
-            ["data.npz", "recording.toml"],
+        beside = {guests.FMU: {"model.fmu"}, guests.INSTRUMENT: {"bench.toml"}}.get(rec.twin.kind, set())
+        assert {p.name for p in path.parent.iterdir()} - beside in (
+            {"data.csv", "recording.toml"},
+            {"data.npz", "recording.toml"},
         )
         assert not [n for n in names if n in text]
         for out, rms in answers[name]["noise_rms"].items():

@@ -13,6 +13,7 @@ from tests.unit.mismatch_model.made import recording
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.fmu import FmuRun
 from tools.mismatch.twins.make import make
 
 pytest.importorskip("fmpy", reason="the extra 'fmu' is not installed")
@@ -88,3 +89,22 @@ def test_what_is_no_fmu_or_lacks_a_variable_is_said(fmu: Path, tmp_path: Path) -
         z.writestr("readme.txt", "nothing")
     with pytest.raises(RecordingError, match="cannot be opened as an FMU"):
         make(of(tmp_path / "empty.fmu"))
+
+
+def test_stepping_it_ourselves_is_what_fmpy_does(fmu: Path) -> None:
+    run = FmuRun(fmu, ("power",), ("position",), DT)
+    inputs, start = {"power": POWER, "t": np.arange(N) * DT}, {"um_per_W": 3.0, "time_constant_s": 0.2}
+    mine = run(inputs, start)["position"]
+    _, _, instance = run._opened()
+    instance.reset()
+    np.testing.assert_allclose(mine, run._simulated(inputs, start)["position"], rtol=0.0, atol=1e-12)
+
+
+def test_values_that_the_fmu_cannot_take_end_no_search_but_the_engineers_own_do(fmu: Path) -> None:
+    """exp(-dt / tau) of a negative time constant overflows: a search must be able to try it and turn round."""
+    rec = of(fmu)
+    tried = Model(make(rec)).simulate(View.whole(rec), np.array([2.0, -1e-5]))["position"]
+    assert np.all(np.isnan(tried))
+    given = of(fmu, time_constant_s=-1e-5)
+    with pytest.raises(RecordingError, match=r"the FMU stopped|is (nan|inf)"):
+        Model(make(given)).simulate(View.whole(given), np.array([2.0, -1e-5]))

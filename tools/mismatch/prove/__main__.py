@@ -32,15 +32,15 @@ def main() -> int:
 
     from rich.console import Console
 
-    from tools.mismatch.prove import draw, seal
+    from tools.mismatch.prove import plans, seal
     from tools.mismatch.prove.proof import generate, prove
     from tools.mismatch.prove.table import show
 
     if args.generate_only:
         if args.keep is None or args.seed is None:
             p.error("--generate-only needs --keep and --seed")
-        plans = draw.plans(args.seed, args.cases, args.only)
-        _, answers = generate(args.seed, plans, args.keep / "recordings", jobs=args.jobs, max_samples=args.max_samples)
+        asked = plans.plans(args.seed, args.cases, args.only)
+        _, answers = generate(args.seed, asked, args.keep / "recordings", jobs=args.jobs, max_samples=args.max_samples)
         print(f"{len(answers)} recordings, sha256 {seal.close(answers, args.keep / 'sealed')}")
         return 0
     result = prove(args.cases, args.seed, args.jobs, args.keep, only=args.only, max_samples=args.max_samples)

@@ -16,6 +16,7 @@ from tools.mismatch.prove import forms_axis as ax
 from tools.mismatch.prove import forms_sensor as fs
 from tools.mismatch.prove import forms_time as ft
 from tools.mismatch.prove.forms_memory import Rng
+from tools.mismatch.prove.guests import FMU, INSTRUMENT, USER
 from tools.mismatch.prove.plants import Bound, Scene
 from tools.mismatch.prove.ports import shaped
 
@@ -38,6 +39,12 @@ class Entry:
     needs_all_axes: bool = False
     context: str | None = None
     fast_only: bool = False
+
+
+INSTRUMENT_DRIVE = ("hysteresis", "backlash", "dead_zone", "saturation", "slew_limit", "dead_time")
+INSTRUMENT_ANYTIME = (
+    "mains_interference", "vibration", "spikes", "step_shift", "quantization", "clock_skew", "dropped_samples",
+)  # fmt: skip
 
 
 def _shape(name: str, where: str) -> Callable[[Rng, Scene], Bound]:
@@ -186,6 +193,16 @@ def _table() -> dict[str, dict[str, Entry]]:
         "resonance": Entry(_shape("resonance", "one_out"), BODY, "content near the mode", fast_only=True),
     }
     cluster.pop("random_walk")
+    # an opaque twin has inputs and outputs; two seconds of the bench hold no slow effect
+    brief = {k: _anytime(ss_under)[k] for k in INSTRUMENT_ANYTIME}
+    at_commands = {k: _one_signal("drive")[k] for k in INSTRUMENT_DRIVE}
+    bench = {
+        **at_commands,
+        **brief,
+        "static_nonlinearity": Entry(_shape("static_nonlinearity", "one_out"), WIDE, "a range of readings"),
+        "first_order_lag": Entry(_shape("first_order_lag", "one_out"), WIDE, "several frequencies", fast_only=True),
+        "channel_delay": Entry(ft.channel_delay, WIDE, "several outputs, fast input", fast_only=True),
+    }
     return {
         "piezo_stack": piezo,
         "accelerometer": acc,
@@ -193,6 +210,9 @@ def _table() -> dict[str, dict[str, Entry]]:
         "accelerometer_cluster": cluster,
         "mechanical_axis": axis,
         "state_space": ss,
+        FMU: ss,
+        USER: ss,
+        INSTRUMENT: bench,
     }
 
 

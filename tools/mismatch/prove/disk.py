@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from tools.mismatch.prove import guests
 from tools.mismatch.prove.draw import Case
 from tools.mismatch.prove.forms_memory import Array, Rng
 
@@ -26,6 +27,8 @@ UNITS: dict[str, tuple[tuple[str, float, float], ...]] = {
     "A": (("A", 1.0, 0.0), ("mA", 1e3, 0.0)),
     "Pa": (("Pa", 1.0, 0.0),),
     "1": (("1", 1.0, 0.0),),
+    "W": (("W", 1.0, 0.0), ("mW", 1e3, 0.0)),
+    "rad": (("rad", 1.0, 0.0), ("mrad", 1e3, 0.0)),
 }
 
 SIGNAL_UNITS = {
@@ -45,14 +48,24 @@ SIGNAL_UNITS = {
     "y": "V",
     "angle": "V",
     "speed": "V",
+    "power": "W",
+    "expansion": "um",
+    "lift": "um",
 }
+
+
+STARTS = (
+    ("voltage", "V"), ("field", "uT"), ("accel_", "m/s^2"), ("angular_rate", "rad/s"),
+    # of the instrument
+    ("command_", "V"), ("volts_", "V"), ("path_", "m"), ("angle_", "rad"), ("tip_", "m"),
+)  # fmt: skip
 
 
 def contract_unit(signal: str) -> str:
     """The unit of a signal in the contract's section 2."""
     if signal in SIGNAL_UNITS:
         return SIGNAL_UNITS[signal]
-    for start, unit in (("voltage", "V"), ("field", "uT"), ("accel_", "m/s^2"), ("angular_rate", "rad/s")):
+    for start, unit in STARTS:
         if signal.startswith(start):
             return unit
     if signal.startswith("specific_force"):
@@ -88,6 +101,19 @@ def toml_text(head: dict[str, Any]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def _beside(case: Case, folder: Path) -> dict[str, Any]:
+    """The descriptor's parameters; what a twin of somebody else needs is put where they say."""
+    if case.scene.twin == guests.FMU:
+        guests.build_fmu(folder / "model.fmu")
+        return {"path": "model.fmu", **case.given}
+    if case.scene.twin == guests.INSTRUMENT:
+        guests.write_bench(folder / "bench.toml", int(case.given["unit"]))
+        return {"bench": "bench.toml"}
+    if case.scene.twin == guests.USER:
+        guests.install_user_twin(folder.parent.parent)
+    return case.given
+
+
 def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
     """Write descriptor and data; the path of the descriptor."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -106,6 +132,8 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
         if family not in chosen:
             options = UNITS[base]
             chosen[family] = options[int(rng.integers(len(options)))] if rng.random() < 0.6 else options[0]
+            if scene.twin in (guests.FMU, guests.USER):
+                chosen[family] = options[0]  # such a twin gets what the recording says, in whatever unit
         unit, factor, shift = chosen[family]
         name = f"ch{number}" if style == "plain" else f"{signal}_{unit.replace('/', '_per_').replace('^', '')}"
         columns[name] = values[: scene.keep] * factor + shift
@@ -127,7 +155,7 @@ def write(case: Case, folder: Path, title: str, rng: Rng) -> Path:
     else:
         head["data"] = "data.npz"
         np.savez(folder / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
-    head |= {"twin": {"kind": scene.twin, "parameters": case.given}, "channels": tables}
+    head |= {"twin": {"kind": scene.twin, "parameters": _beside(case, folder)}, "channels": tables}
     path = folder / "recording.toml"
     path.write_text(toml_text(head))
     return path

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from tools.mismatch.prove import guests
 from tools.mismatch.prove import noise as noises
-from tools.mismatch.prove.catalog import RIVALS, TABLE, TWINS, Entry
+from tools.mismatch.prove.catalog import TABLE, Entry
 from tools.mismatch.prove.forms_memory import Rng
 from tools.mismatch.prove.forms_unknown import NAME as UNKNOWN
 from tools.mismatch.prove.forms_unknown import unknown
@@ -212,9 +213,8 @@ def _wish(rng: Rng, plan: Plan, entries: Sequence[Entry], max_samples: int) -> W
 
 
 def _strangers(twin: str) -> tuple[str, ...]:
-    return {"piezo_stack": ("load",), "state_space": ("pressure", "humidity", "load")}.get(
-        twin, ("pressure", "humidity", "load")
-    )
+    few = {"piezo_stack": ("load",), guests.INSTRUMENT: ("pressure", "humidity")}
+    return few.get(twin, ("pressure", "humidity", "load"))
 
 
 def believed(rng: Rng, scene: Scene, share: float) -> dict[str, Any]:
@@ -227,7 +227,8 @@ def believed(rng: Rng, scene: Scene, share: float) -> dict[str, Any]:
         sign = float(rng.choice([-1.0, 1.0]))
         return float(v + sign * share * rng.uniform(0.5, 1.0) * (abs(v) + around))
 
-    for key in ("gain_um_per_V", "scale_V_per_g", "scale_V_per_uT", "mass", "damping", "stiffness"):
+    moved = ("gain_um_per_V", "scale_V_per_g", "scale_V_per_uT", "mass", "damping", "stiffness")
+    for key in (*moved, "um_per_W", "time_constant_s", "arm_um", "rad_per_V"):
         if key in p:
             p[key] = move(p[key])
     if "bias_V" in p:
@@ -356,71 +357,4 @@ def _attempt(rng: Rng, plan: Plan, max_samples: int, noise_kind: str | None) -> 
     )
 
 
-def plans(seed: int, count: int, only: tuple[str, str, float] | None = None) -> list[Plan]:
-    """A balanced list: every effect name in turn, then pairs, controls, effects outside the vocabulary.
-
-    ``only`` = (twin, effect, severity), empty or zero where free, restricts the single effects.
-    """
-    rng = np.random.default_rng([seed, 7])
-    if only is not None:
-        return _restricted(rng, count, only)
-    share = {"single": 0.55, "pair": 0.125, "agrees": 0.1, "recalibrate": 0.1, "unknown": 0.125}
-    number = {k: round(v * count) for k, v in share.items()}
-    number["single"] += count - sum(number.values())
-    out: list[Plan] = []
-    names = sorted({n for t in TABLE.values() for n in t})
-    deck: list[str] = []
-    for i in range(number["single"]):
-        if not deck:
-            deck = [str(n) for n in rng.permutation(names)]
-        name = deck.pop()
-        twin = str(rng.choice([t for t in TWINS if name in TABLE[t]]))
-        out.append(Plan("single", twin, (name,), SEVERITIES[i % 4]))
-    for _ in range(number["pair"]):
-        out.append(Plan("pair", *_pair(rng), float(rng.choice(SEVERITIES[1:]))))
-    for kind in ("agrees", "recalibrate"):
-        for i in range(number[kind]):
-            twin = TWINS[int((i + rng.integers(6)) % 6)]
-            if kind == "recalibrate" and twin == "accelerometer_cluster":
-                twin = "piezo_stack"  # the cluster has no base parameter that is not an effect of its own
-            out.append(Plan(kind, twin, (), float(rng.choice(SEVERITIES))))
-    for _ in range(number["unknown"]):
-        out.append(Plan("unknown", str(rng.choice(TWINS)), (), float(rng.choice(SEVERITIES[1:]))))
-    return [out[i] for i in rng.permutation(len(out))]
-
-
-def _pair(rng: Rng) -> tuple[str, tuple[str, ...]]:
-    while True:
-        twin = str(rng.choice(TWINS))
-        a, b = (str(n) for n in rng.choice(list(TABLE[twin]), 2, replace=False))
-        if any({a, b} <= g for g in RIVALS):
-            continue
-        shared = set(TABLE[twin][a].under) & set(TABLE[twin][b].under) & set(excitations_of(twin))
-        contexts = {TABLE[twin][n].context for n in (a, b)} - {None}
-        if shared and len(contexts) < 2:
-            return twin, (a, b)
-
-
-def _restricted(rng: Rng, count: int, only: tuple[str, str, float]) -> list[Plan]:
-    twin, effect, severity = only
-    out: list[Plan] = []
-    for i in range(count):
-        sev = severity or SEVERITIES[i % 4]
-        if effect in ("agrees", "recalibrate", "unknown"):
-            out.append(Plan(effect, twin or str(rng.choice(TWINS)), (), sev))
-            continue
-        if effect == "pair":
-            t, names = _pair(rng)
-            while twin and t != twin:
-                t, names = _pair(rng)
-            out.append(Plan("pair", t, names, sev))
-            continue
-        twins = [t for t in TWINS if (not twin or t == twin) and (not effect or effect in TABLE[t])]
-        if not twins:
-            raise ValueError(f"no twin of {TWINS} shows {effect!r} on {twin or 'any twin'}")
-        t = str(rng.choice(twins))
-        out.append(Plan("single", t, (effect or str(rng.choice(list(TABLE[t]))),), sev))
-    return out
-
-
-__all__ = ["KINDS", "SEVERITIES", "UNKNOWN", "Case", "NotVisible", "Plan", "Truth", "make", "plans"]
+__all__ = ["KINDS", "SEVERITIES", "UNKNOWN", "Case", "NotVisible", "Plan", "Truth", "make"]

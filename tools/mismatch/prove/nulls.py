@@ -18,6 +18,7 @@ from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.catalog import TWINS
 from tools.mismatch.prove.noise import KINDS
+from tools.mismatch.prove.plans import NOTHING_TO_REFIT
 from tools.mismatch.prove.proof import draw_one
 from tools.mismatch.prove.runner import Diagnose, in_processes, timed, tool
 from tools.mismatch.prove.score import FALSE_ALARM, names_of
@@ -56,8 +57,8 @@ def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
     for i in range(n):
         twin = TWINS[i % len(TWINS)]
         kind = "recalibrate" if (i // (len(TWINS) * len(KINDS))) % 3 == 2 else "agrees"
-        if twin == "accelerometer_cluster":
-            kind = "agrees"  # its only base parameters, the positions, are an effect of their own
+        if twin in NOTHING_TO_REFIT:
+            kind = "agrees"
         plans.append(draw.Plan(kind, twin, (), draw.SEVERITIES[i % 4]))
         kinds.append(KINDS[(i // len(TWINS)) % len(KINDS)])
     return plans, kinds

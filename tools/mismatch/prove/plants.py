@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from tools.mismatch.prove import kernels
+from tools.mismatch.prove import guests, kernels
+from tools.mismatch.prove.plants_bench import run_bench
 
 Array = NDArray[np.float64]
 Signals = dict[str, Array]
@@ -68,6 +69,7 @@ class Scene:
     excitation: str
     keep: int
     hold: str = "linear"
+    memo: dict[bytes, Signals] = field(default_factory=dict[bytes, Signals], repr=False, compare=False)
 
     @property
     def dt(self) -> float:
@@ -185,6 +187,26 @@ def _state_space(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
         flow.out[out] = y[:, k] + y0[k]
 
 
+def _expander(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
+    decay = np.exp(-(flow.t[1] - flow.t[0]) / p["time_constant_s"])
+    gain, none = np.array([[p["um_per_W"]]]), np.zeros((1, 1))
+    power = flow.drive["power"][:, None]
+    warm = kernels.linear_system(np.array([[decay]]), np.array([[1.0 - decay]]), gain, none, np.zeros(1), power)
+    flow.out["expansion"] = p["offset_um"] + warm[:, 0]
+
+
+def _lever(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
+    flow.out["lift"] = p["offset_um"] + p["arm_um"] * np.sin(p["rad_per_V"] * flow.drive["drive"])
+
+
+def _bench(flow: Flow, scene: Scene, p: Mapping[str, Any]) -> None:
+    """One run costs more than all else here, so runs with the same inputs are kept."""
+    key = b"".join(k.encode() + v.tobytes() for k, v in flow.drive.items())
+    if key not in scene.memo:
+        scene.memo[key] = run_bench(int(p["unit"]), flow.t, flow.drive, scene.outputs)
+    flow.out.update(scene.memo[key])
+
+
 CORES: dict[str, Callable[[Flow, Scene, Mapping[str, Any]], None]] = {
     "piezo_stack": _piezo,
     "accelerometer": _triad("specific_force", "scale_V_per_g"),
@@ -192,6 +214,9 @@ CORES: dict[str, Callable[[Flow, Scene, Mapping[str, Any]], None]] = {
     "accelerometer_cluster": _cluster,
     "mechanical_axis": _axis,
     "state_space": _state_space,
+    guests.FMU: _expander,
+    guests.USER: _lever,
+    guests.INSTRUMENT: _bench,
 }
 
 
@@ -263,6 +288,10 @@ def free_parameters(scene: Scene) -> list[str]:
         return keys + (["stiffness"] if scene.parameters["stiffness"] else [])
     if scene.twin == "state_space":
         return ["A", "B", "C", "x0", "y0"]
+    if scene.twin == guests.FMU:
+        return ["um_per_W", "time_constant_s", "offset_um"]
+    if scene.twin == guests.USER:
+        return ["arm_um", "rad_per_V", "offset_um"]
     return []
 
 
@@ -332,7 +361,7 @@ class Refit:
         if not theta.size:
             return self._per_output(r)
         jac = self.jac
-        linear = self.scene.twin not in ("mechanical_axis", "state_space")
+        linear = self.scene.twin not in ("mechanical_axis", "state_space", guests.FMU, guests.USER)
         for _ in range(1 if linear else steps):
             norm = np.maximum(np.linalg.norm(jac, axis=0), 1e-300)
             step = np.linalg.lstsq(jac / norm, r, rcond=1e-7)[0] / norm

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 
 from firmware_py.recording.revision import git_revision
-from tools.mismatch.prove import draw, seal
+from tools.mismatch.prove import draw, guests, seal
 from tools.mismatch.prove.disk import write
+from tools.mismatch.prove.plans import plans as drawn_plans
 from tools.mismatch.prove.runner import Diagnose, Done, diagnose_all, tool
 from tools.mismatch.prove.score import score, summary
 
@@ -52,8 +53,11 @@ class ProofResult:
 
 def draw_one(job: tuple[int, int, draw.Plan, Path, int, str | None]) -> tuple[str, dict[str, Any], str] | None:
     """(name, answer, path) of one recording written below a folder; its noise is kept beside that folder. None when no
-    scene shows the effect. ``job``: seed, index, plan, folder, most samples, kind of noise (None: drawn)."""
+    scene shows the effect, or the extra ``fmu`` is missing for it. ``job``: seed, index, plan, folder, most samples,
+    kind of noise (None: drawn)."""
     seed, index, plan, folder, max_samples, noise_kind = job
+    if plan.twin == guests.FMU and not guests.fmu_possible():
+        return None
     case = None
     # where no scene shows the effect at this severity, a larger one takes its place
     for severity in (plan.severity, *(s for s in draw.SEVERITIES if s > plan.severity)):
@@ -116,8 +120,11 @@ def prove(
     say = progress or (lambda text: print(text, file=sys.stderr, flush=True))
     seed = int(time.time_ns() % 1_000_000_007) if seed is None else seed
     folder = Path(tempfile.mkdtemp(prefix="micron-prove-")) if folder is None else folder
-    asked = draw.plans(seed, cases, only) if plans is None else plans
+    asked = drawn_plans(seed, cases, only) if plans is None else plans
     say(f"seed {seed}, {len(asked)} cases, folder {folder}")
+    of_fmus = sum(p.twin == guests.FMU for p in asked)
+    if of_fmus and not guests.fmu_possible():
+        say(f"{of_fmus} cases of an FMU are left out: they need FMPy (the extra 'fmu') and PythonFMU")
     paths, answers = generate(seed, asked, folder / "recordings", jobs=jobs, max_samples=max_samples)
     digest = seal.close(answers, folder / "sealed")
     missing = "" if len(answers) == len(asked) else f" ({len(asked) - len(answers)} could not be drawn)"

@@ -13,6 +13,8 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tools.mismatch.prove.guests import installed
+
 Diagnose = Callable[[Path], dict[str, Any]]
 A = TypeVar("A")
 B = TypeVar("B")
@@ -53,7 +55,8 @@ def timed(job: tuple[str, Path, Diagnose]) -> Done:
     name, path, diagnose = job
     wall, cpu = time.perf_counter(), time.process_time()
     try:
-        report = diagnose(path)
+        with installed(path):
+            report = diagnose(path)
     except Exception as e:  # a crash of the tool is a result to be counted, not ours to raise
         last = traceback.extract_tb(e.__traceback__)[-1]
         report = {

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from tools.mismatch.prove import excite
+from tools.mismatch.prove import excite, guests
 from tools.mismatch.prove.catalog import BODY, SCALAR_ALL, VECTOR_ALL
 from tools.mismatch.prove.forms_memory import Array, Rng
 from tools.mismatch.prove.plants import AXES, Scene, Signals, held_step
@@ -20,6 +20,9 @@ CONTEXTS: dict[str, dict[str, tuple[float, float]]] = {
     "accelerometer_cluster": {"temperature": (25.0, 8.0)},
     "mechanical_axis": {"temperature": (25.0, 10.0), "current": (0.2, 1.5)},
     "state_space": {"temperature": (25.0, 10.0), "supply": (12.0, 0.5), "pressure": (1.0e5, 3.0e3)},
+    guests.FMU: {"temperature": (25.0, 10.0), "supply": (12.0, 0.5), "pressure": (1.0e5, 3.0e3)},
+    guests.USER: {"temperature": (25.0, 10.0), "supply": (12.0, 0.5), "pressure": (1.0e5, 3.0e3)},
+    guests.INSTRUMENT: {"pressure": (1.0e5, 3.0e3), "humidity": (0.45, 0.2)},
 }
 # further names that only an effect outside the vocabulary may follow
 STRANGERS: dict[str, tuple[float, float]] = {
@@ -58,6 +61,11 @@ def _timing(rng: Rng, wish: Wish) -> tuple[float, int]:
     if wish.excitation.startswith("slow"):
         return 1.0, int(min(rng.uniform(1.0, 8.0) * 3600.0, wish.max_samples))
     low = max(10.0, wish.least_s)
+    if wish.twin == guests.FMU:  # every sample of every run is a call of somebody else's program
+        rate = 125.0 if wish.fast_only else 50.0
+        return rate, int(rate * max(rng.uniform(8.0, 12.0), 1.05 * wish.least_s))
+    if wish.twin == guests.INSTRUMENT:  # a run costs 50 us a millisecond
+        return 1000.0, int(rng.uniform(1000.0, 1600.0))
     rates = (200.0, 250.0, 400.0, 500.0, 1000.0)
     rate = float(rng.choice([r for r in rates if r * low <= wish.max_samples] or rates[:1]))
     longest = max(min(120.0, wish.max_samples / rate), low * 1.05)
@@ -194,6 +202,27 @@ def _state_space(rng: Rng, wish: Wish, t: Array) -> tuple[Signals, tuple[str, ..
     return {"drive": u}, outs, p
 
 
+def _expander(rng: Rng, wish: Wish, t: Array) -> tuple[Signals, tuple[str, ...], dict[str, Any]]:
+    power = rng.uniform(2.0, 8.0) * (1.0 + 0.9 * excite.scalar(rng, wish.excitation, t))
+    p = {"um_per_W": rng.uniform(0.5, 4.0), "time_constant_s": rng.uniform(0.03, 0.4), "offset_um": rng.uniform(-3, 3)}
+    return {"power": power}, ("expansion",), p
+
+
+def _lever(rng: Rng, wish: Wish, t: Array) -> tuple[Signals, tuple[str, ...], dict[str, Any]]:
+    u = rng.uniform(1.0, 5.0) * excite.scalar(rng, wish.excitation, t)
+    turn = rng.uniform(0.5, 1.2) / float(np.max(np.abs(u)))
+    return {"drive": u}, ("lift",), {"arm_um": rng.uniform(50, 500), "rad_per_V": turn, "offset_um": rng.uniform(-9, 9)}
+
+
+def _bench(rng: Rng, wish: Wish, t: Array) -> tuple[Signals, tuple[str, ...], dict[str, Any]]:
+    """Commands move the tip; in half of them a hand does too, and the accelerometers see it."""
+    inputs = {"command_1": 50.0 + rng.uniform(15.0, 40.0) * excite.scalar(rng, wish.excitation, t)}
+    if rng.random() < 0.5:
+        inputs["path_x"] = 1e-4 * rng.uniform(0.5, 3.0) * excite.scalar(rng, "tremor", t)
+        return inputs, ("volts_0", "tip_x"), {"unit": int(rng.integers(1, 9))}
+    return inputs, ("tip_x", "tip_y"), {"unit": int(rng.integers(1, 9))}
+
+
 def build(rng: Rng, wish: Wish) -> Scene:
     """Draw a scene. The arrays are longer than the recording, so that clocks can run and samples get lost."""
     rate, keep = _timing(rng, wish)
@@ -214,6 +243,14 @@ def build(rng: Rng, wish: Wish) -> Scene:
         inputs, outs, p = _cluster(rng, wish, t)
     elif wish.twin == "mechanical_axis":
         inputs, outs, p, hidden = _axis(rng, wish, t)
+    elif wish.twin == guests.FMU:
+        inputs, outs, p = _expander(rng, wish, t)
+        hold = "zero"
+    elif wish.twin == guests.USER:
+        inputs, outs, p = _lever(rng, wish, t)
+    elif wish.twin == guests.INSTRUMENT:
+        inputs, outs, p = _bench(rng, wish, t)
+        fine = 1
     else:
         inputs, outs, p = _state_space(rng, wish, t)
         if p.get("discrete"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import shutil
 import stat
 import struct
@@ -56,6 +57,49 @@ class FmuRun:
         return self._open
 
     def __call__(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        description = self._opened()[0]
+        start = {k: v for k, v in parameters.items() if k != "path"}
+        kind = {v.name: v.type for v in description.modelVariables}
+        plain = all(kind.get(name) == "Real" for name in (*self.inputs, *self.outputs, *start))
+        try:
+            self._opened()[2].reset()
+            if plain and str(description.fmiVersion).startswith("2"):
+                return self._stepped(inputs, start)
+            return self._simulated(inputs, start)
+        except Exception as error:
+            raise RecordingError(
+                f"{self.path}: the FMU stopped ({_line(error)}); parameters {dict(parameters)}"
+            ) from error
+
+    def _stepped(self, inputs: Mapping[str, Array], start: Mapping[str, Any]) -> dict[str, Array]:
+        """FMI 2 with real variables alone: what FMPy's ``simulate_fmu`` does, at a third of its cost a step."""
+        description, _, fmu = self._opened()
+        number = {v.name: int(v.valueReference) for v in description.modelVariables}
+        n_in, n_out = len(self.inputs), len(self.outputs)
+        to = (ctypes.c_uint * n_in)(*(number[s] for s in self.inputs))
+        sent = (ctypes.c_double * n_in)()
+        of = (ctypes.c_uint * n_out)(*(number[o] for o in self.outputs))
+        got = (ctypes.c_double * n_out)()
+        rows = np.column_stack([inputs[s] for s in self.inputs]).tolist()
+        t, c = inputs["t"].tolist(), fmu.component
+        found = np.empty((len(t), n_out))
+        fmu.setupExperiment(startTime=t[0], stopTime=t[-1])
+        fmu.setReal([number[k] for k in start], [float(v) for v in start.values()])
+        fmu.enterInitializationMode()
+        sent[:] = rows[0]
+        fmu.fmi2SetReal(c, to, n_in, sent)
+        fmu.exitInitializationMode()
+        for k, row in enumerate(rows):
+            fmu.fmi2GetReal(c, of, n_out, got)
+            found[k] = got
+            if k + 1 < len(rows):
+                sent[:] = row
+                fmu.fmi2SetReal(c, to, n_in, sent)
+                fmu.fmi2DoStep(c, t[k], self.dt, 1)
+        return {o: found[:, i] for i, o in enumerate(self.outputs)}
+
+    def _simulated(self, inputs: Mapping[str, Array], start: Mapping[str, Any]) -> dict[str, Array]:
+        """Any other FMU, by FMPy itself."""
         fm = _fmpy(self.path)
         description, folder, instance = self._opened()
         t = inputs["t"]
@@ -63,23 +107,17 @@ class FmuRun:
         table["time"] = t
         for s in self.inputs:
             table[s] = inputs[s]
-        try:
-            instance.reset()
-            result = fm.simulate_fmu(
-                folder,
-                model_description=description,
-                fmu_instance=instance,
-                start_time=float(t[0]),
-                stop_time=float(t[-1]),
-                output_interval=self.dt,
-                start_values={k: v for k, v in parameters.items() if k != "path"},
-                input=table,
-                output=list(self.outputs),
-            )
-        except Exception as error:
-            raise RecordingError(
-                f"{self.path}: the FMU stopped ({_line(error)}); parameters {dict(parameters)}"
-            ) from error
+        result = fm.simulate_fmu(
+            folder,
+            model_description=description,
+            fmu_instance=instance,
+            start_time=float(t[0]),
+            stop_time=float(t[-1]),
+            output_interval=self.dt,
+            start_values=dict(start),
+            input=table,
+            output=list(self.outputs),
+        )
         return {o: np.interp(t, result["time"], result[o]) for o in self.outputs}
 
 

@@ -83,23 +83,36 @@ class OpaqueTwin:
         values = dict(self.given) | {k: float(v) for k, v in zip(self.free, theta, strict=False)}
         key = ("opaque", tuple(x.token for x in used.values()), tuple(values[k] for k in self.free))
 
+        as_given = all(values[k] == float(self.given[k]) for k in self.free)
+
         def make() -> Array:
-            found = self.call({s: x.value for s, x in used.items()} | {"t": run.t}, values)
-            rows: list[Array] = []
-            for o in self.outputs:
-                if o not in found:
-                    raise RecordingError(f"twin '{self.kind}' ({self.source}) returned no output '{o}'")
-                y = np.asarray(found[o], np.float64)
-                if y.shape != run.t.shape or not np.all(np.isfinite(y)):
-                    raise RecordingError(
-                        f"twin '{self.kind}' ({self.source}): output '{o}' has shape {y.shape} or is not finite,"
-                        f" expected {run.t.shape}"
-                    )
-                rows.append(y)
-            return np.stack(rows)
+            try:
+                return self._checked(self.call({s: x.value for s, x in used.items()} | {"t": run.t}, values), run.t)
+            except RecordingError:
+                if as_given:
+                    raise
+                # nobody knows which values a stranger's program can take; a search that leaves them turns round
+                return np.full((len(self.outputs), run.t.size), np.nan)
 
         stacked = remember(run.memo, key, make)
         return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
+
+    def _checked(self, found: Mapping[str, Array], t: Array) -> Array:
+        """The outputs (outputs, n). RecordingError when one is not there, not finite, or not as long as ``t``."""
+        rows: list[Array] = []
+        for o in self.outputs:
+            if o not in found:
+                raise RecordingError(f"twin '{self.kind}' ({self.source}) returned no output '{o}'")
+            y = np.asarray(found[o], np.float64)
+            if y.shape != t.shape:
+                raise RecordingError(
+                    f"twin '{self.kind}' ({self.source}): output '{o}' has shape {y.shape}, expected {t.shape}"
+                )
+            if not np.all(np.isfinite(y)):
+                i = int(np.argmin(np.isfinite(y)))
+                raise RecordingError(f"twin '{self.kind}' ({self.source}): output '{o}' is {y[i]} at sample {i}")
+            rows.append(y)
+        return np.stack(rows)
 
     def human(self, theta: Array) -> Sequence[Human]:
         """See Twin."""
