@@ -13,7 +13,8 @@ from tools.mismatch.prove import draw, guests
 from tools.mismatch.prove.disk import contract_unit
 from tools.mismatch.prove.plans import plans
 from tools.mismatch.prove.proof import draw_one, generate
-from tools.mismatch.recording import RecordingError, load
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
