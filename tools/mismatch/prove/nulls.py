@@ -18,7 +18,7 @@ from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.catalog import TWINS
 from tools.mismatch.prove.noise import KINDS
-from tools.mismatch.prove.plans import NOTHING_TO_REFIT
+from tools.mismatch.prove.plans import NOTHING_TO_REFIT, SELDOM
 from tools.mismatch.prove.proof import draw_one
 from tools.mismatch.prove.runner import Diagnose, in_processes, timed, tool
 from tools.mismatch.prove.score import FALSE_ALARM, names_of
@@ -51,17 +51,20 @@ def clopper_pearson(k: int, n: int, level: float = 0.95) -> tuple[float, float]:
 
 
 def null_plans(n: int) -> tuple[list[draw.Plan], list[str]]:
-    """Every twin with every noise in turn; two of three agree as given, one needs recalibration."""
+    """Every twin with every noise in turn (an FMU in every second round, the bench in every fourth); two of three agree
+    as given, one needs recalibration.
+    """
     plans: list[draw.Plan] = []
     kinds: list[str] = []
-    for i in range(n):
-        twin = TWINS[i % len(TWINS)]
-        kind = "recalibrate" if (i // (len(TWINS) * len(KINDS))) % 3 == 2 else "agrees"
-        if twin in NOTHING_TO_REFIT:
-            kind = "agrees"
-        plans.append(draw.Plan(kind, twin, (), draw.SEVERITIES[i % 4]))
-        kinds.append(KINDS[(i // len(TWINS)) % len(KINDS)])
-    return plans, kinds
+    for turn in range(n):
+        for twin in TWINS:
+            if turn % round(1.0 / SELDOM.get(twin, 1.0)):
+                continue
+            again = (turn // len(KINDS)) % 3 == 2 and twin not in NOTHING_TO_REFIT
+            severity = draw.SEVERITIES[len(plans) % 4]
+            plans.append(draw.Plan("recalibrate" if again else "agrees", twin, (), severity))
+            kinds.append(KINDS[(turn + turn // len(KINDS)) % len(KINDS)])
+    return plans[:n], kinds[:n]
 
 
 @dataclass(frozen=True)

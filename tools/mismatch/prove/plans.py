@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from types import MappingProxyType
 
 import numpy as np
 
@@ -39,8 +40,8 @@ def plans(seed: int, count: int, only: tuple[str, str, float] | None = None) -> 
     for _ in range(number["pair"]):
         out.append(Plan("pair", *_pair(rng), float(rng.choice(SEVERITIES[1:]))))
     for kind in ("agrees", "recalibrate"):
-        for i in range(number[kind]):
-            twin = TWINS[int((i + rng.integers(len(TWINS))) % len(TWINS))]
+        for _ in range(number[kind]):
+            twin = _twin(rng, TWINS)
             if kind == "recalibrate" and twin in NOTHING_TO_REFIT:
                 twin = "piezo_stack"
             out.append(Plan(kind, twin, (), float(rng.choice(SEVERITIES))))
@@ -49,9 +50,12 @@ def plans(seed: int, count: int, only: tuple[str, str, float] | None = None) -> 
     return [out[i] for i in rng.permutation(len(out))]
 
 
+SELDOM = MappingProxyType({guests.FMU: 0.5, guests.INSTRUMENT: 0.25})
+"""Every run of these is a whole program: that often beside the other kinds."""
+
+
 def _twin(rng: Rng, among: Sequence[str]) -> str:
-    """One of these kinds; those whose every run is a whole program of somebody else come half as often."""
-    weight = np.array([0.5 if t in (guests.FMU, guests.INSTRUMENT) else 1.0 for t in among])
+    weight = np.array([SELDOM.get(t, 1.0) for t in among])
     return str(rng.choice(list(among), p=weight / weight.sum()))
 
 

@@ -65,7 +65,7 @@ def _timing(rng: Rng, wish: Wish) -> tuple[float, int]:
         rate = 125.0 if wish.fast_only else 50.0
         return rate, int(rate * max(rng.uniform(8.0, 12.0), 1.05 * wish.least_s))
     if wish.twin == guests.INSTRUMENT:  # a run costs 50 us a millisecond
-        return 1000.0, int(rng.uniform(1000.0, 1600.0))
+        return 1000.0, int(rng.uniform(800.0, 1200.0))
     rates = (200.0, 250.0, 400.0, 500.0, 1000.0)
     rate = float(rng.choice([r for r in rates if r * low <= wish.max_samples] or rates[:1]))
     longest = max(min(120.0, wish.max_samples / rate), low * 1.05)
