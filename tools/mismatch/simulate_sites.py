@@ -34,6 +34,8 @@ def why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
 def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
     if effect.twins and twin.kind not in effect.twins:
         return f"not in a {twin.kind}"
+    if not set(effect.stages) & set(twin.chain):
+        return f"no {' or '.join(effect.stages)} in the chain of this twin"
     if effect.kind == "feedback" and not twin.feedback_on:
         return "the twin has no equation of motion"
     missing = [s for s in effect.needs if s not in recording.signals]

@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
+from tools.mismatch.engine.families import own_form
 from tools.mismatch.engine.fit import Fit, covariance, residuals
 from tools.mismatch.engine.identifiability import detection, experiment
 from tools.mismatch.engine.locate import follow, regime, windows
@@ -190,8 +191,16 @@ def base_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> list[Base
     return shifts
 
 
-FLEXIBLE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "step_shift", "dropped_samples"))
-"""Families with so much freedom that a real effect of theirs leaves little: one that leaves more is an imitation."""
+MUCH = 5.0
+"""Mean square over noise variance beyond what the colour of noise adds to a floor that was read off its quiet end."""
+WANDERS = 0.1
+"""Share of what a random walk leaves that must follow a recorded signal before it is held against the walk: nobody
+predicts a walk, so what it leaves on held-out data says nothing by itself."""
+
+
+def beyond_form(selection: Selection) -> float:
+    """Share of the mismatch that no form of the named effects accounts for: more than that is something else."""
+    return max(own_form(s.name for s in selection.steps), 0.03)
 
 
 LOUD = 25.0
@@ -209,9 +218,14 @@ def decide(
         worst = max(left.values(), key=lambda v: v.ratio)
         before = max(compare_ratio(problem, base, o) for o in left)
         left_over = (worst.ratio - 1) / max(before - 1, 1e-9)
+        walks = any(s.name == "random_walk" and worst.output in s.placed.outputs for s in selection.steps)
+        if walks and not any(d.signal != "time" and d.strength > WANDERS for d in worst.follows):
+            return "missing_physics", p
         if worst.real and left_over > 0.3 and worst.ratio > 1.3:
             return "unexplained", p
-        if worst.real and left_over > 0.15 and worst.ratio > 2.0 and {s.name for s in selection.steps} <= FLEXIBLE:
+        if worst.real and not walks and worst.ratio > 2.0 and left_over > beyond_form(selection):
+            return "unexplained", p
+        if not walks and worst.ratio > MUCH and left_over > 0.1:
             return "unexplained", p
         return "missing_physics", p
     if any(v.real and v.ratio > 1.05 for v in left.values()):

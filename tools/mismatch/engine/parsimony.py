@@ -134,10 +134,12 @@ def fewest(
     taken = excess(misfits(problem, base)) - now
     limit = 1.1 * now + 0.03 * outputs + 0.001 * taken
     freedom = sum(complexity(t) for t in steps)
+    events = {t.label for t in steps if t.placed.effect.claims is not None}  # named by their own test, not by what goes
     near = [
         c
         for c in passed
         if len(c) < len(steps)
+        and events <= {t.label for t in c}
         and sum(complexity(t) for t in c) < freedom
         and excess(c[-1].misfits) <= 1.3 * limit + 0.05
     ]

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.families import (
+    FLEXIBLE,
+    LOOSE,
+    beside_flexible,
+    in_disguise,
+    key_of,
+    own_form,
+    part_flexible,
+)
 from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.locate import follow
 from tools.mismatch.engine.parsimony import Rule, choose, fewest, refine
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.revise import added, pair_search, prune, simplify_pass, size, swap_pass, total
@@ -16,26 +26,9 @@ from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Progress, Trial, try_all
 from tools.mismatch.engine.unexplained import Stranger, about, stranger
-from tools.mismatch.simulate import Placed
 
 MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
-
-
-EXACT = frozenset(
-    (
-        "dead_time", "channel_delay", "clock_skew", "dropped_samples", "first_order_lag", "misalignment", "soft_iron",
-        "mains_interference", "vibration", "step_shift", "centripetal_acceleration", "sensor_position_error",
-        "current_coupling",
-    )
-)  # fmt: skip
-"""Effects of which there is one form: what they leave is something else."""
-LOOSE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "random_walk", "stribeck_friction"))
-
-
-def own_form(names: Iterable[str]) -> float:
-    """Share of what the named effects took that their true form may leave over."""
-    return max((0.004 if n in EXACT else 0.05 if n in LOOSE else 0.015 for n in names), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -70,26 +63,19 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
         if taken > MOST_EXCUSED * trial.fitted.residual[trial.placed.outputs[0]].size:
             return False
         loud = max(c.before.values(), default=0.0) > 1.3
-        return (p < rule.p_tested and share > 0.2) or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
+        # no tail, however heavy, puts most of a record's energy into a few neighbours
+        most = p < 1e-4 and share > 0.8
+        return (p < rule.p_tested and share > 0.2) or most or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.candidate.tested and trial.candidate.p_value > 1e-3:
         return False
     if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess or in_disguise(trial):
         return False
     # what the form of an earlier effect leaves over, no other effect explains down to the noise
     after = max(c.after.values(), default=np.inf)
-    clean = after < 1.25 and c.gain > 0.4 and c.z > 2 * rule.z
+    clean = after < 1.25 and (c.gain > 0.4 or c.excess_gain > 0.75) and c.z > 2 * rule.z
     # nor does one number take most of it, far beyond doubt, unless that is the physics
     sharp = after < 2.0 and c.excess_gain > 0.5 and c.z > 3 * rule.z and size(trial.placed) <= 2
     return c.improvement > taken or ((clean or sharp) and trial.name not in LOOSE)
-
-
-def in_disguise(trial: Trial) -> bool:
-    """Whether a report figure of the fitted effect is beyond what its physics can be."""
-    limits = trial.placed.effect.limits
-    if not limits or trial.fitted is None:
-        return False
-    found = trial.fitted.model.human(trial.fitted.theta)[trial.label]
-    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
 
 
 def search(
@@ -127,16 +113,16 @@ def search(
             if p.effect.claims is not None
             or p.effect.name == "quantization"  # the noise floor holds its steps
             or any(
-                now[o] - 1 > max(0.5 * rule.gain, form[o] if p.effect.name in LOOSE else min(form[o], 0.5))
+                now[o] - 1 > max(0.5 * rule.gain, form[o] if p.effect.name in LOOSE else min(form[o], 0.2))
                 for o in p.outputs
             )
         ]
-        todo = [p for p in pool if _key(p) not in known]
+        todo = [p for p in pool if key_of(p) not in known]
         for t in try_all(
             problem, current, todo, stride=stride, jobs=jobs, progress=progress, what=f"step {len(steps) + 1}"
         ):
-            known[_key(t.placed)] = t
-        trials = [known[_key(p)] for p in pool]
+            known[key_of(t.placed)] = t
+        trials = [known[key_of(p)] for p in pool]
         if not steps:
             first = tuple(trials)
         good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in t.placed.outputs))]
@@ -152,7 +138,13 @@ def search(
             known = {}
             continue
         if not good:
-            break
+            freed = beside_flexible(problem, current, steps, trials, 2 * rule.z) if steps else None
+            if freed is None:
+                break
+            current, steps = freed[0], list(freed[1])
+            rivals.append(())
+            known = {}
+            continue
         # bursts taken out of the comparison make no model: only where no model does better
         models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
         best = choose(models or good, rule, now, frozenset(t.name for t in steps))
@@ -195,58 +187,41 @@ def search(
         if fewer is not None:
             current, steps = fewer[0], list(fewer[1])
             rivals = [*rivals[: len(steps) - 1], ()]
+    walk = unshaped(problem, current, effects, rule) if strange is None else None
+    if walk is not None:
+        current = walk[0]
+        steps.append(walk[1])
+        rivals.append(())
     return Selection(problem, base, current, tuple(steps), tuple(rivals), first, strange)
 
 
-FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
-
-
-def part_flexible(
-    problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial]
-) -> tuple[Fit, tuple[Trial, Trial]] | None:
-    """Two specific effects in place of one flexible family that took both of them; None when no two do as well."""
-    outputs = flexible.placed.outputs
-    excess = sum(max(flexible.misfits[o] - 1.0, 0.0) for o in outputs)
-    limit = 0.5 * excess if excess > 0.1 else excess
-    specific = [
-        t
-        for t in first
-        if t.fitted is not None and t.fitted.ok and t.placed.effect.claims is None
-        and t.name not in LOOSE and size(t.placed) <= 5 and set(t.placed.outputs) & set(outputs)
-    ]  # fmt: skip
-    specific.sort(key=lambda t: (sum(t.misfits[o] for o in outputs if o in t.misfits), t.label))
-    best: tuple[float, Fit, tuple[Trial, Trial]] | None = None
-    for one in specific[:2]:
-        assert one.fitted is not None
-        beside = [
-            p
-            for p in places(problem, [t.placed.effect for t in first if t.name not in LOOSE], one.fitted.model.placed)
-            if p.effect.claims is None and p.effect.test is None and set(p.outputs) & set(outputs)
-        ]
-        unique = list({_key(p): p for p in beside}.values())
+def unshaped(problem: Problem, current: Fit, effects: Iterable[Effect], rule: Rule) -> tuple[Fit, Trial] | None:
+    """Integrated noise where nothing else is left: nobody predicts it, so no held-out score can vouch for it. Its own
+    test does, when what is left stands far above the noise and follows nothing that was recorded.
+    """
+    now = misfits(problem, current)
+    walks = [e for e in effects if e.name == "random_walk"]
+    for place in places(problem, walks, current.model.placed):
+        o = place.outputs[0]
+        if now[o] < 2.0:
+            continue
         with np.errstate(all="ignore"):
-            bends = bend(problem, one.fitted)
-            looked = [one_step(problem, one.fitted, p, bends) for p in unique]
-        looked.sort(key=lambda c: (-c.share, c.placed.label))
-        for other in [c for c in looked if c.share > 0.3][:2]:
-            both = added(problem, one.fitted, other.placed)
-            value = misfits(problem, both)
-            left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
-            if both.ok and left <= limit and (best is None or left < best[0]):
-                energy = block_energy(problem, both, problem.held_blocks)
-                second = Trial(
-                    both.model.placed[-1],
-                    other,
-                    both,
-                    compare(problem, one.fitted, both),
-                    value,
-                    energy,
-                    0,
-                    one.outputs,
-                )
-                head = replace(one, fitted=both, misfits=value, energy=energy)
-                best = (left, both, (head, second))
-    return None if best is None else (best[1], best[2])
+            seen = one_step(problem, current, place, bend(problem, current))
+        if seen.p_value > rule.p_tested or seen.share < 0.5:
+            continue
+        found, _ = follow(problem, current, o)
+        if any(d.signal != "time" and d.p_value < 1e-4 and d.strength > 0.1 for d in found):
+            continue
+        with np.errstate(all="ignore"):
+            walk = added(problem, current, place)
+        value = misfits(problem, walk)
+        if walk.ok and value[o] < now[o]:
+            better = compare(problem, current, walk)
+            energy = block_energy(problem, walk, problem.held_blocks)
+            added_one = walk.model.placed[-1]
+            count = size(added_one)
+            return walk, Trial(added_one, seen, walk, better, value, energy, count, problem.twin.outputs)
+    return None
 
 
 def second_thoughts(
@@ -279,7 +254,3 @@ def second_thoughts(
 def _left(rival: Trial, best: Trial) -> float:
     """What a rival leaves on the outputs that both serve."""
     return sum(rival.misfits[o] for o in best.placed.outputs if o in rival.placed.outputs)
-
-
-def _key(p: Placed) -> tuple[str, ...]:
-    return (p.effect.name, p.effect.kind, p.site, p.target, p.effect.equation)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -161,8 +161,9 @@ def _plainest(
         return None
     e = thinned(problem, fitted, output)[0]
     features, own = context_features(problem, fitted, output, names)
-    size = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
-    beyond = e - own @ (np.linalg.lstsq(own / size, e, rcond=1e-8)[0] / size)
+    beyond = without(e, own)
+    # both sides less what the movers do on their own (Frisch and Waugh): a gain holds a share of its mover
+    features = [replace(f, columns=without(f.columns, own)) for f in features]
     part = float(np.var(beyond) / max(float(np.var(e)), 1e-300))
     best: Stranger | None = None
     for d in dependences(beyond, features, own_colour=True):
@@ -173,6 +174,12 @@ def _plainest(
         if d.p_value < p_limit and enough(share) and close:
             best = Stranger(output, d.signal, d.feature, share, d.p_value)
     return best
+
+
+def without(x: Array, own: Array) -> Array:
+    """``x`` (n,) or (n, k) less its projection on the columns of ``own`` (n, j)."""
+    size = np.maximum(np.linalg.norm(own, axis=0), 1e-300)
+    return x - (own / size) @ np.linalg.lstsq(own / size, x, rcond=1e-8)[0]
 
 
 _PLAIN = ("value", "rate", "cross product", "cross product with rate")

@@ -1,0 +1,158 @@
+"""Families of many parameters: what their form may leave over, and specific effects that they hide."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from tools.mismatch.engine.fit import Fit, residuals
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.revise import added, size
+from tools.mismatch.engine.score import block_energy, compare, misfits
+from tools.mismatch.engine.screen import bend, one_step, places
+from tools.mismatch.engine.trial import Trial
+from tools.mismatch.simulate import Model, Placed
+
+EXACT = frozenset(
+    (
+        "dead_time", "channel_delay", "clock_skew", "dropped_samples", "first_order_lag", "misalignment", "soft_iron",
+        "mains_interference", "vibration", "step_shift", "centripetal_acceleration", "sensor_position_error",
+        "current_coupling",
+    )
+)  # fmt: skip
+"""Effects of which there is one form: what they leave is something else."""
+LOOSE = frozenset(("hysteresis", "rate_dependent_hysteresis", "creep", "random_walk", "stribeck_friction"))
+
+
+def own_form(names: Iterable[str]) -> float:
+    """Share of what the named effects took that their true form may leave over."""
+    return max((0.004 if n in EXACT else 0.05 if n in LOOSE else 0.015 for n in names), default=0.0)
+
+
+def key_of(p: Placed) -> tuple[str, ...]:
+    """What tells one candidate from another."""
+    return (p.effect.name, p.effect.kind, p.site, p.target, p.effect.equation)
+
+
+def in_disguise(trial: Trial) -> bool:
+    """Whether a report figure of the fitted effect is beyond what its physics can be."""
+    limits = trial.placed.effect.limits
+    if not limits or trial.fitted is None:
+        return False
+    found = trial.fitted.model.human(trial.fitted.theta)[trial.label]
+    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
+
+
+FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
+
+
+def part_flexible(
+    problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial]
+) -> tuple[Fit, tuple[Trial, Trial]] | None:
+    """Two specific effects in place of one flexible family that took both of them; None when no two do as well."""
+    outputs = flexible.placed.outputs
+    excess = sum(max(flexible.misfits[o] - 1.0, 0.0) for o in outputs)
+    limit = 0.5 * excess if excess > 0.1 else excess
+    specific = [
+        t
+        for t in first
+        if t.fitted is not None and t.fitted.ok and t.placed.effect.claims is None
+        and t.name not in LOOSE and size(t.placed) <= 5 and set(t.placed.outputs) & set(outputs)
+    ]  # fmt: skip
+    specific.sort(key=lambda t: (sum(t.misfits[o] for o in outputs if o in t.misfits), t.label))
+    best: tuple[float, Fit, tuple[Trial, Trial]] | None = None
+    for one in specific[:2]:
+        assert one.fitted is not None
+        beside = [
+            p
+            for p in places(problem, [t.placed.effect for t in first if t.name not in LOOSE], one.fitted.model.placed)
+            if p.effect.claims is None and p.effect.test is None and set(p.outputs) & set(outputs)
+        ]
+        unique = list({key_of(p): p for p in beside}.values())
+        with np.errstate(all="ignore"):
+            bends = bend(problem, one.fitted)
+            looked = [one_step(problem, one.fitted, p, bends) for p in unique]
+        looked.sort(key=lambda c: (-c.share, c.placed.label))
+        for other in [c for c in looked if c.share > 0.3][:2]:
+            both = added(problem, one.fitted, other.placed)
+            value = misfits(problem, both)
+            left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
+            if both.ok and left <= limit and (best is None or left < best[0]):
+                energy = block_energy(problem, both, problem.held_blocks)
+                second = Trial(
+                    both.model.placed[-1],
+                    other,
+                    both,
+                    compare(problem, one.fitted, both),
+                    value,
+                    energy,
+                    0,
+                    one.outputs,
+                )
+                head = replace(one, fitted=both, misfits=value, energy=energy)
+                best = (left, both, (head, second))
+    return None if best is None else (best[1], best[2])
+
+
+def less(problem: Problem, trial: Trial, at: int) -> Fit:
+    """The fit of a trial with effect ``at`` of its model taken out and nothing fitted again."""
+    assert trial.fitted is not None
+    whole = trial.fitted
+    model = Model(problem.twin, [p for j, p in enumerate(whole.model.placed) if j != at])
+    theta = model.carry(whole.model, whole.theta, problem.recording)
+    return replace(whole, model=model, theta=theta, residual=residuals(problem, model, theta))
+
+
+RATE_FREE = frozenset(("backlash", "dead_zone", "saturation", "static_nonlinearity", "quantization"))
+"""What may be the form of a rate-independent memory as well as an effect of its own."""
+
+
+def beside_flexible(
+    problem: Problem, current: Fit, steps: Sequence[Trial], trials: Sequence[Trial], z: float
+) -> tuple[Fit, list[Trial]] | None:
+    """A specific effect beside a flexible family that had taken both; None when no such pair does clearly better.
+
+    The allowance for a family's form hides a second effect that the family soaked up in part, the more the larger
+    the family grew for it. So the second goes first, and the family is read anew off what it leaves: at least half of
+    the excess must go (four fifths where the second may be the family's form), or as much with less freedom.
+    """
+    for k, flexible in enumerate(steps):
+        if flexible.name not in FLEXIBLE or flexible.name in {t.name for t in steps[:k]}:
+            continue
+        outputs = flexible.placed.outputs
+        now = misfits(problem, current)
+        excess = sum(max(now[o] - 1.0, 0.0) for o in outputs)
+        if excess < 0.1:
+            continue
+        specific = [
+            t
+            for t in trials
+            if t.fitted is not None and t.comparison is not None and t.comparison.z > z and t.comparison.gain > 0.04
+            and t.placed.effect.claims is None and t.name not in LOOSE and size(t.placed) <= 5
+            and set(t.placed.outputs) & set(outputs) and not in_disguise(t)
+        ]  # fmt: skip
+        specific.sort(key=lambda t: (sum(t.misfits[o] for o in outputs), t.label))
+        at = next(i for i, p in enumerate(current.model.placed) if p.label == flexible.label)
+        bare = replace(flexible.placed, settings={})
+        found: list[tuple[float, int, str, Fit, Trial]] = []
+        with np.errstate(all="ignore"):
+            for t in specific[:5]:
+                both = added(problem, less(problem, t, at), bare)
+                value = misfits(problem, both)
+                left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
+                freedom = size(both.model.placed[-1]) + size(t.placed)
+                share = 0.2 if t.name in RATE_FREE else 0.75 if freedom < size(flexible.placed) else 0.5
+                if both.ok and left <= share * excess:
+                    found.append((left, freedom, t.label, both, t))
+        if found:
+            near = min(f[0] for f in found) + 0.03 + 0.1 * excess
+            both, t = min((f for f in found if f[0] <= near), key=lambda f: (f[1], f[0], f[2]))[3:]
+            energy = block_energy(problem, both, problem.held_blocks)
+            value = misfits(problem, both)
+            family = replace(flexible, placed=both.model.placed[-1], fitted=both, misfits=value, energy=energy)
+            second = replace(t, placed=both.model.placed[-2], fitted=both, misfits=value, energy=energy)
+            rest_of = [s for i, s in enumerate(steps) if i != k]
+            return both, [*rest_of[:k], family, *rest_of[k:], second]
+    return None
