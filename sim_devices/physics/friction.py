@@ -190,6 +190,60 @@ _BRISTLES = Effect(
     report=_lugre_report,
 )
 
+
+def _gentle_parts(settings: Settings) -> Parts:
+    speed = settings.get("speed", (1.0,))[0]
+    return Parts(
+        (Parameter("full_speed", "{out}/s", 2e-3 * speed, 0.5 * speed, log=True, scale=0.05 * speed),),
+        (Parameter("level", _UNIT, 0.0),),
+    )
+
+
+def _gentle_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    v = velocity_of(x, ctx)
+    return (-soft_sign(v) * (1.0 - np.exp(-((v / q[0]) ** 2))))[:, None]
+
+
+def _gentle_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0], row[2], row[3] = w[0], -w[0], q[0]
+    return {"friction": row}
+
+
+def _gentle_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    k = thin(ctx.keep, 8000)
+    tried: list[tuple[float, float]] = []
+    for full in settings["speed"][0] * np.geomspace(0.01, 0.4, 6):
+        column = ctx.to_output(np.ascontiguousarray(_gentle_basis(x, ctx, np.array([full]), settings)[:, 0]))[k]
+        tried.append((least_squares(np.column_stack([np.ones(k.size), column]), residual[k])[1], float(full)))
+    return tuple((full,) for _, full in sorted(tried)[:2])
+
+
+def _gentle_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("coulomb_forward", float(p[1]) / g, "{in}"),
+        Human("coulomb_backward", float(p[1]) / g, "{in}"),
+        Human("full_speed", float(p[0]), "{out}/s"),
+    )
+
+
+_GENTLE = Effect(
+    name="coulomb_friction",
+    summary="constant force against the motion, which sets in smoothly around rest",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_gentle_parts,
+    equation=r"m\ddot x = F - F_c (1 - e^{-(\dot x/v_0)^2})\,\mathrm{sgn}\,\dot x",
+    source=_FRICTION_SOURCE + "; smooth around rest as every simulator has it (tanh, arctan and the like)",
+    excitation="reversals of motion, at speeds that differ",
+    prepare=_no_settings,
+    guess=_gentle_guess,
+    basis=_gentle_basis,
+    fill=_gentle_fill,
+    report=_gentle_report,
+)
+
 COULOMB_FRICTION = Effect(
     name="coulomb_friction",
     summary="constant force against the motion",
@@ -204,7 +258,7 @@ COULOMB_FRICTION = Effect(
     basis=_coulomb_basis,
     fill=_coulomb_fill,
     report=_coulomb_report,
-    variants=(_BRISTLES,),
+    variants=(_BRISTLES, _GENTLE),
 )
 
 

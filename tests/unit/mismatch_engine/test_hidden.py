@@ -95,4 +95,4 @@ def test_more_than_a_form_may_leave_is_something_else() -> None:
         return beyond_form(SimpleNamespace(steps=[SimpleNamespace(name=n) for n in names]))  # type: ignore[arg-type]
 
     assert left("step_shift") == 0.03
-    assert left("step_shift", "hysteresis") == 0.05
+    assert left("step_shift", "hysteresis") == 0.06
