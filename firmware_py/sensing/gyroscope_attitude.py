@@ -65,8 +65,12 @@ def gyroscope_attitude(
     rate_hz: float,
     method: Literal["error-state", "quaternion-kalman"] | Method = "error-state",
     gravity_m_s2: float = 9.81,
+    setting: Record | None = None,
 ) -> NDArray[np.float64]:
-    """(n, 4) quaternions, body to world (x magnetic north, z up), starting from TRIAD over the first 0.1 s."""
+    """(n, 4) quaternions, body to world (x magnetic north, z up), starting from TRIAD over the first 0.1 s.
+
+    ``setting``: other numbers for the error-state filter than ``gyroscope_error_state`` (dtype ``ERROR_STATE``).
+    """
     if not len(rate) == len(force) == len(field) or len(rate) < 2:
         raise ValueError(f"rate, force and field have {len(rate)}, {len(force)} and {len(field)} rows")
     if method not in ("error-state", "quaternion-kalman"):
@@ -75,7 +79,7 @@ def gyroscope_attitude(
         ATTITUDE,
         dt_s=1.0 / rate_hz,
         method=METHODS[method],
-        error_state=gyroscope_error_state(gravity_m_s2),
+        error_state=gyroscope_error_state(gravity_m_s2) if setting is None else setting,
         quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2),
     )
     out = np.empty((len(rate), 4))

@@ -12,6 +12,7 @@ from rich.table import Table as RichTable
 
 from firmware_py.recording.revision import git_revision
 from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
 
@@ -26,7 +27,7 @@ def reproduce(
 
     A page: micron reproduce sensing real-sensors --out docs/sensing-tables.md
     """
-    from tools.reproduce.names import expand, reproduce_table
+    from tools.reproduce.names import check, expand, reproduce_table
     from tools.reproduce.page import markdown
     from tools.reproduce.rows import Table
 
@@ -58,10 +59,24 @@ def reproduce(
         for note in table.notes:
             console().print(note, soft_wrap=True)
 
+    def ready(chosen: list[str]) -> list[str]:
+        """Without what cannot be computed here: an error before the first minute, or a note when all were asked for."""
+        there = []
+        for name in chosen:
+            try:
+                check(name)
+            except InputError as error:
+                if "all" not in names:
+                    raise
+                console().print(f"left out: {error}", soft_wrap=True)
+            else:
+                there.append(name)
+        return there
+
     with clear_errors():
         check_writable(json_file, out)
         tables: list[Table] = []
-        for name in expand(names):
+        for name in ready(expand(names)):
             tables.append(reproduce_table(name))
             show(tables[-1])
         if out is not None:

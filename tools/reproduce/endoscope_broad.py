@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
-
 import numpy as np
 
 from firmware_py.sensing.fusion import Fusion, FusionConfig
 from firmware_py.sensing.quaternion import from_matrix
-from tools.reproduce.orientation_error import Array, east_north_up, rms_errors_deg
-from tools.reproduce.real_sensors import BROAD_HZ, data_folder
+from tools.reproduce.broad_trials import BROAD_HZ, trials
+from tools.reproduce.orientation_error import Array
+from tools.reproduce.recordings import data_folder
 from tools.reproduce.rows import Row
 
 FILTERS = {
@@ -36,34 +35,22 @@ def start_of_the_authors(force: Array, field: Array) -> Array:
 
 def broad() -> list[Row]:
     """Total error of each trial and filter beside the published one."""
-    folder = data_folder() / "broad"
-    if not folder.is_dir():
+    if not (data_folder() / "broad").is_dir():
         return []
     rows: list[Row] = []
-    for entry in tomllib.loads((folder / "meta.toml").read_text())["files"]:
-        with np.load(folder / entry["name"]) as data:
-            rate, force, field, truth = (
-                np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64)
-                for stem, axes, unit in (
-                    ("gyro", "xyz", "_rad_s"),
-                    ("acc", "xyz", "_m_s2"),
-                    ("mag", "xyz", "_uT"),
-                    ("opt_quat", "wxyz", ""),
-                )
-            )
-            counts = data["movement"].astype(bool)
+    for trial in trials():
         for method, config in FILTERS.items():
             fusion = Fusion(config, BROAD_HZ)
-            fusion.restart(start_of_the_authors(force[0], field[0]))
-            total, _, _ = rms_errors_deg(east_north_up(fusion.run(rate, force, field)), truth, counts)
+            fusion.restart(start_of_the_authors(trial.force[0], trial.field[0]))
+            total, _, _ = trial.errors_deg(fusion.run(trial.rate, trial.force, trial.field))
             settings = "beta 0.12" if method == "madgwick" else "Kp 0.74, Ki 0.0012"
             rows.append(
                 Row(
                     "BROAD, authors' Madgwick and Mahony (2021)",
-                    f"{method} total error, trial {entry['name'][:2]}",
+                    f"{method} total error, trial {trial.name}",
                     "deg",
                     f"{settings}, start and field scale as in their code",
-                    float(entry[f"{method}_rmse_deg"]),
+                    float(trial.published[f"{method}_rmse_deg"]),
                     total,
                     "equal",
                     "recording",

@@ -26,6 +26,13 @@ def expand(names: list[str]) -> list[str]:
     return list(dict.fromkeys(names))
 
 
+def check(name: str) -> None:
+    """``InputError`` when a table's inputs are not there: calls ``check()`` of its module, where it has one."""
+    ready = getattr(import_module(MODULES[name]), "check", None)
+    if ready is not None:
+        ready()
+
+
 def reproduce_table(name: str) -> Table:
     """Compute one table: calls ``table()`` of its module."""
     return import_module(MODULES[name]).table()

@@ -6,10 +6,7 @@ there is left out with a note.
 
 from __future__ import annotations
 
-import os
-import tomllib
-from pathlib import Path
-from typing import Any
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -18,29 +15,20 @@ from tools.calibrate.gyroscope import fit_gyroscope
 from tools.calibrate.logs import load_log
 from tools.calibrate.multi_position import fit_poses, identify_poses
 from tools.calibrate.still import quiet_level
+from tools.errors import InputError
 from tools.noise.allan import allan_curve
-from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
+from tools.reproduce import broad
+from tools.reproduce.recordings import data_folder, meta
 from tools.reproduce.rows import Row, Table, build
 
 ACCELEROMETER = ("acc_x_raw", "acc_y_raw", "acc_z_raw")
 GYROSCOPE = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw")
-BROAD_HZ = 1.0 / 0.0035
-
-
-def data_folder() -> Path:
-    """Where the public recordings are."""
-    given = os.environ.get("MICRON_DATA")
-    return Path(given) if given else Path(__file__).resolve().parents[3] / "shared" / "data"
-
-
-def _meta(name: str) -> dict[str, Any]:
-    return tomllib.loads((data_folder() / name / "meta.toml").read_text())
 
 
 def xsens() -> list[Row]:
     """Accelerometer of an Xsens MTi from still poses."""
     log = load_log(data_folder() / "imu_tk_xsens")
-    factory = _meta("imu_tk_xsens")["reference_factory"]
+    factory = meta("imu_tk_xsens")["reference_factory"]
     result = identify_poses(log.matrix(ACCELEROMETER), log.need_rate(), 9.81744)
     source, condition = "imu_tk, Xsens MTi (factory)", f"{result.poses} poses, |g| = 9.81744 m/s^2"
     rows = [
@@ -91,8 +79,8 @@ def xsens() -> list[Row]:
 def mpu6050() -> list[Row]:
     """Accelerometer of an MPU-6050 from ten poses: those that we find, and the author's, three of them under 0.3 s."""
     log = load_log(data_folder() / "mpu6050_tomisuarez" / "calibration.npz", 100.0)
-    meta = _meta("mpu6050_tomisuarez")
-    reference, intervals = meta["reference_accelerometer"], meta["reference_static_intervals"]
+    about = meta("mpu6050_tomisuarez")
+    reference, intervals = about["reference_accelerometer"], about["reference_static_intervals"]
     raw = log.matrix(ACCELEROMETER)
     found = identify_poses(raw, 100.0, 9.80665)
     bounds = list(zip(intervals["start_sample"], intervals["stop_sample"], strict=True))
@@ -144,8 +132,8 @@ SATURATED = "in two turns the gyroscope is at its end; with them, as the author 
 def gyroscopes() -> list[Row]:
     """Scale of two gyroscopes from still poses and the turns between them (Tedaldi sec. V)."""
     rows = []
-    xsens_factory = [1.0 / v for v in _meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]]
-    mpu = _meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
+    xsens_factory = [1.0 / v for v in meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]]
+    mpu = meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
     author = "tomisuarez2/ImuCalibration, MPU-6050"
     cheap = "mpu6050_tomisuarez/calibration.npz"
     for source, file, rate_hz, gravity, published, keep in (
@@ -182,7 +170,7 @@ def gyroscopes() -> list[Row]:
 
 def adis16405() -> list[Row]:
     """Overlapping Allan variance of the x gyroscope of an ADIS16405."""
-    reference = _meta("adis16405_static")["reference_allan_variance_gyro_x"]
+    reference = meta("adis16405_static")["reference_allan_variance_gyro_x"]
     log = load_log(data_folder() / "adis16405_static")
     factors = np.round(np.array(reference["tau_s"]) * 100.0).astype(np.int64)
     curve = allan_curve(log.matrix(("gyro_x_raw",))[:, 0] * 0.05, 100.0, factors)
@@ -209,7 +197,7 @@ def adis16405() -> list[Row]:
 
 def qmc5883l() -> list[Row]:
     """Norm of the calibrated field of a QMC5883L."""
-    reference = _meta("mag_qmc5883l_tomisuarez")["reference_calibration"]
+    reference = meta("mag_qmc5883l_tomisuarez")["reference_calibration"]
     rows = []
     for name in ("filtered", "noisy"):
         log = load_log(data_folder() / "mag_qmc5883l_tomisuarez" / f"{name}.npz", 50.0)
@@ -230,106 +218,32 @@ def qmc5883l() -> list[Row]:
     return rows
 
 
-def broad() -> list[Row]:
-    """Orientation of four BROAD trials, one fixed setting, beside Madgwick, Mahony and the vqf package."""
-    from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
-
-    rows, totals = [], []
-    for entry in _meta("broad")["files"]:
-        with np.load(data_folder() / "broad" / entry["name"]) as archive:
-            data = {name: np.asarray(archive[name]) for name in archive.files}
-
-        def columns(*names: str, data: dict[str, np.ndarray] = data) -> np.ndarray:
-            return np.stack([data[name] for name in names], axis=1).astype(np.float64)
-
-        rate = columns("gyro_x_rad_s", "gyro_y_rad_s", "gyro_z_rad_s")
-        force = columns("acc_x_m_s2", "acc_y_m_s2", "acc_z_m_s2")
-        field = columns("mag_x_uT", "mag_y_uT", "mag_z_uT")
-        truth = columns("opt_quat_w", "opt_quat_x", "opt_quat_y", "opt_quat_z")
-        counts = data["movement"].astype(bool)
-        errors = {
-            method: rms_errors_deg(
-                east_north_up(gyroscope_attitude(rate, force, field, BROAD_HZ, method)), truth, counts
-            )
-            for method in ("error-state", "quaternion-kalman")
-        }
-        total, _, inclination = errors["error-state"]
-        totals.append(total)
-        trial = f"trial {entry['name'][:2]}"
-        peers = [
-            ("Madgwick, best setting of this trial", entry["madgwick_best_rmse_deg"], total, "total"),
-            ("Mahony, best setting of this trial", entry["mahony_best_rmse_deg"], total, "total"),
-        ]
-        vqf = _vqf(rate, force, field)
-        if vqf is not None:
-            theirs = rms_errors_deg(vqf, truth, counts)
-            peers += [
-                ("1.1 x vqf 2.1.2, run side by side", 1.1 * theirs[0], total, "total"),
-                ("1.1 x vqf 2.1.2, run side by side", 1.1 * theirs[2], inclination, "inclination"),
-            ]
-        for peer, published, ours, what in peers:
-            rows.append(
-                Row(
-                    f"BROAD, {peer}",
-                    f"{what} error, {trial}",
-                    "deg",
-                    "gyroscope as rate source, error-state filter, one setting for all trials",
-                    float(published),
-                    ours,
-                    "lower",
-                    "recording",
-                )
-            )
-        rows.append(
-            Row(
-                "quaternion Kalman filter of 000 on the same trial",
-                f"total error of the default (error-state) against it, {trial}",
-                "deg",
-                "one setting for all trials",
-                errors["quaternion-kalman"][0],
-                total,
-                "lower",
-                "recording",
-            )
-        )
-    rows.append(
-        Row(
-            "design survey, vqf over 30 trials",
-            "mean total error",
-            "deg",
-            "four trials here, thirty there",
-            2.43,
-            float(np.mean(totals)),
-            "lower",
-            "recording",
-        )
-    )
-    return rows
-
-
-def _vqf(rate: np.ndarray, force: np.ndarray, field: np.ndarray) -> np.ndarray | None:
-    """Quaternions (east-north-up) of the vqf package, or None when it is not installed (development extra)."""
-    try:
-        from vqf import VQF  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return None
-    arrays = [np.ascontiguousarray(a) for a in (rate, force, field)]
-    return np.asarray(VQF(1.0 / BROAD_HZ).updateBatch(*arrays)["quat9D"])
-
-
 SETS = {
     "imu_tk_xsens": xsens,
     "mpu6050_tomisuarez": mpu6050,
     "adis16405_static": adis16405,
     "mag_qmc5883l_tomisuarez": qmc5883l,
-    "broad": broad,
+    "broad": broad.rows,
 }
 
 
+def check() -> None:
+    """``InputError`` when none of the recordings is there."""
+    folder = data_folder()
+    if not any((folder / name).is_dir() for name in SETS):
+        raise InputError(
+            f"real-sensors compares public recordings, and none is in {folder}: put {', '.join(SETS)} there, "
+            "or name their folder in the environment variable MICRON_DATA"
+        )
+
+
 def table() -> Table:
-    """All sets that are there."""
+    """All sets that are there; ``InputError`` without any."""
+    check()
     there = {name: section for name, section in SETS.items() if (data_folder() / name).is_dir()}
     notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in there]
+    if "broad" in there and find_spec("vqf") is None:
+        notes.append("the vqf package (development extra) is not installed: its rows are left out")
     if all(name in there for name in ("imu_tk_xsens", "mpu6050_tomisuarez")):
         there["gyroscopes"] = gyroscopes
     return build("real-sensors", list(there.values()), notes)

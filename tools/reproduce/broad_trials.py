@@ -1,0 +1,62 @@
+"""The BROAD trials as arrays (D. Laidig et al., Data 6 (7), 2021): every file that the set's ``meta.toml`` names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.reproduce.orientation_error import Array, east_north_up, rms_errors_deg
+from tools.reproduce.recordings import data_folder, meta
+
+BROAD_HZ = 1.0 / 0.0035
+
+
+@dataclass(frozen=True)
+class Trial:
+    """``rate`` rad/s, ``force`` m/s^2, ``field`` uT (n, 3); ``truth`` (n, 4) east-north-up; ``published`` figures."""
+
+    name: str
+    rate: Array
+    force: Array
+    field: Array
+    truth: Array
+    counts: NDArray[np.bool_]
+    published: dict[str, Any]
+
+    def errors_deg(self, attitude: Array) -> tuple[float, float, float]:
+        """Total, heading, inclination rms of quaternions (n, 4) whose world has x to magnetic north."""
+        return rms_errors_deg(east_north_up(attitude), self.truth, self.counts)
+
+
+def trials() -> list[Trial]:
+    """All trials that are there."""
+    found = []
+    for entry in meta("broad")["files"]:
+        with np.load(data_folder() / "broad" / entry["name"]) as data:
+            rate, force, field, truth = (
+                np.ascontiguousarray(
+                    np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64)
+                )
+                for stem, axes, unit in (
+                    ("gyro", "xyz", "_rad_s"),
+                    ("acc", "xyz", "_m_s2"),
+                    ("mag", "xyz", "_uT"),
+                    ("opt_quat", "wxyz", ""),
+                )
+            )
+            counts = data["movement"].astype(bool)
+        found.append(Trial(entry["name"][:2], rate, force, field, truth, counts, entry))
+    return found
+
+
+def vqf_errors_deg(trial: Trial) -> tuple[float, float, float] | None:
+    """The vqf package (its defaults) on the same samples; None when it is not installed (development extra)."""
+    try:
+        from vqf import VQF  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    found = np.asarray(VQF(1.0 / BROAD_HZ).updateBatch(trial.rate, trial.force, trial.field)["quat9D"])
+    return rms_errors_deg(found, trial.truth, trial.counts)
