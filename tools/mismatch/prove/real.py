@@ -173,12 +173,12 @@ def document(rows: Sequence[RealRow]) -> str:
         "which effects to name is decided on that part, too, so a figure is a little kinder than one of a third part "
         "would be. The data are not part of the repository.",
         "",
-        f"Tool {', '.join(sorted({r.revision[:12] for r in rows}))}, {date}. The seconds are CPU time of one process.",
+        f"{date}; each row says which state of the tool made it. The seconds are CPU time of one process.",
         "",
         *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
         "| set | unit | naive | re-calibrated | with physics | noise (tool's) | left over noise | published "
-        "| what it said | CPU s |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "| what it said | CPU s | tool |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for r in rows:
         published = "; ".join(f"{p.figure:g} ({p.what})" for p in r.real.published)
@@ -186,7 +186,8 @@ def document(rows: Sequence[RealRow]) -> str:
         left, floor = r.rms("fitted_rms"), r.rms("noise_floor_rms")
         cells.append(f"{left / floor:.1f}" if left is not None and floor else "")
         lines.append(
-            f"| {r.real.name} | {r.real.unit} | {' | '.join(cells)} | {published} | {r.said()} | {r.cpu_s:.0f} |"
+            f"| {r.real.name} | {r.real.unit} | {' | '.join(cells)} | {published} | {r.said()} | {r.cpu_s:.0f} "
+            f"| {r.revision[:8]} |"
         )
     lines.append("")
     for r in rows:
