@@ -27,6 +27,7 @@ from tools.cli import (
     run,
     sensing,
     simulate,
+    soak,
     tremor,
 )
 
@@ -62,6 +63,7 @@ app.command("replay")(replay.replay)
 app.command("doctor")(doctor.doctor)
 app.command("hands")(hands.hands)
 app.command("faults")(faults.faults)
+app.command("soak")(soak.soak)
 app.command("reproduce")(reproduce.reproduce)
 app.command("noise")(noise.noise)
 app.command("placement")(placement.placement)
