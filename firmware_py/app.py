@@ -26,6 +26,7 @@ from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.exit_codes import exit_code_of
 from firmware_py.frame import LAYOUT
 from firmware_py.guardian.start import guarded
+from firmware_py.inject import Injector, check_injections, parse_injection
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
@@ -55,6 +56,10 @@ def run_in_process(
     nothing else; the guardian may kill it where it stands still in the middle of a command.
     """
     bench = load_bench(request.bench)
+    injections = [parse_injection(text) for text in request.inject]
+    check_injections(bench, injections, request.max_effect)
+    injector = Injector(injections, wrap)
+    wrap = injector.wrap if injections else wrap
     if is_endoscope(bench.description):
         from firmware_py.endoscope.app import run_request
 
@@ -104,6 +109,8 @@ def run_in_process(
         if heart is not None and heart.noticed_ns:
             loop.counts.noticed.setdefault("no command for a while (guardian)", heart.noticed_ns)
         outcome = make_outcome(request, bench, devices, loop, config, report, summary)
+        if injections:
+            outcome["injected"] = injector.counts()
         return outcome, truth_of(opened)
 
 

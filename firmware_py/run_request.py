@@ -44,6 +44,10 @@ class RunRequest:
     """How much truth an emulated world keeps; None: all of it."""
     clock_start_ns: int = 0
     """Where the virtual clock begins: marks of time are crossed without waiting for them."""
+    inject: tuple[str, ...] = ()
+    """Faults on buses (``firmware_py.inject``)."""
+    max_effect: int | None = None
+    """How much these may disturb a real bench."""
 
     def to_json(self, runtime_dir: Path) -> str:
         """For the firmware's own process."""

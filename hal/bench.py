@@ -216,6 +216,15 @@ Provider = Callable[..., EmulatedWorld]
 
 
 @dataclass
+class Processes:
+    """In virtual time all processes of a bench are one: which of them a fault test has killed, and what the guardian
+    reports."""
+
+    dead: set[str] = field(default_factory=set[str])
+    guardian_report: Callable[[], dict[str, Any]] | None = None
+
+
+@dataclass
 class OpenBench:
     """An opened bench: its clock, its ports by bus name and, where something is emulated, the world behind."""
 
@@ -225,6 +234,7 @@ class OpenBench:
     world: EmulatedWorld | None
     runtime_dir: Path
     closers: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
+    processes: Processes = field(default_factory=Processes)
 
     def serial(self, bus: str) -> SerialPort:
         return cast(SerialPort, self.ports[bus])

@@ -148,10 +148,10 @@ class OutputGuard:
         """``next_V`` cannot take force before ``t_ns``: its transfer takes so long."""
         self._offered_ns = t_ns
 
-    def sent(self) -> None:
-        """The device has been told ``next_V``."""
+    def sent(self, ago_ns: int = 0) -> None:
+        """The device was told ``next_V``, at least ``ago_ns`` ago."""
         self.last_V[:] = self.next_V
-        self._sent_ns = self._clock.now_ns()
+        self._sent_ns = self._clock.now_ns() - ago_ns
         self.told.append(Told(self._offered_ns, self._sent_ns, tuple(self.next_V)))
         if self._ramp_done >= 0:
             self._ramp_done = self._ramp_next

@@ -23,6 +23,9 @@ FAULTS = (
     "press / release: the stop button, or the button of the motion card named",
     "brown_out: an I2C DAC restarts with its power-up outputs",
     "clock=PPM: the DAQ's crystal runs fast by so much from now on",
+    "clock_step=US: the DAQ's scans come so many microseconds later, once",
+    "model=NUMBER: the DAQ says that it is another model",
+    "always_ready: an I2C converter says that it has finished when it has not",
     "sensor_KIND[=AMOUNT] / sensor_ok: at DAQ input NUMBER; kinds: " + ", ".join(SENSOR_FAULTS),
     "actuator_KIND[=AMOUNT] / actuator_ok: at amplifier channel NUMBER; kinds: " + ", ".join(ACTUATOR_FAULTS),
     "supply=FACTOR: the supply of the sensors sags (1 ends it)",
@@ -72,6 +75,7 @@ def inject(
         "free": ("stuck", False),
         "silence": ("silent", True),
         "speak": ("silent", False),
+        "always_ready": ("always_ready", True),
     }
     if fault == "ack":
         where.nack_address = where.nack_data = False
@@ -81,6 +85,10 @@ def inject(
         where.brown_out(t_ns)
     elif fault.startswith("clock=") and isinstance(where, Di4108):
         where.set_clock_error_ppb(round(_number(fault, fault[6:]) * 1000), t_ns)
+    elif fault.startswith("clock_step=") and isinstance(where, Di4108):
+        where.step_clock(round(_number(fault, fault[11:]) * 1000), t_ns)
+    elif fault.startswith("model=") and isinstance(where, Di4108):
+        where.model = fault[6:]
     elif fault in flags and hasattr(where, flags[fault][0]):
         setattr(where, *flags[fault])
     else:

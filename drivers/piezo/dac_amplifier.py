@@ -17,9 +17,9 @@ import numpy as np
 
 from drivers.base import wait_s
 from hal.contracts import Clock, Float64Array, I2cBus
-from hal.errors import BenchError, HalError, WrongDevice
+from hal.errors import BenchError, HalError, ProtocolError, WrongDevice
 from hal.output_guard import OutputGuard
-from hal.types import ChannelInfo, I2cRead, I2cWrite, OutputLimit
+from hal.types import ChannelInfo, I2cOp, I2cRead, I2cWrite, OutputLimit
 
 CHANNELS = 3
 WRITE_INPUT, UPDATE, POWER, LDAC_MASK, REFERENCE = 0x10, 0x20, 0x40, 0x50, 0x70
@@ -29,6 +29,7 @@ PATTERNS = (0x5AA5, 0x0000, 0xA55A)  # into DAC D; the last one stays there and 
 DAC_SPAN_V = 5.0
 CODES = 65536
 RAMP_TICK_S = 0.001
+READ_BACK_NS = 200_000  # pointer and six bytes at 400 kHz: the update has been in force for at least so long
 TRANSFER_NS = 365_000  # 4 segments of 4 bytes at 400 kHz, the fastest that the part allows, less a bit each
 
 
@@ -56,6 +57,7 @@ class DacAmplifier:
         hi_V: float = 100.0,
         neutral_V: float = 50.0,
         slew_V_per_s: float = 20_000.0,
+        read_back: bool = False,
         name: str = "piezo",
     ) -> None:
         full_V = DAC_SPAN_V * gain
@@ -79,6 +81,7 @@ class DacAmplifier:
         self._update = I2cWrite(bytes((UPDATE | 0x7, 0, 0)))
         self._read_abc = (I2cWrite(bytes((ADDRESS_BITS[0],))), I2cRead(2 * CHANNELS))
         self._read_all = (I2cWrite(bytes((ADDRESS_BITS[0],))), I2cRead(2 * (CHANNELS + 1)))
+        self._read_back = read_back
         self._probed = False
         self._position_known = False
 
@@ -118,8 +121,9 @@ class DacAmplifier:
         self.guard.armed = True
 
     def write(self, values_V: Float64Array) -> int:
+        """``ProtocolError`` with ``read_back``: the DAC holds something else than it was told just now."""
         mask = self.guard.admit(values_V)
-        self._send()
+        self._send(self._read_abc if self._read_back else ())
         return mask
 
     def safe_step(self) -> bool:
@@ -175,7 +179,7 @@ class DacAmplifier:
     def _code(self, value_V: float) -> int:
         return int(value_V * self._codes_per_V + 0.5)
 
-    def _send(self) -> None:
+    def _send(self, read_back: tuple[I2cOp, ...] = ()) -> None:
         k = self._codes_per_V
         a, b, c = self.guard.next_V
         a, b, c = int(a * k + 0.5), int(b * k + 0.5), int(c * k + 0.5)
@@ -184,17 +188,31 @@ class DacAmplifier:
             I2cWrite(bytes((0x12, b >> 8, b & 0xFF))),
             I2cWrite(bytes((0x14, c >> 8, c & 0xFF))),
             self._update,
+            *read_back,
         )
         self.guard.not_before(self._clock.now_ns() + TRANSFER_NS)
         if self.gate is None:
-            self._bus.transfer(self._address, segments)
+            answer = self._bus.transfer(self._address, segments)
         else:
             self.gate.enter((a, b, c))
             try:
-                self._bus.transfer(self._address, segments)
+                answer = self._bus.transfer(self._address, segments)
             finally:
                 self.gate.leave()
-        self.guard.sent()
+        self.guard.sent(READ_BACK_NS if read_back else 0)
+        if read_back:
+            self._compare(answer, (a, b, c))
+
+    def _compare(self, answer: bytes, told: tuple[int, int, int]) -> None:
+        held = [int.from_bytes(answer[2 * i : 2 * i + 2], "big") for i in range(CHANNELS)]
+        for i, (code, wanted) in enumerate(zip(held, told, strict=True)):
+            if code != wanted:
+                self._position_known = False  # the ramp begins where the outputs are
+                raise ProtocolError(
+                    f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {wanted * self.lsb_V:.3f} V: check "
+                    "the wires of the bus",
+                    device=self.name,
+                )
 
     def read_codes(self) -> list[int]:
         """Input registers A, B, C as codes."""

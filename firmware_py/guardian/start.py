@@ -16,7 +16,7 @@ from firmware_py.guardian.gate import LEASE_MARGIN_MS
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart
 from firmware_py.guardian.process import GuardianProcess
-from hal.bench import I2cSpec, OpenBench
+from hal.bench import I2cSpec, OpenBench, Processes
 from hal.clock import VirtualClock
 
 
@@ -41,7 +41,8 @@ def guarded(
         heart = Heart()
         own = DacAmplifier(_bus_of(opened, amplifier.name), opened.clock, **options)
         guardian = Guardian(heart, own, opened.clock, notice_ms=notice_ms, limit_ms=limit_ms)
-        _step_in_virtual_time(guardian, opened.clock)
+        opened.processes.guardian_report = guardian.report
+        _step_in_virtual_time(guardian, opened.clock, opened.processes)
         process, evict = None, guardian.retire
     else:
         order = {**_uri(opened, amplifier.name), "options": options, "notice_ms": notice_ms, "limit_ms": limit_ms}
@@ -58,11 +59,13 @@ def guarded(
         evict() if process is None else process.stop()
 
 
-def _step_in_virtual_time(guardian: Guardian, clock: VirtualClock) -> None:
+def _step_in_virtual_time(guardian: Guardian, clock: VirtualClock, processes: Processes) -> None:
     """Half a step beside the firmware's ticks; its transfers take their time on the bus as the firmware's do."""
 
     def step(t_ns: int) -> None:
-        guardian.step(alive=True)
+        if "guardian" in processes.dead:
+            return
+        guardian.step(alive="firmware" not in processes.dead)
         if guardian.state is not State.DONE:
             clock.at(t_ns + STEP_NS, step)
 

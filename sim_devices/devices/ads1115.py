@@ -41,6 +41,7 @@ class Ads1115:
         self.nack_address = False
         self.nack_data = False
         self.frozen = False
+        self.always_ready = False  # fault hook: the OS bit says so even while a conversion runs
         self.conversions = 0
         self._inputs = inputs
         self._rate_error = rate_error
@@ -78,7 +79,7 @@ class Ads1115:
         self.advance_to(t_ns)
         value = self.registers[self._pointer]
         if self._pointer == CONFIG:
-            value = value & ~OS_BIT | (0 if self._due_ns is not None else OS_BIT)
+            value = value & ~OS_BIT | (0 if self._due_ns is not None and not self.always_ready else OS_BIT)
         if self._pointer == CONVERSION and self._latching:
             self.alert_asserted = False
         return (value.to_bytes(2, "big") * (n // 2 + 1))[:n]

@@ -74,6 +74,7 @@ class Di4108:
         self.settings = Di4108Settings()
         self.unread = 0
         self.frozen = False
+        self.model = "4108"
         self.scanning = False
         self.scans = 0
         self.overflows = 0
@@ -152,6 +153,12 @@ class Di4108:
         self._conversion = 0
         self._den = DIVIDEND_HZ * (10**9 + ppb) * self._conversions
         self._next_ns = self._start_ns + self._num // self._den
+
+    def step_clock(self, dt_ns: int, t_ns: int) -> None:
+        """Fault hook: the next conversion, and all that follow, come ``dt_ns`` later (earlier where negative)."""
+        self.advance_to(t_ns)
+        self._start_ns += dt_ns
+        self._next_ns = max(t_ns + 1, self._next_ns + dt_ns)
 
     def force_overflow(self) -> None:
         """Fault hook: as if the host had not read for too long."""
@@ -329,7 +336,7 @@ class Di4108:
             return line
         answers = {
             "0": "DATAQ",
-            "1": "4108",
+            "1": self.model,
             "2": f"{self._firmware:X}",
             "5": self.settings.description,
             "6": self._serial_number,

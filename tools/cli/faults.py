@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from pathlib import Path
 from typing import Annotated
 
@@ -17,7 +18,9 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.faults.campaign import run_campaign, totals
 from tools.faults.catalogue import faults as catalogue
-from tools.faults.page import markdown
+from tools.faults.drift_bound import drift_bounds
+from tools.faults.fault import Fault
+from tools.faults.page import Beside, markdown
 from tools.faults.points import POINTS
 from tools.output import check_writable, write_json, write_text_atomic
 
@@ -27,6 +30,13 @@ def faults(
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs per fault and operating point.")] = 3,
     only: Annotated[str, typer.Option(metavar="TEXT", help="Only faults whose name contains this.")] = "",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = os.cpu_count() or 1,
+    beside: Annotated[
+        list[str] | None,
+        typer.Option(metavar="BENCH[#TEXT]", help="Another bench into the same page; faults whose name contains TEXT."),
+    ] = None,
+    keep: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Keep what is done there; a stopped campaign goes on from it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -39,34 +49,68 @@ def faults(
     with clear_errors():
         check_writable(json_file, out)
         path = bench_path(bench)
-        description = load_bench(path).description
-        if len(description.emulated_buses()) < len(description.bus):
-            raise InputError(f"{path}: faults are injected into emulated benches only; use a bench of sim:// buses")
-        chosen = [fault for fault in catalogue() if only.lower() in fault.name.lower()]
-        if not chosen:
-            raise InputError(
-                f"--only {only!r}: no fault is called so; names begin with serial, daq, sensor, output bus ..."
-            )
+        revision = git_revision() or "unknown"
+        if keep is not None:
+            if not keep.is_dir():
+                raise InputError(f"--keep {keep}: there is no such folder; create it first")
+            if revision.endswith("-dirty"):
+                raise InputError("--keep needs a committed tree: results of changed files would be taken for its own")
+        others = [(Path(text.partition("#")[0]), text.partition("#")[2]) for text in beside or []]
+        benches = [(path, _chosen("--only", only)), *((file, _chosen("--beside", text)) for file, text in others)]
+        for file, _ in benches:
+            _emulated(file)
         with Progress(
             TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console(), transient=True
         ) as progress:
-            task = progress.add_task("starting", total=len(POINTS) * seeds)
-            rows = run_campaign(
-                path,
-                chosen,
-                seeds=range(1, seeds + 1),
-                jobs=jobs,
-                progress=lambda text: progress.update(task, advance=1, description=text),
+            task = progress.add_task("starting", total=len(POINTS) * seeds * len(benches))
+            rows, *others_rows = (
+                run_campaign(
+                    file,
+                    chosen,
+                    seeds=range(1, seeds + 1),
+                    jobs=jobs,
+                    progress=lambda text: progress.update(task, advance=1, description=text),
+                    keep=keep,
+                    revision=revision,
+                )
+                for file, chosen in benches
             )
+            besides = [Beside(f"{f}", text, more) for (f, text), more in zip(others, others_rows, strict=True)]
+            bounds = drift_bounds(path, rows) if out is not None else []
         total = totals(rows)
         if out is not None:
-            command = f"micron faults --seeds {seeds} --out {out}"
-            write_text_atomic(out, markdown(rows, command, git_revision() or "unknown"))
+            asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
+            command = f"micron faults --seeds {seeds}{asked} --out {out}"
+            write_text_atomic(out, markdown(rows, command, revision, bounds, besides))
         if json_file != "-":
             _print(rows, total)
-        write_json({"format": 1, "rows": [row.as_dict() for row in rows], "totals": total}, json_file)
-    if total["unsafe_outputs"] or total["uncounted_samples"] or total["wrong_messages"]:
-        raise typer.Exit(1)
+        more = [
+            {"bench": b.bench, "only": b.chosen, "rows": [r.as_dict() for r in b.rows], "totals": totals(b.rows)}
+            for b in besides
+        ]
+        result = {"format": 1, "rows": [row.as_dict() for row in rows], "totals": total}
+        write_json({**result, "beside": more} if more else result, json_file)
+    for figures in (total, *(totals(b.rows) for b in besides)):
+        if figures["unsafe_outputs"] or figures["uncounted_samples"] or figures["wrong_messages"]:
+            raise typer.Exit(1)
+
+
+def _chosen(option: str, text: str) -> list[Fault]:
+    chosen = [fault for fault in catalogue() if text.lower() in fault.name.lower()]
+    if not chosen:
+        raise InputError(
+            f"{option} {text!r}: no fault is called so; names begin with serial, daq, sensor, output bus ..."
+        )
+    return chosen
+
+
+def _emulated(path: Path) -> None:
+    description = load_bench(path).description
+    if len(description.emulated_buses()) < len(description.bus):
+        raise InputError(
+            f"{path}: the campaign runs on emulated benches only; use a bench of sim:// buses, or one fault at a time "
+            "on a real one: micron run --inject"
+        )
 
 
 def _print(rows: list, total: dict) -> None:

@@ -22,6 +22,7 @@ from rich.table import Table
 from firmware_py.app import run_in_process
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import REPORT, describe
+from firmware_py.inject import check_injections, parse_injection
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
@@ -57,6 +58,16 @@ def run(
         str | None, typer.Option(metavar="NAME", help="Another tremor estimator than the bench file's.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
+    inject: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="BUS:KEY=VALUE", help="A fault on a bus, e.g. daq0:loss=0.001,from_s=2 (may be repeated)."
+        ),
+    ] = None,
+    max_effect: Annotated[
+        int | None,
+        typer.Option(min=0, max=4, help="With --inject on a real bus: 1 may spoil readings, 4 may move the outputs."),
+    ] = None,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
     image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = Path(
@@ -71,6 +82,8 @@ def run(
         check_writable(json_file, html, record)
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
+        if max_effect is not None and not inject:
+            raise InputError("--max-effect belongs to --inject; give both or neither")
         request = RunRequest(
             bench=bench_path(bench),
             seconds=seconds,
@@ -80,8 +93,11 @@ def run(
             record=record,
             seed=seed,
             sense_only=sense_only,
+            inject=tuple(inject or ()),
+            max_effect=max_effect,
             method=None if method is None else estimator_name(method),
         )
+        check_injections(load_bench(request.bench), [parse_injection(text) for text in request.inject], max_effect)
         if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None or sense_only):
             raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
         if is_endoscope(load_bench(request.bench).description) and method is not None:

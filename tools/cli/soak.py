@@ -11,18 +11,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
-from tools.cli.common import (
-    InputError,
-    JsonOption,
-    check_writable,
-    clear_errors,
-    console,
-    data_console,
-    write_json,
-    write_text_atomic,
-)
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
 from tools.faults.long_page import block, with_block
 from tools.faults.long_run import with_wires, without_wires
+from tools.output import check_writable, write_json, write_text_atomic
 
 
 def soak(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
+import re
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -19,6 +23,7 @@ from tools.faults.judge import Observation
 from tools.faults.points import POINTS, Point, write_bench
 from tools.faults.trial import observe_running, observe_start
 
+NUMBERS = re.compile(r"-?\d+\.\d+")
 WITHIN_MS = 20.0  # from the moment at which the tip has gone 5 um astray
 
 
@@ -66,6 +71,19 @@ class FaultRow:
         told = [o for o in self.observations if o.answer in ("safe state", "refused")]
         return sum(not any(word.lower() in o.message.lower() for word in self.fault.names) for o in told)
 
+    @property
+    def known_by(self) -> str:
+        """What said so first, in the words most often used (numbers left out); empty: nothing."""
+        said = [NUMBERS.sub("#", o.known_by) for o in self.observations if o.known_by]
+        return max(sorted(set(said)), key=said.count) if said else ""
+
+    @property
+    def isolated(self) -> int:
+        """Runs in which what was said names the part that is broken."""
+        parts = (self.fault.part,) if self.fault.part else self.fault.names
+        said = [f"{o.known_by} {o.message}".lower() for o in self.observations if o.known_by]
+        return sum(any(part.lower() in text for part in parts) for text in said)
+
     def as_dict(self) -> dict[str, Any]:
         """Row of the contract's JSON, and what else is known."""
         return {
@@ -86,6 +104,9 @@ class FaultRow:
             "not_confirmed": sum(not o.confirmed for o in self.observations),
             "message": next((o.message for o in self.observations if o.answer in ("safe state", "refused")), ""),
             "why": self.fault.why,
+            "known_by": self.known_by,
+            "isolated": self.isolated,
+            "samples_lost_max": max(o.lost for o in self.observations),
         }
 
 
@@ -122,16 +143,31 @@ def run_campaign(
     seeds: Sequence[int],
     jobs: int,
     progress: Callable[[str], None],
+    keep: Path | None = None,
+    revision: str = "",
 ) -> list[FaultRow]:
-    """Every fault at every point with every seed, in virtual time, in ``jobs`` processes. Deterministic."""
+    """Every fault at every point with every seed, in virtual time, in ``jobs`` processes. Deterministic.
+
+    ``keep``: a folder in which what is done is kept; a campaign that was stopped goes on from there. Kept results of
+    another ``revision``, bench or choice of faults are not used.
+    """
     if has_redundancy(bench):
         faults = [fault.with_redundancy() for fault in faults]
     folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
     try:
         benches = {point.name: write_bench(bench, point, folder) for point in points}
-        tasks = [(benches[point.name], point.name, tuple(faults), seed) for point in points for seed in seeds]
+        key = hashlib.sha256(repr((revision, bench.read_text(encoding="utf-8"), faults)).encode()).hexdigest()[:16]
+        kept = _Kept(keep, key)
+        tasks: list[tuple[Any, ...]] = []
+        done: list[list[Observation]] = []
+        for point in points:
+            for seed in seeds:
+                if (observations := kept.read(point.name, seed)) is None:
+                    tasks.append((benches[point.name], point.name, tuple(faults), seed))
+                else:
+                    done.append(observations)
         found: dict[tuple[str, str], list[Observation]] = {}
-        for observations in _in_parallel(tasks, jobs):
+        for observations in chain(done, map(kept.write, _in_parallel(tasks, jobs))):
             progress(f"{observations[0].point} hand, seed {observations[0].seed}")
             for o in observations:
                 found.setdefault((o.fault, o.point), []).append(o)
@@ -142,6 +178,29 @@ def run_campaign(
         ]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class _Kept:
+    folder: Path | None
+    key: str
+
+    def _path(self, point: str, seed: int) -> Path | None:
+        return None if self.folder is None else self.folder / f"{self.key}-{point}-{seed}.json"
+
+    def read(self, point: str, seed: int) -> list[Observation] | None:
+        path = self._path(point, seed)
+        if path is None or not path.is_file():
+            return None
+        return [Observation(**table) for table in json.loads(path.read_text(encoding="utf-8"))]
+
+    def write(self, observations: list[Observation]) -> list[Observation]:
+        path = self._path(observations[0].point, observations[0].seed)
+        if path is not None:
+            part = path.with_suffix(".part")
+            part.write_text(json.dumps([asdict(o) for o in observations]), encoding="utf-8")
+            part.replace(path)
+        return observations
 
 
 def has_redundancy(bench: Path) -> bool:

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from tools.faults.fault import Expected, Fault, InWorld, OnBus, OnHost
+from tools.faults.fault import Expected, Fault, InWorld, Kill, OnBus, OnHost, OutOfMemory
 
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
 ONE_BYTE = (
-    "each wrong command stands for 1 ms; reading back every command takes 0.21 ms more, which beside the magnetometer "
-    "and the monitor does not fit a tick at 400 kHz, the fastest that the DAC allows; registers are read back at "
-    "100 Hz, outputs measured at 400 Hz; a link with checksums (E-727, CAN amplifier) sees each"
+    "each wrong command stands for 1 ms; registers are read back at 100 Hz, outputs measured at 400 Hz; with "
+    "`read_back = true` at the amplifier every command is read back within its own transfer (0.21 ms more of the bus), "
+    "and each wrong one is known: benches/micron-read-back.toml, below"
 )
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
@@ -47,6 +47,7 @@ def serial_line() -> tuple[Fault, ...]:
 
 
 def daq_device() -> tuple[Fault, ...]:
+    step = "less than a period is what a USB packet may be late by; the time line follows it"
     small = "100 ppm of a sample period is 0.1 us a tick; the time line follows it"
     return (
         Fault("daq: unplugged", InWorld("unplug", "daq"), "safe state", ("daq",)),
@@ -55,6 +56,9 @@ def daq_device() -> tuple[Fault, ...]:
         Fault("daq: FIFO overflow", InWorld("overflow", "daq"), "safe state", ("overflow",)),
         Fault("daq: crystal 100 ppm fast", InWorld("clock=100", "daq"), "harmless", why=small, redraws=True),
         Fault("daq: crystal 100 ppm slow", InWorld("clock=-100", "daq"), "harmless", why=small, redraws=True),
+        Fault("daq: clock steps by 0.4 ms", InWorld("clock_step=400", "daq"), "cannot be seen", redraws=True, why=step),
+        Fault("daq: clock steps by 2.5 ms", InWorld("clock_step=2500", "daq"), "noticed", ("daq",), redraws=True),
+        Fault("daq: another model at start", InWorld("model=2108", "daq"), "refused", ("DI-4108",), at_start=True),
         Fault("daq: does not answer at start", InWorld("freeze", "daq"), "refused", ("daq",), at_start=True),
     )
 
@@ -63,7 +67,8 @@ def sensors() -> tuple[Fault, ...]:
     def one(name: str, fault: str, expected: str, channel: int = 1, why: str = "", watch_s: float = 0.15) -> Fault:
         words = ("acc", "DAQ input")
         how = InWorld(fault, str(channel))
-        return Fault(f"sensor: {name}", how, expected, words, watch_s, why=why, redundant="noticed")  # type: ignore[arg-type]
+        part = f"DAQ input {channel}"
+        return Fault(f"sensor: {name}", how, expected, words, watch_s, why=why, redundant="noticed", part=part)  # type: ignore[arg-type]
 
     def plain(
         name: str, fault: str, target: str, expected: Expected, names: tuple[str, ...] = (), why: str = ""
@@ -87,7 +92,7 @@ def sensors() -> tuple[Fault, ...]:
         one("50 mV of noise", "sensor_noise", "safe state"),
         one("half the sensitivity", "sensor_gain", "safe state"),
         one("sign turned round", "sensor_sign", "safe state"),
-        replace(one("exchanged with its neighbour", "sensor_swap", "safe state", 2), redundant=None),
+        replace(one("exchanged with its neighbour", "sensor_swap", "safe state", 2), redundant=None, part="DAQ input"),
         Fault("sensor: supply sags to 4.25 V", InWorld("supply=0.85", ""), "safe state", ("supply", "acc"), 0.3),
         Fault(
             "sensor: supply sags by 1 %",
@@ -135,9 +140,11 @@ def output_bus() -> tuple[Fault, ...]:
 
 def magnetometer() -> tuple[Fault, ...]:
     coasts = "the heading coasts for 150 ms"
+    waits = "the driver waits for the longest conversion of the data sheet and does not ask the bit"
     return (
         Fault("magnetometer: ADC refuses its address", InWorld("nack", "mag_adc"), "safe state", ("mag", "0x48"), 0.3),
         Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "safe state", ("mag",), 0.3),
+        Fault("magnetometer: ADC always says ready", InWorld("always_ready", "mag_adc"), "harmless", why=waits),
         Fault("magnetometer: one transfer in ten refused", OnBus("i2c0", {"nack": 0.1}, ADC), "noticed", ("mag",)),
         Fault(
             "magnetometer: bits of its readings flipped", OnBus("i2c0", {"corruption": 0.1}, ADC), "noticed", ("mag",),
@@ -188,4 +195,7 @@ def host() -> tuple[Fault, ...]:
         Fault("host: stalls for 5 ms", OnHost(5.0), "noticed", ("daq",), effect=0),
         Fault("host: stalls for 50 ms", OnHost(50.0), "safe state", ("guardian",), effect=0, why=GUARDED),
         Fault("host: stalls for 500 ms", OnHost(500.0), "safe state", ("daq", "host"), effect=0, why=GUARDED),
+        Fault("host: 8 MB of memory left", OutOfMemory(8.0), "harmless", effect=0, why="a tick allocates nothing"),
+        Fault("host: firmware killed (kill -9)", Kill("firmware"), "safe state", ("firmware died",), 0.3),
+        Fault("host: guardian killed (kill -9)", Kill("guardian"), "noticed", ("guardian",), 0.3),
     )

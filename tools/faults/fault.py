@@ -36,7 +36,21 @@ class OnHost:
     stall_ms: float
 
 
-How = InWorld | OnBus | OnHost
+@dataclass(frozen=True)
+class Kill:
+    """kill -9 of ``process``: firmware or guardian."""
+
+    process: str
+
+
+@dataclass(frozen=True)
+class OutOfMemory:
+    """The process may not map more than ``left_MB`` from the strike on."""
+
+    left_MB: float
+
+
+How = InWorld | OnBus | OnHost | Kill | OutOfMemory
 
 
 @dataclass(frozen=True)
@@ -47,7 +61,8 @@ class Fault:
     far as it would with other noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
     ``effect``: how much it disturbs a real bench, by the scale of the HIL tests (0 reads .. 4 motion); 9 is for the
     emulated world only. ``why``: for what cannot be seen, comes late or is harmless. ``redundant``: what is expected of
-    a bench with more than six axes, where that is something else.
+    a bench with more than six axes, where that is something else. ``part``: what a message says that isolates the
+    fault, where that is more than one of ``names``.
     """
 
     name: str
@@ -61,6 +76,7 @@ class Fault:
     effect: int = 9
     why: str = ""
     redundant: Expected | None = None
+    part: str = ""
 
     def with_redundancy(self) -> Fault:
         """The same on a bench that can do without an axis."""

@@ -34,6 +34,7 @@ class Observation:
 
     ``unsafe``: demands at the amplifier beyond its range, faster than the slew limit, or not neutral 20 ms after the
     decision although the report says so. ``uncounted``: scans of the device that the firmware cannot account for.
+    ``lost``: scans that the firmware reports as lost.
     ``astray_um``: largest distance of the tip from the same run without the fault, until the decision; ``moved_ms``:
     when it passed 5 um.
     """
@@ -52,6 +53,7 @@ class Observation:
     uncounted: int
     astray_um: float
     moved_ms: float | None
+    lost: int = 0
 
     @classmethod
     def refusal(cls, fault: str, point: str, seed: int, message: str) -> Observation:
@@ -66,6 +68,13 @@ class Observation:
         if self.tripped_ms is not None:
             return "safe state"
         return "noticed" if self.noticed_ms is not None else "none"
+
+    @property
+    def known_by(self) -> str:
+        """What was said first."""
+        if self.noticed_ms is not None and (self.tripped_ms is None or self.noticed_ms < self.tripped_ms):
+            return self.noticed
+        return self.message if self.refused or self.tripped_ms is not None else ""
 
     @property
     def detect_ms(self) -> float | None:
@@ -118,6 +127,7 @@ def judge(
         uncounted=max(0, seen.scans - counted),
         astray_um=1e6 * float(away_m[before].max(initial=0.0)),
         moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size else None,
+        lost=int(samples["lost"]),
     )
 
 

@@ -13,9 +13,9 @@ HEAD = f"""# Long runs: what grows, what drifts, what is not counted
 Each block is made by the command that it names. Virtual time, scored by eighths of the run. Asked for: memory grows by
 less than {GROWTH_MB:g} MB after the first eighth, the part of the tremor that is left stays within {DRIFT:.0%} of its
 median, every sample and every tick is accounted for, nothing is noticed. What is left is the tip's distance from the
-path that the hand intends, tremor the same without compensation; both without their mean over
-a fifth of a second, at all frequencies (8 to 12 Hz alone: `micron run`). `tests/hil/test_time_marks.py` asks that runs across 2^31, 2^32 and 2^53 ns be the run from zero,
-bit for bit.
+path that the hand intends, tremor the same without compensation; both without their mean over a fifth of a second, at
+all frequencies (8 to 12 Hz alone: `micron run`). `tests/hil/test_time_marks.py` asks that runs across 2^31, 2^32 and
+2^53 ns be the run from zero, bit for bit.
 """
 
 

@@ -16,8 +16,9 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.app import RunRequest, run_in_process
+from firmware_py.app import run_in_process
 from firmware_py.frame import QUATERNION, TICK
+from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
 from sim_devices.plant.kernel import TRUTH

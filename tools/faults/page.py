@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from tools.faults.campaign import FaultRow, totals
+from tools.faults.drift_bound import FALSE_PER_HOUR, SEEN, DriftBound
 
 HEAD = """# Reliability: what breaks, what the instrument does
 
@@ -33,7 +35,7 @@ and that are neither received, nor reported lost, nor unread at the end.
 
 {unseen}
 
-## When the firmware is gone: the guardian
+{bound}{beside}## When the firmware is gone: the guardian
 
 A DAC has no watchdog. A second process (`firmware_py/guardian`) holds a heartbeat in shared memory, the reading end of
 a pipe that the kernel closes when the firmware dies, and a connection of its own to the amplifier's bus. It starts with
@@ -70,20 +72,43 @@ shorted, stuck, slow or weak amplifiers.
 
 Every finished block survives `kill -9`, truncation at any byte and flipped bits elsewhere; `fdatasync` once a second,
 so a power failure takes about a second (simulated by dropping pages that were not synced). A full disk ends the
-recording, not the run: see `docs/recording-format.md`.
+recording, not the run; a slow one fills a ring of 8 s, and every row that finds no room is counted: see
+`docs/recording-format.md`.
 
 ## Long runs
 
-`pytest -m slow tests/hil/test_long_run.py` runs half an hour in virtual time (`MICRON_LONG_S=28800`: eight hours) and
-asks for flat memory, exact counts and nothing noticed; `tests/hil/test_time_marks.py` crosses 2^31, 2^32 and 2^53 ns
-and asks for the same bits as from zero.
+Half an hour on all buses and eight hours without wires, by eighths: [long runs](long-runs.md), made by `micron soak`.
 
 ## Hostile input
 
 `tests/fuzz` damages sound inputs of every parser (bench files, recordings, csv, npz, mcap, descriptors, hands, FMU
 archives, DI-4108 streams, motion card lines, GCS replies, CAN frames, page orders, WebSocket messages, reports) in the
-default tests; `make fuzz` does it coverage guided with atheris, 60 s each. npz files are read without pickle and sized
-before allocation, FMU archives checked for paths outside and for size.
+default tests, and replays the corpus in `tests/fuzz/corpus`, which coverage-guided runs have collected; CI goes on from
+it with atheris (`make fuzz`, 60 s per parser). npz files are read without pickle and sized before allocation, FMU
+archives checked for paths outside and for size.
+
+## Where else
+
+| what | where it is tried |
+|---|---|
+| kill -9 of the firmware, of the guardian, SIGSTOP; real processes | `tests/hil/test_guardian_process.py` |
+| kill -9 of the emulated world | `tests/hil/test_real_time.py` |
+| kill -9 of the recorder | `tests/unit/recording/test_recorder_process.py` |
+| slow disk, full disk under a running instrument | `tests/hil/test_disk_faults.py`, `tests/unit/recording` |
+| clocks and counters that wrap: 2^31, 2^32, 2^53 ns | `tests/hil/test_time_marks.py`, [long runs](long-runs.md) |
+| bit flips in frames with a checksum | `tests/wire/drivers/test_can_drivers_wire.py`, `test_e727_wire.py` |
+| real benches: `micron run --inject`, refused without `--max-effect` | `tests/unit/faults/test_inject.py` |
+| secrets in output, logs, recordings | `tests/bench/test_secrets.py` |
+
+## What says so, and what then
+
+Over all hands. "Names the part": runs in which what was said names the broken part (input, output, device), so that it
+is isolated and not only noticed. A safe state is latched: it ends the run, and a new one begins only when somebody
+starts it.
+
+| fault | said first | names the part | then | scans lost, most |
+|---|---|---|---|---|
+{matrix}
 
 ## All faults
 
@@ -95,10 +120,28 @@ Times in ms; error in um; "hand" is the operating point.
 """
 
 
-def markdown(rows: Sequence[FaultRow], command: str, revision: str) -> str:
-    """The whole page."""
+@dataclass(frozen=True)
+class Beside:
+    """The same on another bench: ``chosen`` is the text that its faults have in their names."""
+
+    bench: str
+    chosen: str
+    rows: Sequence[FaultRow]
+
+
+def markdown(
+    rows: Sequence[FaultRow],
+    command: str,
+    revision: str,
+    bounds: Sequence[DriftBound] = (),
+    beside: Sequence[Beside] = (),
+) -> str:
+    """The whole page. ``beside``: other benches, told by their totals and by what is otherwise than on the first."""
     total = totals(rows)
     return HEAD.format(
+        bound=_bound(bounds),
+        beside="".join(_beside(other, rows) for other in beside),
+        matrix="\n".join(_matrix(rows)),
         command=command,
         revision=revision,
         names=", ".join(dict.fromkeys(row.point for row in rows)),
@@ -140,3 +183,79 @@ def _line(row: FaultRow) -> str:
         f"| {row.fault.name} | {row.point} | {row.answer} | {known} | {neutral} | {table['tip_error_um_max']:.1f} | "
         f"{row.as_expected}/{row.seeds} |"
     )
+
+
+THEN = {
+    "refused": "does not start: mend, start again",
+    "safe state": "latched: mend, start again",
+    "noticed": "goes on, counted",
+    "none": "goes on",
+}
+
+
+def _matrix(rows: Sequence[FaultRow]) -> list[str]:
+    lines: list[str] = []
+    for name in dict.fromkeys(row.fault.name for row in rows):
+        mine = [row for row in rows if row.fault.name == name]
+        said = next((row.known_by for row in mine if row.known_by), "-")
+        told = sum(1 for row in mine for o in row.observations if o.known_by)
+        named = f"{sum(row.isolated for row in mine)} of {told}" if told else "-"
+        answers = [row.answer for row in mine]
+        then = THEN[max(sorted(set(answers)), key=answers.count)]
+        if any(not o.confirmed for row in mine for o in row.observations):
+            then = "latched: switch the amplifier off"
+        lost = max(o.lost for row in mine for o in row.observations)
+        lines.append(f"| {name} | {_short(said)} | {named} | {then} | {lost} |")
+    return lines
+
+
+def _short(text: str, most: int = 90) -> str:
+    text = text.replace("|", "/").replace("\n", " ")
+    return text if len(text) <= most else text[: most - 2].rsplit(" ", 1)[0] + " .."
+
+
+def _bound(bounds: Sequence[DriftBound]) -> str:
+    if not bounds:
+        return ""
+    lines = "\n".join(
+        f"| {b.rate_V_per_s:g} V/s | {b.point} | {b.moved_ms:.0f} | {100.0 * b.seen_part:.1f} % | "
+        f"{b.least_V_per_s:.3f} V/s |"
+        for b in bounds
+    )
+    return f"""### What any detector could know of a drift
+
+A detector that is given the spectra of hand and noise, the axis, the instant and the rate of the drift is a matched
+filter, and none sees it more often (`tools/faults/drift_bound.py`, Neyman-Pearson). With {FALSE_PER_HOUR:g} false
+alarms an hour, each of which ends a run, within 20 ms of 5 um:
+
+| drift | hand | 5 um after ms | seen at best | seen in {100.0 * SEEN:.0f} % from |
+|---|---|---|---|---|
+{lines}
+
+A real detector knows none of that. Below the last column "all within 20 ms" cannot be reached with six axes.
+
+"""
+
+
+def _beside(other: Beside, first: Sequence[FaultRow]) -> str:
+    total = totals(other.rows)
+    usual = {(row.fault.name, row.point): row.answer for row in first}
+    differs = [row for row in other.rows if usual.get((row.fault.name, row.point)) != row.answer]
+    table = "\n".join(_line(row) for row in differs)
+    chosen = f' (faults with "{other.chosen}" in their names)' if other.chosen else ""
+    return f"""### Beside it: `{other.bench}`{chosen}
+
+{total["faults"]} kinds of fault, {total["runs"]} runs: {total["as_expected"]} answered as expected;
+{total["of_these_known_within_20_ms"]} of {total["moving_the_tip_5_um"]} that moved the tip more than 5 um were known
+within 20 ms; {total["unsafe_outputs"]} unsafe outputs, {total["uncounted_samples"]} uncounted samples,
+{total["wrong_messages"]} wrong messages. Not seen or too late:
+
+{chr(10).join(_unseen(other.rows)) or "Nothing."}
+
+Answered otherwise than on the first bench:
+
+| fault | hand | answer | known after p50 / max | neutral after max | tip error max | as expected |
+|---|---|---|---|---|---|---|
+{table}
+
+"""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import pickle
+import resource
 import signal
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,13 +18,14 @@ from typing import Any, NoReturn, cast
 import numpy as np
 
 from firmware_py.app import run_in_process
+from firmware_py.guardian.process import describe
 from firmware_py.run_request import RunRequest
-from hal.bench import OpenBench, Port
+from hal.bench import OpenBench, Port, Processes
 from hal.clock import VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import HalError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
-from tools.faults.fault import Fault, InWorld, OnBus, OnHost
+from tools.faults.fault import Fault, How, InWorld, Kill, OnBus, OnHost, OutOfMemory
 from tools.faults.judge import Observation, Seen, judge
 
 STRIKE_S = 2.0  # the run proper begins at about 0.58 s, commands 0.7 s after the first scan
@@ -43,11 +45,13 @@ class _Bench:
 
     clock: VirtualClock = field(default_factory=VirtualClock)
     world: Any = None
+    processes: Processes = field(default_factory=Processes)
     ports: dict[str, Sabotaged] = field(default_factory=dict[str, Sabotaged])
     demands: list[tuple[int, int, float]] = field(default_factory=list[tuple[int, int, float]])
 
     def attach(self, opened: OpenBench) -> None:
         self.clock, self.world = cast(VirtualClock, opened.clock), cast(Any, opened.world)
+        self.processes = opened.processes
         self.world.world.faults.on_demand = lambda channel, volts: self.demands.append(
             (self.clock.now_ns(), channel, volts)
         )
@@ -64,7 +68,7 @@ class _Bench:
         self.ports[bus] = made
         return made
 
-    def strike(self, how: InWorld | OnBus | OnHost, seed: int) -> None:
+    def strike(self, how: How, seed: int) -> None:
         now_ns = self.clock.now_ns()
         match how:
             case InWorld(name, target, heal, for_s):
@@ -79,9 +83,32 @@ class _Bench:
                     port.arm(full)
             case OnHost(stall_ms):
                 self.clock.burn_ns(round(stall_ms * 1e6))
+            case Kill(process):
+                self.processes.dead.add(process)
+            case OutOfMemory(left_MB):
+                mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+                most = resource.getrlimit(resource.RLIMIT_AS)[1]
+                resource.setrlimit(resource.RLIMIT_AS, (mapped + round(left_MB * 1e6), most))
 
     def scans(self) -> int:
         return int(self.world.world.devices["daq"].scans)
+
+    def after_death(self, strike_ns: int, watch_s: float) -> Seen:
+        """The firmware is dead: not one more instruction of it, but time, devices and guardian go on for ``watch_s``.
+        Its counters died with it; what it had recorded is the recorder's affair."""
+        self.clock.burn_ns(round(watch_s * 1e9))
+        asked = self.processes.guardian_report
+        report = asked() if asked is not None else {}
+        reached = bool(report.get("neutral_ns"))
+        outcome: dict[str, Any] = {
+            "armed_ns": 0,
+            "safe_ns": report.get("taken_ns") or self.clock.now_ns(),
+            "safe_state": {"reason": describe(report) if report else "no guardian", "reached": reached},
+            "noticed": {},
+            "samples": {"received": self.scans(), "lost": 0, "unread": 0},
+        }
+        truth = self.world.world.truth(self.clock.now_ns())
+        return Seen(strike_ns, outcome, truth["t_ns"], truth["tip_m"], self.demands, self.scans())
 
 
 def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observation:
@@ -121,6 +148,8 @@ def observe_running(
         for strike, watch_s in [*references, *strikes]:
             if me.fork(answers):
                 strike()
+                if "firmware" in far.processes.dead:
+                    me.answer(far.after_death(at_ns, watch_s))
                 far.clock.at(at_ns + round(watch_s * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
                 return
             done()
@@ -183,6 +212,8 @@ class _Child:
 
     def answer(self, value: Any) -> NoReturn:
         """Tell the parent and end this process at once: nothing of the parent's is to be cleaned up here."""
+        most = resource.getrlimit(resource.RLIMIT_AS)[1]
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))  # what was taken from the firmware is not taken from us
         try:
             with os.fdopen(self._pipe, "wb") as pipe:
                 pickle.dump(value, pipe)

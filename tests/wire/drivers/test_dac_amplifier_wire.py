@@ -9,7 +9,7 @@ import pytest
 
 from drivers.piezo.dac_amplifier import DacAmplifier
 from hal.clock import VirtualClock
-from hal.errors import BenchError, I2cNack, SafetyTrip, WrongDevice
+from hal.errors import BenchError, I2cNack, ProtocolError, SafetyTrip, WrongDevice
 from hal.output_guard import RAMP_STEPS
 from tests.wire.drivers.scripted_ports import ScriptedI2c
 
@@ -197,3 +197,36 @@ def test_readback_is_in_volts():
 def test_impossible_settings(options: dict[str, float]):
     with pytest.raises(BenchError):
         make(**options)
+
+
+def read_with(update_: tuple[int, object], held: bytes) -> tuple[int, object]:
+    """An update and its read-back in one transfer."""
+    address, segments = update_
+    return (address, [*segments, ("w", b"\x01"), ("r", held)])  # type: ignore[misc]
+
+
+def test_read_back_is_part_of_the_transfer_and_a_wrong_bit_is_named():
+    told = (0x8000, 0x8400, 0x8000)
+    script = (
+        read_with(update(*told), bytes.fromhex("800084008000")),
+        read_with(update(*told), bytes.fromhex("8000c4008000")),
+        readback(bytes.fromhex("8000c4008000")),  # the ramp begins where the outputs are
+    )
+    amplifier, _, clock = armed(*script, read_back=True, slew_V_per_s=20_000.0)
+    volts = np.array([50.0, 0x8400 * 100.0 / 65536.0, 50.0])
+    assert amplifier.write(volts) == 0
+    clock.burn_ns(MS)
+    with pytest.raises(ProtocolError, match=r"output 2 holds 76\.562 V and was told 51\.562 V"):
+        amplifier.write(volts)
+    clock.burn_ns(MS)
+    with pytest.raises(AssertionError):  # the script ends before the first step of the ramp
+        amplifier.safe_step()
+    assert amplifier.guard.last_V[1] == pytest.approx(0xC400 * 100.0 / 65536.0)
+
+
+def test_a_command_that_is_read_back_took_force_before_the_reading():
+    amplifier, _, clock = armed(
+        read_with(update(0x8000, 0x8000, 0x8000), NEUTRAL), update(0x8000, 0x8000, 0x8000), read_back=True
+    )
+    amplifier.write(np.full(3, 50.0))
+    assert clock.now_ns() - amplifier.guard.told[-1].sent_ns == 200_000

@@ -1,0 +1,132 @@
+"""Faults on purpose on any bench, also a real one (``micron run --inject``), guarded by how much they may disturb it.
+
+The scale is that of the hardware tests: 0 reads, 1 configures, 2 small output, 3 full range, 4 motion. On a real bus
+nothing is injected without a limit that somebody has named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any, cast
+
+from hal.bench import SIM_SCHEME, BenchDescription, BenchFile, Port
+from hal.contracts import CanBus, Clock, I2cBus, SerialPort
+from hal.errors import BenchError
+from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
+
+SENSING_DRIVERS = frozenset(
+    {
+        "di4108",
+        "nidaqmx",
+        "adxl203",
+        "analog",
+        "ads1115",
+        "hmc2003",
+        "amplifier_monitor",
+        "can_telemetry",
+        "motion_card",
+    }
+    | {"mpu6050", "bmx055", "lsm6ds3"}
+)
+"""Whoever is not known to sense only may move something."""
+SENSING, MOTION = 1, 4
+PROBABILITIES = (
+    "loss", "corruption", "write_corruption", "duplication", "reorder", "truncation", "delay", "nack",
+)  # fmt: skip
+KEYS = tuple(f.name for f in fields(FaultPlan))
+FORM = "write --inject BUS:KEY=VALUE[,KEY=VALUE], or BUS@0x0C:KEY=VALUE for one I2C device"
+
+Wrap = Callable[[str, Port, Clock], Port]
+
+
+@dataclass(frozen=True)
+class Injection:
+    """``plan`` on the port of ``bus``; ``only``: one I2C address. Times of the plan count from opening the bench."""
+
+    bus: str
+    plan: FaultPlan
+    only: int | None = None
+
+
+def parse_injection(text: str) -> Injection:
+    """``daq0:loss=0.001,from_s=2`` or ``i2c0@0x0C:nack=0.1``. ``BenchError`` says what is not understood."""
+    where, colon, plan = text.partition(":")
+    bus, at, address = where.partition("@")
+    if not (bus and colon and plan):
+        raise BenchError(f"--inject {text!r} is not understood; {FORM}")
+    values: dict[str, Any] = {}
+    for item in plan.split(","):
+        key, equals, value = (part.strip() for part in item.partition("="))
+        if key not in KEYS or not equals:
+            raise BenchError(f"--inject {text!r}: {item!r} is not KEY=VALUE with one of {', '.join(KEYS)}")
+        number = _number(text, key, value)
+        if not (number >= 0.0 and (key not in PROBABILITIES or number <= 1.0)):
+            raise BenchError(f"--inject {text!r}: {key} is {'0 to 1' if key in PROBABILITIES else '0 or more'}")
+        values[key] = int(number) if key == "seed" else number
+    return Injection(bus, FaultPlan(**values), int(_number(text, "address", address)) if at else None)
+
+
+def _number(text: str, key: str, value: str) -> float:
+    try:
+        return float(int(value, 16)) if value.lower().startswith("0x") else float(value)
+    except ValueError:
+        raise BenchError(f"--inject {text!r}: {key} = {value!r} is not a number") from None
+
+
+def effect_of(description: BenchDescription, injection: Injection) -> int:
+    """How much the fault may disturb: motion where outputs may be commanded over the bus, else reading."""
+    moves = any(
+        device.driver not in SENSING_DRIVERS
+        and device.bus == injection.bus
+        and injection.only in (None, device.address if device.address is not None else injection.only)
+        for device in description.device.values()
+    )
+    return MOTION if moves else SENSING
+
+
+def check_injections(bench: BenchFile, injections: Sequence[Injection], max_effect: int | None) -> None:
+    """Raises ``BenchError`` for a bus that is not there, and for a real one that may not be disturbed so much."""
+    description = bench.description
+    for injection in injections:
+        spec = description.bus.get(injection.bus)
+        if spec is None:
+            known = ", ".join(description.bus)
+            raise BenchError(f"{bench.path}: --inject: there is no bus '{injection.bus}'; buses are {known}")
+        effect = effect_of(description, injection)
+        if spec.uri.startswith(SIM_SCHEME) or (max_effect is not None and effect <= max_effect):
+            continue
+        given = "no --max-effect was given" if max_effect is None else f"--max-effect is {max_effect}"
+        raise BenchError(
+            f"{bench.path}: bus '{injection.bus}' is real ({spec.uri}) and a fault on it has effect {effect} "
+            f"({'motion' if effect == MOTION else 'reads and configures'}), but {given}: take the tip away from "
+            f"everything and give --max-effect {effect}, or use an emulated bench"
+        )
+
+
+class Injector:
+    """Puts the middleware around the ports as they are opened; ``counts`` by bus says what was really done."""
+
+    def __init__(self, injections: Sequence[Injection], inner: Wrap | None = None) -> None:
+        self._injections = {injection.bus: injection for injection in injections}
+        self._inner = inner
+        self._ports: dict[str, FaultSerial | FaultI2c | FaultCan] = {}
+
+    def wrap(self, bus: str, port: Port, clock: Clock) -> Port:
+        if self._inner is not None:
+            port = self._inner(bus, port, clock)
+        injection = self._injections.get(bus)
+        if injection is None:
+            return port
+        made: FaultSerial | FaultI2c | FaultCan
+        if hasattr(port, "transfer"):
+            made = FaultI2c(cast(I2cBus, port), clock, injection.plan, only=injection.only)
+        elif hasattr(port, "recv"):
+            made = FaultCan(cast(CanBus, port), clock, injection.plan)
+        else:
+            made = FaultSerial(cast(SerialPort, port), clock, injection.plan)
+        self._ports[bus] = made
+        return made
+
+    def counts(self) -> Mapping[str, dict[str, Any]]:
+        return {bus: asdict(port.counts) for bus, port in self._ports.items()}

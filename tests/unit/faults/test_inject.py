@@ -1,0 +1,107 @@
+"""Faults on purpose: what the option says, and that a real bench is only disturbed as far as somebody allowed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from firmware_py.app import run_in_process
+from firmware_py.inject import check_injections, effect_of, parse_injection
+from firmware_py.run_request import RunRequest
+from hal.bench import load_bench
+from hal.errors import BenchError
+from tests.conftest import DEFAULT_BENCH
+from tools.cli.main import app
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Path:
+    """The default bench with real buses, on ports that no machine has."""
+    text = DEFAULT_BENCH.read_text()
+    for bus, uri in (
+        ("daq0", "serial:///dev/none"), ("i2c0", "linux-i2c:///dev/none"), ("can0", "socketcan://none0"),
+    ):  # fmt: skip
+        text = text.replace(f"sim://{bus}", uri)
+    for name in ("sensors", "piezo", "manipulator"):
+        text = text.replace(f"calibration/{name}.toml", str(DEFAULT_BENCH.parent / "calibration" / f"{name}.toml"))
+    path = tmp_path / "lab.toml"
+    path.write_text(text)
+    return path
+
+
+def test_a_plan_is_read_as_it_is_written():
+    found = parse_injection("i2c0@0x0C:nack=0.25,from_s=2,seed=7")
+    assert (found.bus, found.only, found.plan.nack, found.plan.from_s, found.plan.seed) == ("i2c0", 12, 0.25, 2.0, 7)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("daq0", "not understood"),
+        ("daq0:los=1", "'los=1' is not KEY=VALUE"),
+        ("daq0:loss=2", "loss is 0 to 1"),
+        ("daq0:loss=nan", "loss is 0 to 1"),
+        ("daq0:delay_s=-1", "delay_s is 0 or more"),
+        ("daq0:loss=often", "'often' is not a number"),
+    ],
+)
+def test_what_is_not_understood_is_named(text: str, says: str):
+    with pytest.raises(BenchError, match=says):
+        parse_injection(text)
+
+
+@pytest.mark.parametrize(
+    ("text", "effect"),
+    [
+        ("daq0:loss=0.1", 1),
+        ("can0:loss=0.1", 1),
+        ("i2c0:nack=0.1", 4),
+        ("i2c0@0x0C:nack=0.1", 4),
+        ("i2c0@0x48:nack=1", 1),
+    ],
+)
+def test_what_may_move_outputs_has_the_effect_of_motion(text: str, effect: int):
+    assert effect_of(load_bench(DEFAULT_BENCH).description, parse_injection(text)) == effect
+
+
+def test_a_real_bus_needs_the_limit_an_emulated_one_does_not(lab: Path):
+    on_dac, on_daq = [parse_injection("i2c0:nack=0.1")], [parse_injection("daq0:loss=0.1")]
+    check_injections(load_bench(DEFAULT_BENCH), on_dac, None)
+    real = load_bench(lab)
+    with pytest.raises(BenchError, match=r"'i2c0' is real \(linux-i2c.* effect 4 .*--max-effect is 3"):
+        check_injections(real, on_dac, 3)
+    with pytest.raises(BenchError, match="no --max-effect was given"):
+        check_injections(real, on_daq, None)
+    check_injections(real, on_dac, 4)
+    check_injections(real, on_daq, 1)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["--inject", "daq0:loss=0.1"], "no --max-effect was given"),
+        (["--inject", "i2c0:nack=0.1", "--max-effect", "1"], "give --max-effect 4"),
+        (["--inject", "nowhere:loss=0.1", "--max-effect", "4"], "no bus 'nowhere'"),
+        (["--max-effect", "4"], "belongs to --inject"),
+    ],
+)
+def test_the_command_refuses_before_a_port_is_touched(lab: Path, arguments: list[str], says: str):
+    result = CliRunner().invoke(app, ["run", "--bench", str(lab), *arguments])
+    assert result.exit_code == 2
+    assert says in result.stderr
+    assert result.stdout == ""
+
+
+def test_the_firmware_itself_refuses_too(lab: Path):
+    with pytest.raises(BenchError, match="is real"):
+        run_in_process(RunRequest(lab, 1.0, inject=("daq0:loss=0.1",)))
+
+
+def test_an_injected_fault_happens_is_counted_and_named():
+    request = RunRequest(DEFAULT_BENCH, 0.5, virtual=True, inject=("daq0:silent_after_s=1.0",))
+    outcome, _ = run_in_process(request)
+    assert outcome["injected"]["daq0"]["silenced"] > 0
+    assert "daq: no new scan for 5 ms" in outcome["safe_state"]["reason"]
+    assert outcome["safe_state"]["reached"]

@@ -1,0 +1,36 @@
+"""The page of long runs keeps the other block, and is written into no other file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tools.cli.main import app
+from tools.errors import InputError
+from tools.faults.long_page import with_block
+
+
+def test_a_block_replaces_its_own_and_leaves_the_other(tmp_path: Path):
+    page = tmp_path / "long.md"
+    page.write_text(with_block(page, "wires", "## one\n"))
+    page.write_text(with_block(page, "bare", "## two\n"))
+    page.write_text(with_block(page, "wires", "## three\n"))
+    text = page.read_text()
+    assert [line for line in text.splitlines() if line.startswith("## ")] == ["## three", "## two"]
+
+
+def test_another_page_is_not_overwritten(tmp_path: Path):
+    page = tmp_path / "notes.md"
+    page.write_text("# My notes\n")
+    with pytest.raises(InputError, match="not a page of long runs"):
+        with_block(page, "wires", "")
+    result = CliRunner().invoke(app, ["soak", "--seconds", "60", "--out", str(page)])
+    assert (result.exit_code, page.read_text()) == (2, "# My notes\n")
+
+
+def test_a_start_of_the_clock_needs_a_clock():
+    result = CliRunner().invoke(app, ["soak", "--without-wires", "--start-ns", "5"])
+    assert result.exit_code == 2
+    assert "--start-ns moves the clock of the buses" in result.stderr
