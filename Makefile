@@ -28,7 +28,7 @@ lint: setup
 audit: setup
 	$(BIN)/python -m tools.supply.audit
 
-# coverage guided, 60 s per parser: make fuzz SECONDS=600 TARGET=own_recording
+# coverage guided, 60 s per parser, one parser per core: make fuzz SECONDS=600 TARGET=own_recording
 SECONDS ?= 60
 TARGET  ?= all
 fuzz: setup

@@ -1,57 +1,95 @@
-"""Coverage-guided fuzzing of one target: ``python -m tests.fuzz.run TARGET [--seconds 60]``, or ``all``.
+"""Coverage-guided fuzzing: ``python -m tests.fuzz.run TARGET [--seconds 60]``, or ``all``.
 
 Starts from the seeds and ``corpus/TARGET``; new inputs that reach new code go to ``out/fuzz/TARGET``. A crash is
 printed, written to ``out/fuzz`` and ends the run with a status that is not 0: repair it, and put the input into
-``tests/fuzz/corpus/TARGET`` so that the default tests keep it repaired.
+``tests/fuzz/corpus/TARGET`` so that the default tests keep it repaired. ``--collect`` puts small inputs that reached
+new code into the corpus; the default tests replay it.
 """
 
 from __future__ import annotations
 
 import argparse
-import subprocess
+import hashlib
+import os
 import sys
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
+CORPUS = ROOT / "tests" / "fuzz" / "corpus"
+SMALL_BYTES = 2048
+FILES = 24  # per target
 
 
 def fuzz(name: str, seconds: int) -> None:
+    """Does not return."""
     import atheris
 
-    with atheris.instrument_imports(include=["hal", "drivers", "firmware_py", "tools", "sim_devices", "mcap"]):
-        from tests.fuzz.targets import TARGETS, seeds
+    from tests.fuzz.targets import TARGETS, seeds
+
     found = ROOT / "out" / "fuzz" / name
     found.mkdir(parents=True, exist_ok=True)
-    for k, data in enumerate(seeds()[name]):
-        (found / f"seed-{k}").write_bytes(data)
-    corpus = ROOT / "tests" / "fuzz" / "corpus" / name
+    for data in seeds()[name]:
+        (found / hashlib.sha1(data).hexdigest()).write_bytes(data)
+    corpus = CORPUS / name
     folders = [str(found), *([str(corpus)] if corpus.is_dir() else [])]
     flags = [
         f"-max_total_time={seconds}",
         f"-artifact_prefix={found.parent}/{name}-",
         "-rss_limit_mb=2048",
-        "-timeout=10",
+        "-timeout=30",
+        "-verbosity=0",
     ]
     atheris.Setup([sys.argv[0], *flags, *folders], TARGETS[name])
     atheris.Fuzz()
+
+
+def collect(name: str) -> int:
+    """Small inputs of ``out/fuzz/NAME`` into the corpus, from the shortest to the longest; how many there are now."""
+    from tests.fuzz.targets import seeds
+
+    known = {hashlib.sha1(data).hexdigest() for data in seeds()[name]}
+    found = sorted((ROOT / "out" / "fuzz" / name).iterdir(), key=lambda path: (path.stat().st_size, path.name))
+    small = [p for p in found if 0 < p.stat().st_size <= SMALL_BYTES and p.name not in known]
+    folder = CORPUS / name
+    folder.mkdir(parents=True, exist_ok=True)
+    room = FILES - len(list(folder.iterdir()))
+    for path in small[:: max(1, len(small) // max(1, room))][: max(0, room)]:
+        (folder / path.name[:16]).write_bytes(path.read_bytes())
+    return len(list(folder.iterdir()))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", help="a name of tests/fuzz/targets.py, or all")
     parser.add_argument("--seconds", type=int, default=60, help="per target")
+    parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="targets at a time")
+    parser.add_argument("--collect", action="store_true", help="put small inputs that reached new code into the corpus")
     chosen = parser.parse_args()
-    if chosen.target != "all":
-        fuzz(chosen.target, chosen.seconds)
-        return 0
-    from tests.fuzz.targets import TARGETS
+    import atheris
 
-    failed = []
-    for name in TARGETS:
-        command = [sys.executable, "-m", "tests.fuzz.run", name, "--seconds", str(chosen.seconds)]
-        if subprocess.run(command, cwd=ROOT, check=False).returncode:
+    with atheris.instrument_imports(include=["hal", "drivers", "firmware_py", "tools", "sim_devices", "mcap"]):
+        from tests.fuzz.targets import TARGETS
+    names = list(TARGETS) if chosen.target == "all" else [chosen.target]
+    if unknown := [name for name in names if name not in TARGETS]:
+        print(f"there is no target {unknown[0]!r}; targets are {', '.join(TARGETS)}", file=sys.stderr)
+        return 2
+    failed: list[str] = []
+    running: dict[int, str] = {}
+    waiting = list(names)
+    while waiting or running:
+        while waiting and len(running) < chosen.jobs:
+            child = os.fork()  # the instrumented imports are made once
+            if child == 0:
+                fuzz(waiting[0], chosen.seconds)
+            running[child] = waiting.pop(0)
+        child, status = os.wait()
+        name = running.pop(child)
+        print(f"{name}: {f'CRASH, status {status}' if status else 'no crash'} in {chosen.seconds} s", flush=True)
+        if status:
             failed.append(name)
-    print(f"{len(TARGETS) - len(failed)} of {len(TARGETS)} targets without a crash", *failed)
+        elif chosen.collect:
+            print(f"{name}: {collect(name)} inputs in the corpus", flush=True)
+    print(f"{len(names) - len(failed)} of {len(names)} targets without a crash", *failed)
     return 1 if failed else 0
 
 

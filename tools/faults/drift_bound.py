@@ -17,7 +17,6 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import brentq
 from scipy.stats import norm
 
 from firmware_py.frame import COUNTS
@@ -94,8 +93,11 @@ def drift_bound(bench: Path, point: str, rate_V_per_s: float, moved_ms: float, a
         window_ms = moved_ms * (rate_V_per_s / rate) ** (1.0 / 3.0) + LATEST_MS
         return seen(white.signal_to_noise(rate, axis, window_ms), 3.6e6 / window_ms)
 
-    least = brentq(lambda log_rate: part(float(np.exp(log_rate))) - SEEN, np.log(1e-4), np.log(10.0))
-    return DriftBound(point, rate_V_per_s, moved_ms, part(rate_V_per_s), float(np.exp(least)))
+    missed, found = 1e-4, 10.0
+    for _ in range(30):
+        middle = (missed * found) ** 0.5
+        missed, found = (middle, found) if part(middle) < SEEN else (missed, middle)
+    return DriftBound(point, rate_V_per_s, moved_ms, part(rate_V_per_s), found)
 
 
 def drift_bounds(bench: Path, rows: Sequence[FaultRow]) -> list[DriftBound]:
