@@ -7,6 +7,7 @@ The live loop calls ``step_kernel`` once a tick; replay and batches loop the sam
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,14 @@ def memory_dtype(parts: Sequence[tuple[np.dtype[Any], np.dtype[Any]]]) -> np.dty
     fields: list[Any] = [("frame", "f8", (LAYOUT.size,))]
     for name, (state, params) in zip(PARTS, parts, strict=True):
         fields += [(f"{name}_state", state, (1,)), (f"{name}_params", params, (1,))]
-    return np.dtype(fields)
+    return _the_one(np.dtype(fields))
+
+
+@cache
+def _the_one(dtype: np.dtype[Any]) -> np.dtype[Any]:
+    """The first of all dtypes that are equal to this one: numba looks a record's type up by its dtype at every call, and
+    to find out that two objects are equal takes 100 us, twenty times as long as the step."""
+    return dtype
 
 
 @kernel

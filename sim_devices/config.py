@@ -239,6 +239,14 @@ class ImuConfig(_Table):
     noise: NotNegative = 1.0
 
 
+class DaqConfig(_Table):
+    """``[emulation.daq]``."""
+
+    fifo_samples: Annotated[int, Field(ge=64)] = 1024
+    """What a DI-4108 keeps for a host that does not read: 128 ms of eight channels at 1 kHz. Deeper than the part: for
+    a test machine that takes the processor away for longer than that."""
+
+
 class MoreAxis(_Table):
     """``[[emulation.more_axes]]``: an accelerometer axis beyond the six, in place of supply or temperature."""
 
@@ -301,6 +309,7 @@ class EmulationConfig(_Table):
     manipulator: ManipulatorConfig = ManipulatorConfig()
     environment: EnvironmentConfig = EnvironmentConfig()
     endoscope: EndoscopeConfig | None = None
+    daq: DaqConfig = DaqConfig()
     imu: dict[str, ImuConfig] = Field(default_factory=dict)
     more_axes: tuple[MoreAxis, ...] = Field(default=(), max_length=2)
     twin: str | tuple[str, str, str] | None = None

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hal.errors import BenchError
 from sim_devices.added import Surroundings, added_device
-from sim_devices.config import ImuConfig
+from sim_devices.config import DaqConfig, ImuConfig
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.devices.ads1115 import Ads1115
 from sim_devices.devices.bmx055 import Bmx055Accelerometer, Bmx055Gyroscope
@@ -225,6 +225,7 @@ class World:
             for device in description["device"].values()
             if device["driver"] == "amplifier_monitor"
         }
+        self._daq = DaqConfig.model_validate(emulation.get("daq", {}))
         self._seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
         self._presses = (emulation.get("endoscope") or {}).get("presses", ())
         self._baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
@@ -279,7 +280,8 @@ class World:
         self._timed.append(face)
 
     def _add_di4108(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_serial(name, device["bus"], Di4108(self._analog_V, on_switches=self._strap_switch))
+        daq = Di4108(self._analog_V, fifo_samples=self._daq.fifo_samples, on_switches=self._strap_switch)
+        self._add_serial(name, device["bus"], daq)
 
     def _add_e727(self, name: str, device: Mapping[str, Any]) -> None:
         controller = E727(on_output=self._piezo_demand, measure_um=self._stroke_um)

@@ -1,21 +1,23 @@
 """I2cBus through a Unix stream socket: how the process of the emulated world offers its I2C devices.
 
-Request: u8 address, u8 number of segments, then per segment u8 kind (0 write, 1 read), u16 LE length and, for
-a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus error), u16 LE length, the bytes
-of all read segments. One request is one transfer.
+Request: u8 address, u8 number of segments, i64 LE monotonic time of the request in ns, then per segment u8 kind (0
+write, 1 read), u16 LE length and, for a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus
+error), u16 LE length, the bytes of all read segments. One request is one transfer. A real adapter begins when it is
+asked; the time is there so that an emulated one need not charge for the wake-up of its process.
 """
 
 from __future__ import annotations
 
 import socket
 import struct
+import time
 from collections.abc import Sequence
 
 from hal.backends.i2c_checks import check_address
 from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, I2cNack, ProtocolError
 from hal.types import I2cOp, I2cWrite, PortInfo
 
-_HEAD = struct.Struct("<BB")
+_HEAD = struct.Struct("<BBq")
 _SEGMENT = struct.Struct("<BH")
 _REPLY = struct.Struct("<BH")
 
@@ -44,7 +46,7 @@ class UnixI2c:
         check_address(address, self._path)
         if not self._open:
             raise Closed("the bus is closed", device=self._path)
-        parts = [_HEAD.pack(address, len(ops))]
+        parts = [_HEAD.pack(address, len(ops), time.monotonic_ns())]
         for op in ops:
             if isinstance(op, I2cWrite):
                 parts.append(_SEGMENT.pack(0, len(op.data)))

@@ -33,7 +33,7 @@ import numpy as np
 from sim_devices.devices.faces import VoltageSource, Volts
 
 DIVIDEND_HZ = 60_000_000  # page 48, table of srate variables
-FIFO_BYTES = 2 * 1024  # page 50, 1024 samples
+FIFO_SAMPLES = 1024  # page 50
 RANGES_V = (10.0, 5.0, 2.0, 1.0, 0.5, 0.2)  # page 44, codes 0..5
 RATE_RANGES_HZ = (50e3, 20e3, 10e3, 5e3, 2e3, 1e3, 500.0, 200.0, 100.0, 50.0, 20.0, 10.0)  # codes 1..12
 IGNORE = 0xFFFF
@@ -69,6 +69,7 @@ class Di4108:
         serial_number: str = "5E0B1A2C",
         firmware: int = 121,
         clock_error_ppb: int = 0,
+        fifo_samples: int = FIFO_SAMPLES,
         on_switches: Callable[[int, int], None] | None = None,
     ) -> None:
         self.settings = Di4108Settings()
@@ -86,6 +87,7 @@ class Di4108:
         self._serial_number = serial_number
         self._firmware = firmware
         self._clock_error_ppb = clock_error_ppb
+        self._fifo_bytes = 2 * fifo_samples
         self._on_switches = on_switches
         self._endo = 0
         self._now_ns = 0
@@ -244,7 +246,7 @@ class Di4108:
         return code - 65536 if code > 32767 else code
 
     def _emit(self, data: bytes) -> None:
-        room = FIFO_BYTES - len(self._out) - len(self._partial) - self.unread
+        room = self._fifo_bytes - len(self._out) - len(self._partial) - self.unread
         if len(data) > room:
             self._partial += data[: max(room, 0) // 2 * 2]
             self._overflow()

@@ -1,10 +1,11 @@
 """An I2C bus behind a Unix stream socket, so that the firmware's process can reach emulated devices.
 
-Request: u8 address, u8 number of operations, then per operation u8 kind (0 write, 1 read), u16 LE length and, for
-a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus error), u16 LE length, data. One
-request at a time per connection; several connections share the bus in turn. The answer leaves when the bus time
-of the transfer has passed, so the caller waits as long as it would for a real adapter. A request that breaks the
-format closes the connection.
+Request: u8 address, u8 number of operations, i64 LE monotonic time of the request in ns, then per operation u8 kind (0
+write, 1 read), u16 LE length and, for a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus
+error), u16 LE length, data. One request at a time per connection; several connections share the bus in turn. The
+transfer begins when it was asked for, unless the emulated world has gone past that or the bus was busy; the answer
+leaves when its bus time has passed, so the caller waits as long as it would for a real adapter. A request that breaks
+the format closes the connection.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from sim_devices.transports.i2c_line import I2cLine, Transfer, TransferResult
 
 MAX_OPS = 42  # Linux I2C_RDWR_IOCTL_MAX_MSGS
 MAX_LENGTH = 8192  # Linux i2c-dev limit of one message
+_HEAD = struct.Struct("<BBq")
 
 
 class I2cSocketServer:
@@ -34,16 +36,18 @@ class I2cSocketServer:
         self._listener.listen(4)
         self._listener.setblocking(False)
         self._clients: dict[int, tuple[socket.socket, bytearray]] = {}
-        self._queue: deque[tuple[int, int, Sequence[I2cOp]]] = deque()  # client, address, operations
+        self._queue: deque[tuple[int, int, int, Sequence[I2cOp]]] = deque()  # start, client, address, operations
         self._active: tuple[int, Transfer] | None = None
         self._due_ns = 0
         self._reply_ns = 0
+        self._free_ns = 0
 
     def filenos(self) -> list[int]:
         return [self._listener.fileno(), *self._clients]
 
-    def on_readable(self, fileno: int, t_ns: int) -> None:
-        """Take what arrived on one of ``filenos``; a complete request starts its transfer at ``t_ns``."""
+    def on_readable(self, fileno: int, reached_ns: int, now_ns: int) -> None:
+        """Take what arrived on one of ``filenos``. The transfer of a complete request becomes due when it was asked
+        for, but not before ``reached_ns``, up to which the world has gone, nor after ``now_ns``."""
         if fileno == self._listener.fileno():
             client, _ = self._listener.accept()
             client.setblocking(False)
@@ -56,29 +60,34 @@ class I2cSocketServer:
         buffer += data
         try:
             while (request := _parse(buffer)) is not None:
-                self._queue.append((fileno, *request))
+                asked_ns, address, ops = request
+                self._queue.append((min(max(asked_ns, reached_ns), now_ns), fileno, address, ops))
         except ValueError:
             data = b""
         if not data:
             self._drop(fileno)
-        self._start_next(t_ns)
 
     def reply_ns(self) -> int | None:
         """When the transfer under way is over: nobody needs to wake for its single segments."""
         return self._reply_ns if self._active is not None else None
 
     def next_event_ns(self) -> int | None:
-        return self._due_ns if self._active is not None else None
+        if self._active is not None:
+            return self._due_ns
+        return max(self._queue[0][0], self._free_ns) if self._queue else None
 
     def advance_to(self, t_ns: int) -> None:
-        while self._active is not None and self._due_ns <= t_ns:
+        while (due_ns := self.next_event_ns()) is not None and due_ns <= t_ns:
+            if self._active is None:
+                self._start(due_ns)
+                continue
             fileno, transfer = self._active
             try:
                 self._due_ns = next(transfer)
             except StopIteration as done:
                 self._active = None
+                self._free_ns = due_ns
                 self._answer(fileno, done.value)
-                self._start_next(t_ns)
 
     def close(self) -> None:
         self._listener.close()
@@ -87,13 +96,12 @@ class I2cSocketServer:
         self._clients.clear()
         self.path.unlink(missing_ok=True)
 
-    def _start_next(self, t_ns: int) -> None:
-        if self._active is None and self._queue:
-            fileno, address, ops = self._queue.popleft()
-            transfer = self._line.transfer(address, ops, t_ns)
-            self._active = (fileno, transfer)
-            self._due_ns = next(transfer)
-            self._reply_ns = t_ns + self._line.duration_ns(ops)
+    def _start(self, t_ns: int) -> None:
+        _, fileno, address, ops = self._queue.popleft()
+        transfer = self._line.transfer(address, ops, t_ns)
+        self._active = (fileno, transfer)
+        self._due_ns = next(transfer)
+        self._reply_ns = t_ns + self._line.duration_ns(ops)
 
     def _answer(self, fileno: int, result: TransferResult) -> None:
         status, data = result
@@ -106,18 +114,19 @@ class I2cSocketServer:
     def _drop(self, fileno: int) -> None:
         client, _ = self._clients.pop(fileno)
         client.close()
-        self._queue = deque(item for item in self._queue if item[0] != fileno)
+        self._queue = deque(item for item in self._queue if item[1] != fileno)
 
 
-def _parse(buffer: bytearray) -> tuple[int, Sequence[I2cOp]] | None:
-    """The first complete request, removed from ``buffer``; ``None`` when more bytes are needed."""
-    if len(buffer) < 2:
-        return None
-    address, count = buffer[0], buffer[1]
-    if address > 0x7F or not 1 <= count <= MAX_OPS:
+def _parse(buffer: bytearray) -> tuple[int, int, Sequence[I2cOp]] | None:
+    """Time, address and operations of the first complete request, removed from ``buffer``; ``None`` when more bytes
+    are needed."""
+    if buffer and (buffer[0] > 0x7F or (len(buffer) > 1 and not 1 <= buffer[1] <= MAX_OPS)):
         raise ValueError("not an I2C request")
+    if len(buffer) < _HEAD.size:
+        return None
+    address, count, asked_ns = _HEAD.unpack_from(buffer)
     ops: list[I2cOp] = []
-    at = 2
+    at = _HEAD.size
     for _ in range(count):
         if len(buffer) < at + 3:
             return None
@@ -133,4 +142,4 @@ def _parse(buffer: bytearray) -> tuple[int, Sequence[I2cOp]] | None:
         ops.append(I2cWrite(bytes(buffer[at : at + length])))
         at += length
     del buffer[:at]
-    return address, ops
+    return asked_ns, address, ops

@@ -25,7 +25,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import DEFAULT_BENCH, PATIENT, copy_of_default_bench
 
 START_S = 220.0
 ARTEFACTS = Path(__file__).parents[2] / "out" / "browser"
@@ -109,14 +109,15 @@ class Server:
 
 @contextmanager
 def bench_server(more_toml: str) -> Iterator[Server]:
-    """``micron bench`` on the default bench and ``more_toml``; its files are in a short path, for Unix sockets."""
+    """``micron bench`` on the default bench, patient, and ``more_toml``.
+
+    Its files are in a short path, for Unix sockets.
+    """
     folder = Path(tempfile.mkdtemp(prefix="mb", dir="/tmp"))
     recordings = folder / "recordings"
-    bench = folder / "bench.toml"
-    text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')
-    bench.write_text(text + more_toml)
+    bench = copy_of_default_bench(folder, PATIENT + more_toml)
     shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)  # has the motion card
-    command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
+    command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0"]
     command += ["--bench", str(bench)]
     process = subprocess.Popen(
         [*command, "--recordings", str(recordings)],
@@ -200,7 +201,12 @@ def opened_page(browser: Any, server: Server) -> Iterator[Any]:
     tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
     tab.goto(f"{server.base}/#token={server.token}")
     tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
-    yield tab
+    try:
+        yield tab
+    except BaseException as error:
+        state = server.state()
+        error.add_note(f"firmware: {state['phase']}, {state['reason']!r}; recording {state['recording']}")
+        raise
     context.close()
     assert not errors
 

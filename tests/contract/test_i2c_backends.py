@@ -8,6 +8,7 @@ import os
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -48,7 +49,8 @@ def serve(listener: socket.socket, device: RegisterDevice) -> None:
     connection, _ = listener.accept()
     try:
         while True:
-            address, count = read_exactly(connection, 2)
+            address, count, asked_ns = struct.unpack("<BBq", read_exactly(connection, 10))
+            assert asked_ns <= time.monotonic_ns()
             reply = b""
             status = {MEMORY: 0, REFUSING: 2}.get(address, 1)
             for _ in range(count):

@@ -22,7 +22,7 @@ from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
 from sim_devices.register import ProcessWorld
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import PATIENT, copy_of_default_bench
 from tools.cli.run import complete_result
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
@@ -30,12 +30,7 @@ pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 
 @pytest.fixture
 def patient_bench(tmp_path: Path) -> Path:
-    """The default bench with a stale limit that a busy machine does not reach."""
-    text = DEFAULT_BENCH.read_text()
-    calibration = DEFAULT_BENCH.parent / "calibration"
-    path = tmp_path / "bench.toml"
-    path.write_text(text.replace('"calibration/', f'"{calibration}/') + "\n[firmware.safety]\nstale_ms = 500.0\n")
-    return path
+    return copy_of_default_bench(tmp_path, PATIENT)
 
 
 def test_closed_loop_over_real_ports_cancels_tremor(patient_bench: Path, tmp_path: Path):

@@ -9,17 +9,13 @@ import pytest
 
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import copy_of_default_bench
 
 
 @pytest.fixture
 def turned(tmp_path: Path) -> Path:
-    text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')
-    bench = tmp_path / "turned.toml"
-    bench.write_text(
-        text + '\n[emulation.hand]\nperforms = "poses"\nreach_s = [0.9, 0.9]\nhold_s = [0, 0]\n', encoding="utf-8"
-    )
-    return bench
+    hand = '[emulation.hand]\nperforms = "poses"\nreach_s = [0.9, 0.9]\nhold_s = [0, 0]\n'
+    return copy_of_default_bench(tmp_path, hand)
 
 
 def test_turned_by_hand(turned: Path):

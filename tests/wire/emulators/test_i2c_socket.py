@@ -25,11 +25,18 @@ class Rig:
         client = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         client.settimeout(2.0)
         client.connect(str(self.server.path))
-        self.server.on_readable(self.server.filenos()[0], 0)
+        self.server.on_readable(self.server.filenos()[0], 0, 0)
         return client
 
-    def deliver(self, t_ns: int, client: int = 1) -> None:
-        self.server.on_readable(self.server.filenos()[client], t_ns)
+    def ask(self, words: str, asked_ns: int = 0, client: socket.socket | None = None) -> None:
+        """``words``: address and count, then the operations; the time of the request goes between them."""
+        data = bytes.fromhex(words)
+        (client or self.client).sendall(data[:2] + asked_ns.to_bytes(8, "little") + data[2:])
+
+    def deliver(self, t_ns: int, client: int = 1, reached_ns: int | None = None) -> None:
+        """At ``t_ns`` the world sees the request; it has gone up to ``reached_ns`` before, else to now."""
+        self.server.on_readable(self.server.filenos()[client], t_ns if reached_ns is None else reached_ns, t_ns)
+        self.server.advance_to(t_ns)
 
 
 @pytest.fixture
@@ -41,7 +48,7 @@ def rig(tmp_path: Path) -> Iterator[Rig]:
 
 
 def test_write_answers_after_its_bus_time(rig: Rig) -> None:
-    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.ask("0c 01 00 0300 31 4000")
     rig.deliver(1000)
     # START 1 + 4 bytes x 9 = 37 bits of 2.5 us, then STOP
     assert rig.server.next_event_ns() == 1000 + 92_500
@@ -58,8 +65,26 @@ def test_write_answers_after_its_bus_time(rig: Rig) -> None:
     assert rig.server.next_event_ns() is None
 
 
+@pytest.mark.parametrize(
+    ("reached_ns", "asked_ns", "begins_ns"),
+    [(1000, 61_000, 61_000), (1000, 200_000, 141_000), (100_000, 61_000, 100_000)],
+    ids=["when it was asked for", "never in the future", "never before what has happened"],
+)
+def test_begin_of_a_transfer(rig: Rig, reached_ns: int, asked_ns: int, begins_ns: int) -> None:
+    rig.ask("0c 01 00 0300 31 4000", asked_ns)
+    rig.deliver(141_000, reached_ns=reached_ns)
+    assert rig.dac.output_V[0] == (1.25 if begins_ns + 92_500 <= 141_000 else 2.5)
+    rig.server.advance_to(begins_ns + 95_000 - 1)
+    rig.client.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        rig.client.recv(1)
+    rig.client.settimeout(2.0)
+    rig.server.advance_to(begins_ns + 95_000)
+    assert rig.client.recv(100) == bytes.fromhex("00 0000")
+
+
 def test_write_then_read_in_one_transfer(rig: Rig) -> None:
-    rig.client.sendall(bytes.fromhex("0c 02 00 0100 01 01 0200"))
+    rig.ask("0c 02 00 0100 01 01 0200")
     rig.deliver(0)
     rig.server.advance_to(10**6)
     assert rig.client.recv(100) == bytes.fromhex("00 0200 8000")
@@ -78,14 +103,14 @@ def test_status_codes(rig: Rig, request_hex: str, prepare: str, reply: str) -> N
         rig.line.stuck = True
     elif prepare:
         setattr(rig.dac, prepare, True)
-    rig.client.sendall(bytes.fromhex(request_hex))
+    rig.ask(request_hex)
     rig.deliver(0)
     rig.server.advance_to(10**6)
     assert rig.client.recv(100) == bytes.fromhex(reply)
 
 
 def test_request_in_pieces(rig: Rig) -> None:
-    for piece in ("0c", "01 00 03", "00 31 40", "00"):
+    for piece in ("0c", "01 0000", "0000 0000 0000 00 03", "00 31 40", "00"):
         assert rig.server.next_event_ns() is None
         rig.client.sendall(bytes.fromhex(piece))
         rig.deliver(5)
@@ -94,9 +119,9 @@ def test_request_in_pieces(rig: Rig) -> None:
 
 def test_two_clients_share_the_bus_in_turn(rig: Rig) -> None:
     other = rig.connect()
-    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.ask("0c 01 00 0300 31 4000")
     rig.deliver(0, client=1)
-    other.sendall(bytes.fromhex("0c 01 00 0300 31 c000"))
+    rig.ask("0c 01 00 0300 31 c000", client=other)
     rig.deliver(0, client=2)
     rig.server.advance_to(95_000)
     assert rig.dac.output_V[0] == 1.25
@@ -109,19 +134,19 @@ def test_two_clients_share_the_bus_in_turn(rig: Rig) -> None:
 
 @pytest.mark.parametrize("garbage", ["ff 01", "0c 00", "0c ff", "0c 01 07 0000", "0c 01 01 ffff"])
 def test_garbage_closes_the_connection_only(rig: Rig, garbage: str) -> None:
-    rig.client.sendall(bytes.fromhex(garbage))
+    rig.ask(garbage)
     rig.deliver(0)
     assert rig.client.recv(10) == b""
     rig.client.close()
     rig.client = rig.connect()
-    rig.client.sendall(bytes.fromhex("0c 01 01 0200"))
+    rig.ask("0c 01 01 0200")
     rig.deliver(0)
     rig.server.advance_to(10**6)
     assert len(rig.client.recv(10)) == 5
 
 
 def test_client_that_goes_away_during_a_transfer(rig: Rig) -> None:
-    rig.client.sendall(bytes.fromhex("0c 01 00 0300 31 4000"))
+    rig.ask("0c 01 00 0300 31 4000")
     rig.deliver(0)
     rig.client.close()
     rig.deliver(10)
