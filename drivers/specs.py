@@ -15,8 +15,9 @@ from drivers.added import added_driver, added_load, added_names
 from drivers.imu.bench import IMU_OPTIONS, ImuOptions, address_problems, bus_load
 from drivers.motion_card_protocol import LINE_BYTES
 from drivers.options import BusLoad, DaqOptions, Options, one_of
-from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec, validate_table
+from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec
 from hal.errors import BenchError
+from hal.validation import validate_table
 
 Channel = Annotated[int, Field(ge=0, le=7)]
 

@@ -9,20 +9,21 @@ from __future__ import annotations
 
 import importlib
 import tomllib
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal, Protocol, TypeVar, cast
+from typing import Annotated, Any, Literal, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 
 from hal.clock import MonotonicClock, VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
+from hal.validation import validate_table
 
 SIM_SCHEME = "sim://"
 Port = SerialPort | I2cBus | CanBus
@@ -111,33 +112,6 @@ class BenchFile:
     def resolve(self, relative: str) -> Path:
         """A path named in the bench file, relative to the file."""
         return (self.path.parent / relative).resolve()
-
-
-def describe_validation_error(error: ValidationError, where: str) -> str:
-    """One line per wrong key: file, key, what is wrong with it."""
-    lines: list[str] = []
-    for item in error.errors():
-        key = ".".join(str(part) for part in item["loc"] if part not in ("serial", "i2c", "can")) or "(top level)"
-        message = item["msg"]
-        if item["type"] == "extra_forbidden":
-            message = "unknown key; check the spelling"
-        elif item["type"] == "missing":
-            message = "this key is missing"
-        elif item["type"] == "value_error":
-            message = message.removeprefix("Value error, ")
-        lines.append(f"{where}: [{key}] {message}")
-    return "\n".join(lines)
-
-
-_Model = TypeVar("_Model", bound=BaseModel)
-
-
-def validate_table(model: type[_Model], table: Mapping[str, Any], where: str) -> _Model:
-    """``model`` from ``table``, with a ``BenchError`` that names file and key when that is impossible."""
-    try:
-        return model.model_validate(dict(table))
-    except ValidationError as error:
-        raise BenchError(describe_validation_error(error, where)) from error
 
 
 def load_bench(path: Path) -> BenchFile:

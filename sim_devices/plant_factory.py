@@ -8,8 +8,8 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from hal.bench import describe_validation_error
 from hal.errors import BenchError
+from hal.validation import describe_validation_error
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand

@@ -13,8 +13,9 @@ from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.stages import StageConfigs
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.noise_file import noise_table
-from hal.bench import BenchFile, validate_table
+from hal.bench import BenchFile
 from hal.errors import BenchError
+from hal.validation import validate_table
 
 STAGES = ("sensing", "tremor", "actuation")
 

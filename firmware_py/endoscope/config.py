@@ -6,7 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.endoscope.targets import GameConfig
 from firmware_py.sensing.fusion import FusionConfig
-from hal.bench import BenchFile, validate_table
+from hal.bench import BenchFile
+from hal.validation import validate_table
 
 
 class EndoscopeConfig(BaseModel):

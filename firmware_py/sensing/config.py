@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from hal.bench import validate_table
+from hal.validation import validate_table
 
 Vector = tuple[float, float, float]
 NotNegative = Annotated[float, Field(ge=0.0)]

@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from firmware_py.tremor.detector_config import DetectorConfig
-from hal.bench import validate_table
 from hal.plugins import ESTIMATORS, offered
+from hal.validation import validate_table
 
 Positive = Annotated[float, Field(gt=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]

@@ -28,6 +28,12 @@ Rows = NDArray[np.float64]
 N = 900
 
 
+def test_all_memories_are_of_one_dtype():
+    """Of one object: numba would otherwise compare two equal ones at every call, 100 us long (see ``chain``)."""
+    configs = StageConfigs(SensingConfig(), TremorConfig(), ActuationConfig())
+    assert Stages(configs).memory.dtype is Stages(configs).memory.dtype
+
+
 def scans(n: int) -> Rows:
     """A trembling instrument: aligned after 80 ticks, commanded from tick 500 on, with everything that can happen."""
     rows = np.zeros((n, LAYOUT.size))

@@ -1,0 +1,36 @@
+"""A table of a configuration file into its model, with errors that name file and key."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ValidationError
+
+from hal.errors import BenchError
+
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+def describe_validation_error(error: ValidationError, where: str) -> str:
+    """One line per wrong key: file, key, what is wrong with it."""
+    lines: list[str] = []
+    for item in error.errors():
+        key = ".".join(str(part) for part in item["loc"] if part not in ("serial", "i2c", "can")) or "(top level)"
+        message = item["msg"]
+        if item["type"] == "extra_forbidden":
+            message = "unknown key; check the spelling"
+        elif item["type"] == "missing":
+            message = "this key is missing"
+        elif item["type"] == "value_error":
+            message = message.removeprefix("Value error, ")
+        lines.append(f"{where}: [{key}] {message}")
+    return "\n".join(lines)
+
+
+def validate_table(model: type[_Model], table: Mapping[str, Any], where: str) -> _Model:
+    """``model`` from ``table``, with a ``BenchError`` that names file and key when that is impossible."""
+    try:
+        return model.model_validate(dict(table))
+    except ValidationError as error:
+        raise BenchError(describe_validation_error(error, where)) from error
