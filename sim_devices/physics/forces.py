@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from hal.compiled import kernel
+from sim_devices.physics.effect import Array, Context
 
 FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness
 SPRING = 2  # cubic, quadratic
@@ -54,3 +55,12 @@ def smooth_force(p, v, spring, cogging, friction):
         f += cogging[1] * np.sin(a) + cogging[2] * np.cos(a)
         f += cogging[3] * np.sin(2.0 * a) + cogging[4] * np.cos(2.0 * a)
     return f
+
+
+def base_moves(x: Array, ctx: Context) -> list[Array]:
+    """How an output (n,) moves, to first order, when offset, spring, drag and inertia of its equation of motion change:
+    what base parameters that a missing force has bent leave, beside that force. ``x`` (n,) the recorded position.
+    """
+    drives = [ctx.signals[s] for s in ("force", "torque") if s in ctx.signals]
+    inside = (np.ones(x.size), x, np.gradient(x, ctx.dt), *drives)
+    return [ctx.to_output(np.ascontiguousarray(c)) for c in inside]

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import COGGING
+from sim_devices.physics.forces import COGGING, base_moves
 from sim_devices.physics.statistics import least_squares, thin
 
 
@@ -76,7 +76,7 @@ def _cog_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tuple[float, float]]:
     """(misfit, period), best first, over a grid on which the phase turns by a quarter over the travel, then finer."""
     k = thin(ctx.keep, 4000)
-    line = np.stack([np.ones(k.size), x[k], ctx.to_output(np.ones(x.size))[k]], axis=1)
+    line = np.stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))], axis=1)
 
     def tried(turns: Array) -> list[tuple[float, float]]:
         out: list[tuple[float, float]] = []
@@ -86,9 +86,9 @@ def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tu
             out.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
         return sorted(out)
 
-    coarse = tried(np.concatenate([np.arange(0.5, 16, 0.3), np.geomspace(16, 300, 50)]))
+    coarse = tried(np.concatenate([np.arange(0.5, 60, 0.3), np.geomspace(60, 300, 80)]))
     near = travel / coarse[0][1]
-    fine = tried(near + np.linspace(-0.3, 0.3, 13) * max(1.0, near / 16))
+    fine = tried(near + np.linspace(-0.3, 0.3, 13) * max(1.0, near / 15))
     return sorted([*fine[:2], *coarse[:2]])
 
 

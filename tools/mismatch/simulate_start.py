@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Settings
+from sim_devices.physics.forces import base_moves
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.simulate import Model, Placed, make_context
 from tools.mismatch.simulate_view import View, view_run
@@ -88,6 +89,8 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
         columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
     k = thin(ctx.keep, 20_000)
     line = np.ones((k.size, 1)) if pl.site == "output" else np.stack([np.ones(k.size), x[k]], axis=1)
+    if pl.site == "feedback":
+        line = np.column_stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))])
     w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
     return w[: columns.shape[1]]
 
