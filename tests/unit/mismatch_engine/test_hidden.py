@@ -11,7 +11,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import bouc_wen, recording, wave
 from tools.mismatch.engine.assemble import beyond_form
-from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.score import Comparison
 from tools.mismatch.engine.screen import Candidate, places
@@ -96,3 +96,14 @@ def test_more_than_a_form_may_leave_is_something_else() -> None:
 
     assert left("step_shift") == 0.03
     assert left("step_shift", "hysteresis") == 0.06
+
+
+def test_rightly_named_steps_are_not_unexplained_for_the_readings_beside_their_edges() -> None:
+    rng = np.random.default_rng(9)
+    u = 50 + 30 * wave(rng, 2500)
+    step = 0.3
+    y = np.floor((0.125 * u + 0.02 * rng.standard_normal(u.size)) / step) * step
+    said = diagnose(stack(y, u, noise={"displacement": 0.02}), effects=[EFFECTS["quantization"]], jobs=1)
+    assert (said.verdict, [p.name for p in said.physics]) == ("missing_physics", ["quantization"])
+    # more than the edges account for
+    assert said.fit.fitted_rms["displacement"] > 2 * 0.02

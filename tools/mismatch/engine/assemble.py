@@ -224,6 +224,11 @@ def decide(
         walks = any(s.name == "random_walk" and worst.output in s.placed.outputs for s in selection.steps)
         if walks and not any(d.signal != "time" and d.strength > WANDERS for d in worst.follows):
             return "missing_physics", p
+        if any(s.name == "quantization" and worst.output in s.placed.outputs for s in selection.steps):
+            # readings beside an edge of the grid fall on either side, and nobody knows on which
+            step = problem.floors[worst.output].step
+            if worst.ratio * problem.sigma(worst.output) ** 2 < step**2 / 12:
+                return "missing_physics", p
         if worst.real and left_over > 0.3 and worst.ratio > 1.3:
             return "unexplained", p
         if worst.real and not walks and worst.ratio > 2.0 and left_over > beyond_form(selection):
