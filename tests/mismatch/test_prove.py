@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 
 from tools.mismatch.prove import draw, page, prove, real, seal
-from tools.mismatch.prove.nulls import clopper_pearson, document, nulls
+from tools.mismatch.prove.nulls import clopper_pearson, document, kept, nulls
 from tools.mismatch.prove.score import coverage, score
 from tools.mismatch.prove.table import failures, show
 from tools.mismatch.recording_load import load
@@ -163,6 +163,10 @@ def test_an_interrupted_null_run_ends_as_an_uninterrupted_one(tmp_path: Path) ->
     drawn = [[{k: v for k, v in row.items() if k != "seconds"} for row in r.rows] for r in (continued, whole)]
     assert drawn[0] == drawn[1]
     assert [row["index"] for row in continued.rows] == [0, 1, 2, 3]
+    assert kept(rows).rows == continued.rows
+    text = document(kept(rows), [whole])
+    assert f"| {whole.revision[:12]} | 3 | 0 of 4 (0.0 to 60.2 %) |" in text
+    assert "- false alarms: 0 of 4 (0.0 to 60.2 %)" in text  # the earlier ones are not counted in
     with pytest.raises(ValueError, match="made with seed 3, not 9"):
         nulls(4, 9, 1, rows_file=rows, **more)
 

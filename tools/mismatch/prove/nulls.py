@@ -167,6 +167,16 @@ def nulls(
     return result
 
 
+def kept(file: Path) -> NullResult:
+    """What a run has kept in its rows file so far, finished or not. ValueError when it is no such file."""
+    try:
+        body = json.loads(file.read_text())
+        rows = sorted(body["rows"], key=lambda r: r["index"])
+        return NullResult(body["seed"], tuple(rows), body["seconds"], body["max_samples"], body["revision"])
+    except (KeyError, TypeError, json.JSONDecodeError) as error:
+        raise ValueError(f"{file}: not the rows of a null run ({error!r})") from error
+
+
 def _cell(k: int, n: int) -> str:
     low, high = clopper_pearson(k, n)
     return f"{k} of {n} ({100 * low:.1f} to {100 * high:.1f} %)"
@@ -181,8 +191,8 @@ def _by(result: NullResult, key: str, values: Sequence[str]) -> list[str]:
     return lines
 
 
-def document(result: NullResult) -> str:
-    """The text of docs/mismatch-false-alarms.md."""
+def document(result: NullResult, earlier: Sequence[NullResult] = ()) -> str:
+    """The text of docs/mismatch-false-alarms.md; ``earlier`` runs of other states of the tool stand beside, uncounted."""
     k, n = result.count()
     failed = sum(r["failed"] for r in result.rows)
     named: dict[str, int] = {}
@@ -192,19 +202,20 @@ def document(result: NullResult) -> str:
             named[word] = named.get(word, 0) + 1
     false_names = sum(bool(r["said"]) and r["alarm"] for r in result.rows)
     exact = sum(r["verdict"] == r["kind"] for r in result.rows)
+    last = 1 + max((r["index"] for r in result.rows), default=-1)
     cpu_s = statistics.median(r["cpu_s"] for r in result.rows)
     lines = [
         "# False alarms of the mismatch tool",
         "",
         "Made by `python -m tools.mismatch.prove.nulls`; do not edit. Recordings in which no physics is missing, "
-        "drawn by the blind prover's own simulator over all twins and excitations, with white, coloured, "
-        "heavy-tailed and quantised noise, the noise declared in half of them; two thirds agree as given, "
+        "drawn by the blind prover's own simulators over all twins (FMU and bench less often) and excitations, with "
+        "white, coloured, heavy-tailed and quantised noise, the noise declared in half of them; two thirds agree as given, "
         "one third needs recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
         "Intervals are Clopper-Pearson, 95 %.",
         "",
         f"{n} recordings of at most {result.max_samples} samples, seed {result.seed}, tool {result.revision[:12]}, "
         f"{time.strftime('%Y-%m-%d', time.gmtime())}; {result.seconds:.0f} s, median {cpu_s:.1f} s of CPU a recording. "
-        f"`--seed {result.seed} --n {n} --max-samples {result.max_samples}` makes them again.",
+        f"`--seed {result.seed} --n {last} --max-samples {result.max_samples}` makes them again.",
         "",
         f"- false alarms: {_cell(k, n)}",
         f"- of these with a false name: {_cell(false_names, n)}",
@@ -220,6 +231,11 @@ def document(result: NullResult) -> str:
         "What was blamed: " + (", ".join(f"{w} {c}" for w, c in sorted(named.items())) or "nothing") + ".",
         "",
     ]
+    if earlier:
+        lines += ["Earlier states of the tool, each with its own seed:", ""]
+        lines += ["| tool | seed | false alarms (95 % interval) |", "|---|---|---|"]
+        lines += [f"| {e.revision[:12]} | {e.seed} | {_cell(*e.count())} |" for e in earlier]
+        lines.append("")
     return "\n".join(lines)
 
 
@@ -236,9 +252,21 @@ def main() -> None:
     p.add_argument("--max-samples", type=int, default=12_000)
     p.add_argument("--doc", type=Path, default=DOC)
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every recording, and continued from")
+    p.add_argument("--page-only", action="store_true", help="no further recording: the page of what --rows holds")
+    p.add_argument("--earlier", type=Path, nargs="*", default=[], help="rows of earlier states, to stand beside")
     a = p.parse_args()
+    if a.page_only and a.rows is None:
+        p.error("--page-only needs --rows")
     try:
-        print(document(nulls(a.n, a.seed, a.jobs, doc=a.doc, rows_file=a.rows, max_samples=a.max_samples)))
+        earlier = [kept(file) for file in a.earlier]
+        result = (
+            kept(a.rows)
+            if a.page_only
+            else nulls(a.n, a.seed, a.jobs, doc=None, rows_file=a.rows, max_samples=a.max_samples)
+        )
+        text = document(result, earlier)
+        a.doc.write_text(text)
+        print(text)
     except (ValueError, OSError) as error:  # rows of another run, a file that cannot be written
         p.error(str(error))
 
