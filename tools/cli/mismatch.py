@@ -28,6 +28,10 @@ RecordingArgument = Annotated[
 SeedOption = Annotated[int, typer.Option(min=0, help="Same recording and seed: same answer.")]
 
 
+MOST_SHARED = 1_000_000
+"""Samples above which one process works alone: every further one would hold a gigabyte of columns of its own."""
+
+
 @contextmanager
 def _clear_errors() -> Iterator[None]:
     """As ``clear_errors``; a bad recording is bad input."""
@@ -119,7 +123,8 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
         def show(what: str, done: int, total: int) -> None:
             progress.update(bar, description=what, completed=done, total=total)
 
-        return engine(loaded, held_out=held_out, seed=seed, jobs=jobs, progress=show)
+        alone = loaded.n > MOST_SHARED
+        return engine(loaded, held_out=held_out, seed=seed, jobs=1 if alone else jobs, progress=show)
 
 
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
