@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 NAMES = ("misalignment_0", "misalignment_1", "misalignment_2", "scale_x", "scale_y", "scale_z")
 NAMES += ("bias_x", "bias_y", "bias_z")
 
+LARGEST_CONDITION = 1e3
+"""Poses all round have 2 to 4, a half sphere 130, a cone of 35 degrees 7e4: there a scale came out negative."""
 MISALIGNMENT_RAD = 0.02
 """Standard deviation of a misalignment before any pose is seen: 2 % cross-axis sensitivity, as data sheets print it."""
 
@@ -104,6 +106,12 @@ def fit_poses(
     reach95 = float(student.ppf(0.975, freedom)) * deviation
     magnitude = np.linalg.norm(compensate(values, mean), axis=1)
     directions = compensate(values, mean) / magnitude[:, None]
+    missing = missing_poses(directions)
+    if condition > LARGEST_CONDITION or np.any(values[3:6] <= 0.0):
+        raise InputError(
+            f"{n} poses are too alike to tell nine parameters (condition {condition:.3g}, {LARGEST_CONDITION:g} is "
+            f"allowed): turn the sensor over; no pose within 35 degrees of {', '.join(missing) or 'nothing'}"
+        )
     return MultiPosition(
         {
             name: Estimate(float(v), float(v - r), float(v + r))
@@ -113,7 +121,7 @@ def fit_poses(
         float(np.sqrt(np.mean((magnitude - gravity) ** 2))),
         condition,
         n,
-        missing_poses(directions),
+        missing,
         threshold,
     )
 

@@ -94,15 +94,36 @@ def remove_drift(raw: Array, rate_hz: float, *, allowed: bool) -> tuple[Array, W
             "wait and record again, or give --drift fit"
         )
     out = raw.copy()
+    span = t[last - 1] - t[first]
+    constant, to_come = common_warm_up(t[first:last], raw[first:last])
     for i, w in enumerate(found):
         if w.steady:
             continue
-        if np.isfinite(w.time_constant_s) and w.time_constant_s <= 3.0 * (t[last - 1] - t[first]):
+        if constant <= 3.0 * span:
             # what was still to come at the end of the rest, carried back and forth along the exponential
-            out[:, i] += w.remaining * np.exp(-(t - t[last - 1]) / w.time_constant_s)
+            out[:, i] += to_come[i] * np.exp(-(t - t[last - 1]) / constant)
         else:
-            out[:, i] -= w.remaining / (t[last - 1] - t[first]) * (t - t[last - 1])
+            out[:, i] -= w.remaining / span * (t - t[last - 1])
     return out, worst
+
+
+def common_warm_up(t_s: Array, value: Array) -> tuple[float, Array]:
+    """Time constant in s, and what each column of ``value`` (n, m) at rest has still to go when ``t_s`` (n,) ends.
+
+    The axes are in one package and warm up together: one time constant for all is known far better than one for each.
+    """
+    blocks = min(64, len(t_s))
+    t = np.array([part.mean() for part in np.array_split(t_s, blocks)])
+    v = np.array([part.mean(axis=0) for part in np.array_split(value, blocks)])
+    span = t_s[-1] - t_s[0]
+    best, constant, to_come = np.inf, np.inf, np.zeros(value.shape[1])
+    for tau in np.geomspace(span / 20.0, 20.0 * span, 240):
+        shape = np.column_stack([np.ones(blocks), np.exp(-(t - t_s[-1]) / tau)])
+        found = np.linalg.lstsq(shape, v)[0]
+        left = float(np.sum((v - shape @ found) ** 2))
+        if left < best:
+            best, constant, to_come = left, float(tau), -found[1]
+    return constant, to_come
 
 
 def warm_up(t_s: Array, value: Array, tolerance: float) -> WarmUp:

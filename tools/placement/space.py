@@ -56,7 +56,9 @@ def load_space(path: Path) -> Space:
     """Read and check; ``InputError`` names the key."""
     try:
         return Space.model_validate(tomllib.loads(path.read_text()))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}; benches/space-004.toml is an example") from error
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.multi_position import fit_poses, identify_poses, missing_poses
 from tools.calibrate.quick import flat, free_fall, turn
-from tools.calibrate.still import remove_drift, warm_up
+from tools.calibrate.still import common_warm_up, remove_drift, warm_up
 from tools.errors import InputError
 
 G = 9.80665
@@ -139,6 +139,24 @@ def test_a_cold_log_is_refused_or_its_drift_removed() -> None:
     assert not found.steady
     late = t > 60.0
     assert np.sqrt(np.mean((out - log)[late] ** 2)) < 0.2 * np.sqrt(np.mean(drift[late] ** 2))
+
+
+def test_axes_warm_up_with_one_time_constant() -> None:
+    rng = np.random.default_rng(1)
+    t = np.arange(6000) / 100.0
+    amplitude = np.array([50.0, -30.0, 0.0])
+    value = 7.0 + amplitude * np.exp(-t / 40.0)[:, None] + rng.standard_normal((len(t), 3))
+    constant, to_come = common_warm_up(t, value)
+    assert constant == pytest.approx(40.0, rel=0.1)
+    np.testing.assert_allclose(to_come, -amplitude * np.exp(-t[-1] / 40.0), atol=1.0)
+
+
+def test_poses_within_a_cone_are_refused_and_the_missing_ones_named() -> None:
+    rng = np.random.default_rng(2)
+    lean = 0.3 * rng.uniform(-1.0, 1.0, (14, 2))
+    up = np.column_stack([lean, np.sqrt(1.0 - np.sum(lean**2, axis=1))])
+    with pytest.raises(InputError, match="x up, x down, y up, y down, z down"):
+        fit_poses(16384.0 * up + 2.0 * rng.standard_normal((14, 3)), np.ones(14), 9.81)
 
 
 def test_an_ellipsoid_with_outliers_comes_back() -> None:
