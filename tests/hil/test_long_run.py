@@ -52,6 +52,7 @@ def run_of(**changes: object) -> LongRun:
     [
         ({"memory_MB": [100.0] * 7 + [103.0]}, "memory grew by 3.0 MB"),
         ({"left_um": [2.0] * 7 + [3.0]}, "varied by 50 %"),
+        ({"tremor_um": [20.0] * 7 + [0.0]}, "nothing was seen in 1 of 8 eighths"),
         ({"counters": {"samples lost": 2}}, "samples lost: 2"),
         ({"ended": "daq: gone"}, "it ended with: daq: gone"),
     ],

@@ -23,7 +23,7 @@ def block(run: LongRun, command: str, revision: str) -> str:
     """One run as Markdown."""
     columns = ["eighth", "left um", "tremor um", "left %", "memory MB"]
     rows = [
-        [f"{k + 1}", f"{left:.2f}", f"{there:.2f}", f"{100 * left / there:.1f}", f"{memory:.2f}"]
+        [f"{k + 1}", f"{left:.2f}", f"{there:.2f}", f"{100 * left / there:.1f}" if there else "-", f"{memory:.2f}"]
         for k, (left, there, memory) in enumerate(zip(run.left_um, run.tremor_um, run.memory_MB, strict=True))
     ]
     if run.tilt_mrad is not None:

@@ -59,9 +59,9 @@ class LongRun:
     @property
     def drift(self) -> float:
         """Largest departure of the part that is left from its median, relative to it."""
-        part = np.divide(self.left_um, self.tremor_um)
-        middle = float(np.median(part))
-        return float(np.max(np.abs(part - middle))) / middle
+        part = [left / there for left, there in zip(self.left_um, self.tremor_um, strict=True) if there > 0.0]
+        middle = float(np.median(part)) if part else 1.0
+        return max((abs(p - middle) / middle for p in part), default=0.0)
 
     def problems(self) -> list[str]:
         """What a run must not show, in words."""
@@ -70,6 +70,8 @@ class LongRun:
             found.append(f"memory grew by {self.growth_MB:.1f} MB")
         if self.drift > DRIFT:
             found.append(f"what is left of the tremor varied by {100 * self.drift:.0f} %")
+        if empty := sum(there == 0.0 for there in self.tremor_um):
+            found.append(f"nothing was seen in {empty} of {EIGHTHS} eighths")
         if self.ended != "run finished":
             found.append(f"it ended with: {self.ended}")
         return found + [f"{name}: {value}" for name, value in self.counters.items() if name in MUST_BE_ZERO and value]
