@@ -107,3 +107,22 @@ def test_rightly_named_steps_are_not_unexplained_for_the_readings_beside_their_e
     assert (said.verdict, [p.name for p in said.physics]) == ("missing_physics", ["quantization"])
     # more than the edges account for
     assert said.fit.fitted_rms["displacement"] > 2 * 0.02
+
+
+def test_a_gain_on_a_reading_of_several_inputs_follows_its_context() -> None:
+    rng = np.random.default_rng(12)
+    n = 3000
+    f = {f"specific_force_{a}": 3 * wave(rng, n) for a in "xyz"}
+    w = {f"angular_rate_{a}": 3 * wave(rng, n) for a in "xyz"}
+    r = np.array([0.09, 0.02, 0.03])
+    rate = np.stack([w[f"angular_rate_{a}"] for a in "xyz"], axis=1)
+    turned = np.cross(np.gradient(rate, 1 / 500.0, axis=0), r)[:, 2]
+    pressure = 1e5 + 1e3 * np.interp(np.arange(n), np.linspace(0, n, 12), rng.uniform(-1, 1, 12))
+    y = f["specific_force_z"] + turned
+    y = y * (1 + 0.1 * np.sin((pressure - 1e5) / 300.0)) + 0.1 * rng.standard_normal(n)
+    rec = recording("accelerometer_cluster", f | w, {"accel_1z": y}, {"positions_m": {"1": r.tolist()}},
+                    context={"pressure": pressure})  # fmt: skip
+    problem, _, base = prepared(rec, 0.3, 0, False)
+    first = lead(problem, base, "accel_1z")
+    assert first is not None
+    assert (first.signal, first.feature) == ("pressure", "cross product")

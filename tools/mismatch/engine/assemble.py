@@ -206,7 +206,7 @@ def beyond_form(selection: Selection) -> float:
     return 0.03 if all(s.name in EXACT for s in selection.steps) else 0.06
 
 
-LOUD = 25.0
+LOUD = 9.0
 """Mean square over noise variance that no colour of noise accounts for, even when nothing is known to follow it."""
 
 
@@ -222,7 +222,7 @@ def decide(
         before = max(compare_ratio(problem, base, o) for o in left)
         left_over = (worst.ratio - 1) / max(before - 1, 1e-9)
         walks = any(s.name == "random_walk" and worst.output in s.placed.outputs for s in selection.steps)
-        if walks and not any(d.signal != "time" and d.strength > WANDERS for d in worst.follows):
+        if walks and not any(d.signal != "time" and d.strength > WANDERS and d.p_value < 1e-4 for d in worst.follows):
             return "missing_physics", p
         if any(s.name == "quantization" and worst.output in s.placed.outputs for s in selection.steps):
             # readings beside an edge of the grid fall on either side, and nobody knows on which

@@ -87,6 +87,11 @@ def standard(x: Array) -> Array:
     return (x - x.mean()) / (np.std(x) or 1.0)
 
 
+def alike(a: Array, b: Array) -> bool:
+    """Whether two standardised signals (n,) are one but for a trifle (correlation beyond 0.99)."""
+    return abs(float(np.mean(a * b))) > 0.99
+
+
 def _moves(x: Array) -> bool:
     return bool(np.std(x) > 1e-9 * max(float(np.max(np.abs(x))), 1e-300))
 

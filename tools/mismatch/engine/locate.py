@@ -8,7 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.mismatch.engine.dependence import Dependence, dependences, needs_memory
-from tools.mismatch.engine.features import Feature, envelope, features_of, local_frequency, rate_of
+from tools.mismatch.engine.features import (
+    Feature,
+    alike,
+    envelope,
+    features_of,
+    local_frequency,
+    rate_of,
+    standard,
+)
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.windows import bad_windows
@@ -35,11 +43,14 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
     Both its mean and its size are looked at: bursts have no mean that follows, but a size that does.
     """
     e, signals, dt = thinned(problem, fitted, output)
-    if not problem.twin.static:
-        # a plant's own motion is what friction, springs and play follow
-        motion = problem.measured[output] - fitted.residual[output]
-        k = max(1, round(dt / problem.recording.dt))
-        signals[output] = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
+    # a plant's own motion is what friction, springs and play follow; a reading made of several inputs, what a gain does
+    motion = problem.measured[output] - fitted.residual[output]
+    k = max(1, round(dt / problem.recording.dt))
+    motion = motion[: e.size * k].reshape(e.size, k).mean(axis=1)
+    if not problem.twin.static or not any(
+        alike(standard(motion), standard(signals[i])) for i in problem.twin.inputs if i in signals
+    ):
+        signals[output] = motion
     features = features_of(signals, dt, drive=problem.twin.drive(output), motion=output)
     found = dependences(e, features)
     present = [f for f in features if not f.memory and f.kind in ("value", "rate")]

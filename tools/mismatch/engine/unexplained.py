@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.dependence import Dependence, dependences
-from tools.mismatch.engine.features import Feature, curve, rate_of, standard
+from tools.mismatch.engine.features import Feature, alike, curve, rate_of, standard
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.locate import follow, follow_size, thinned
 from tools.mismatch.engine.problem import Problem
@@ -53,8 +53,8 @@ def leftover(
         followed = bool(sizes)
         said += sizes
     loud = problem.floors[output].declared and ratio > 1.5
-    if loud and not said:
-        said = found[:1]
+    if (loud or ratio > 2.0) and not said:
+        said = found[:1]  # the likeliest, however weak: somebody has to look somewhere
     return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
 
 
@@ -87,8 +87,10 @@ def context_features(problem: Problem, before: Fit, output: str, names: Iterable
     _, signals, dt = thinned(problem, before, output)
     drive = problem.twin.drive(output)
     movers = [standard(signals[i]) for i in sorted(problem.twin.inputs, key=lambda i: i != drive)]
-    if not problem.twin.static or drive not in signals:
-        movers.append(standard(block_means(problem.measured[output] - before.residual[output], dt, problem)))
+    motion = standard(block_means(problem.measured[output] - before.residual[output], dt, problem))
+    if not any(alike(motion, m) for m in movers):
+        # a plant's own course, or a reading made of several inputs: the gain of a channel acts on it
+        movers.append(motion)
     found: list[Feature] = []
     for name in names:
         bend = curve(signals[name], 10)
