@@ -18,6 +18,8 @@ def main() -> int:
     """Exit 0 when the proof ran, whatever its figures; 2 on bad usage."""
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ.setdefault(key, "1")
+    from tools.mismatch.prove.proof import MOST_SAMPLES
+
     p = argparse.ArgumentParser(prog="python -m tools.mismatch.prove", description="Blind self-proof, for tuning.")
     p.add_argument("--cases", type=int, default=40)
     p.add_argument("--seed", type=int, default=None, help="a fresh one if left out; it is printed")
@@ -25,7 +27,7 @@ def main() -> int:
                    "agrees, recalibrate, unknown or pair")  # fmt: skip
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--keep", type=Path, default=None, help="folder for recordings, sealed answers and reports")
-    p.add_argument("--max-samples", type=int, default=12_000)
+    p.add_argument("--max-samples", type=int, default=MOST_SAMPLES)
     p.add_argument("--json", type=Path, default=None)
     p.add_argument("--generate-only", action="store_true", help="write recordings and answers, diagnose nothing")
     args = p.parse_args()

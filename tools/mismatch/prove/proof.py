@@ -18,9 +18,13 @@ import numpy as np
 from firmware_py.recording.revision import git_revision
 from tools.mismatch.prove import draw, guests, seal
 from tools.mismatch.prove.disk import write
+from tools.mismatch.prove.plans import SELDOM
 from tools.mismatch.prove.plans import plans as drawn_plans
 from tools.mismatch.prove.runner import Diagnose, Done, diagnose_all, tool
 from tools.mismatch.prove.score import score, summary
+
+MOST_SAMPLES = 8_000
+"""Of a recording, unless told."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +37,7 @@ class ProofResult:
     summary: dict[str, Any]
     seconds: float
     folder: Path
-    max_samples: int = 12_000
+    max_samples: int = MOST_SAMPLES
 
     def to_json(self) -> dict[str, Any]:
         """What `micron mismatch prove --json` writes."""
@@ -80,7 +84,7 @@ def generate(
     folder: Path,
     *,
     jobs: int = 1,
-    max_samples: int = 12_000,
+    max_samples: int = MOST_SAMPLES,
     each_noise: Sequence[str] | None = None,
 ) -> tuple[dict[str, Path], dict[str, dict[str, Any]]]:
     """Write the recordings of these plans; (paths, answers). A plan that no scene shows is left out.
@@ -105,7 +109,7 @@ def prove(
     *,
     only: tuple[str, str, float] | None = None,
     plans: Sequence[draw.Plan] | None = None,
-    max_samples: int = 12_000,
+    max_samples: int = MOST_SAMPLES,
     diagnose: Diagnose = tool,
     progress: Any = None,
 ) -> ProofResult:
@@ -135,7 +139,9 @@ def prove(
     reports = {file.stem: Done(**json.loads(file.read_text())) for file in sorted(kept.glob("*.json"))}
     if reports:
         say(f"{len(reports)} of them diagnosed before")
-    for done in diagnose_all({k: p for k, p in paths.items() if k not in reports}, jobs, diagnose):
+    # the longest first: a process that begins one last would work alone
+    left = sorted((k for k in paths if k not in reports), key=lambda k: SELDOM.get(asked[int(k[1:])].twin, 1.0))
+    for done in diagnose_all({k: paths[k] for k in left}, jobs, diagnose):
         reports[done.name] = done
         (kept / "unfinished").write_text(json.dumps(asdict(done), indent=1))
         (kept / "unfinished").replace(kept / f"{done.name}.json")
