@@ -209,8 +209,8 @@ def document(result: NullResult, earlier: Sequence[NullResult] = ()) -> str:
         "",
         "Made by `python -m tools.mismatch.prove.nulls`; do not edit. Recordings in which no physics is missing, "
         "drawn by the blind prover's own simulators over all twins (FMU and bench less often) and excitations, with "
-        "white, coloured, heavy-tailed and quantised noise, the noise declared in half of them; two thirds agree as "
-        "given, one third needs recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
+        "white, coloured, heavy-tailed and quantised noise, the noise declared in half of them; "
+        f"{result.count(kind='agrees')[1]} agree as given, {result.count(kind='recalibrate')[1]} need recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
         "Intervals are Clopper-Pearson, 95 %.",
         "",
         f"{n} recordings of at most {result.max_samples} samples, seed {result.seed}, tool {result.revision[:12]}, "
