@@ -210,8 +210,8 @@ def document(result: NullResult, earlier: Sequence[NullResult] = ()) -> str:
         "Made by `python -m tools.mismatch.prove.nulls`; do not edit. Recordings in which no physics is missing, "
         "drawn by the blind prover's own simulators over all twins (FMU and bench less often) and excitations, with "
         "white, coloured, heavy-tailed and quantised noise, the noise declared in half of them; "
-        f"{result.count(kind='agrees')[1]} agree as given, {result.count(kind='recalibrate')[1]} need recalibration. A false alarm is the verdict `missing_physics` or `unexplained`. "
-        "Intervals are Clopper-Pearson, 95 %.",
+        f"{result.count(kind='agrees')[1]} agree as given, {result.count(kind='recalibrate')[1]} need recalibration. "
+        "A false alarm is the verdict `missing_physics` or `unexplained`. Intervals are Clopper-Pearson, 95 %.",
         "",
         f"{n} recordings of at most {result.max_samples} samples, seed {result.seed}, tool {result.revision[:12]}, "
         f"{time.strftime('%Y-%m-%d', time.gmtime())}; {result.seconds:.0f} s, median {cpu_s:.1f} s of CPU a recording. "
