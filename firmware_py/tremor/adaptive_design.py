@@ -113,8 +113,10 @@ def spectra(config: TremorConfig) -> _Spectra:
     seen = sensor_response(config, hz)
     narrow = 1.0 / (1.0 + np.abs((hz - a.tremor_hz) / a.tremor_half_width_hz) ** 6)
     narrow /= np.sum(narrow) * GRID_STEP_HZ
-    # a movement that begins and ends: its displacement falls with the second power of frequency
-    burst = 1.0 / (1.0 + (hz / a.burst_hz) ** 4)
+    # as recorded people move; beyond what their recordings hold, the fourth power
+    top_hz = a.burst_hz[-1]
+    level_dB = np.interp(np.log(hz), np.log(a.burst_hz), a.burst_dB)
+    burst = 10.0 ** (0.1 * level_dB) / np.maximum(1.0, hz / top_hz) ** 4
     burst /= np.sum(burst * band(hz, (*a.cancel_from_hz, *a.cancel_to_hz))) * GRID_STEP_HZ
     mixed = a.burst_share * burst + (1.0 - a.burst_share) * narrow
     slow = a.voluntary_m**2 / a.voluntary_hz / (1.0 + (hz / a.voluntary_hz) ** 6)

@@ -43,6 +43,7 @@ def bmflc_dtype(size: int) -> np.dtype[Any]:
             ("follow", "f8"),  # of the centroid, per FOLLOW_TICKS; 0: the band stays
             ("kalman", "i8"),
             ("walk2", "f8"),
+            ("bias_walk2", "f8"),
         ]
     )
 
@@ -81,6 +82,7 @@ def bmflc_params(config: TremorConfig) -> Record:
         follow=c.band_gain * FOLLOW_TICKS / config.tick_hz if moves else 0.0,
         kalman=int(config.method == "bmflc_kalman"),
         walk2=c.walk**2,
+        bias_walk2=c.bias_walk**2,
     )
 
 
@@ -123,8 +125,9 @@ def bmflc_predict(state: Record, params: Record) -> None:
         for i in range(AXES):
             _follow(state, i, params)
     if params.kalman:
-        for j in range(2 * size + 1):
+        for j in range(2 * size):
             state.covariance[j, j] += params.walk2
+        state.covariance[2 * size, 2 * size] += params.bias_walk2
 
 
 @kernel

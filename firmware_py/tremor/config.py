@@ -71,6 +71,8 @@ class WflcConfig(_Table):
     bias_gain: Positive = 0.003
     leakage: Annotated[float, Field(ge=0.0, lt=0.1)] = 1e-4
     power_s: Positive = 1.0
+    prefilter: Literal["elliptic", "butterworth"] = "elliptic"
+    prefilter_order: Annotated[int, Field(ge=1, le=3)] = 3  # of the prototype: a band-pass doubles it
     ripple_dB: Positive = 1.0
     attenuation_dB: Positive = 40.0
 
@@ -80,7 +82,8 @@ class BmflcConfig(_Table):
 
     ``memory_s`` is the window of E-BMFLC, ``memory_gain`` its gain; its band follows the centroid of the weights by
     ``band_gain`` per second.
-    ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise.
+    ``walk`` is the weights' random walk per sample of the Kalman form, in units of the reading's noise, ``bias_walk``
+    that of the bias weight.
     """
 
     low_hz: Positive = 7.0
@@ -92,6 +95,7 @@ class BmflcConfig(_Table):
     memory_s: Positive = 0.3
     band_gain: Positive = 0.5
     walk: Positive = 0.05
+    bias_walk: Annotated[float, Field(ge=0.0)] = 0.05
 
 
 class ArConfig(_Table):
@@ -131,16 +135,19 @@ class AdaptiveConfig(_Table):
     outlier: Positive = 16.0
     gate_hz: Positive = 6.3
     gate_q: Positive = 0.5
-    gate_s: Positive = 0.1
-    gate_ratio: Positive = 300.0
+    gate_s: Positive = 0.05
+    gate_ratio: Positive = 150.0
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
     least_rms_m: Positive = 2e-6
     tremor_hz: Positive = 10.0
     tremor_half_width_hz: Positive = 1.7
     burst_rms_m: Positive = 100e-6
-    burst_hz: Positive = 2.0
-    burst_share: Share = 0.3
+    # a burst: half its power like the calm hand's tremor, half as seven recorded people move (mean spectrum of their
+    # displacement, any level; without one of them it moves by 1.5 dB)
+    burst_share: Share = 0.5
+    burst_hz: tuple[Positive, ...] = (0.25, 0.5, 1, 2, 3, 4, 5, 6, 8, 10, 12, 14, 16, 20, 24)
+    burst_dB: tuple[float, ...] = (24, 16, 8, 0, -5, -9, -11, -13, -16, -20, -24, -27, -29, -33, -38)
     voluntary_m: Positive = 300e-6
     voluntary_hz: Positive = 0.6
     unsteadiness_m: Positive = 4e-6
@@ -157,6 +164,8 @@ class AdaptiveConfig(_Table):
             raise ValueError("adaptive: cancel_from_hz and cancel_to_hz must rise: from low to high")
         if any(low >= high for low, high in pairwise(self.core_hz)):
             raise ValueError("adaptive: core_hz must rise: from low to high")
+        if len(self.burst_dB) != len(self.burst_hz) or any(low >= high for low, high in pairwise(self.burst_hz)):
+            raise ValueError("adaptive: burst_hz must rise, with one value of burst_dB for each")
         return self
 
 

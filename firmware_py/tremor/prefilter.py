@@ -1,4 +1,4 @@
-"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (000, 5.2.1; ERRATA 56).
+"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (000, 5.2.1; ERRATA 56), unless told otherwise.
 
 Ripple and attenuation are not printed there; they are parameters here. Its response is known exactly at any
 frequency, so whoever uses its output can undo phase and gain.
@@ -16,22 +16,18 @@ from firmware_py.designs import design
 from firmware_py.tremor.config import WflcConfig
 from hal.compiled import kernel
 
-PROTOTYPE_ORDER = 3  # a band-pass doubles it
+SECTIONS = 3
 
 
 def prefilter_sections(config: WflcConfig, tick_hz: float) -> NDArray[np.float64]:
-    """Three second-order sections (3, 5): b0 b1 b2 a1 a2."""
-    (sos,) = design(
-        "ellip",
-        PROTOTYPE_ORDER,
-        config.ripple_dB,
-        config.attenuation_dB,
-        [config.low_hz, config.high_hz],
-        btype="bandpass",
-        output="sos",
-        fs=tick_hz,
-    )
-    return np.ascontiguousarray(sos[:, [0, 1, 2, 4, 5]])
+    """Three second-order sections (3, 5): b0 b1 b2 a1 a2; those that a lower order does not need let all pass."""
+    ripple = [config.ripple_dB, config.attenuation_dB] if config.prefilter == "elliptic" else []
+    name = "ellip" if config.prefilter == "elliptic" else "butter"
+    edges = [config.low_hz, config.high_hz]
+    (sos,) = design(name, config.prefilter_order, *ripple, edges, btype="bandpass", output="sos", fs=tick_hz)
+    sections = np.tile([1.0, 0.0, 0.0, 0.0, 0.0], (SECTIONS, 1))
+    sections[: len(sos)] = sos[:, [0, 1, 2, 4, 5]]
+    return sections
 
 
 def prefilter_response(

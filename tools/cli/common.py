@@ -13,6 +13,8 @@ from typing import Annotated
 import typer
 from rich.console import Console
 from rich.markup import escape
+from rich.measure import Measurement
+from rich.table import Table
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
@@ -31,6 +33,22 @@ def console() -> Console:
 def data_console() -> Console:
     """For data: standard output."""
     return Console(highlight=False)
+
+
+def print_whole(full: Table, narrow: Table | None = None) -> None:
+    """``full`` to standard output, no cell cut: as wide as it must be in a file or pipe.
+
+    A terminal that is too narrow for it gets ``narrow`` instead, and is told so.
+    """
+    out = data_console()
+    needed = Measurement.get(out, out.options.update(max_width=1000), full).maximum
+    if not out.is_terminal:
+        out = Console(highlight=False, width=max(needed, out.width))
+    elif narrow is not None and needed > out.width:
+        out.print(narrow)
+        console().print(f"{needed} columns show more than these {out.width}; so does --json FILE", soft_wrap=True)
+        return
+    out.print(full)
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, console, data_console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 
@@ -54,14 +54,15 @@ def evaluate(
         title = f"{group} ({lines[0].cases}): left of the involuntary motion, % rms"
         shown = Table(title=title, title_justify="left", box=None, padding=(0, 1))
         shown.add_column("method", no_wrap=True)
-        for name in ("ms", "all", "8-12", "lifted", "/others", "/oracle", "late ms", "Hz off", "us"):
+        for name in ("ms", "all", "8-12", "lifted", "/others", "/oracle", "/unseen", "late ms", "Hz off", "us"):
             shown.add_column(name, justify="right", no_wrap=True)
         for s in lines:
             shown.add_row(
                 s.method,
                 str(s.horizon_ms),
                 *(f"{v:.1f}" for v in (s.all_percent, s.band_percent, s.lifted_percent)),
-                *(f"{v:.2f}" for v in (s.to_others, s.to_oracle, s.delay_ms, s.frequency_error_hz, s.us_per_sample)),
+                *(f"{v:.2f}" for v in (s.to_others, s.to_oracle, s.to_unseen, s.delay_ms, s.frequency_error_hz)),
+                f"{s.us_per_sample:.1f}",
             )
         return shown
 
@@ -87,7 +88,7 @@ def evaluate(
             save_series_picture(cases[0], methods, min(horizons, key=lambda h: abs(h - LOOP_MS)), series)
         if json_file != "-":
             for group in dict.fromkeys(line.group for line in lines):
-                data_console().print(table(group, [line for line in lines if line.group == group]))
+                print_whole(table(group, [line for line in lines if line.group == group]))
             if behaviour:
                 shown = Table(title="a tone of 25 um, sensor noise on", title_justify="left")
                 for name in ("method", "onset s", "9 -> 11 Hz s", "bias +5 mg/s: left, ratio", "Hz off"):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from math import isfinite
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
-from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
@@ -36,24 +37,31 @@ def inspect(
     from tools.tremor.inspect import Inspection, Rule, inspect_all
     from tools.tremor.signals import load_signals
 
-    def table(found: list[Inspection]) -> Table:
+    def table(found: list[Inspection], whole: bool) -> Table:
+        more = ("Hz", "s", "tremor (%)", "peak (Hz)", "95 % (Hz)", "amplitude", "excursion", "2f, 3f (%)")
+        less = ("tremor %", "peak, 95 % (Hz)", "excursion")
         shown = Table(title=recording, title_justify="left")
         shown.add_column("signal", overflow="fold")
-        for column in ("Hz", "s", "tremor (%)", "peak (Hz)", "95 % (Hz)", "amplitude", "excursion", "2f, 3f (%)"):
+        for column in more if whole else less:
             shown.add_column(column, justify="right", no_wrap=True)
         for one in found:
             s = one.signal
-            factor, unit = _readable(one.excursion_unit)
+            factor, unit = _readable(one.excursion_unit, one.excursion)
+            share, peak, excursion = f"{100 * one.tremor_share:.0f}", f"{one.peak_hz:.2f}", factor * one.excursion
+            interval = f"{one.low_hz:.2f}..{one.high_hz:.2f}" if one.steady else "not steady"
+            if not whole:
+                shown.add_row(s.name, share, f"{peak} {interval}", f"{excursion:.3g} {unit}")
+                continue
             shown.add_row(
                 s.name,
                 f"{s.rate_hz:.2f}",
                 f"{s.seconds:.0f}",
-                f"{100 * one.tremor_share:.0f}",
-                f"{one.peak_hz:.2f}",
-                f"{one.low_hz:.2f}..{one.high_hz:.2f}" if one.steady else "not steady",
+                share,
+                peak,
+                interval,
                 f"{one.amplitude:.3g} {s.unit}",
-                f"{factor * one.excursion:.3g} {unit}",
-                ", ".join(f"{100 * h:.0f}" for h in one.harmonics),
+                f"{excursion:.3g} {unit}",
+                ", ".join(f"{100 * h:.0f}" if isfinite(h) else "-" for h in one.harmonics),
             )
         return shown
 
@@ -71,7 +79,7 @@ def inspect(
         for note in dict.fromkeys(note for s in signals for note in s.notes):
             console().print(f"note: {note}", soft_wrap=True)
         if json_file != "-":
-            data_console().print(table(found))
+            print_whole(table(found, whole=True), table(found, whole=False))
         if png is not None or html is not None:
             from tools.tremor.inspect_picture import inspection_figure, page, png_bytes
 
@@ -84,6 +92,8 @@ def inspect(
         write_json({"format": 1, "source": recording, "signals": [one.as_dict() for one in found]}, json_file)
 
 
-def _readable(unit: str) -> tuple[float, str]:
-    """Factor and unit for small excursions."""
-    return {"m": (1e6, "um"), "rad": (1e3, "mrad")}.get(unit, (1.0, unit))
+def _readable(unit: str, size: float) -> tuple[float, str]:
+    """Factor and unit for small excursions of about ``size``."""
+    if unit == "m":
+        return (1e3, "mm") if size >= 1e-3 else (1e6, "um")
+    return (1e3, "mrad") if unit == "rad" else (1.0, unit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,42 @@ from tools.tremor.cases import RATE_HZ
 from tools.tremor.ideal import bound_residual
 
 Array = NDArray[np.float64]
+
+
+SWING_S = 3.0
+
+
+@dataclass(frozen=True)
+class Swing:
+    """The strongest ``seconds`` of a hand in 8 to 12 Hz: their share of the power of all that was scored."""
+
+    start_s: float
+    """After the start of the run."""
+    seconds: float
+    share: float
+    rms_um: float
+    rest_um: float
+    """rms of all the rest; 0 where there is none."""
+
+
+def strongest(truth: Mapping[str, Array], from_ns: int, to_ns: int) -> Swing:
+    """Of the hand alone (the manipulator resting), between two instants of the run."""
+    t_ns = np.asarray(truth["t_ns"])
+    moved = np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"])
+    power = np.sum(band_pass(moved, RATE_HZ, TREMOR_BAND_HZ) ** 2, axis=1)
+    rows = np.flatnonzero((t_ns >= from_ns) & (t_ns < to_ns))
+    length = min(round(SWING_S * RATE_HZ), len(rows))
+    so_far = np.concatenate([[0.0], np.cumsum(power[rows])])
+    sums = so_far[length:] - so_far[:-length]
+    best = int(np.argmax(sums))
+    whole, inside, others = float(so_far[-1]), float(sums[best]), len(rows) - length
+    return Swing(
+        float(t_ns[rows[best]] - t_ns[0]) * 1e-9,
+        length / RATE_HZ,
+        inside / whole,
+        float(1e6 * np.sqrt(inside / length)),
+        float(1e6 * np.sqrt(max(whole - inside, 0.0) / others)) if others else 0.0,
+    )
 
 
 def band_rms_um(x: Array, keep: NDArray[np.bool_]) -> float:

@@ -30,6 +30,7 @@ INVOLUNTARY_HZ = (2.0, 4.0, 16.0, 20.0)
 TREMOR_RMS_M = 50e-6 / (2.0 * np.sqrt(2.0))
 LEVER_M = 0.15  # an angular rate moves a tip this far away
 TREMOR_SEARCH_HZ = (3.0, 14.0)
+EMULATED = "emulated hands"  # their group
 LONGEST_S = 40.0
 _FADE_S = 0.5
 _SIZE_BAND_HZ = (4.0, 13.0)
@@ -181,7 +182,7 @@ def emulated_hand(seed: int, seconds: float = 30.0) -> Case:
     acceleration = rc_filter(pose[:, 12:15]) + sensor_noise((n, 3), seed + 1000)
     return Case(
         f"emulated hand {seed}",
-        "emulated hands",
+        EMULATED,
         str(seed),
         "acceleration",
         acceleration,

@@ -9,7 +9,7 @@ import numpy as np
 
 from firmware_py.tremor.config import Method, TremorConfig
 from tools.tremor.cases import RATE_HZ, Case
-from tools.tremor.evaluate import ORACLE, OTHERS, Summary, run_case, with_horizon
+from tools.tremor.evaluate import LIMITS, ORACLE, OTHERS, UNSEEN, Summary, run_case, with_horizon
 from tools.tremor.scores import residual
 
 LOOP_MS = 2
@@ -28,13 +28,13 @@ def save_horizon_picture(lines: Sequence[Summary], path: Path) -> None:
         axes = figure.add_subplot(1, len(groups), n + 1)
         for method in dict.fromkeys(line.method for line in lines if line.group == group):
             own = [line for line in lines if line.group == group and line.method == method]
-            limit = method in (OTHERS, ORACLE)
+            limit = method in LIMITS
             axes.plot(
                 [line.horizon_ms for line in own],
                 [line.lifted_percent for line in own],
                 label=method,
                 color="black" if limit else None,
-                linestyle={OTHERS: "--", ORACLE: ":"}.get(method, "-"),
+                linestyle={OTHERS: "--", ORACLE: ":", UNSEEN: "-."}.get(method, "-"),
                 marker=None if limit else "o",
                 markersize=3,
             )

@@ -4,6 +4,9 @@ Ideal: every error that the emulation knows is off, the stacks are lines, and th
 is, so no calibration is needed. What is left is the loop itself: delay, converter steps, the attitude filter, and the
 estimator. With ``noise`` the accelerometers keep theirs, which the bound then has too.
 
+``estimator_um`` is what the estimator leaves by itself, fed with the very samples that the bound is fitted to: what the
+loop leaves beyond it, the instrument's sensing, steps and strokes have cost; what it leaves beyond the bound, learning.
+
 The bound: the best fixed causal linear filter, fitted to this record, on the tip's own acceleration through the sensor
 filter (and noise), at the loop's delay. It knows no instrument: what it leaves is what any instrument must leave.
 """
@@ -22,6 +25,7 @@ from numpy.typing import NDArray
 
 from firmware_py.tremor.adaptive_design import design_adaptive, solve_scaled
 from firmware_py.tremor.config import TremorConfig
+from firmware_py.tremor.estimator import Estimator
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
 from tools.reports.tremor_figures import tremor_figures
@@ -60,6 +64,7 @@ class IdealRow:
     what: str
     reduction_percent: float  # 8 to 12 Hz
     loop_um: float
+    estimator_um: float
     bound_um: float
 
     @property
@@ -100,18 +105,22 @@ def ideal_run(bench: Path, seconds: float, noise: bool, seed: int | None = None)
     t_ns = np.asarray(truth["t_ns"])
     # zero-phase bands are not trusted at the end
     keep = (t_ns >= from_ns) & (t_ns < to_ns - 500_000_000)
-    loop, bound = residuals(truth, keep, noise)
+    left = residuals(truth, keep, noise)
     what = "accelerometer noise on" if noise else "no noise"
-    return IdealRow(what, figures.vector.reduction_percent, 1e6 * loop, 1e6 * bound)
+    return IdealRow(what, figures.vector.reduction_percent, *(1e6 * um for um in left))
 
 
-def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> tuple[float, float]:
-    """Lifted residual (m rms) of the run and of the bound over the rows ``keep`` of ``truth``."""
+def residuals(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> tuple[float, float, float]:
+    """Lifted residual (m rms) of the run, of the estimator alone and of the bound over the rows ``keep``."""
     design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
-    left = involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"]))
-    lifted = [lift(x, design)[keep] for x in (left, bound_residual(truth, keep, noise))]
-    loop, bound = (float(np.sqrt(np.mean(np.sum(x**2, axis=1)))) for x in lifted)
-    return loop, bound
+    samples, wanted = _samples(truth, noise), _wanted(truth)
+    left = (
+        involuntary(np.asarray(truth["tip_m"]) - np.asarray(truth["intended_m"])),
+        _alone(samples, wanted, noise),
+        _bound(samples, wanted, keep),
+    )
+    loop, alone, bound = (float(np.sqrt(np.mean(np.sum(lift(x, design)[keep] ** 2, axis=1)))) for x in left)
+    return loop, alone, bound
 
 
 def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: bool) -> Array:
@@ -119,14 +128,34 @@ def bound_residual(truth: Mapping[str, Array], keep: NDArray[np.bool_], noise: b
 
     Fitted over the rows ``keep``, lifted, at ``LOOP_DELAY_S``, to the tip's acceleration behind the sensor's filter.
     """
-    rigid, intended = (np.asarray(truth[k]) for k in ("tip_rigid_m", "intended_m"))
-    design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
-    wanted = involuntary(rigid - intended)
+    return _bound(_samples(truth, noise), _wanted(truth), keep)
+
+
+def _wanted(truth: Mapping[str, Array]) -> Array:
+    return involuntary(np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"]))
+
+
+def _samples(truth: Mapping[str, Array], noise: bool) -> Array:
+    """(n, 3) m/s^2: the tip's own acceleration as an ideal instrument would see it."""
+    rigid = np.asarray(truth["tip_rigid_m"])
     samples = np.zeros_like(rigid)
     samples[1:-1] = np.diff(rigid, 2, axis=0) * RATE_HZ**2
     samples = rc_filter(samples)
-    if noise:
-        samples = samples + sensor_noise(samples.shape, 99)
+    return samples + sensor_noise(samples.shape, 99) if noise else samples
+
+
+def _alone(samples: Array, wanted: Array, noise: bool) -> Array:
+    """What the estimator leaves as the ideal bench configures it, at the bound's horizon in whole ticks."""
+    ticks = ceil(LOOP_DELAY_S * RATE_HZ)
+    table = {**ideal_changes(noise)["firmware"]["tremor"], "loop_delay_s": ticks / RATE_HZ}
+    ahead = Estimator(TremorConfig.model_validate(table)).run(samples).ahead_m
+    left = wanted.copy()
+    left[ticks:] -= ahead[:-ticks]
+    return left
+
+
+def _bound(samples: Array, wanted: Array, keep: NDArray[np.bool_]) -> Array:
+    design = design_adaptive(TremorConfig(loop_delay_s=LOOP_DELAY_S))
     ticks = ceil(LOOP_DELAY_S * RATE_HZ)
     rows = np.flatnonzero(keep)[::EVERY]
     left = wanted.copy()

@@ -6,9 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
+from rich.table import Table
 
 from hal.errors import BenchError, DeviceNotFound, HalTimeout
-from tools.cli.common import Exit, clear_errors
+from tools.cli.common import Exit, clear_errors, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 
@@ -28,6 +29,17 @@ def test_json_to_standard_output(capsys: pytest.CaptureFixture[str]):
 def test_a_missing_folder_is_refused_before_work(tmp_path: Path):
     with pytest.raises(InputError, match="does not exist; create it first"):
         check_writable("-", None, tmp_path / "no" / "r.json")
+
+
+def test_a_table_in_a_pipe_is_whole(capsys: pytest.CaptureFixture[str]):
+    table = Table()
+    for _ in range(12):
+        table.add_column("a column that is wide", no_wrap=True)
+    table.add_row(*(f"value number {n:03d}" for n in range(12)))
+    print_whole(table)
+    out = capsys.readouterr().out
+    assert all(f"value number {n:03d}" in out for n in range(12))
+    assert out.count("a column that is wide") == 12
 
 
 @pytest.mark.parametrize(

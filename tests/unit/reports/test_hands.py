@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from tools.reports.hand_limits import band_rms_um, known_tremor_um
+from tools.reports.hand_limits import Swing, band_rms_um, known_tremor_um, strongest
 from tools.reports.hands import HandRow, markdown
 from tools.reports.tremor_figures import BandFigures, TremorFigures
 
@@ -32,12 +32,47 @@ def test_band_rms_of_a_tone() -> None:
     assert band_rms_um(swinging(100e-6)["tip_rigid_m"], KEEP) == pytest.approx(100.0 / np.sqrt(2.0), rel=0.01)
 
 
-def test_the_page_says_which_hands_miss_the_goal() -> None:
+def test_the_strongest_stretch_of_a_swing() -> None:
+    t_s = np.arange(20_000) / 1000.0
+    size = np.where((t_s > 8.0) & (t_s < 11.0), 100e-6, 5e-6)
+    tip = np.zeros((len(t_s), 3))
+    tip[:, 2] = size * np.sin(2.0 * np.pi * 10.0 * t_s)
+    truth = {"t_ns": 1e9 * t_s + 7e9, "tip_rigid_m": tip, "intended_m": np.zeros_like(tip)}
+    found = strongest(truth, round(10e9), round(26e9))
+    assert found.start_s == pytest.approx(8.0, abs=0.1)
+    assert found.rms_um == pytest.approx(100.0 / np.sqrt(2.0), rel=0.05)
+    assert found.share > 0.95
+    # without the swing: nothing stands out
+    assert strongest(truth, round(19e9), round(26e9)).share == pytest.approx(3.0 / 7.0, abs=0.05)
+
+
+@pytest.mark.parametrize(
+    ("share", "rest_um", "said"),
+    [
+        (0.93, 5.0, "93 % of the tremor's power is one swing from 14 to 17 s"),
+        (0.3, 40.0, "hold 30 % of the tremor's power: no single swing"),
+        (1.0, 0.0, "Wild: With the tremor known"),  # a run of 8 s: three are scored
+    ],
+)
+def test_the_page_says_which_hands_miss_the_goal_and_why(share: float, rest_um: float, said: str) -> None:
     def row(hand: str, method: str, left_um: float) -> HandRow:
         vector = BandFigures(20.0, left_um, 100.0 * (1.0 - left_um / 20.0))
         figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, 1.0, 0.0)
-        return HandRow(hand, "-", method, figures, 1.5, 4.0, 2.0)
+        return HandRow(hand, "-", method, figures, 1.5, 4.0, 2.0, Swing(14.0, 3.0, share, 74.0, rest_um))
 
     page = markdown([row("calm", "adaptive", 4.0), row("calm", "kalman", 9.0), row("wild", "adaptive", 8.0)], 40.0, "x")
     assert "| calm | adaptive | 20.00 | 4.00 | 80.0 | 80.0, 90.0 | 1.5 |" in page
     assert "reached in 1 of 2 hands; not in: wild (60.0 %)." in page
+    assert said in " ".join(page.split())
+    assert "Wild:" in page
+    assert "Calm:" not in page
+
+
+def test_a_page_of_hands_that_all_reach_the_goal_explains_none() -> None:
+    vector = BandFigures(20.0, 4.0, 80.0)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, 1.0, 0.0)
+    page = markdown(
+        [HandRow("calm", "-", "adaptive", figures, 1.5, 4.0, 2.0, Swing(9.0, 3.0, 0.9, 74.0, 5.0))], 8.0, "x"
+    )
+    assert "reached in 1 of 1 hands." in page
+    assert "swing" not in page

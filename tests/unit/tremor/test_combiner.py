@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import ellip, sosfilt, sosfreqz
+from scipy.signal import butter, ellip, sosfilt, sosfreqz
 
 from firmware_py.records import attributes, new_record
 from firmware_py.tremor.combiner import (
@@ -41,6 +41,15 @@ def test_prefilter_response_is_scipys() -> None:
     np.testing.assert_allclose(prefilter_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
     gain = np.abs(expected)
     assert np.all(gain[(f > 7.0) & (f < 13.0)] > 10 ** (-config.ripple_dB / 20) - 1e-6)
+
+
+def test_a_butterworth_of_first_order_lets_all_pass_in_the_sections_it_does_not_need() -> None:
+    config = WflcConfig(prefilter="butterworth", prefilter_order=1, low_hz=6.0, high_hz=14.0)
+    sections = prefilter_sections(config, RATE_HZ)
+    assert sections.shape == (3, 5)
+    f = np.linspace(0.5, 100.0, 400)
+    _, expected = sosfreqz(butter(1, [6.0, 14.0], "bandpass", output="sos", fs=RATE_HZ), worN=f, fs=RATE_HZ)
+    np.testing.assert_allclose(prefilter_response(sections, f, RATE_HZ), expected, rtol=1e-9, atol=1e-12)
 
 
 def test_prefilter_steps_as_scipy_filters() -> None:

@@ -8,9 +8,10 @@ import pytest
 from firmware_py.tremor.ar_kalman import chain_gain_and_lag, horizons
 from firmware_py.tremor.bmflc import comb_size
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
-from firmware_py.tremor.estimator import Estimator, peek, unfiltered
+from firmware_py.tremor.estimator import ROWS, Estimator, peek, run_estimator, unfiltered
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_response, prefilter_sections
 from firmware_py.tremor.seen import seen_params, undo
+from tests.unit.allocations import allocations
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 from tests.unit.tremor.test_adaptive import tone_acceleration
 
@@ -40,6 +41,22 @@ def test_a_tone_is_predicted_whatever_its_size(method: Method, size: float) -> N
     assert result.frequency_hz[-1, 0] == pytest.approx(10.0, abs=0.02)
     assert result.amplitude_m[-1, 0] == pytest.approx(size, rel=0.2)
     assert result.confidence[-1, 0] > 0.8
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_a_step_allocates_nothing(method: Method) -> None:
+    """A call from Python wraps its arrays: one tick and eight hundred, with a hole in them, ask for the same."""
+    estimator = Estimator(TremorConfig(method=method))
+    samples = np.tile(tone_acceleration(10.0, 50e-6, 2000)[:, None], 3)
+    samples[1500:1520] = np.nan
+    out = np.empty((len(samples), ROWS, 3))
+    run_estimator(samples[:1199], out[:1199], estimator.state, estimator.params)
+    asked = []
+    for part in (slice(1199, 1200), slice(1200, 2000)):
+        before = allocations()
+        run_estimator(samples[part], out[part], estimator.state, estimator.params)
+        asked.append(allocations() - before)
+    assert asked[0] == asked[1]
 
 
 @pytest.mark.parametrize("method", [m for m in METHODS if m != "kalman"])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,7 @@ from firmware_py.tremor.config import TremorConfig
 from tools.errors import InputError
 from tools.tremor.bound import lift, wiener_bounds
 from tools.tremor.cases import case_of, cases_from, emulated_hand
-from tools.tremor.published import published_case
+from tools.tremor.published import band_passed, held, published_case, two_hundred_taps
 from tools.tremor.scores import score
 from tools.tremor.signal import TremorSignal
 
@@ -38,6 +40,40 @@ def test_the_oracle_over_the_bank_is_that_of_plain_taps() -> None:
 def test_others_are_never_trained_on_the_same_subject() -> None:
     case = published_case(2, 5, 8.0)
     assert wiener_bounds([case, case], [0], CONFIG)[0].others == {}
+    # hands of other sets stand in, and only where there is nobody else
+    far, near = published_case(2, 6, 8.0), published_case(2, 7, 8.0)
+    alone = wiener_bounds([case], [0], CONFIG, [far])[0].others[0]
+    np.testing.assert_array_equal(alone, wiener_bounds([case, far], [0], CONFIG)[0].others[0])
+    with_far = wiener_bounds([case, near], [0], CONFIG, [far])[0].others[0]
+    np.testing.assert_array_equal(with_far, wiener_bounds([case, near], [0], CONFIG)[0].others[0])
+
+
+def test_the_oracle_learns_noise_by_heart_and_a_filter_that_has_not_seen_the_second_does_not() -> None:
+    """Samples that know nothing of the tremor: any filter of them can only add to it."""
+    case = published_case(1, 5, 16.0)
+    blind = replace(case, samples=np.random.default_rng(1).standard_normal(case.samples.shape))
+    (bounds,) = wiener_bounds([blind], [8], CONFIG)
+    design = design_adaptive(CONFIG)
+    oracle, unseen = (score(blind, x[8], 8, design).lifted_percent for x in (bounds.oracle, bounds.unseen))
+    assert oracle < 99.0
+    assert unseen > 100.0
+
+
+def test_a_steady_tremor_is_no_secret_to_either() -> None:
+    case = published_case(2, 5, 16.0)
+    (bounds,) = wiener_bounds([case], [8], CONFIG)
+    design = design_adaptive(CONFIG)
+    oracle, unseen = (score(case, x[8], 8, design).lifted_percent for x in (bounds.oracle, bounds.unseen))
+    assert oracle < unseen < 1.3 * oracle
+
+
+def test_published_records_are_like_that_page_s() -> None:
+    """algorithms.md, part A: figures that need no estimator, within a tenth."""
+    alone, mixed = ([published_case(task, s) for s in range(201, 211)] for task in (1, 2))
+    assert [held(alone, h) for h in (1, 8, 20)] == pytest.approx([6.2, 49.0, 115.5], rel=0.1)
+    assert [band_passed(mixed, h) for h in (0, 8, 20)] == pytest.approx([45.9, 78.3, 130.5], rel=0.1)
+    others = [published_case(2, s) for s in range(301, 321)]
+    assert two_hundred_taps(mixed, others, 8) == pytest.approx(21.6, rel=0.1)
 
 
 @pytest.mark.parametrize(

@@ -61,9 +61,10 @@ def test_a_loop_that_does_nothing_leaves_the_whole_and_the_bound_a_part() -> Non
     truth = {"tip_rigid_m": rigid, "tip_m": rigid, "intended_m": hand.slow}
     keep = np.zeros(len(rigid), dtype=np.bool_)
     keep[5000:-1000] = True
-    loop, bound = residuals(truth, keep, noise=True)
+    loop, alone, bound = residuals(truth, keep, noise=True)
     assert 0.03 < bound / loop < 0.25
+    assert bound < alone < 1.2 * bound
     # a loop that leaves half of it all
-    half, same = residuals({**truth, "tip_m": hand.slow + 0.5 * hand.truth}, keep, noise=True)
+    half, _, same = residuals({**truth, "tip_m": hand.slow + 0.5 * hand.truth}, keep, noise=True)
     assert half == pytest.approx(0.5 * loop, rel=1e-6)
     assert same == bound

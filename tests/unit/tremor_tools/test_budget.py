@@ -1,0 +1,42 @@
+"""The budget's benches: one source gone in each, everything else as it was."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from firmware_py.control.config import load_firmware_config
+from hal.bench import load_bench
+from sim_devices.config import EmulationConfig
+from tools.cli.main import app
+from tools.tremor.bench_variant import write_variant
+from tools.tremor.budget import MADE, sources
+
+BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"
+
+
+def test_the_first_row_is_the_bench_as_it_is(tmp_path: Path) -> None:
+    first = next(iter(sources(BENCH).values()))
+    table = tomllib.loads(write_variant(BENCH, first, tmp_path, "same").read_text(encoding="utf-8"))
+    assert table["emulation"] == tomllib.loads(BENCH.read_text(encoding="utf-8"))["emulation"]
+
+
+@pytest.mark.parametrize("source", sorted(MADE))
+def test_a_part_that_is_made_perfect_loses_its_calibration(tmp_path: Path, source: str) -> None:
+    file = write_variant(BENCH, sources(BENCH)[source], tmp_path, "made")
+    table = tomllib.loads(file.read_text(encoding="utf-8"))
+    assert sorted(Path(name).stem for name in table["firmware"]["calibration"]) == sorted(
+        {"sensors", "piezo", "manipulator"} - {MADE[source][0]}
+    )
+    config = EmulationConfig.model_validate(table["emulation"])
+    assert config.sensors.noise_ug_per_rtHz > 0.0  # noise is another row's
+    load_firmware_config(load_bench(file), {})
+
+
+def test_an_endoscope_has_no_budget_of_tremor() -> None:
+    result = CliRunner().invoke(app, ["tremor", "budget", "--bench", str(BENCH.with_name("endoscope.toml"))])
+    assert result.exit_code == 2
+    assert "belongs to the instrument" in result.output
