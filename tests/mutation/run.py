@@ -1,0 +1,117 @@
+"""Does a test fail when a line of what must not be wrong is changed? ``python -m tests.mutation.run [GROUP ...]``.
+
+mutmut changes one expression at a time and runs the tests that reach it. A group is a few files with the tests that
+are about them, and nothing else: each runs in a copy of the tree under ``out/mutation/GROUP``. The table goes to
+standard output, what no test noticed to ``out/mutation/survivors.diff``: read it, and write the test that is missing.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+OUT = ROOT / "out" / "mutation"
+PACKAGES = ("hal", "drivers", "firmware_py", "sim_devices", "tools", "benches", "tests")
+# mutmut's exit codes of the run of one mutant's tests (mutmut.stats); a time limit is a test that noticed
+SURVIVED, UNREACHED = 0, 33
+
+GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
+    "scheduler": (
+        tuple(f"firmware_py/scheduler/{name}.py" for name in ("scheduler", "ticker", "task", "background", "check")),
+        (
+            "tests/virtual_time/test_scheduler.py",
+            "tests/virtual_time/test_tickers.py",
+            "tests/virtual_time/test_background.py",
+        ),
+    ),
+    "safety": (("firmware_py/control/safety.py",), ("tests/unit/control/test_safety.py",)),
+    "guardian": (
+        ("firmware_py/guardian/gate.py", "firmware_py/guardian/guardian.py", "firmware_py/guardian/heart.py"),
+        ("tests/unit/guardian",),
+    ),
+    "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
+    "daq": (("drivers/daq/di4108.py",), ("tests/wire/drivers/test_di4108_wire.py",)),
+    "e727": (("drivers/piezo/gcs.py",), ("tests/wire/drivers/test_e727_wire.py",)),
+    "can": (("drivers/can_frames.py", "drivers/can_telemetry.py"), ("tests/wire/drivers/test_can_drivers_wire.py",)),
+    "motion card": (("drivers/motion_card_protocol.py",), ("tests/wire/drivers/test_motion_card_wire.py",)),
+}
+
+
+def prepare(name: str) -> Path:
+    """A copy of the tree with mutmut's settings for one group."""
+    files, tests = GROUPS[name]
+    folder = OUT / name.replace(" ", "_")
+    shutil.rmtree(folder, ignore_errors=True)
+    for package in PACKAGES:
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    project = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    settings = {
+        "source_paths": ["hal", "drivers", "firmware_py"],
+        "only_mutate": list(files),
+        "also_copy": ["sim_devices", "tools", "benches"],
+        # one order for all mutants; a mutant may leave a thread or a file behind that would be warned of
+        "pytest_add_cli_args": ["-p", "no:randomly", "-p", "no:xdist", "-p", "no:cacheprovider", "-W", "default"],
+        "pytest_add_cli_args_test_selection": list(tests),
+        "use_git_change_detection": False,
+    }
+    lines = "\n".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
+    (folder / "pyproject.toml").write_text(f"{project}\n[tool.mutmut]\n{lines}\n", encoding="utf-8")
+    return folder
+
+
+def mutate(folder: Path, processes: int) -> dict[str, dict[str, int]]:
+    """Exit code of each mutant by file, and ``run.log``. Raises SystemExit where mutmut itself failed."""
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    command = [str(Path(sys.executable).with_name("mutmut")), "run", "--max-children", str(processes)]
+    with (folder / "run.log").open("w") as log:
+        done = subprocess.run(command, cwd=folder, env=environment, stdout=log, stderr=log, check=False)
+    found = {
+        str(meta.relative_to(folder / "mutants").with_suffix("")): json.loads(meta.read_text())["exit_code_by_key"]
+        for meta in sorted((folder / "mutants").rglob("*.py.meta"))
+    }
+    if done.returncode or not found or any(code is None for codes in found.values() for code in codes.values()):
+        raise SystemExit(f"mutmut did not finish; see {folder / 'run.log'}")
+    return found
+
+
+def diff_of(folder: Path, mutant: str) -> str:
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    command = [str(Path(sys.executable).with_name("mutmut")), "show", mutant]
+    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("groups", nargs="*", metavar="GROUP", help=f"of: {', '.join(GROUPS)}; default: all")
+    parser.add_argument("--processes", type=int, default=2)
+    chosen = parser.parse_args()
+    unknown = [name for name in chosen.groups if name not in GROUPS]
+    if unknown:
+        parser.error(f"no group {', '.join(unknown)}; there are: {', '.join(GROUPS)}")
+    OUT.mkdir(parents=True, exist_ok=True)
+    print("| group | file | mutants | noticed | survived | reached by no test |\n|---|---|---|---|---|---|", flush=True)
+    survivors: list[str] = []
+    total: Counter[str] = Counter()
+    for name in chosen.groups or GROUPS:
+        folder = prepare(name)
+        for file, codes in mutate(folder, chosen.processes).items():
+            left = [mutant for mutant, code in codes.items() if code == SURVIVED]
+            unreached = [mutant for mutant, code in codes.items() if code == UNREACHED]
+            noticed = len(codes) - len(left) - len(unreached)
+            total += Counter(mutants=len(codes), noticed=noticed, survived=len(left), unreached=len(unreached))
+            print(f"| {name} | `{file}` | {len(codes)} | {noticed} | {len(left)} | {len(unreached)} |", flush=True)
+            survivors += [diff_of(folder, mutant) for mutant in (*left, *unreached)]
+    print(f"| all | | {total['mutants']} | {total['noticed']} | {total['survived']} | {total['unreached']} |")
+    (OUT / "survivors.diff").write_text("\n".join(survivors), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
