@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from firmware_py.control.safety import RAMP_TICKS, State, Supervisor
+from firmware_py.control.safety import FINISHED, RAMP_TICKS, State, Supervisor, Trip
 from hal.contracts import Float64Array
 from hal.errors import I2cNack, SafetyTrip
 from hal.types import OutputLimit
@@ -79,7 +79,8 @@ def test_first_reason_wins_and_neutral_in_20_ticks():
     assert steps == RAMP_TICKS
     assert supervisor.safe_reached
     assert supervisor.trip_cause is not None
-    assert (supervisor.trip_cause.reason, supervisor.trip_cause.tick) == ("stop button", 7)
+    assert supervisor.trip_cause == Trip("stop button", 7, 7_000_000, normal=False)
+    assert supervisor.ramp_failure == ""
 
 
 def test_no_way_back():
@@ -102,6 +103,64 @@ def test_a_refused_step_is_tried_again_within_its_tick():
 def test_a_dead_bus_ends_in_a_report_not_in_a_loop():
     supervisor = running(FakeAmplifier(failing=10_000))
     supervisor.trip("link lost", tick=1, t_ns=1)
-    assert any(supervisor.step() for _ in range(2 * RAMP_TICKS))
+    assert [supervisor.step() for _ in range(2 * RAMP_TICKS)] == [False] * (2 * RAMP_TICKS - 1) + [True]
     assert not supervisor.safe_reached
     assert "0x0c not acknowledged" in supervisor.ramp_failure
+
+
+def test_an_amplifier_that_never_says_neutral_is_given_up_and_told_of():
+    supervisor = running(FakeAmplifier(ticks=10_000))
+    supervisor.trip("link lost", tick=1, t_ns=1)
+    assert [supervisor.step() for _ in range(2 * RAMP_TICKS)] == [False] * (2 * RAMP_TICKS - 1) + [True]
+    assert supervisor.safe_reached is False
+    assert supervisor.ramp_failure == "the amplifier did not report neutral in time"
+
+
+def test_neutral_after_a_refusal_leaves_no_failure_in_the_report():
+    supervisor = running(FakeAmplifier(ticks=1, failing=2))
+    supervisor.trip("link lost", tick=1, t_ns=1)
+    assert supervisor.step()
+    assert supervisor.ramp_failure == ""
+
+
+def test_no_ramp_before_a_trip_nor_after_neutral():
+    amplifier = FakeAmplifier(ticks=1)
+    supervisor = running(amplifier)
+    assert not supervisor.step()
+    supervisor.trip(FINISHED, tick=1, t_ns=1, normal=True)
+    assert supervisor.step()
+    assert supervisor.step()
+    assert amplifier.ticks == 0
+    assert supervisor.trip_cause == Trip(FINISHED, 1, 1, normal=True)
+
+
+def test_only_the_planned_end_waits_for_scans():
+    asked, planned = running(FakeAmplifier()), running(FakeAmplifier())
+    assert not asked.must_not_wait
+    asked.trip("stop button", tick=1, t_ns=1)
+    planned.trip(FINISHED, tick=1, t_ns=1, normal=True)
+    assert asked.must_not_wait
+    assert not planned.must_not_wait
+
+
+def test_a_run_that_only_looks_cannot_be_armed_any_more():
+    amplifier = FakeAmplifier()
+    supervisor = Supervisor(amplifier)
+    supervisor.begin_sensing()
+    supervisor.begin_self_test()
+    supervisor.arm()
+    assert supervisor.state is State.SENSING_ONLY
+    assert not supervisor.may_move
+    assert not amplifier.armed
+    armed = running(FakeAmplifier())
+    armed.begin_sensing()
+    assert armed.state is State.RUNNING
+
+
+def test_warnings_are_counted_and_end_nothing():
+    supervisor = running(FakeAmplifier())
+    assert supervisor.warnings == {"jerk": 0, "drift": 0}
+    for what in ("jerk", "field", "field"):
+        supervisor.warn(what)
+    assert supervisor.warnings == {"jerk": 1, "drift": 0, "field": 2}
+    assert supervisor.may_move
