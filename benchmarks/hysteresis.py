@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from benchmarks import step_input
 from benchmarks.row import Row, side_by_side
-from firmware_py.actuation.hysteresis import drive, extension
+from firmware_py.actuation.hysteresis import drive, stack_stroke
 from firmware_py.records import Record, attributes
 from hal.compiled import kernel
 
@@ -21,7 +21,7 @@ NUMPY_N = 2000
 @kernel
 def forward_run(volts: Array, out: Array, plays: Array, creep: Array, slopes: Array, stacks: Record) -> None:
     for k in range(len(volts)):
-        out[k] = extension(volts[k], slopes, plays, creep, stacks[0])
+        out[k] = stack_stroke(volts[k], slopes, plays, creep, stacks[0])
 
 
 @kernel
@@ -29,7 +29,7 @@ def inverse_run(wanted: Array, out: Array, plays: Array, creep: Array, slopes: A
     """Inverse and then the forward model, which the inverse needs to remember what the stack has seen."""
     for k in range(len(wanted)):
         out[k] = drive(wanted[k], slopes, plays, creep, stacks[0])
-        extension(out[k], slopes, plays, creep, stacks[0])
+        stack_stroke(out[k], slopes, plays, creep, stacks[0])
 
 
 def numpy_forward(volts: Array, plays: Array, creep: Array, slopes: Array, p: Record) -> Array:

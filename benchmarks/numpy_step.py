@@ -347,7 +347,7 @@ class NumpyStep:
         slope = np.maximum(slope, k.least_slope[:, None])
         # inverse
         share = (1.0 - k.creep_keep) * k.creep_share
-        rest = p.neutral_extension + target + (share * k.creep_reference[:, None] - k.creep_keep * a.creep).sum(axis=1)
+        rest = p.neutral_stroke + target + (share * k.creep_reference[:, None] - k.creep_keep * a.creep).sum(axis=1)
         x = rest / (1.0 + share.sum(axis=1)) - k.offset
         h = self.zones(x, k.d_inverse, k.s_inverse) - k.level
         weights = np.diff(slope, axis=1, prepend=0.0)
@@ -364,8 +364,8 @@ class NumpyStep:
         drive = (command - k.centre_V)[:, None]
         a.plays[:] = np.maximum(drive - k.r, np.minimum(drive + k.r, a.plays))
         level = (weights * a.plays).sum(axis=1) + k.level
-        extension = self.zones(level, k.d, k.s) + k.offset
-        a.creep[:] = k.creep_keep * a.creep + share * (extension - k.creep_reference)[:, None]
+        stroke = self.zones(level, k.d, k.s) + k.offset
+        a.creep[:] = k.creep_keep * a.creep + share * (stroke - k.creep_reference)[:, None]
         a.target[:], a.command_V[:] = target, command
         f[AT["command"]] = command
         f[AT["clip"]] = 2.0 * np.any(inside != wanted) + 4.0 * np.any(command != inside)

@@ -668,7 +668,7 @@ static int actuate(double *f, actuate_state *s, const actuate_params *p)
             slope[n] = w;
         }
         /* inverse */
-        double rest = p->neutral_extension[i] + target, gain = 1.0;
+        double rest = p->neutral_stroke[i] + target, gain = 1.0;
         for (int n = 0; n < CREEP; n++) {
             double share = (1.0 - k->creep_keep[n]) * k->creep_share[n];
             gain += share;
@@ -694,9 +694,9 @@ static int actuate(double *f, actuate_state *s, const actuate_params *p)
             sum += (slope[n] - before) * play[n];
             before = slope[n];
         }
-        double extension = zones(sum + k->level, k->d, k->s) + k->offset;
+        double stroke = zones(sum + k->level, k->d, k->s) + k->offset;
         for (int n = 0; n < CREEP; n++)
-            creep[n] = k->creep_keep[n] * creep[n] + (1.0 - k->creep_keep[n]) * k->creep_share[n] * (extension - k->creep_reference);
+            creep[n] = k->creep_keep[n] * creep[n] + (1.0 - k->creep_keep[n]) * k->creep_share[n] * (stroke - k->creep_reference);
         s->target[i] = target;
         s->command_V[i] = command;
         f[COMMAND + i] = command;

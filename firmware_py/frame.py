@@ -69,7 +69,7 @@ _QUANTITIES: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("tremor_amplitude", "m", XYZ, "amplitude of the estimated tremor"),
     ("confidence", "1", XYZ, "0 not settled .. 1 the estimate explains the signal"),
     ("desired_tip", "m", XYZ, "wanted displacement of the tip, manipulator frame"),
-    ("stroke", "m", ("1", "2", "3"), "wanted actuator extensions from neutral"),
+    ("stroke", "m", ("1", "2", "3"), "wanted actuator strokes from neutral"),
     ("command", "V", ("1", "2", "3"), "amplifier output voltages"),
     ("clip", "bits", (), "Clip"),
     ("status", "bits", (), "FrameStatus"),

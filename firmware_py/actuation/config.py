@@ -104,7 +104,7 @@ class ActuationConfig(BaseModel):
     """Taps on the wanted stroke of each stack, newest first: inverse of its lag and resonance; one list for all or
     three. ``micron calibrate piezo`` writes them."""
     preview_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0
-    """From a demand to the extension that it is for; part of the predictor's horizon ([firmware.tremor]
+    """From a demand to the stroke that it is for; part of the predictor's horizon ([firmware.tremor]
     loop_delay_s), which must reach at least this far."""
 
     @field_validator("lever_gain", mode="before")

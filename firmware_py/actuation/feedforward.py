@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 Answer = Callable[[Array], Complex]
-"""(n,) complex gain from demands that are held for a tick to the extension, at (n,) Hz; 1 at rest."""
+"""(n,) complex gain from demands that are held for a tick to the stroke, at (n,) Hz; 1 at rest."""
 
 
 def design_feedforward(
     answer: Answer, dt: float, preview_s: float, taps: int = 6, band_hz: float = 40.0, penalty: float = 1e-3
 ) -> Array:
-    """(taps,) weights on the wanted extension at ``preview_s`` from now, one tick earlier, ...
+    """(taps,) weights on the wanted stroke at ``preview_s`` from now, one tick earlier, ...
 
     Every frequency up to ``band_hz`` weighs the same. ``penalty`` weighs the taps' own gain beyond: they must not raise
     the noise of what is wanted. The gain at rest is exactly one.

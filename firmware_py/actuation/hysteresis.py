@@ -1,9 +1,9 @@
 """Rate-dependent modified Prandtl-Ishlinskii hysteresis, creep, and the exact inverse (000, 7.2, 7.3; ERRATA 73-79).
 
 Forward: z = x + creep(x), x = w_s . S_d(w_h(v) . H_r[u]): plays H_r of the drive with memory, weighted by slopes
-W_i(v) = W_i + c_i v that depend on the rate v = |dz/dt| of the wanted extension, then one-sided dead zones without
+W_i(v) = W_i + c_i v that depend on the rate v = |dz/dt| of the wanted stroke, then one-sided dead zones without
 memory, then creep. The inverse keeps the forward play states and transforms them anew in every step (ERRATA 78).
-Units: drive V, extension m (slopes m/V), rate m/s; dead-zone thresholds in m.
+Units: drive V, stroke m (slopes m/V), rate m/s; dead-zone thresholds in m.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def operator_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("offset", "f8"),
             ("creep_share", "f8", (n_creep,)),
             ("creep_keep", "f8", (n_creep,)),  # of one tick
-            ("creep_reference", "f8"),  # extension without creep at which it rests, m
+            ("creep_reference", "f8"),  # stroke without creep at which it rests, m
         ]
     )
 
@@ -175,8 +175,8 @@ def dead_zones(y: float, d: Array, s: Array) -> float:
 
 
 @kernel
-def extension(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
-    """Forward model, one tick: extension m at ``drive_V``; moves ``plays`` and ``creep`` (m)."""
+def stack_stroke(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+    """Forward model, one tick: stroke m at ``drive_V``; moves ``plays`` and ``creep`` (m)."""
     y = play(drive_V - stack.centre_V, plays, slopes, stack.r) + stack.level
     x = dead_zones(y, stack.d, stack.s) + stack.offset
     z = x
@@ -188,9 +188,9 @@ def extension(drive_V: float, slopes: Array, plays: Array, creep: Array, stack: 
 
 
 @kernel
-def drive(extension_m: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
-    """Inverse model: drive V with which ``extension`` would give ``extension_m`` in this tick; nothing moves."""
-    rest = extension_m
+def drive(stroke_m: float, slopes: Array, plays: Array, creep: Array, stack: Record) -> float:
+    """Inverse model: drive V with which ``stroke`` would give ``stroke_m`` in this tick; nothing moves."""
+    rest = stroke_m
     gain = 1.0
     for j in range(len(creep)):
         share = (1.0 - stack.creep_keep[j]) * stack.creep_share[j]

@@ -1,11 +1,11 @@
-"""Three-legged manipulator: extensions of the three actuators <-> displacement of the tip (000, ch. 6; ERRATA 58-70).
+"""Three-legged manipulator: strokes of the three actuators <-> displacement of the tip (000, ch. 6; ERRATA 58-70).
 
 Each ball joint stays in the vertical plane of its leg, which makes the star's orientation a rotation about a
 horizontal axis: n_z = -a_x, o_z = -a_y, and moves the star's centre sideways in second order (ERRATA 68):
 x_c = r (a_y^2 - a_x^2) / (2 (1 + a_z)), y_c = r a_x a_y / (1 + a_z). Forward is closed; inverse is Newton's method on
 (a_x, a_y) with the analytic Jacobian. With a = a_x + i a_y the equation is l a - r conj(a)^2 / (2 (1 + a_z)) = d: in
 polar form a sextic (cos 3 phi stays), so no closed form is used.
-Frame: x toward leg 1, z along the shaft; a is the shaft's direction. Ball i is at rest_i + lever_i * extension_i.
+Frame: x toward leg 1, z along the shaft; a is the shaft's direction. Ball i is at rest_i + lever_i * stroke_i.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ def tip_jacobian(strokes: Array, geometry: Record, out: Array) -> None:
 
 @kernel
 def strokes_from_tip(tip: Array, geometry: Record, warm: Array, out: Array) -> int:
-    """Inverse kinematics: ``out`` (3,) = actuator extensions m from neutral for ``tip`` (3,) m, manipulator frame.
+    """Inverse kinematics: ``out`` (3,) = actuator strokes m from neutral for ``tip`` (3,) m, manipulator frame.
 
     ``warm`` (2,): tilt to start from, the solution when it returns. Returns the number of Newton steps (0 to
     ``NEWTON_PASSES``), or -1 with nan in ``out`` and a level ``warm`` when no tilt gives that displacement.

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.hysteresis import (
     drive,
-    extension,
     operator_dtype,
     operator_params,
     plays_at,
     sizes_of,
     slopes_at,
+    stack_stroke,
 )
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip, tip_from_strokes
@@ -66,7 +66,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("slew_step_V", "f8"),
             ("stroke_low", "f8", (3,)),  # m from neutral
             ("stroke_high", "f8", (3,)),
-            ("neutral_extension", "f8", (3,)),  # m
+            ("neutral_stroke", "f8", (3,)),  # m
             ("taps", "f8", (3, TAPS)),
             ("stacks", operator_dtype(n_plays, n_zones, n_creep), (3,)),
         ]
@@ -80,7 +80,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
             ("tilt", "f8", (2,)),  # of the shaft, where the next inverse kinematics starts
             ("yielding", YIELD_STATE),
             ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
-            ("target", "f8", (3,)),  # extension from neutral that was asked of the stack, m
+            ("target", "f8", (3,)),  # stroke from neutral that was asked of the stack, m
             ("command_V", "f8", (3,)),
             ("plays", "f8", (3, n_plays)),
             ("creep", "f8", (3, n_creep)),
@@ -131,9 +131,9 @@ def actuate_params(config: ActuationConfig) -> Record:
         slopes_at(0.0, at, slopes)
         plays, creep = plays_at(at, config.neutral_V, config.high_V), np.zeros(sizes[2])
         volts = (config.neutral_V, config.high_V, config.low_V)
-        rest, high, low = (extension(v, slopes, plays, creep, at) for v in volts)
+        rest, high, low = (stack_stroke(v, slopes, plays, creep, at) for v in volts)
         # what is reached whatever came before: the top erases all memory, the bottom is worst right after the top
-        param.neutral_extension[i] = rest
+        param.neutral_stroke[i] = rest
         param.stroke_high[i] = high - rest
         param.stroke_low[i] = low - rest
         record["creep_reference"] = rest
@@ -154,7 +154,7 @@ def actuate_state(config: ActuationConfig, params: Record) -> Record:
 def command_stack(
     target: float, plays: Array, creep: Array, slopes: Array, last_target: float, last_V: float, i: int, param: Record
 ) -> tuple[float, int]:
-    """Drive V of stack ``i`` for the extension ``target`` (m from neutral), limited, and the Clip bits that took.
+    """Drive V of stack ``i`` for the stroke ``target`` (m from neutral), limited, and the Clip bits that took.
 
     Moves ``plays`` and ``creep`` by what is commanded, so that after a limit the model still knows the stack.
     """
@@ -162,14 +162,14 @@ def command_stack(
     clip = 0
     if slopes_at(abs(target - last_target) * param.tick_hz, stack, slopes):
         clip |= CLIP_SINGULAR
-    wanted = drive(param.neutral_extension[i] + target, slopes, plays, creep, stack)
+    wanted = drive(param.neutral_stroke[i] + target, slopes, plays, creep, stack)
     inside_V = limit_voltage(wanted, param.low_V, param.high_V)
     if inside_V != wanted:
         clip |= CLIP_VOLTAGE
     command = limit_slew(inside_V, last_V, param.slew_step_V)
     if command != inside_V:
         clip |= CLIP_SLEW
-    extension(command, slopes, plays, creep, stack)
+    stack_stroke(command, slopes, plays, creep, stack)
     return command, clip
 
 

@@ -12,7 +12,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.actuation.hysteresis import extension, slopes_at
+from firmware_py.actuation.hysteresis import slopes_at, stack_stroke
 from firmware_py.frame import CLIP, COMMAND, DESIRED_TIP, STROKE
 from firmware_py.records import Record
 from hal.compiled import kernel
@@ -81,7 +81,7 @@ def follow_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
         plays = state.plays[i]
         command = frame[COMMAND + i]
         slopes_at(0.0, stack, state.slopes)
-        stroke = extension(command, state.slopes, plays, state.creep[i], stack) - param.neutral_extension[i]
+        stroke = stack_stroke(command, state.slopes, plays, state.creep[i], stack) - param.neutral_stroke[i]
         frame[STROKE + i] = stroke
         state.strokes[i, :] = stroke
         state.target[i] = stroke

@@ -73,7 +73,7 @@ class EndoscopeControl:
         if status not in (INACTIVE, MOVE, ZOOM):
             raise ValueError(f"card status {status} is not 0, 1 or 2")
         if not (math.isfinite(psi_deg) and math.isfinite(theta_deg) and dt_s >= 0.0):
-            raise ValueError(f"angles {psi_deg}, {theta_deg} deg and time step {dt_s} s must be numbers, dt >= 0")
+            raise ValueError(f"angles {psi_deg}, {theta_deg} deg and step {dt_s} s must be numbers, dt >= 0")
         if status != self._status:
             self._begin(psi_deg, theta_deg, status)
         if status == INACTIVE:

@@ -51,14 +51,14 @@ class LabError(BenchError):
 
 
 @kernel
-def drive_stack(params, state, volts, temperature_C, steps_per_sample, extension, terminal_V):
-    """One stack under held demands ``volts`` (n,): ``extension`` (n,) m and ``terminal_V`` (n,) at each sample's time.
+def drive_stack(params, state, volts, temperature_C, steps_per_sample, stroke, terminal_V):
+    """One stack under held demands ``volts`` (n,): ``stroke`` (n,) m and ``terminal_V`` (n,) at each sample's time.
 
     Sample i is taken when its demand is given, so the answer to demand i shows from sample i + 1 on.
     """
     p, s = params[0], state[0]
     for i in range(volts.shape[0]):
-        extension[i] = s["mode"][0]
+        stroke[i] = s["mode"][0]
         terminal_V[i] = s["stack_V"]
         for _ in range(steps_per_sample):
             drive_step(p, s, volts[i], temperature_C)
@@ -136,17 +136,17 @@ def measure_piezo(
     if twin is not None:
         if twin.kind != "piezo_stack":
             raise LabError(f"{twin.path}: a twin of kind {twin.kind}; the interferometer measures a piezo_stack")
-        extension = 1e-6 * twin.run(1.0 / read_hz, {"command": volts, "temperature": room_C})["displacement"]
+        stroke = 1e-6 * twin.run(1.0 / read_hz, {"command": volts, "temperature": room_C})["displacement"]
     else:
         unit = stack_unit(config.stack, config.unit, axis)
         params, state = drive_channel(unit, config.amplifier, STEP_S, temperature_C)
-        extension, terminal_V = np.empty(len(volts)), np.empty(len(volts))
-        drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), extension, terminal_V)
+        stroke, terminal_V = np.empty(len(volts)), np.empty(len(volts))
+        drive_stack(params, state, volts, temperature_C, round(1.0 / (read_hz * STEP_S)), stroke, terminal_V)
     hiss = stream(config.seed, f"lab.piezo.{axis}.{profile}.{rate_hz:g}").standard_normal(len(volts))
     noise = INTERFEROMETER_RMS_UM * hiss
     columns = {
         "command_V": volts,
-        "displacement_um": extension * 1e6 + noise,
+        "displacement_um": stroke * 1e6 + noise,
         "temperature_C": room_C,
     }
     descriptor = f"""format = 1

@@ -1,6 +1,6 @@
 """The lab's scan of the manipulator: the tip under an optical tracker, the stacks under interferometers.
 
-Every stack goes through a grid of voltages; at each point the tip is averaged in the body's frame and the extension of
+Every stack goes through a grid of voltages; at each point the tip is averaged in the body's frame and the stroke of
 each stack is averaged too, so that hysteresis and geometry come apart.
 """
 
@@ -37,32 +37,32 @@ def scan_grid(per_axis: int) -> Array:
 
 
 def measure_scan(config: EmulationConfig, per_axis: int, rng: np.random.Generator) -> tuple[dict[str, Array], str]:
-    """Columns of the scan and its descriptor. Extensions and tip are counted from rest at neutral."""
+    """Columns of the scan and its descriptor. Strokes and tip are counted from rest at neutral."""
     unit = build_unit(config, config.unit)
     temperature_C = start_temperature_C(config)
     channels = [drive_channel(stack, config.amplifier, STEP_S, temperature_C) for stack in unit.stacks]
     m = unit.manipulator
     grid = scan_grid(per_axis)
-    extension, tip = np.empty((len(grid), 3)), np.empty((len(grid), 3))
+    stroke, tip = np.empty((len(grid), 3)), np.empty((len(grid), 3))
     z, rest, at = np.empty(3), np.empty(3), np.empty(3)
     tip_displacement(m.rest_m, m.circle_m, m.shaft_m, rest)
     for k, volts in enumerate(grid):
         for i, (params, state) in enumerate(channels):
             for _ in range(round(SETTLE_S / STEP_S)):
                 drive_step(params[0], state[0], volts[i], temperature_C)
-            extension[k, i] = state[0]["mode"][0] - params[0]["reference_m"]
-            z[i] = m.rest_m[i] + m.lever[i] * extension[k, i]
+            stroke[k, i] = state[0]["mode"][0] - params[0]["reference_m"]
+            z[i] = m.rest_m[i] + m.lever[i] * stroke[k, i]
         tip_displacement(z, m.circle_m, m.shaft_m, at)
         tip[k] = m.mount @ (at - rest)
     noise = rng.standard_normal((2, len(grid), 3)) / np.sqrt(SAMPLES)
     columns = {
         "command_V": grid,
-        "extension_um": extension * 1e6 + INTERFEROMETER_RMS_UM * noise[0],
+        "stroke_um": stroke * 1e6 + INTERFEROMETER_RMS_UM * noise[0],
         "tip_um": tip * 1e6 + TRACKER_RMS_UM * noise[1],
     }
     descriptor = f"""format = 1
 title = "manipulator of unit {config.unit}: {len(grid)} positions, mean of {SAMPLES} samples each"
 data = "data.npz"
-# command_V (n, 3); extension_um (n, 3) of each stack and tip_um (n, 3) in the body frame, from rest at neutral
+# command_V (n, 3); stroke_um (n, 3) of each stack and tip_um (n, 3) in the body frame, from rest at neutral
 """
     return columns, descriptor

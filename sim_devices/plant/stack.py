@@ -67,7 +67,7 @@ DRIVE_STATE = np.dtype(
         ("slip_V", "f8", (SLIPS,)),
         ("creep_m", "f8", (CREEPS,)),
         ("drive_m", "f8"),
-        ("mode", "f8", (2,)),  # extension m, its rate m/s
+        ("mode", "f8", (2,)),  # stroke m, its rate m/s
     ]
 )
 
@@ -136,7 +136,7 @@ def effective_drive(p, s, change_V, stack_V):
 
 @kernel
 def drive_step(p, s, demand_V, temperature_C):
-    """One step of amplifier and stack at a demand held over the step; the extension is ``s["mode"][0]``, m."""
+    """One step of amplifier and stack at a demand held over the step; the stroke is ``s["mode"][0]``, m."""
     target = min(max(demand_V, p["low_V"]), p["high_V"])
     move = (target - s["amplifier_V"]) * p["lag"]
     slew = p["slew_step_V"]

@@ -17,7 +17,7 @@ from tests.conftest import DEFAULT_BENCH
 
 
 @dataclass
-class Rig:
+class Stand:
     """An opened bench with its probed devices."""
 
     file: BenchFile
@@ -37,7 +37,7 @@ def virtual(request: pytest.FixtureRequest) -> bool:
 
 
 @pytest.fixture
-def rig(request: pytest.FixtureRequest, bench_file: BenchFile, virtual: bool, tmp_path: Path) -> Iterator[Rig]:
+def stand(request: pytest.FixtureRequest, bench_file: BenchFile, virtual: bool, tmp_path: Path) -> Iterator[Stand]:
     """The bench, opened and probed afresh for each test, and left in its safe state."""
     marker = request.node.get_closest_marker("needs")
     for name in marker.args if marker is not None else ():
@@ -46,7 +46,7 @@ def rig(request: pytest.FixtureRequest, bench_file: BenchFile, virtual: bool, tm
     with open_bench(bench_file, virtual=virtual, runtime_dir=tmp_path) as bench:
         devices = open_devices(bench)
         try:
-            yield Rig(bench_file, bench, devices)
+            yield Stand(bench_file, bench, devices)
         finally:
             devices.daq.stop()
             devices.amplifier.close()

@@ -7,14 +7,14 @@ import pytest
 
 from firmware_py.control.wiring import ACCELEROMETERS
 from hal.types import Status
-from tests.hil.conftest import Rig
+from tests.hil.conftest import Stand
 
 G = 9.81
 
 
-def scan(rig: Rig, n: int) -> tuple[np.ndarray, np.ndarray]:
+def scan(stand: Stand, n: int) -> tuple[np.ndarray, np.ndarray]:
     """``n`` scans in volts (n, 8) and their times in ns."""
-    daq, info = rig.devices.daq, rig.devices.scan
+    daq, info = stand.devices.daq, stand.devices.scan
     buffer = np.zeros((256, len(info.channels)), dtype=np.int16)
     rows, times = [], []
     daq.start()
@@ -30,17 +30,17 @@ def scan(rig: Rig, n: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.effect(1)
-def test_scans_come_at_their_rate_and_in_order(rig: Rig):
-    _, times_ns = scan(rig, 1000)
+def test_scans_come_at_their_rate_and_in_order(stand: Stand):
+    _, times_ns = scan(stand, 1000)
     steps = np.diff(times_ns)
     assert np.all(steps > 0)
     assert (times_ns[-1] - times_ns[0]) / 999 == pytest.approx(1e6, rel=0.02)
 
 
 @pytest.mark.effect(1)
-def test_at_rest_in_a_hand_the_readings_are_near_gravity(rig: Rig):
+def test_at_rest_in_a_hand_the_readings_are_near_gravity(stand: Stand):
     """Six axes give each body axis twice: the vector of their means has the size of g within 5 % (uncalibrated)."""
-    volts, _ = scan(rig, 500)
+    volts, _ = scan(stand, 500)
     readings = (volts[:, :6].mean(axis=0) - 2.5) * G
     by_axis = {a: [readings[i] for i, (_, axis) in enumerate(ACCELEROMETERS) if axis == a] for a in "xyz"}
     size = np.linalg.norm([np.mean(values) for values in by_axis.values()])
@@ -48,15 +48,15 @@ def test_at_rest_in_a_hand_the_readings_are_near_gravity(rig: Rig):
 
 
 @pytest.mark.effect(1)
-def test_supply_and_temperature_are_plausible(rig: Rig):
-    volts, _ = scan(rig, 100)
+def test_supply_and_temperature_are_plausible(stand: Stand):
+    volts, _ = scan(stand, 100)
     assert 4.75 <= 2 * volts[:, 6].mean() <= 5.25
     assert 10.0 <= (volts[:, 7].mean() - 0.5) / 0.010 <= 45.0
 
 
 @pytest.mark.effect(1)
-def test_every_axis_makes_noise_and_none_is_stuck(rig: Rig):
-    volts, _ = scan(rig, 500)
+def test_every_axis_makes_noise_and_none_is_stuck(stand: Stand):
+    volts, _ = scan(stand, 500)
     noise_V = np.diff(volts[:, :6], axis=0).std(axis=0)
     assert np.all(noise_V > 1e-5)
     assert np.all(noise_V < 20e-3)
@@ -64,10 +64,10 @@ def test_every_axis_makes_noise_and_none_is_stuck(rig: Rig):
 
 @pytest.mark.effect(1)
 @pytest.mark.needs("mag")
-def test_the_magnetic_field_is_the_earths(rig: Rig):
-    magnetometer = rig.devices.magnetometer
+def test_the_magnetic_field_is_the_earths(stand: Stand):
+    magnetometer = stand.devices.magnetometer
     assert magnetometer is not None
-    clock = rig.bench.clock
+    clock = stand.bench.clock
     limit_ns = clock.now_ns() + 1_000_000_000
     while not magnetometer.poll():
         assert clock.now_ns() < limit_ns, "no reading within 1 s"

@@ -1,4 +1,4 @@
-"""Geometry of the manipulator from a scan: extensions of the stacks beside the tip's position (000, ch. 6).
+"""Geometry of the manipulator from a scan: strokes of the stacks beside the tip's position (000, ch. 6).
 
 Found together: circle of the balls, shaft, three levers, how the star leans at neutral, and the rotation from the
 body's frame to the manipulator's. What fixes each: levers the motion along the shaft, shaft length the drop of a
@@ -45,7 +45,7 @@ class ManipulatorFit:
 
 
 def load_scan(folder: Path) -> dict[str, Array]:
-    """``extension_um`` and ``tip_um``, both (n, 3), of a scan recording. ``InputError`` says what is wrong."""
+    """``stroke_um`` and ``tip_um``, both (n, 3), of a scan recording. ``InputError`` says what is wrong."""
     path = folder / "data.npz" if folder.is_dir() else folder
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -54,24 +54,24 @@ def load_scan(folder: Path) -> dict[str, Array]:
         raise InputError(
             f"{path}: cannot be read as .npz ({error}); record one with the lab's 'manipulator'"
         ) from error
-    for name in ("extension_um", "tip_um"):
+    for name in ("stroke_um", "tip_um"):
         if name not in data or data[name].ndim != 2 or data[name].shape[1] != 3:
             raise InputError(f"{path}: array '{name}' (n, 3) is missing or has another shape")
         if not np.all(np.isfinite(data[name])):
             row = int(np.argwhere(~np.isfinite(data[name]))[0][0])
             raise InputError(f"{path}: '{name}' is not finite at position {row}")
-    if len(data["tip_um"]) != len(data["extension_um"]):
-        raise InputError(f"{path}: {len(data['extension_um'])} extensions but {len(data['tip_um'])} tip positions")
+    if len(data["tip_um"]) != len(data["stroke_um"]):
+        raise InputError(f"{path}: {len(data['stroke_um'])} strokes but {len(data['tip_um'])} tip positions")
     return data
 
 
-def tip_um(p: Array, extension_um: Array) -> Array:
+def tip_um(p: Array, stroke_um: Array) -> Array:
     """(n, 3) tip in the body frame, um, for parameters ``p`` (10,) in the order of ``NAMES``."""
     circle_m, shaft_m = p[0] * 1e-3, p[1] * 1e-3
     rest = rest_heights(circle_m, p[5] * 1e-3, p[6] * 1e-3)
-    at, zero = np.empty((len(extension_um), 3)), np.empty(3)
+    at, zero = np.empty((len(stroke_um), 3)), np.empty(3)
     star_tip(rest, circle_m, shaft_m, zero)
-    for k, heights in enumerate(rest + p[2:5] * extension_um * 1e-6):
+    for k, heights in enumerate(rest + p[2:5] * stroke_um * 1e-6):
         star_tip(heights, circle_m, shaft_m, at[k])
     turn: Array = np.asarray(Rotation.from_rotvec(np.radians(p[7:])).as_matrix())
     return 1e6 * (at - zero) @ turn.T
@@ -86,14 +86,14 @@ def rest_heights(circle_m: float, ax: float, ay: float) -> Array:
 def identify_manipulator(data: dict[str, Array], start: ActuationConfig | None = None) -> ManipulatorFit:
     """Fit all ten parameters. Raises ``InputError`` when the scan cannot fix them."""
     config = start or ActuationConfig()
-    extension, tip = data["extension_um"], data["tip_um"]
+    stroke, tip = data["stroke_um"], data["tip_um"]
     if len(tip) < LEAST_POSITIONS:
         raise InputError(f"{len(tip)} positions: at least {LEAST_POSITIONS} are needed, a grid of 3 x 3 x 3 is better")
     p0 = np.array([1e3 * config.ball_circle_m, 1e3 * config.shaft_m, *config.lever_gain, 0.0, 0.0, 0.0, 0.0, 0.0])
 
     def residuals(p: Array) -> Array:
         # a common zero of the tracker is no geometry
-        e = tip - tip_um(p, extension)
+        e = tip - tip_um(p, stroke)
         return (e - e.mean(axis=0)).ravel()
 
     scale = np.array([1.0, 10.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5])

@@ -141,7 +141,7 @@ def _lag(pieces: list[Piece], shape: Shape, centre_V: float) -> tuple[list[Piece
 
 
 def _levels(drive: Array, shape: Shape, axes: Axes, solution: Solution) -> Array:
-    """Extension um of the rate-independent model, held drive, zones left out: good enough for rates and dynamics."""
+    """Strokes um of the rate-independent model, held drive, zones left out: good enough for rates and dynamics."""
     steps = np.diff(solution.rest, prepend=0.0)
     return play_states(drive, axes.r, axes.centre_V) @ steps
 

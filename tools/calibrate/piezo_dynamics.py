@@ -1,7 +1,7 @@
 """The linear part behind the hysteresis: dead time, amplifier lag and resonance of one stack.
 
 A demand that is held for a tick moves the stack by a step through amplifier (first order) and mechanism (second
-order); what is read at the sampling instants is the extension's levels filtered with that step response. Recordings
+order); what is read at the sampling instants is the stroke's levels filtered with that step response. Recordings
 that do not say that their drive was held only give a delay.
 """
 
@@ -27,7 +27,7 @@ LONG = 2048
 
 @dataclass(frozen=True)
 class Dynamics:
-    """Dead time, first-order lag, resonance (0: none found) and its damping; ``slow_share`` of the extension follows
+    """Dead time, first-order lag, resonance (0: none found) and its damping; ``slow_share`` of the stroke follows
     with ``slow_s`` more (domain walls do not jump with the field)."""
 
     delay_s: float = 0.0
@@ -57,7 +57,7 @@ class Dynamics:
         return fast * (1.0 - self.slow_share + self.slow_share / (1.0 + s * self.slow_s))
 
     def held_gain(self, hz: Array, tick_s: float) -> Complex:
-        """(n,) complex gain from demands held for ``tick_s`` to the extension: what moves the tip."""
+        """(n,) complex gain from demands held for ``tick_s`` to the stroke: what moves the tip."""
         x = hz * tick_s
         return self.gain(hz) * np.sinc(x) * np.exp(-1j * np.pi * x)
 
@@ -105,7 +105,7 @@ def _step_through(poles: list[complex], t: Array) -> Array:
 
 
 def fit_dynamics(levels: Sequence[Array], measured: Sequence[Array], dt: float, rows: Sequence[slice]) -> Dynamics:
-    """Amplifier lag and resonance from the model's held extension ``levels`` and what was ``measured``, um."""
+    """Amplifier lag and resonance from the model's held stroke ``levels`` and what was ``measured``, um."""
 
     def misfit(p: Array) -> float:
         dynamics = _from_logs(p)

@@ -26,7 +26,7 @@ MORE_S = (0.0, 0.5e-3, 1.0e-3)
 
 @dataclass(frozen=True)
 class Feedforward:
-    """``taps`` of each stack, newest first; ``preview_s`` from the demand to the extension that it is for. ``left`` and
+    """``taps`` of each stack, newest first; ``preview_s`` from the demand to the stroke that it is for. ``left`` and
     ``without``: largest error at 1 to 40 Hz, share of the amplitude, with the taps and with the preview alone;
     ``peak``: largest gain of the taps at any frequency."""
 

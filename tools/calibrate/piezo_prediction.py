@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.actuation.config import StackConfig
-from firmware_py.actuation.hysteresis import drive, extension, operator_params, plays_at, slopes_at
+from firmware_py.actuation.hysteresis import drive, operator_params, plays_at, slopes_at, stack_stroke
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.records import Record, attributes
 from hal.compiled import kernel
@@ -36,7 +36,7 @@ def forward_kernel(volts: Array, rate: Array, plays: Array, creep: Array, stack:
     slopes = np.empty(len(plays))
     for k in range(len(volts)):
         slopes_at(rate[k], stack, slopes)
-        out[k] = extension(volts[k], slopes, plays, creep, stack)
+        out[k] = stack_stroke(volts[k], slopes, plays, creep, stack)
 
 
 @kernel
@@ -55,20 +55,20 @@ def inverse_kernel(
         voltage += inside_V != u
         out[k] = limit_slew(inside_V, before_V, limits[2])
         slew += out[k] != inside_V
-        extension(out[k], slopes, plays, creep, stack)
+        stack_stroke(out[k], slopes, plays, creep, stack)
         before_V, before = out[k], wanted[k]
     return singular, voltage, slew
 
 
-def rest_extension(stack: StackConfig, drive_V: float, tick_hz: float, high_V: float) -> tuple[Record, Array, float]:
-    """The stack's numbers with creep counted from rest at ``drive_V``, its play states and extension m there."""
+def rest_stroke(stack: StackConfig, drive_V: float, tick_hz: float, high_V: float) -> tuple[Record, Array, float]:
+    """The stack's numbers with creep counted from rest at ``drive_V``, its play states and stroke m there."""
     params = operator_params(stack, tick_hz)
     at = attributes(params)[0]
     plays, slopes, none = plays_at(at, drive_V, high_V), np.empty(len(at.r)), np.zeros(len(at.creep_share))
     slopes_at(0.0, params[0], slopes)
     still = params.copy()
     still["creep_share"] = 0.0
-    rest = extension(drive_V, slopes, plays.copy(), none, still[0])
+    rest = stack_stroke(drive_V, slopes, plays.copy(), none, still[0])
     params["creep_reference"] = rest
     return params, plays, rest
 
@@ -81,7 +81,7 @@ def simulate(stack: StackConfig, drive_V: Array, tick_hz: float = 1000.0, high_V
     rate = np.zeros(len(drive_V))
     out = np.empty(len(drive_V))
     for _ in range(2 if stack.slope_per_rate_s_per_V else 1):
-        params, plays, _ = rest_extension(stack, float(drive_V[0]), tick_hz, high_V)
+        params, plays, _ = rest_stroke(stack, float(drive_V[0]), tick_hz, high_V)
         creep = np.zeros(len(params["creep_share"][0]))
         forward_kernel(drive_V, rate, plays, creep, params[0], out)
         rate = np.abs(np.diff(out, prepend=out[0])) * tick_hz
@@ -98,7 +98,7 @@ def command(
     slew_V_per_s: float = 20_000.0,
 ) -> Commanded:
     """Drive for displacements ``wanted_um`` (n,) from rest at ``neutral_V``, limited as the firmware limits it."""
-    params, plays, rest = rest_extension(stack, neutral_V, tick_hz, high_V)
+    params, plays, rest = rest_stroke(stack, neutral_V, tick_hz, high_V)
     creep = np.zeros(len(params["creep_share"][0]))
     out = np.empty(len(wanted_um))
     limits = np.array([low_V, high_V, slew_V_per_s / tick_hz, neutral_V])

@@ -3,7 +3,7 @@
 z = z0 + S(W . H[u]) + creep is not linear in its parameters, but S^-1(z - z0 - creep) = W . H is (Kuhnen): dead-zone
 slopes of the inverse, slopes W_i at rest and at the highest rate, and creep shares are found together. The unknowns
 are the slopes themselves (partial sums of the weights), so a lower bound on each keeps the inverse valid between the
-two rates (ERRATA 74). Creep follows the extension, which is corrected by the last solution: three passes.
+two rates (ERRATA 74). Creep follows the stroke, which is corrected by the last solution: three passes.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Shape:
 class Piece:
     """One recording ready to be fitted: drive V as the stack sees it, displacement um, its rate um/s, usable rows.
 
-    ``response``: how the displacement follows a held extension, weights of this and earlier samples.
+    ``response``: how the displacement follows a held stroke, weights of this and earlier samples.
     """
 
     drive: Array
@@ -148,7 +148,7 @@ def local_slope(x: Array, axes: Axes, zones: Array) -> Array:
 
 
 def triangle(piece: Piece, x: Array, shape: Shape, axes: Axes, zones: Array) -> Array:
-    """The piece's equations as a triangle; its zero is eliminated, every piece weighs the same. ``x``: (n,) extension
+    """The piece's equations as a triangle; its zero is eliminated, every piece weighs the same. ``x``: (n,) stroke
     without creep, um. ``zones``: slopes T_j so far; rows are divided by them, so that an error counts in um of
     displacement: unweighted, a fit would flatten S^-1 to make its errors small."""
     both = np.column_stack([_columns(piece, x, shape, axes), _target(piece, x, axes)])
@@ -175,7 +175,7 @@ def solve(triangles: Sequence[Array], shape: Shape, axes: Axes) -> Solution:
 
 
 def without_creep(piece: Piece, shape: Shape, solution: Solution) -> Array:
-    """Extension of the piece less what creep adds, um: two passes, creep is a few percent."""
+    """Strokes of the piece less what creep adds, um: two passes, creep is a few percent."""
     x = piece.z
     for _ in range(2):
         creep = np.zeros(len(x))

@@ -129,7 +129,7 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforw
     row("  largest (um, % of p-p)", *(f"{p.max_um:.3f}, {100 * p.max_um / p.wanted_um:.2f}" for p in predictions))
     data_console().print(table)
     data_console().print(
-        f"preview: {1e3 * inverse.preview_s:.2f} ms from demand to extension (error by lag: with it alone -> with the "
+        f"preview: {1e3 * inverse.preview_s:.2f} ms from demand to stroke (error by lag: with it alone -> with the "
         "taps). The tremor stage's loop_delay_s is this and the time from sample to command.",
         soft_wrap=True,
     )

@@ -229,7 +229,7 @@ def _status_table(status: dict[str, Any], seconds: float) -> Table:
     table.add_row("tremor frequency (Hz)", *(f"{v:.2f}" for v in status["frequency_hz"]))
     table.add_row("command (V)", *(f"{v:.1f}" for v in status["command_V"]))
     table.add_row("sample to command p50, p99 (us)", *(f"{v:.0f}" for v in status["latency_us"]), "")
-    table.add_row("samples lost, ticks skipped", str(status["lost"]), str(status["skipped"]), "")
+    table.add_row("scans lost, ticks skipped", str(status["lost"]), str(status["skipped"]), "")
     if "fallbacks" in status:
         table.add_row("numeric kinematics fell back (ticks)", str(status["fallbacks"]), "", "")
     return table

@@ -78,7 +78,7 @@ def task_table(result: Mapping[str, Any]) -> Table:
 
 
 def summary_lines(result: Mapping[str, Any]) -> list[str]:
-    """What is not a table: latency, samples, voluntary motion, safe state, recording."""
+    """What is not a table: latency, scans, voluntary motion, safe state, recording."""
     latency = result["latency"]["sample_to_command_us"]
     samples, safe, voluntary = result["samples"], result["safe_state"], result["voluntary"]
     lines = [
@@ -87,7 +87,7 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
             f"{name} {_number(latency[key], '{:.0f}')} us"
             for name, key in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p99_9"), ("max", "max"))
         ),
-        f"samples: {samples['received']} of {samples['expected']} received, {samples['lost']} lost; "
+        f"scans: {samples['received']} of {samples['expected']} received, {samples['lost']} lost; "
         f"{result['ticks']['skipped']} ticks skipped, {result['ticks']['caught_up']} caught up without a command of "
         f"their own, {result['commands']['clipped']} commands clipped",
     ]

@@ -173,12 +173,12 @@ def lab() -> tuple[EmulationConfig, tuple[Stand, ...]]:
 
 
 def run(config: EmulationConfig, axis: int, volts: Array) -> Array:
-    """Extension um of a stack that was at rest at neutral, without noise."""
+    """Strokes um of a stack that was at rest at neutral, without noise."""
     unit = stack_unit(config.stack, config.unit, axis)
     params, state = drive_channel(unit, config.amplifier, STEP_S, TEMPERATURE_C)
-    extension, terminal = np.empty(len(volts)), np.empty(len(volts))
-    drive_stack(params, state, volts, TEMPERATURE_C, STEPS_PER_MS, extension, terminal)
-    return extension * 1e6
+    stroke, terminal = np.empty(len(volts)), np.empty(len(volts))
+    drive_stack(params, state, volts, TEMPERATURE_C, STEPS_PER_MS, stroke, terminal)
+    return stroke * 1e6
 
 
 def with_approach(path_um: Array, first_um: float) -> Array:

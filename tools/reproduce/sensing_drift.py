@@ -13,7 +13,7 @@ DT_S = 1e-3
 def growth_order(seconds: float, integrations: int, through_gravity: bool) -> float:
     """Slope of log position error over log time for a constant error of 1 mg or of 1e-4 in rate or alpha.
 
-    The error goes through ``integrations`` time steps of the ordinary strapdown sums; ``through_gravity`` turns an
+    The error goes through ``integrations`` steps of the ordinary strapdown sums; ``through_gravity`` turns an
     attitude error into an acceleration error first.
     """
     n = round(seconds / DT_S)

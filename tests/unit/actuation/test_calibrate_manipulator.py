@@ -24,10 +24,10 @@ TURN = np.array([0.3, -0.2, 0.6])  # deg
 
 def scan(levels: tuple[float, ...] = (-6.0, 0.0, 6.0)) -> dict[str, np.ndarray]:
     """Tip by solving the mechanism's constraints, turned into the body frame."""
-    extension = np.array(list(itertools.product(levels, repeat=3)))
-    tip = np.array([tip_from_strokes(e * 1e-6, BUILT) for e in extension])
+    stroke = np.array(list(itertools.product(levels, repeat=3)))
+    tip = np.array([tip_from_strokes(e * 1e-6, BUILT) for e in stroke])
     turn = Rotation.from_rotvec(TURN, degrees=True)
-    return {"extension_um": extension, "tip_um": 1e6 * turn.apply(tip)}
+    return {"stroke_um": stroke, "tip_um": 1e6 * turn.apply(tip)}
 
 
 def test_the_geometry_comes_back() -> None:
@@ -61,9 +61,9 @@ def test_poor_scans_are_named(tmp_path: Path) -> None:
         identify_manipulator(few)
     line = np.linspace(-6, 6, 20)[:, None] * np.ones(3)
     with pytest.raises(InputError, match="does not fix"):
-        identify_manipulator({"extension_um": line, "tip_um": line * [0.0, 0.0, 8.0]})
+        identify_manipulator({"stroke_um": line, "tip_um": line * [0.0, 0.0, 8.0]})
     np.savez(tmp_path / "data.npz", tip_um=np.zeros((5, 3)))
-    with pytest.raises(InputError, match="extension_um"):
+    with pytest.raises(InputError, match="stroke_um"):
         load_scan(tmp_path)
 
 

@@ -26,7 +26,7 @@ STACK = Dynamics(lag_s=0.1e-3, resonance_hz=650.0, damping=0.04)
 
 
 def follow(dynamics: Dynamics, demand: np.ndarray, dt: float) -> np.ndarray:
-    """Extension at the beginning of each ``dt`` for demands held over it: amplifier and mechanism as a state space."""
+    """Strokes at the beginning of each ``dt`` for demands held over it: amplifier and mechanism as a state space."""
     w, z, p = 2 * np.pi * dynamics.resonance_hz, dynamics.damping, 1 / dynamics.lag_s
     system = StateSpace([[-p, 0, 0], [0, 0, 1], [w * w, -w * w, -2 * z * w]], [[p], [0], [0]], [[0, 1, 0]], [[0]])
     a, b, _, _, _ = cont2discrete((system.A, system.B, system.C, system.D), dt)

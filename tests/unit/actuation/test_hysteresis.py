@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from firmware_py.actuation.config import ActuationConfig, StackConfig
 from firmware_py.actuation.hysteresis import (
     drive,
-    extension,
     inverse_weights,
     operator_params,
     plays_at,
     slopes_at,
+    stack_stroke,
 )
 from firmware_py.records import Record, attributes
 from hal.errors import BenchError
@@ -46,7 +46,7 @@ class Stack:
 
     def forward(self, volts: float, rate: float = 0.0) -> float:
         slopes_at(rate, self.params[0], self.slopes)
-        return extension(volts, self.slopes, self.plays, self.creep, self.params[0])
+        return stack_stroke(volts, self.slopes, self.plays, self.creep, self.params[0])
 
     def inverse(self, z: float, rate: float = 0.0) -> float:
         slopes_at(rate, self.params[0], self.slopes)
@@ -199,6 +199,6 @@ def test_kernels_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         hysteresis.slopes_at(300e-6, twin.at, twin.slopes)
         v = hysteresis.drive(z, twin.slopes, twin.plays, twin.creep, twin.at)
         assert v == pytest.approx(u, rel=1e-12)
-        hysteresis.extension(v, twin.slopes, twin.plays, twin.creep, twin.at)
+        hysteresis.stack_stroke(v, twin.slopes, twin.plays, twin.creep, twin.at)
     np.testing.assert_allclose(twin.plays, stack.plays, rtol=1e-12)
     np.testing.assert_allclose(twin.creep, stack.creep, rtol=1e-12)

@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.actuation import stage
 from firmware_py.actuation.config import ActuationConfig, StackConfig
-from firmware_py.actuation.hysteresis import extension, plays_at
+from firmware_py.actuation.hysteresis import plays_at, stack_stroke
 from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import (
     CLIP,
@@ -54,8 +54,8 @@ def tip_of(actuation: Actuation, frames: np.ndarray) -> np.ndarray:
     for k, frame in enumerate(frames):
         z = np.array(
             [
-                extension(frame[COMMAND + i], slopes[i], plays[i], np.zeros(4), actuation.params[0]["stacks"][i])
-                - param.neutral_extension[i]
+                stack_stroke(frame[COMMAND + i], slopes[i], plays[i], np.zeros(4), actuation.params[0]["stacks"][i])
+                - param.neutral_stroke[i]
                 for i in range(3)
             ]
         )
@@ -156,14 +156,14 @@ def test_creep_is_taken_back() -> None:
     np.testing.assert_allclose(attributes(actuation.state)[0].creep[:, 0], 3e-6 * 0.05 / 1.05, rtol=1e-4)
     assert np.all(np.diff(frames[10:, COMMAND]) <= 1e-12)
     z = (
-        extension(
+        stack_stroke(
             frames[-1, COMMAND],
             param.stacks[0].slope,
             plays_at(param.stacks[0], 50.0, 100.0),
             np.zeros(4),
             actuation.params[0]["stacks"][0],
         )
-        - param.neutral_extension[0]
+        - param.neutral_stroke[0]
     )
     assert z < 3e-6
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from firmware_py.actuation.hysteresis import extension, plays_at
+from firmware_py.actuation.hysteresis import plays_at, stack_stroke
 from firmware_py.actuation.stage import Actuation
 from firmware_py.control.manual import ARM_S, HOLD_S, RETURN_V_PER_S, ManualDrive, follow_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STROKE
@@ -81,8 +81,8 @@ def test_stroke_is_the_forward_model_of_the_command():
         frame[COMMAND : COMMAND + 3] = volts
         follow_kernel(frame, stage.state, stage.params)
         expected = [
-            extension(volts[i], param.stacks[i].slope, plays[i], np.zeros(4), param.stacks[i])
-            - param.neutral_extension[i]
+            stack_stroke(volts[i], param.stacks[i].slope, plays[i], np.zeros(4), param.stacks[i])
+            - param.neutral_stroke[i]
             for i in range(3)
         ]
         np.testing.assert_allclose(frame[STROKE : STROKE + 3], expected, rtol=1e-9, atol=1e-13)

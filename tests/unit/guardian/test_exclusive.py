@@ -43,7 +43,7 @@ class Spy:
         self._bus.close()
 
 
-class Rig:
+class Stand:
     """Firmware and guardian at one DAC, the guardian stepping by itself half a tick beside the firmware."""
 
     def __init__(self, *, end: Callable[[], None] | None = None, guardian_steps: bool = True) -> None:
@@ -104,108 +104,108 @@ def alternating(k: int) -> np.ndarray:
 @pytest.mark.parametrize("phase_us", [0, 50, 180, 300, 371, 600, 990])
 @pytest.mark.parametrize("stall_ms", [35.0, 39.0, 39.7, 40.0, 40.4, 41.0, 41.6, 42.1, 45.0, 50.0, 57.0, 70.0])
 def test_nobody_moves_the_outputs_beside_the_guardian(stall_ms: float, phase_us: int):
-    rig = Rig()
-    rig.run(5, alternating)
-    at_ns = (rig.clock.now_ns() // STEP_NS + 3) * STEP_NS + phase_us * 1000
-    rig.clock.at(at_ns, lambda _: rig.clock.burn_ns(round(stall_ms * MS)))
-    refusal = rig.run(130, alternating)
-    taken_ns = rig.heart.taken_ns
+    stand = Stand()
+    stand.run(5, alternating)
+    at_ns = (stand.clock.now_ns() // STEP_NS + 3) * STEP_NS + phase_us * 1000
+    stand.clock.at(at_ns, lambda _: stand.clock.burn_ns(round(stall_ms * MS)))
+    refusal = stand.run(130, alternating)
+    taken_ns = stand.heart.taken_ns
     if not taken_ns:  # too short: the firmware has gone on as if nothing had been
         assert not refusal
         assert stall_ms <= LEASE_MS
         return
     assert "lost the outputs to the guardian" in refusal
-    assert max(rig.commands_of("firmware")) < taken_ns
-    assert rig.heart.why is Why.SILENT
-    assert rig.guardian.exclusive
-    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert max(stand.commands_of("firmware")) < taken_ns
+    assert stand.heart.why is Why.SILENT
+    assert stand.guardian.exclusive
+    assert stand.volts() == pytest.approx([50.0] * 3)
     for channel in range(3):
-        ramp = np.array([v for t_ns, c, v in rig.path if c == channel and t_ns > taken_ns])
+        ramp = np.array([v for t_ns, c, v in stand.path if c == channel and t_ns > taken_ns])
         assert np.all(np.diff(np.abs(ramp - 50.0)) <= 1e-9)  # nothing but nearer and nearer
         assert np.abs(np.diff(ramp)).max() <= 20.0
 
 
 def test_a_command_that_stands_before_the_wire_ends_the_firmware_before_the_guardian_moves():
     ended: list[int] = []
-    rig = Rig(end=lambda: ended.append(rig.clock.now_ns()))
-    rig.run(5, alternating)
+    stand = Stand(end=lambda: ended.append(stand.clock.now_ns()))
+    stand.run(5, alternating)
     late_ns = 0
 
     def die(_: int) -> None:
-        rig.alive = False  # what a kill does: nothing of the firmware runs any more
+        stand.alive = False  # what a kill does: nothing of the firmware runs any more
         raise KeyboardInterrupt
 
-    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.2))
-    rig.clock.at(rig.clock.now_ns() + 60 * MS, die)
+    stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.2))
+    stand.clock.at(stand.clock.now_ns() + 60 * MS, die)
     with pytest.raises(KeyboardInterrupt):
-        rig.run(1, lambda k: FAR_V)
-    late_ns = rig.clock.now_ns()
+        stand.run(1, lambda k: FAR_V)
+    late_ns = stand.clock.now_ns()
     assert len(ended) == 1
-    assert CLAIM_NS < ended[0] - rig.heart.taken_ns <= CLAIM_NS + 2 * MS
-    assert rig.commands_of("guardian") == []  # it waits for the death
-    while rig.guardian.state is not State.DONE:
-        rig.tick()
-    assert min(rig.commands_of("guardian")) >= late_ns
-    assert rig.volts() == pytest.approx([50.0] * 3)
-    assert rig.guardian.report()["firmware_ended"]
-    assert rig.guardian.exclusive
+    assert CLAIM_NS < ended[0] - stand.heart.taken_ns <= CLAIM_NS + 2 * MS
+    assert stand.commands_of("guardian") == []  # it waits for the death
+    while stand.guardian.state is not State.DONE:
+        stand.tick()
+    assert min(stand.commands_of("guardian")) >= late_ns
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    assert stand.guardian.report()["firmware_ended"]
+    assert stand.guardian.exclusive
 
 
 def test_who_may_not_end_the_firmware_waits_for_its_command_and_undoes_it_in_the_end():
-    rig = Rig()
-    rig.run(5, alternating)
-    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.08))
-    began_ns = rig.clock.now_ns()
-    rig.run(1, lambda k: FAR_V)  # comes out 80 ms late, before the last resort
-    assert rig.commands_of("firmware")[-1] > rig.heart.taken_ns
-    assert all(t_ns > rig.commands_of("firmware")[-1] for t_ns in rig.commands_of("guardian"))
-    assert rig.run(60)
-    assert rig.guardian.exclusive
-    assert rig.volts() == pytest.approx([50.0] * 3)
-    assert rig.clock.now_ns() - began_ns < 160 * MS
+    stand = Stand()
+    stand.run(5, alternating)
+    stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.08))
+    began_ns = stand.clock.now_ns()
+    stand.run(1, lambda k: FAR_V)  # comes out 80 ms late, before the last resort
+    assert stand.commands_of("firmware")[-1] > stand.heart.taken_ns
+    assert all(t_ns > stand.commands_of("firmware")[-1] for t_ns in stand.commands_of("guardian"))
+    assert stand.run(60)
+    assert stand.guardian.exclusive
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    assert stand.clock.now_ns() - began_ns < 160 * MS
 
 
 def test_outputs_do_not_wait_for_ever_and_the_report_says_so():
-    rig = Rig()
-    rig.run(5, alternating)
-    rig.slow.arm(FaultPlan(delay=1.0, delay_s=0.4))
-    rig.run(1, lambda k: FAR_V)
-    first_ns = min(rig.commands_of("guardian"))
-    assert LAST_RESORT_NS <= first_ns - rig.heart.taken_ns < LAST_RESORT_NS + 2 * MS
-    assert not rig.guardian.report()["exclusive"]
+    stand = Stand()
+    stand.run(5, alternating)
+    stand.slow.arm(FaultPlan(delay=1.0, delay_s=0.4))
+    stand.run(1, lambda k: FAR_V)
+    first_ns = min(stand.commands_of("guardian"))
+    assert LAST_RESORT_NS <= first_ns - stand.heart.taken_ns < LAST_RESORT_NS + 2 * MS
+    assert not stand.guardian.report()["exclusive"]
 
 
 def test_a_command_that_has_arrived_is_no_reason_to_end_anybody():
     ended: list[int] = []
-    rig = Rig(end=lambda: ended.append(1))
-    rig.run(5, alternating)
-    at_ns = (rig.clock.now_ns() // STEP_NS + 1) * STEP_NS + 100_000  # in the middle of a transfer
-    rig.clock.at(at_ns, lambda _: rig.clock.burn_ns(60 * MS))
-    assert rig.run(100, alternating)
+    stand = Stand(end=lambda: ended.append(1))
+    stand.run(5, alternating)
+    at_ns = (stand.clock.now_ns() // STEP_NS + 1) * STEP_NS + 100_000  # in the middle of a transfer
+    stand.clock.at(at_ns, lambda _: stand.clock.burn_ns(60 * MS))
+    assert stand.run(100, alternating)
     assert ended == []
-    assert rig.volts() == pytest.approx([50.0] * 3)
+    assert stand.volts() == pytest.approx([50.0] * 3)
 
 
 def test_a_guardian_that_does_not_come_is_ended_and_the_firmware_ramps():
-    rig = Rig(guardian_steps=False)
-    rig.run(5)
-    rig.clock.burn_ns(50 * MS)
-    assert rig.run(42)
-    assert rig.guardian.state is State.DONE
-    assert rig.commands_of("guardian") == []
-    assert rig.volts() == pytest.approx([50.0] * 3)
+    stand = Stand(guardian_steps=False)
+    stand.run(5)
+    stand.clock.burn_ns(50 * MS)
+    assert stand.run(42)
+    assert stand.guardian.state is State.DONE
+    assert stand.commands_of("guardian") == []
+    assert stand.volts() == pytest.approx([50.0] * 3)
 
 
 def test_close_does_not_wait_for_a_guardian_that_is_gone():
-    rig = Rig(guardian_steps=False)
-    rig.run(5)
-    rig.clock.burn_ns(50 * MS)
+    stand = Stand(guardian_steps=False)
+    stand.run(5)
+    stand.clock.burn_ns(50 * MS)
     with pytest.raises(SafetyTrip):
-        rig.amplifier.write(FAR_V)
-    rig.amplifier.close()
-    assert rig.guardian.state is State.DONE
-    assert rig.volts() == pytest.approx([50.0] * 3)
-    assert rig.heart.phase is Phase.IDLE
+        stand.amplifier.write(FAR_V)
+    stand.amplifier.close()
+    assert stand.guardian.state is State.DONE
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    assert stand.heart.phase is Phase.IDLE
 
 
 @pytest.mark.parametrize("repeats", [False, True])

@@ -20,7 +20,7 @@ MS = 1_000_000
 FAR = np.array([90.0, 10.0, 60.0])
 
 
-class Rig:
+class Stand:
     """One DAC, two masters: the firmware's guarded amplifier and the guardian with an amplifier of its own."""
 
     def __init__(self, *, loss: float = 0.0) -> None:
@@ -53,125 +53,125 @@ class Rig:
 
 
 def test_a_beating_firmware_is_left_alone():
-    rig = Rig()
-    rig.moving()
-    before = len(rig.path)
+    stand = Stand()
+    stand.moving()
+    before = len(stand.path)
     for _ in range(200):
-        rig.amplifier.write(FAR)
-        rig.tick()
-    assert len(rig.path) == before
-    assert rig.guardian.report()["why"] == "nothing"
-    assert rig.heart.noticed_ns == 0
+        stand.amplifier.write(FAR)
+        stand.tick()
+    assert len(stand.path) == before
+    assert stand.guardian.report()["why"] == "nothing"
+    assert stand.heart.noticed_ns == 0
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.5])
 def test_a_dead_firmware_is_brought_to_neutral_within_twenty_ms(loss: float):
-    rig = Rig(loss=loss)
-    rig.moving()
-    died_ns = rig.clock.now_ns()
-    while rig.guardian.state is not State.DONE:
-        rig.tick(alive=False)
-    assert rig.volts() == pytest.approx([50.0] * 3)
-    assert max(t_ns for t_ns, _, _ in rig.path) - died_ns <= 20 * MS
-    report = rig.guardian.report()
+    stand = Stand(loss=loss)
+    stand.moving()
+    died_ns = stand.clock.now_ns()
+    while stand.guardian.state is not State.DONE:
+        stand.tick(alive=False)
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    assert max(t_ns for t_ns, _, _ in stand.path) - died_ns <= 20 * MS
+    report = stand.guardian.report()
     assert report["why"] == "died"
     assert report["problem"] == ""
     assert report["neutral_ns"] - died_ns <= 25 * MS
-    steps = np.diff([v for t_ns, channel, v in rig.path if channel == 0 and t_ns >= died_ns])
+    steps = np.diff([v for t_ns, channel, v in stand.path if channel == 0 and t_ns >= died_ns])
     assert np.abs(steps).max() <= 20.0  # the slew limit, per ms
 
 
 def test_a_firmware_that_dies_at_rest_needs_nothing():
-    rig = Rig()
-    rig.tick(alive=False)
-    assert rig.guardian.state is State.DONE
-    assert rig.path == []
+    stand = Stand()
+    stand.tick(alive=False)
+    assert stand.guardian.state is State.DONE
+    assert stand.path == []
 
 
 def test_a_pause_is_noticed_and_a_long_one_taken_over_and_the_firmware_gives_in():
-    rig = Rig()
-    rig.moving()
-    beat_ns = rig.heart.beat_ns
+    stand = Stand()
+    stand.moving()
+    beat_ns = stand.heart.beat_ns
     for _ in range(30):
-        rig.tick()
-    assert 8 * MS < rig.heart.noticed_ns - beat_ns <= 10 * MS
-    assert not rig.heart.taken_ns
+        stand.tick()
+    assert 8 * MS < stand.heart.noticed_ns - beat_ns <= 10 * MS
+    assert not stand.heart.taken_ns
     for _ in range(40):
-        rig.tick()
-    assert rig.heart.why is Why.SILENT
-    assert 41 * MS < rig.heart.taken_ns - beat_ns <= 43 * MS
-    assert rig.volts() == pytest.approx([50.0] * 3)
+        stand.tick()
+    assert stand.heart.why is Why.SILENT
+    assert 41 * MS < stand.heart.taken_ns - beat_ns <= 43 * MS
+    assert stand.volts() == pytest.approx([50.0] * 3)
     with pytest.raises(SafetyTrip, match=r"stood still for [67]\d ms"):
-        rig.amplifier.write(FAR)
-    assert rig.amplifier.safe_step()
-    assert rig.volts() == pytest.approx([50.0] * 3)
+        stand.amplifier.write(FAR)
+    assert stand.amplifier.safe_step()
+    assert stand.volts() == pytest.approx([50.0] * 3)
     for _ in range(60):
-        rig.tick()
-    assert rig.guardian.state is State.DONE
+        stand.tick()
+    assert stand.guardian.state is State.DONE
 
 
 def test_a_firmware_that_wakes_during_the_ramp_waits_for_its_end():
-    rig = Rig()
-    rig.moving()
-    while not rig.heart.taken_ns:
-        rig.tick()
-    rig.tick()
-    written = len(rig.path)
-    assert not rig.amplifier.safe_step()
-    assert len(rig.path) == written
-    while not rig.heart.reached_ns:
-        rig.tick()
-    assert rig.amplifier.safe_step()
+    stand = Stand()
+    stand.moving()
+    while not stand.heart.taken_ns:
+        stand.tick()
+    stand.tick()
+    written = len(stand.path)
+    assert not stand.amplifier.safe_step()
+    assert len(stand.path) == written
+    while not stand.heart.reached_ns:
+        stand.tick()
+    assert stand.amplifier.safe_step()
 
 
 def test_a_command_that_was_under_way_is_undone():
-    rig = Rig()
-    rig.moving()
-    while not rig.heart.reached_ns:
-        rig.tick(alive=False)
-    late = DacAmplifier(rig.guardian._output._bus, rig.clock)  # type: ignore[attr-defined]
+    stand = Stand()
+    stand.moving()
+    while not stand.heart.reached_ns:
+        stand.tick(alive=False)
+    late = DacAmplifier(stand.guardian._output._bus, stand.clock)  # type: ignore[attr-defined]
     late.arm()
-    rig.clock.burn_ns(5 * MS)
+    stand.clock.burn_ns(5 * MS)
     late.write(np.array([60.0, 50.0, 50.0]))
-    while rig.guardian.state is not State.DONE:
-        rig.tick(alive=False)
-    assert rig.volts() == pytest.approx([50.0] * 3)
+    while stand.guardian.state is not State.DONE:
+        stand.tick(alive=False)
+    assert stand.volts() == pytest.approx([50.0] * 3)
 
 
 def test_a_dead_bus_ends_in_a_report():
-    rig = Rig()
-    rig.moving()
-    rig.dac.nack_address = True
-    while rig.guardian.state is not State.DONE:
-        rig.tick(alive=False)
-    report = rig.guardian.report()
+    stand = Stand()
+    stand.moving()
+    stand.dac.nack_address = True
+    while stand.guardian.state is not State.DONE:
+        stand.tick(alive=False)
+    report = stand.guardian.report()
     assert report["neutral_ns"] is None
     assert "0x0c" in report["problem"].lower()
 
 
 def test_arming_is_not_silence_and_rest_after_the_ramp_is_not_either():
-    rig = Rig()
-    rig.heart.say(Phase.ARMING)
+    stand = Stand()
+    stand.heart.say(Phase.ARMING)
     for _ in range(100):
-        rig.tick()
-    assert rig.heart.why is Why.NOTHING
-    rig.moving()
-    while not rig.amplifier.safe_step():
-        rig.tick()
-    assert rig.heart.phase is Phase.IDLE
+        stand.tick()
+    assert stand.heart.why is Why.NOTHING
+    stand.moving()
+    while not stand.amplifier.safe_step():
+        stand.tick()
+    assert stand.heart.phase is Phase.IDLE
     for _ in range(100):
-        rig.tick()
-    assert rig.heart.why is Why.NOTHING
+        stand.tick()
+    assert stand.heart.why is Why.NOTHING
 
 
 def test_a_refused_command_is_a_beat_too():
-    rig = Rig()
-    rig.moving()
-    rig.dac.nack_address = True
+    stand = Stand()
+    stand.moving()
+    stand.dac.nack_address = True
     with pytest.raises(I2cNack):
-        rig.amplifier.write(FAR)
-    assert rig.heart.beat_ns <= rig.clock.now_ns()
-    assert rig.clock.now_ns() - rig.heart.beat_ns < MS
+        stand.amplifier.write(FAR)
+    assert stand.heart.beat_ns <= stand.clock.now_ns()
+    assert stand.clock.now_ns() - stand.heart.beat_ns < MS
 
 
 def test_shared_memory_is_seen_through_its_descriptor():

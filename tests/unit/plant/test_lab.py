@@ -22,7 +22,7 @@ from .stand import Still
 
 
 def test_the_stack_in_the_lab_is_the_one_in_the_instrument():
-    """Same demands, same extension: lab bench against the instrument's own truth."""
+    """Same demands, same stroke: lab bench against the instrument's own truth."""
     config = EmulationConfig(unit=4, seed=4)
     unit = Instrument(config, 4, Still(), quiet=True)
     demand = drive_profile("sine", 20.0, 0.2, 40.0, 4)

@@ -46,16 +46,16 @@ def test_the_tip_is_where_the_mechanism_puts_it(quiet: tuple[dict[str, np.ndarra
         rest_heights_m=tuple(m.rest_m),
     )
     for k in (0, 7, 13, 26):
-        truth = m.mount @ tip_from_strokes(columns["extension_um"][k] * 1e-6, built)
+        truth = m.mount @ tip_from_strokes(columns["stroke_um"][k] * 1e-6, built)
         np.testing.assert_allclose(columns["tip_um"][k], truth * 1e6, atol=1e-6)
     assert tomllib.loads(descriptor)["format"] == 1
-    # voltages up, extensions up
-    assert np.all(columns["extension_um"][-1] > columns["extension_um"][0] + 10.0)
+    # voltages up, strokes up
+    assert np.all(columns["stroke_um"][-1] > columns["stroke_um"][0] + 10.0)
 
 
 def test_the_instruments_noise_is_that_of_a_mean(quiet: tuple[dict[str, np.ndarray], str]) -> None:
     noisy, _ = measure_scan(CONFIG, 3, np.random.default_rng(0))
-    for name, rms_um in (("extension_um", INTERFEROMETER_RMS_UM), ("tip_um", TRACKER_RMS_UM)):
+    for name, rms_um in (("stroke_um", INTERFEROMETER_RMS_UM), ("tip_um", TRACKER_RMS_UM)):
         assert np.std(noisy[name] - quiet[0][name]) == pytest.approx(rms_um / np.sqrt(SAMPLES), rel=0.25)
 
 

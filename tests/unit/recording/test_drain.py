@@ -19,7 +19,7 @@ from firmware_py.recording.writer import RecordingWriter
 COLUMNS = [("tick", "1"), ("t", "s")]
 
 
-class Rig:
+class Stand:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.rows = RowRing.create(2, 300)
@@ -45,65 +45,65 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(tmp_path / "run.mcap")
-    yield rig
-    rig.close()
+def stand(tmp_path: Path) -> Iterator[Stand]:
+    stand = Stand(tmp_path / "run.mcap")
+    yield stand
+    stand.close()
 
 
-def test_a_block_is_in_the_file_when_its_hundredth_row_was_taken(rig: Rig) -> None:
-    rig.push(99)
-    rig.drain.step(now_s=0.0)
-    assert rig.in_file() == 0
-    rig.push(1)
-    rig.drain.step(now_s=0.001)
-    assert rig.in_file() == 100
-    assert (rig.rows.written, rig.rows.waiting()) == (100, 0)
+def test_a_block_is_in_the_file_when_its_hundredth_row_was_taken(stand: Stand) -> None:
+    stand.push(99)
+    stand.drain.step(now_s=0.0)
+    assert stand.in_file() == 0
+    stand.push(1)
+    stand.drain.step(now_s=0.001)
+    assert stand.in_file() == 100
+    assert (stand.rows.written, stand.rows.waiting()) == (100, 0)
 
 
-def test_a_block_is_closed_when_it_has_been_open_for_too_long(rig: Rig) -> None:
-    rig.drain.step(now_s=0.0)
-    rig.push(7)
-    rig.drain.step(now_s=0.0)
-    rig.push(7)
-    rig.drain.step(now_s=OPEN_BLOCK_S - 0.001)
-    assert rig.in_file() == 0
-    rig.drain.step(now_s=OPEN_BLOCK_S)
-    assert rig.in_file() == 14
+def test_a_block_is_closed_when_it_has_been_open_for_too_long(stand: Stand) -> None:
+    stand.drain.step(now_s=0.0)
+    stand.push(7)
+    stand.drain.step(now_s=0.0)
+    stand.push(7)
+    stand.drain.step(now_s=OPEN_BLOCK_S - 0.001)
+    assert stand.in_file() == 0
+    stand.drain.step(now_s=OPEN_BLOCK_S)
+    assert stand.in_file() == 14
 
 
-def test_an_event_alone_reaches_the_file_as_soon(rig: Rig) -> None:
-    rig.events.push(json.dumps({"event": "alone"}).encode())
-    rig.drain.step(now_s=0.0)
-    assert Recording(rig.path).events == []
-    rig.drain.step(now_s=OPEN_BLOCK_S)
-    assert [e.content for e in Recording(rig.path).events] == [{"event": "alone"}]
+def test_an_event_alone_reaches_the_file_as_soon(stand: Stand) -> None:
+    stand.events.push(json.dumps({"event": "alone"}).encode())
+    stand.drain.step(now_s=0.0)
+    assert Recording(stand.path).events == []
+    stand.drain.step(now_s=OPEN_BLOCK_S)
+    assert [e.content for e in Recording(stand.path).events] == [{"event": "alone"}]
 
 
-def test_dropped_rows_are_a_gap_in_the_right_place(rig: Rig) -> None:
-    rig.push(350)  # 50 more than the ring holds
-    rig.drain.drain()
-    rig.push(30)
-    rig.drain.drain()
-    rig.writer.finish(rig.drain.totals("stopped"))
-    recording = Recording(rig.path)
+def test_dropped_rows_are_a_gap_in_the_right_place(stand: Stand) -> None:
+    stand.push(350)  # 50 more than the ring holds
+    stand.drain.drain()
+    stand.push(30)
+    stand.drain.drain()
+    stand.writer.finish(stand.drain.totals("stopped"))
+    recording = Recording(stand.path)
     assert recording.row_numbers().tolist() == [*range(300), *range(350, 380)]
     assert recording.column("tick").tolist() == [*range(300), *range(350, 380)]
     assert recording.health.row_gaps == (RowGap(300, 50),)
     assert (recording.health.dropped, recording.health.missing_rows) == (50, 50)
-    assert rig.drain.totals("stopped")["rows_pushed"] == 380
+    assert stand.drain.totals("stopped")["rows_pushed"] == 380
 
 
-def test_a_drop_in_the_last_row_is_known_from_the_totals(rig: Rig) -> None:
-    rig.push(310)
-    rig.drain.drain()
-    rig.writer.finish(rig.drain.totals("stopped"))
-    assert Recording(rig.path).health.row_gaps == (RowGap(300, 10),)
+def test_a_drop_in_the_last_row_is_known_from_the_totals(stand: Stand) -> None:
+    stand.push(310)
+    stand.drain.drain()
+    stand.writer.finish(stand.drain.totals("stopped"))
+    assert Recording(stand.path).health.row_gaps == (RowGap(300, 10),)
 
 
-def test_a_recording_without_rows_is_whole(rig: Rig) -> None:
-    rig.drain.drain()
-    rig.writer.finish(rig.drain.totals("stopped"))
-    recording = Recording(rig.path)
+def test_a_recording_without_rows_is_whole(stand: Stand) -> None:
+    stand.drain.drain()
+    stand.writer.finish(stand.drain.totals("stopped"))
+    recording = Recording(stand.path)
     assert (recording.n_rows, recording.health.lost) == (0, False)
     assert recording.array(["tick"]).shape == (0, 1)

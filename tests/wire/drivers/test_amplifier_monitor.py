@@ -18,7 +18,7 @@ MS = 1_000_000
 LIMIT = OutputLimit(0.0, 100.0, 20_000.0, 50.0)
 
 
-class Rig:
+class Stand:
     """Outputs follow the commands at once, plus ``error_V``."""
 
     def __init__(self, settle_s: float = 0.0003) -> None:
@@ -53,36 +53,36 @@ class Rig:
 
 
 def test_a_healthy_amplifier_is_never_suspected():
-    rig = Rig()
-    assert rig.run(2000) == []
-    assert rig.monitor.suspicions == 0
-    assert rig.monitor.readings > 900
+    stand = Stand()
+    assert stand.run(2000) == []
+    assert stand.monitor.suspicions == 0
+    assert stand.monitor.readings > 900
 
 
 @pytest.mark.parametrize("output", [0, 1, 2])
 def test_a_dead_output_is_named_within_nine_ms(output: int):
-    rig = Rig()
-    rig.run(100)
-    rig.gain[output], rig.error_V[output] = 0.0, -50.0
-    when, text = rig.run(40)[0]
+    stand = Stand()
+    stand.run(100)
+    stand.gain[output], stand.error_V[output] = 0.0, -50.0
+    when, text = stand.run(40)[0]
     assert when - 100 <= 9
     assert text.startswith(f"output {output + 1} is at ")
     assert "V and was told" in text
 
 
 def test_a_small_error_is_believed_at_the_second_look_only():
-    rig = Rig()
-    rig.run(100)
-    rig.error_V[1] = 1.2
-    said = rig.run(40)
+    stand = Stand()
+    stand.run(100)
+    stand.error_V[1] = 1.2
+    said = stand.run(40)
     assert said
     assert said[0][0] - 100 <= 12
-    assert rig.monitor.suspicions >= 2
+    assert stand.monitor.suspicions >= 2
 
 
 def test_one_wrong_reading_is_not_believed(monkeypatch: pytest.MonkeyPatch):
-    rig = Rig()
-    rig.run(100)
+    stand = Stand()
+    stand.run(100)
     collect, wrong = Ads1115.collect, [0.06]  # 1.2 V at the output, once
 
     def disturbed(adc: Ads1115) -> float | None:
@@ -90,27 +90,27 @@ def test_one_wrong_reading_is_not_believed(monkeypatch: pytest.MonkeyPatch):
         return value_V if value_V is None or not wrong else value_V + wrong.pop()
 
     monkeypatch.setattr(Ads1115, "collect", disturbed)
-    assert rig.run(200) == []
-    assert rig.monitor.suspicions == 1
+    assert stand.run(200) == []
+    assert stand.monitor.suspicions == 1
 
 
 def test_a_command_under_way_may_have_arrived_already():
     """A host that was put to sleep between the acknowledge and its own note of it."""
-    rig = Rig()
-    rig.run(10)
-    begun_ns = rig.clock.now_ns()
-    rig.guard.admit(np.array([60.0, 50.0, 50.0]))
-    rig.clock.burn_ns(3 * MS)
-    rig.guard.sent()
-    last_V = rig.guard.told[-2].volts[0]
+    stand = Stand()
+    stand.run(10)
+    begun_ns = stand.clock.now_ns()
+    stand.guard.admit(np.array([60.0, 50.0, 50.0]))
+    stand.clock.burn_ns(3 * MS)
+    stand.guard.sent()
+    last_V = stand.guard.told[-2].volts[0]
     window = Window(begun_ns, begun_ns, 2 * MS, 2 * MS)
-    assert rig.monitor.expected_V(0, window) == pytest.approx((min(last_V, 60.0), max(last_V, 60.0)))
+    assert stand.monitor.expected_V(0, window) == pytest.approx((min(last_V, 60.0), max(last_V, 60.0)))
 
 
-def told_at(rig: Rig, *commands: tuple[float, float, float]) -> None:
+def told_at(stand: Stand, *commands: tuple[float, float, float]) -> None:
     """Commands of output 1: offered at, taken in force at the latest at (ms), volts."""
     for offered_ms, sent_ms, volts in commands:
-        rig.guard.told.append(Told(round(offered_ms * MS), round(sent_ms * MS), (volts, 50.0, 50.0)))
+        stand.guard.told.append(Told(round(offered_ms * MS), round(sent_ms * MS), (volts, 50.0, 50.0)))
 
 
 @pytest.mark.parametrize(
@@ -125,9 +125,9 @@ def told_at(rig: Rig, *commands: tuple[float, float, float]) -> None:
 )
 def test_the_mean_of_commands_over_a_conversion(window_ms: tuple[float, ...], expected_V: tuple[float, float]):
     """Worked out by hand for steps at 1, 2 and 3.0 to 3.2 ms and an amplifier without delay."""
-    rig = Rig(settle_s=0.0)
-    told_at(rig, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0), (3.0, 3.2, 30.0))
-    found = rig.monitor.expected_V(0, Window(*(round(ms * MS) for ms in window_ms)))
+    stand = Stand(settle_s=0.0)
+    told_at(stand, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0), (3.0, 3.2, 30.0))
+    found = stand.monitor.expected_V(0, Window(*(round(ms * MS) for ms in window_ms)))
     assert found is not None
     assert found[0] <= expected_V[0] + 1e-9
     assert found[1] >= expected_V[1] - 1e-9
@@ -135,50 +135,50 @@ def test_the_mean_of_commands_over_a_conversion(window_ms: tuple[float, ...], ex
 
 
 def test_an_amplifier_that_settles_may_be_late():
-    rig = Rig(settle_s=0.0003)
-    told_at(rig, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0))
-    assert rig.monitor.expected_V(0, Window(2 * MS, 2 * MS, MS, MS)) == pytest.approx((17.0, 20.0))
+    stand = Stand(settle_s=0.0003)
+    told_at(stand, (1.0, 1.0, 10.0), (2.0, 2.0, 20.0))
+    assert stand.monitor.expected_V(0, Window(2 * MS, 2 * MS, MS, MS)) == pytest.approx((17.0, 20.0))
 
 
 def test_what_is_within_the_tolerance_is_nothing():
-    rig = Rig()
-    rig.error_V[:] = 0.45
-    assert rig.run(500) == []
+    stand = Stand()
+    stand.error_V[:] = 0.45
+    assert stand.run(500) == []
 
 
 def test_a_command_that_nobody_remembers_judges_nothing():
-    rig = Rig()
-    assert rig.monitor.expected_V(0, Window(0, 0, 10, 10)) is None
-    rig.run(100)
-    early_ns = rig.clock.now_ns() - 50 * MS
-    assert rig.monitor.expected_V(0, Window(early_ns, early_ns, MS, MS)) is None
+    stand = Stand()
+    assert stand.monitor.expected_V(0, Window(0, 0, 10, 10)) is None
+    stand.run(100)
+    early_ns = stand.clock.now_ns() - 50 * MS
+    assert stand.monitor.expected_V(0, Window(early_ns, early_ns, MS, MS)) is None
 
 
 def test_a_small_change_of_what_is_usual_is_seen_within_the_tolerance():
-    rig = Rig()
-    rig.error_V[:], rig.gain[:] = 0.2, 1.01  # trimmed that badly, and healthy for it
-    assert rig.run(1000) == []
-    assert rig.monitor.suspicions == 0
-    rig.error_V[2] -= 0.4  # still within +- 0.5 V
-    said = rig.run(60)
+    stand = Stand()
+    stand.error_V[:], stand.gain[:] = 0.2, 1.01  # trimmed that badly, and healthy for it
+    assert stand.run(1000) == []
+    assert stand.monitor.suspicions == 0
+    stand.error_V[2] -= 0.4  # still within +- 0.5 V
+    said = stand.run(60)
     assert said
     assert said[0][0] - 1000 <= 20
     assert said[0][1].startswith("output 3 is at ")
 
 
 def test_what_changes_slowly_becomes_usual():
-    rig = Rig()
-    assert rig.run(500) == []
+    stand = Stand()
+    assert stand.run(500) == []
     for _ in range(40):
-        rig.error_V[0] += 0.01
-        assert rig.run(100) == []
+        stand.error_V[0] += 0.01
+        assert stand.run(100) == []
 
 
 def test_a_change_while_nothing_is_known_yet_is_judged_by_the_tolerance_alone():
-    rig = Rig()
-    assert rig.run(100) == []
-    rig.error_V[1] = 0.3
-    assert rig.run(300) == []
+    stand = Stand()
+    assert stand.run(100) == []
+    stand.error_V[1] = 0.3
+    assert stand.run(300) == []
 
 
 def test_the_usual_line_is_the_one_through_the_readings():

@@ -69,7 +69,7 @@ class Node:
         self.can.clock.at(t_ns + 10 * MS, self.every_10_ms)
 
 
-def rig(**options: float) -> tuple[CanAmplifier, ScriptedCan, Node, VirtualClock]:
+def stand(**options: float) -> tuple[CanAmplifier, ScriptedCan, Node, VirtualClock]:
     clock = VirtualClock()
     can = ScriptedCan(clock)
     node = Node(can)
@@ -78,7 +78,7 @@ def rig(**options: float) -> tuple[CanAmplifier, ScriptedCan, Node, VirtualClock
 
 
 def armed(**options: float) -> tuple[CanAmplifier, ScriptedCan, Node, VirtualClock]:
-    amplifier, can, node, clock = rig(**options)
+    amplifier, can, node, clock = stand(**options)
     amplifier.arm()
     can.sent.clear()
     clock.burn_ns(MS)
@@ -105,14 +105,14 @@ def test_counter_wraps():
 
 
 def test_arm_sends_the_command_and_its_complement():
-    amplifier, can, _, _ = rig()
+    amplifier, can, _, _ = stand()
     amplifier.arm()
     assert (0x122, "01fe") in can.sent
     assert amplifier.state == 1
 
 
 def test_arm_needs_confirmation():
-    amplifier, _, node, _ = rig()
+    amplifier, _, node, _ = stand()
     node.obedient = False
     with pytest.raises(SafetyTrip, match="does not confirm 'arm'"):
         amplifier.arm()
@@ -121,7 +121,7 @@ def test_arm_needs_confirmation():
 
 
 def test_arm_refuses_a_node_in_fault():
-    amplifier, _, node, _ = rig()
+    amplifier, _, node, _ = stand()
     node.state = FAULT
     with pytest.raises(SafetyTrip, match="fault"):
         amplifier.arm()
@@ -191,7 +191,7 @@ def test_unconfirmed_safe_state_is_an_error():
 
 
 def test_readback_is_measured_by_the_node():
-    amplifier, can, _, clock = rig()
+    amplifier, can, _, clock = stand()
     clock.burn_ns(MS)
     can.queue.clear()
     can.clock.at(4 * MS, lambda t_ns: can.arrive(0x121, "0000ffff00800000"))
@@ -284,7 +284,7 @@ class TestDbc:
         assert (decoded["counter"], decoded["crc"]) == (data[6], data[7])
 
     def test_status_unpacking_is_the_dbc(self):
-        amplifier, can, _, clock = rig()
+        amplifier, can, _, clock = stand()
         values = {"measured_1": 10.0, "measured_2": 20.0, "measured_3": 90.0, "state": 2, "last_counter": 77}
         data = load_database().get_message_by_name("STATUS").encode(values)
         clock.burn_ns(MS)

@@ -13,7 +13,7 @@ from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.transports.i2c_socket import I2cSocketServer
 
 
-class Rig:
+class Stand:
     def __init__(self, path: Path) -> None:
         self.dac = Ad5696r()
         self.line = I2cLine(400_000)
@@ -40,29 +40,29 @@ class Rig:
 
 
 @pytest.fixture
-def rig(tmp_path: Path) -> Iterator[Rig]:
-    rig = Rig(tmp_path / "i2c0.sock")
-    yield rig
-    rig.client.close()
-    rig.server.close()
+def stand(tmp_path: Path) -> Iterator[Stand]:
+    stand = Stand(tmp_path / "i2c0.sock")
+    yield stand
+    stand.client.close()
+    stand.server.close()
 
 
-def test_write_answers_after_its_bus_time(rig: Rig) -> None:
-    rig.ask("0c 01 00 0300 31 4000")
-    rig.deliver(1000)
+def test_write_answers_after_its_bus_time(stand: Stand) -> None:
+    stand.ask("0c 01 00 0300 31 4000")
+    stand.deliver(1000)
     # START 1 + 4 bytes x 9 = 37 bits of 2.5 us, then STOP
-    assert rig.server.next_event_ns() == 1000 + 92_500
-    assert rig.dac.output_V[0] == 2.5
-    rig.server.advance_to(1000 + 92_500)
-    assert rig.dac.output_V[0] == 1.25
-    assert rig.server.next_event_ns() == 1000 + 95_000
-    rig.client.setblocking(False)
+    assert stand.server.next_event_ns() == 1000 + 92_500
+    assert stand.dac.output_V[0] == 2.5
+    stand.server.advance_to(1000 + 92_500)
+    assert stand.dac.output_V[0] == 1.25
+    assert stand.server.next_event_ns() == 1000 + 95_000
+    stand.client.setblocking(False)
     with pytest.raises(BlockingIOError):
-        rig.client.recv(1)
-    rig.client.settimeout(2.0)
-    rig.server.advance_to(1000 + 95_000)
-    assert rig.client.recv(100) == bytes.fromhex("00 0000")
-    assert rig.server.next_event_ns() is None
+        stand.client.recv(1)
+    stand.client.settimeout(2.0)
+    stand.server.advance_to(1000 + 95_000)
+    assert stand.client.recv(100) == bytes.fromhex("00 0000")
+    assert stand.server.next_event_ns() is None
 
 
 @pytest.mark.parametrize(
@@ -70,24 +70,24 @@ def test_write_answers_after_its_bus_time(rig: Rig) -> None:
     [(1000, 61_000, 61_000), (1000, 200_000, 141_000), (100_000, 61_000, 100_000)],
     ids=["when it was asked for", "never in the future", "never before what has happened"],
 )
-def test_begin_of_a_transfer(rig: Rig, reached_ns: int, asked_ns: int, begins_ns: int) -> None:
-    rig.ask("0c 01 00 0300 31 4000", asked_ns)
-    rig.deliver(141_000, reached_ns=reached_ns)
-    assert rig.dac.output_V[0] == (1.25 if begins_ns + 92_500 <= 141_000 else 2.5)
-    rig.server.advance_to(begins_ns + 95_000 - 1)
-    rig.client.setblocking(False)
+def test_begin_of_a_transfer(stand: Stand, reached_ns: int, asked_ns: int, begins_ns: int) -> None:
+    stand.ask("0c 01 00 0300 31 4000", asked_ns)
+    stand.deliver(141_000, reached_ns=reached_ns)
+    assert stand.dac.output_V[0] == (1.25 if begins_ns + 92_500 <= 141_000 else 2.5)
+    stand.server.advance_to(begins_ns + 95_000 - 1)
+    stand.client.setblocking(False)
     with pytest.raises(BlockingIOError):
-        rig.client.recv(1)
-    rig.client.settimeout(2.0)
-    rig.server.advance_to(begins_ns + 95_000)
-    assert rig.client.recv(100) == bytes.fromhex("00 0000")
+        stand.client.recv(1)
+    stand.client.settimeout(2.0)
+    stand.server.advance_to(begins_ns + 95_000)
+    assert stand.client.recv(100) == bytes.fromhex("00 0000")
 
 
-def test_write_then_read_in_one_transfer(rig: Rig) -> None:
-    rig.ask("0c 02 00 0100 01 01 0200")
-    rig.deliver(0)
-    rig.server.advance_to(10**6)
-    assert rig.client.recv(100) == bytes.fromhex("00 0200 8000")
+def test_write_then_read_in_one_transfer(stand: Stand) -> None:
+    stand.ask("0c 02 00 0100 01 01 0200")
+    stand.deliver(0)
+    stand.server.advance_to(10**6)
+    assert stand.client.recv(100) == bytes.fromhex("00 0200 8000")
 
 
 @pytest.mark.parametrize(
@@ -98,61 +98,61 @@ def test_write_then_read_in_one_transfer(rig: Rig) -> None:
         ("0c 01 00 0300 31 4000", "stuck", "03 0000"),
     ],
 )
-def test_status_codes(rig: Rig, request_hex: str, prepare: str, reply: str) -> None:
+def test_status_codes(stand: Stand, request_hex: str, prepare: str, reply: str) -> None:
     if prepare == "stuck":
-        rig.line.stuck = True
+        stand.line.stuck = True
     elif prepare:
-        setattr(rig.dac, prepare, True)
-    rig.ask(request_hex)
-    rig.deliver(0)
-    rig.server.advance_to(10**6)
-    assert rig.client.recv(100) == bytes.fromhex(reply)
+        setattr(stand.dac, prepare, True)
+    stand.ask(request_hex)
+    stand.deliver(0)
+    stand.server.advance_to(10**6)
+    assert stand.client.recv(100) == bytes.fromhex(reply)
 
 
-def test_request_in_pieces(rig: Rig) -> None:
+def test_request_in_pieces(stand: Stand) -> None:
     for piece in ("0c", "01 0000", "0000 0000 0000 00 03", "00 31 40", "00"):
-        assert rig.server.next_event_ns() is None
-        rig.client.sendall(bytes.fromhex(piece))
-        rig.deliver(5)
-    assert rig.server.next_event_ns() == 5 + 92_500
+        assert stand.server.next_event_ns() is None
+        stand.client.sendall(bytes.fromhex(piece))
+        stand.deliver(5)
+    assert stand.server.next_event_ns() == 5 + 92_500
 
 
-def test_two_clients_share_the_bus_in_turn(rig: Rig) -> None:
-    other = rig.connect()
-    rig.ask("0c 01 00 0300 31 4000")
-    rig.deliver(0, client=1)
-    rig.ask("0c 01 00 0300 31 c000", client=other)
-    rig.deliver(0, client=2)
-    rig.server.advance_to(95_000)
-    assert rig.dac.output_V[0] == 1.25
-    assert rig.server.next_event_ns() == 95_000 + 92_500
-    rig.server.advance_to(10**6)
-    assert rig.dac.output_V[0] == 3.75
-    assert rig.client.recv(10) == other.recv(10) == bytes(3)
+def test_two_clients_share_the_bus_in_turn(stand: Stand) -> None:
+    other = stand.connect()
+    stand.ask("0c 01 00 0300 31 4000")
+    stand.deliver(0, client=1)
+    stand.ask("0c 01 00 0300 31 c000", client=other)
+    stand.deliver(0, client=2)
+    stand.server.advance_to(95_000)
+    assert stand.dac.output_V[0] == 1.25
+    assert stand.server.next_event_ns() == 95_000 + 92_500
+    stand.server.advance_to(10**6)
+    assert stand.dac.output_V[0] == 3.75
+    assert stand.client.recv(10) == other.recv(10) == bytes(3)
     other.close()
 
 
 @pytest.mark.parametrize("garbage", ["ff 01", "0c 00", "0c ff", "0c 01 07 0000", "0c 01 01 ffff"])
-def test_garbage_closes_the_connection_only(rig: Rig, garbage: str) -> None:
-    rig.ask(garbage)
-    rig.deliver(0)
-    assert rig.client.recv(10) == b""
-    rig.client.close()
-    rig.client = rig.connect()
-    rig.ask("0c 01 01 0200")
-    rig.deliver(0)
-    rig.server.advance_to(10**6)
-    assert len(rig.client.recv(10)) == 5
+def test_garbage_closes_the_connection_only(stand: Stand, garbage: str) -> None:
+    stand.ask(garbage)
+    stand.deliver(0)
+    assert stand.client.recv(10) == b""
+    stand.client.close()
+    stand.client = stand.connect()
+    stand.ask("0c 01 01 0200")
+    stand.deliver(0)
+    stand.server.advance_to(10**6)
+    assert len(stand.client.recv(10)) == 5
 
 
-def test_client_that_goes_away_during_a_transfer(rig: Rig) -> None:
-    rig.ask("0c 01 00 0300 31 4000")
-    rig.deliver(0)
-    rig.client.close()
-    rig.deliver(10)
-    rig.server.advance_to(10**6)
-    assert rig.dac.output_V[0] == 1.25
-    assert len(rig.server.filenos()) == 1
+def test_client_that_goes_away_during_a_transfer(stand: Stand) -> None:
+    stand.ask("0c 01 00 0300 31 4000")
+    stand.deliver(0)
+    stand.client.close()
+    stand.deliver(10)
+    stand.server.advance_to(10**6)
+    assert stand.dac.output_V[0] == 1.25
+    assert len(stand.server.filenos()) == 1
 
 
 def test_bus_time_at_100_khz() -> None:

@@ -15,7 +15,7 @@ from sim_devices.transports.pty_carrier import PtyCarrier
 MS = 1_000_000
 
 
-class Rig:
+class Stand:
     def __init__(self) -> None:
         self.truth = HeldVoltages(8)
         self.device = Di4108(self.truth)
@@ -51,67 +51,67 @@ class Rig:
 
 
 @pytest.fixture
-def rig() -> Iterator[Rig]:
-    rig = Rig()
-    yield rig
-    rig.carrier.unplug()
-    rig.port.close()
+def stand() -> Iterator[Stand]:
+    stand = Stand()
+    yield stand
+    stand.carrier.unplug()
+    stand.port.close()
 
 
-def test_commands_and_binary_stream_pass_unchanged(rig: Rig) -> None:
-    assert rig.command(b"info 1") == b"info 1 4108\r"
-    rig.start()
+def test_commands_and_binary_stream_pass_unchanged(stand: Stand) -> None:
+    assert stand.command(b"info 1") == b"info 1 4108\r"
+    stand.start()
     # codes that a cooked tty would change: CR, LF, XON, XOFF, ^C, ^D, ^Z, DEL
     codes = [0x0D0A, 0x1113, 0x0304, 0x1A7F, 0x0000, 0x7FFF, -0x8000, -1]
-    rig.truth.volts_V[:] = [c * 5.0 / 32768 for c in codes]
-    rig.turn(MS)
-    assert rig.port.read(16) == b"".join((c & 0xFFFF).to_bytes(2, "little") for c in codes)
+    stand.truth.volts_V[:] = [c * 5.0 / 32768 for c in codes]
+    stand.turn(MS)
+    assert stand.port.read(16) == b"".join((c & 0xFFFF).to_bytes(2, "little") for c in codes)
 
 
-def test_the_devices_fifo_overflows_not_the_pty(rig: Rig) -> None:
-    rig.start()
+def test_the_devices_fifo_overflows_not_the_pty(stand: Stand) -> None:
+    stand.start()
     for k in range(1, 129):
-        rig.turn(MS)
-        rig.settle(16 * k)
-    rig.turn()
-    assert rig.device.fifo_samples == 1024
-    assert rig.device.scanning
-    rig.turn(MS)
-    assert not rig.device.scanning
-    data = rig.port.read(2055)
+        stand.turn(MS)
+        stand.settle(16 * k)
+    stand.turn()
+    assert stand.device.fifo_samples == 1024
+    assert stand.device.scanning
+    stand.turn(MS)
+    assert not stand.device.scanning
+    data = stand.port.read(2055)
     assert data.endswith(b"stop 01")
     assert len(data) == 2055
-    rig.port.timeout = 0
-    assert rig.port.read(1) == b""
+    stand.port.timeout = 0
+    assert stand.port.read(1) == b""
 
 
-def test_a_host_that_reads_keeps_the_fifo_empty(rig: Rig) -> None:
-    rig.start()
+def test_a_host_that_reads_keeps_the_fifo_empty(stand: Stand) -> None:
+    stand.start()
     for _ in range(300):
-        rig.turn(MS)
-        assert len(rig.port.read(16)) == 16
-    rig.carrier.refresh()
-    assert rig.device.fifo_samples == 0
+        stand.turn(MS)
+        assert len(stand.port.read(16)) == 16
+    stand.carrier.refresh()
+    assert stand.device.fifo_samples == 0
 
 
-def test_a_host_that_drains_late_loses_nothing(rig: Rig) -> None:
-    rig.start()
+def test_a_host_that_drains_late_loses_nothing(stand: Stand) -> None:
+    stand.start()
     total = 0
     for _ in range(5):
         for _ in range(100):
-            rig.turn(MS)
-        total += len(rig.port.read(1600))
+            stand.turn(MS)
+        total += len(stand.port.read(1600))
     assert total == 5 * 1600
-    assert rig.device.overflows == 0
+    assert stand.device.overflows == 0
 
 
-def test_unplugging_is_what_pyserial_calls_a_lost_device(rig: Rig) -> None:
-    rig.start()
-    rig.carrier.unplug()
-    rig.carrier.unplug()
+def test_unplugging_is_what_pyserial_calls_a_lost_device(stand: Stand) -> None:
+    stand.start()
+    stand.carrier.unplug()
+    stand.carrier.unplug()
     with pytest.raises(serial.SerialException):
-        rig.port.read(1)
+        stand.port.read(1)
     with pytest.raises(serial.SerialException):
-        rig.port.write(b"stop\r")
-    assert rig.carrier.fileno() == -1
-    rig.turn(MS)  # the device goes on without a host
+        stand.port.write(b"stop\r")
+    assert stand.carrier.fileno() == -1
+    stand.turn(MS)  # the device goes on without a host
