@@ -5,14 +5,19 @@ BIN    := $(VENV)/bin
 # one thread per BLAS call: the work is parallel in processes, and oversubscription costs a factor of ten
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
+COVERED = hal drivers firmware_py
 
-.PHONY: run test test-all lint bench docs pictures wheel coverage setup clean
+.PHONY: run test unit realtime test-all lint audit fuzz bench docs pictures wheel coverage mutation quality setup clean
 
 run: setup
 	$(BIN)/micron run
 
-test: setup lint
+test: lint unit realtime
+
+unit: setup
 	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q
+
+realtime: setup
 	$(BIN)/pytest -m "realtime and not slow" -q
 
 test-all: test
@@ -57,10 +62,18 @@ wheel: setup
 	VIRTUAL_ENV=out/wheel/venv $(BIN)/uv pip install --quiet -c constraints.txt out/wheel/*.whl
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
-# by branch, without kernels: compiled code cannot be traced, their pure-Python twins are tested instead
-coverage: setup
+# the unit tests once more with what they reach: by branch, without kernels (compiled code cannot be traced, their
+# pure-Python twins are tested instead) and without what runs in processes of its own; each room for itself
+coverage: setup quality
+	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --cov --cov-report= --cov-report=html:out/coverage --cov-fail-under=0
+	for room in $(COVERED); do $(BIN)/coverage report --include="$$room/*" --skip-covered --sort=cover || exit 1; done
+
+# does a test fail when a line is changed? minutes to an hour; make mutation ONLY="safety can" for some of it
+mutation: setup quality
+	$(BIN)/python -m tests.mutation.run $(ONLY)
+
+quality: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[quality]'
-	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --cov --cov-report=term --cov-report=html:out/coverage
 
 setup: $(VENV)/.ready
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -38,7 +39,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
     "daq": (("drivers/daq/di4108.py",), ("tests/wire/drivers/test_di4108_wire.py",)),
-    "e727": (("drivers/piezo/gcs.py",), ("tests/wire/drivers/test_e727_wire.py",)),
+    "e727": (("drivers/piezo/gcs.py",), ("tests/wire/drivers/test_gcs_link.py", "tests/wire/drivers/test_e727_wire.py")),
     "can": (("drivers/can_frames.py", "drivers/can_telemetry.py"), ("tests/wire/drivers/test_can_drivers_wire.py",)),
     "motion card": (("drivers/motion_card_protocol.py",), ("tests/wire/drivers/test_motion_card_wire.py",)),
 }
@@ -68,10 +69,9 @@ def prepare(name: str) -> Path:
 
 def mutate(folder: Path, processes: int) -> dict[str, dict[str, int]]:
     """Exit code of each mutant by file, and ``run.log``. Raises SystemExit where mutmut itself failed."""
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
     command = [str(Path(sys.executable).with_name("mutmut")), "run", "--max-children", str(processes)]
     with (folder / "run.log").open("w") as log:
-        done = subprocess.run(command, cwd=folder, env=environment, stdout=log, stderr=log, check=False)
+        done = subprocess.run(command, cwd=folder, env=_environment(), stdout=log, stderr=log, check=False)
     found = {
         str(meta.relative_to(folder / "mutants").with_suffix("")): json.loads(meta.read_text())["exit_code_by_key"]
         for meta in sorted((folder / "mutants").rglob("*.py.meta"))
@@ -81,10 +81,26 @@ def mutate(folder: Path, processes: int) -> dict[str, dict[str, int]]:
     return found
 
 
-def diff_of(folder: Path, mutant: str) -> str:
-    environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
-    command = [str(Path(sys.executable).with_name("mutmut")), "show", mutant]
-    return subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=False).stdout
+def diffs_of(folder: Path, mutants: list[str]) -> list[str]:
+    """One text a mutant: its name and what it changed."""
+    script = (
+        "import sys; from mutmut.mutation.diff_apply import get_diff_for_mutant as of\n"
+        "for name in sys.argv[1:]: print('# ' + name, of(name), sep='\\n', end='\\0')"
+    )
+    command = [sys.executable, "-c", script, *mutants]
+    done = subprocess.run(command, cwd=folder, env=_environment(), capture_output=True, text=True, check=True)
+    return done.stdout.split("\0")[:-1]
+
+
+def is_wording(diff: str) -> bool:
+    """Whether only the text between quotation marks was changed: the wording of a message, in nearly all cases."""
+    without = [re.sub(r'"[^"]*"', '""', line) for line in diff.splitlines() if line[:3] not in ("---", "+++")]
+    gone, come = ([line[1:] for line in without if line.startswith(sign)] for sign in "-+")
+    return gone == come
+
+
+def _environment() -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
 
 
 def main() -> int:
@@ -96,19 +112,20 @@ def main() -> int:
     if unknown:
         parser.error(f"no group {', '.join(unknown)}; there are: {', '.join(GROUPS)}")
     OUT.mkdir(parents=True, exist_ok=True)
-    print("| group | file | mutants | noticed | survived | reached by no test |\n|---|---|---|---|---|---|", flush=True)
+    print("| group | file | mutants | noticed | not noticed | of them wording |\n|---|---|---|---|---|---|", flush=True)
     survivors: list[str] = []
     total: Counter[str] = Counter()
     for name in chosen.groups or GROUPS:
         folder = prepare(name)
         for file, codes in mutate(folder, chosen.processes).items():
-            left = [mutant for mutant, code in codes.items() if code == SURVIVED]
-            unreached = [mutant for mutant, code in codes.items() if code == UNREACHED]
-            noticed = len(codes) - len(left) - len(unreached)
-            total += Counter(mutants=len(codes), noticed=noticed, survived=len(left), unreached=len(unreached))
-            print(f"| {name} | `{file}` | {len(codes)} | {noticed} | {len(left)} | {len(unreached)} |", flush=True)
-            survivors += [diff_of(folder, mutant) for mutant in (*left, *unreached)]
-    print(f"| all | | {total['mutants']} | {total['noticed']} | {total['survived']} | {total['unreached']} |")
+            left = [mutant for mutant, code in codes.items() if code in (SURVIVED, UNREACHED)]
+            diffs = diffs_of(folder, left)
+            wording = sum(map(is_wording, diffs))
+            counts = {"mutants": len(codes), "noticed": len(codes) - len(left), "left": len(left), "wording": wording}
+            total += Counter(counts)
+            print(f"| {name} | `{file}` | {' | '.join(map(str, counts.values()))} |", flush=True)
+            survivors += sorted(diffs, key=is_wording)
+    print(f"| all | | {' | '.join(map(str, total.values()))} |")
     (OUT / "survivors.diff").write_text("\n".join(survivors), encoding="utf-8")
     return 0
 

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import io
 from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
 
 from drivers.daq.di4108 import Di4108
 from hal.clock import VirtualClock
-from hal.errors import BenchError, Disconnected, ErrorKind, I2cNack, ProtocolError
+from hal.errors import BenchError, BusError, Disconnected, ErrorKind, I2cNack, ProtocolError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
+from hal.middleware.faults.can import BABBLE_ID
 from hal.middleware.share import SharedCan
 from hal.middleware.trace import Entry, TraceCan, TraceI2c, TraceSerial, read_transcript
-from hal.types import CanFrame, I2cRead, I2cWrite, ScanConfig
+from hal.types import CanFrame, I2cOp, I2cRead, I2cWrite, ScanConfig
 from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, ScriptedSerial, serial_script
 
 MS = 1_000_000
@@ -175,6 +177,28 @@ class TestFaultSerial:
         assert clock.now_ns() == 100 * MS
         assert port.counts.disconnected
 
+    def test_bytes_doubled_cut_off_and_swapped(self):
+        clock = VirtualClock()
+        twice = FaultSerial(Stream(clock, b"ab"), clock, FaultPlan(duplication=1.0))
+        assert everything(twice) == b"aabb"
+        assert twice.counts.duplicated == 2
+        cut = FaultSerial(Stream(clock, b"abcdefgh", chunk=8), clock, FaultPlan(truncation=1.0))
+        got = everything(cut)
+        assert b"abcdefgh".startswith(got)
+        assert cut.counts.lost == 8 - len(got) > 0
+        swapped = FaultSerial(Stream(clock, b"ab", chunk=2), clock, FaultPlan(reorder=1.0))
+        assert everything(swapped) == b"ba"
+        assert swapped.counts.reordered == 1
+
+    def test_what_does_not_fit_waits_and_can_be_dropped(self):
+        clock = VirtualClock()
+        port = FaultSerial(Stream(clock, b"ab", chunk=1), clock, FaultPlan(duplication=1.0))
+        small = bytearray(1)
+        assert port.read_into(memoryview(small), 0.01) == 1
+        assert port.drain_input() == 1
+        assert port.read_into(memoryview(small), 0.01) == 1
+        assert small == b"b"
+
     def test_the_daq_driver_finds_byte_loss(self):
         """One lost byte per about ten scans: the driver must stop rather than deliver shifted channels."""
         clock = VirtualClock()
@@ -230,6 +254,36 @@ class TestFaultI2c:
         with pytest.raises(Disconnected):
             bus.transfer(0x48, self.ops)
 
+    def test_a_written_byte_suffers_and_the_register_does_not(self):
+        class Echo(ScriptedI2c):
+            def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
+                heard.append([op.data for op in ops if isinstance(op, I2cWrite)])
+                return b""
+
+        heard: list[list[bytes]] = []
+        bus = FaultI2c(Echo([]), VirtualClock(), FaultPlan(write_corruption=1.0))
+        bus.transfer(0x0C, [I2cWrite(b"\x31\x12\x34")])
+        assert heard[0][0][:1] == b"\x31"
+        assert (int.from_bytes(heard[0][0][1:], "big") ^ 0x1234).bit_count() == 1
+        bus.transfer(0x0C, [I2cWrite(b"\x31")])
+        assert heard[1] == [b"\x31"], "a register alone has no data to damage"
+
+    def test_a_transfer_that_happens_twice(self):
+        bus, _ = self.bus(FaultPlan(duplication=1.0), n=2)
+        assert bus.transfer(0x48, self.ops) == b"\x12\x34"
+        assert bus.counts.duplicated == 1
+        bus._bus.done()  # type: ignore[attr-defined]
+
+    def test_one_address_suffers_alone(self):
+        clock = VirtualClock()
+        script = [(0x48, [("w", b"\x00"), ("r", b"\x12\x34")])]
+        bus = FaultI2c(ScriptedI2c(script), clock, FaultPlan(loss=1.0), only=0x0C)
+        assert bus.transfer(0x48, self.ops) == b"\x12\x34"
+        with pytest.raises(I2cNack, match="0x0C"):
+            bus.transfer(0x0C, self.ops)
+        bus.arm(FaultPlan(), only=None)
+        assert bus.counts.lost == 1, "counts go on"
+
 
 class TestFaultCan:
     def test_loss_corruption_and_silence(self):
@@ -254,6 +308,47 @@ class TestFaultCan:
         assert bus.recv(0.001) is None
         assert can.sent == []
         assert bus.counts.silenced == 2
+
+    def test_a_bus_that_is_off_refuses_until_the_plan_ends(self):
+        clock = VirtualClock()
+        can = ScriptedCan(clock)
+        bus = FaultCan(can, clock, FaultPlan(bus_off_after_s=0.001))
+        bus.send(CanFrame(0x120, b""), 0.0)
+        clock.burn_ns(MS)
+        with pytest.raises(BusError, match="bus-off"):
+            bus.send(CanFrame(0x120, b""), 0.0)
+        bus.arm(FaultPlan())
+        bus.send(CanFrame(0x120, b""), 0.0)
+        assert len(can.sent) == 2
+        assert bus.counts.lost == 1
+
+    def test_babble_and_error_frames_come_at_their_rates(self):
+        clock = VirtualClock()
+        bus = FaultCan(ScriptedCan(clock), clock, FaultPlan(babble_hz=100.0, error_frames_hz=200.0))
+        heard = 0
+        for _ in range(100):
+            clock.burn_ns(MS)
+            frame = bus.recv(0.0)
+            heard += frame is not None and frame.can_id == BABBLE_ID
+        assert heard == bus.counts.babbled == 10
+        assert bus.stats().error_frames == bus.counts.error_frames == 20
+
+    def test_frames_shortened_doubled_and_out_of_order(self):
+        clock = VirtualClock()
+        can = ScriptedCan(clock)
+        bus = FaultCan(can, clock, FaultPlan(truncation=1.0))
+        can.arrive(0x121, "0011")
+        frame = bus.recv(0.0)
+        assert frame is not None
+        assert frame.data == b"\x00"
+        bus.arm(FaultPlan(duplication=1.0))
+        can.arrive(0x121, "22")
+        assert [f.data for f in (bus.recv(0.0), bus.recv(0.0)) if f] == [b"\x22", b"\x22"]
+        bus.arm(FaultPlan(reorder=1.0))
+        can.arrive(0x121, "01")
+        can.arrive(0x121, "02")
+        assert [f.data for f in (bus.recv(0.0), bus.recv(0.0)) if f] == [b"\x02", b"\x01"]
+        assert (bus.counts.truncated, bus.counts.duplicated, bus.counts.reordered) == (1, 1, 1)
 
 
 class TestShare:

@@ -1,0 +1,202 @@
+"""Orders of the bench page: what they do, and that one that makes no sense does nothing. Incidents on the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from collections.abc import Iterator
+from contextlib import closing
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from firmware_py.control.incidents import Incidents, LoopCounts
+from firmware_py.control.manual import ManualDrive
+from firmware_py.control.orders import PageOrders
+from firmware_py.control.safety import State, Supervisor, Trip
+from firmware_py.control.stages import Stages
+from firmware_py.exit_codes import Exit, exit_code_of
+from firmware_py.live.link import MAX_ORDERS, LiveLink
+from firmware_py.live.memory import LiveMemory
+from firmware_py.scheduler.histogram import DurationHistogram
+from hal.clock import VirtualClock
+from hal.contracts import AnalogOutput
+from hal.errors import BenchError, DeviceNotFound, HalTimeout, OpenFailed
+
+MS = 1_000_000
+
+
+class Events:
+    """A recorder that keeps what it is told."""
+
+    def __init__(self) -> None:
+        self.events: list[dict[str, object]] = []
+
+    def push(self, row: np.ndarray) -> bool:
+        return True
+
+    def event(self, event: dict[str, object]) -> bool:
+        self.events.append(event)
+        return True
+
+
+class Desk:
+    """A page at the other end of the control socket, and a loop that may move."""
+
+    def __init__(self, *, sensing_only: bool = False) -> None:
+        self.clock = VirtualClock()
+        amplifier = cast(AnalogOutput, SimpleNamespace(arm=lambda: None))
+        self.supervisor = Supervisor(amplifier)
+        if sensing_only:
+            self.supervisor.begin_sensing()
+        else:
+            self.supervisor.begin_self_test()
+            self.supervisor.arm()
+        self.recorder, self.counts = Events(), LoopCounts()
+        self.incidents = Incidents(self.supervisor, self.counts, self.clock, self.recorder)
+        self.memory = LiveMemory.create(2, 64)
+        self.page, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.link = LiveLink(os.dup(self.memory.fd), ours.detach())
+        self.manual = ManualDrive(0.0, 100.0, 50.0)
+        self.params = {"gain": 1.0}
+        stages = cast(
+            Stages,
+            SimpleNamespace(command_V=np.array([40.0, 50.0, 60.0]), actuation=SimpleNamespace(params=self.params)),
+        )
+        self.orders = PageOrders(self.link, self.manual, stages, self.supervisor, self.incidents, self.clock)
+
+    def close(self) -> None:
+        self.page.close()
+        self.link.close()
+        self.memory.close()
+
+    def say(self, *messages: Any) -> None:
+        for message in messages:
+            self.page.send(message if isinstance(message, bytes) else json.dumps(message).encode())
+        self.orders.obey_all()
+
+
+@pytest.fixture
+def desk() -> Iterator[Desk]:
+    with closing(Desk()) as desk:
+        yield desk
+
+
+@pytest.fixture
+def looking() -> Iterator[Desk]:
+    """Of a run that arms nothing."""
+    with closing(Desk(sensing_only=True)) as desk:
+        yield desk
+
+
+def test_the_safe_button_is_the_operators_end_of_the_run(desk: Desk):
+    desk.clock.burn_ns(7 * MS)
+    desk.incidents.tick = 7
+    desk.say({"order": "safe", "t_ns": 6_500_000})
+    reason = "stopped by the operator (safe button of the bench page)"
+    assert desk.supervisor.trip_cause == Trip(reason, 7, 7 * MS, normal=True)
+    assert desk.orders.asked_safe_ns == 6_500_000
+    assert desk.recorder.events == [{"t_ns": 7 * MS, "tick": 7, "event": "safe state", "reason": reason}]
+    desk.incidents.trip("later")
+    assert desk.supervisor.trip_cause.reason == reason
+    assert len(desk.recorder.events) == 1
+
+
+def test_a_safe_order_without_a_time_was_asked_for_now(desk: Desk):
+    desk.clock.burn_ns(3 * MS)
+    desk.say({"order": "safe", "t_ns": "soon"})
+    assert desk.orders.asked_safe_ns == 3 * MS
+    assert desk.supervisor.state is State.SAFE_RAMP
+
+
+def test_jogging_needs_arming_and_ends_with_disarming(desk: Desk):
+    desk.say({"order": "jog", "channel": 1, "rate_V_per_s": 100})
+    assert not desk.manual.active
+    desk.say({"order": "arm"}, {"order": "jog", "channel": 1, "rate_V_per_s": -100.0})
+    desk.clock.burn_ns(10 * MS)
+    np.testing.assert_allclose(desk.manual.step(desk.clock.now_ns()), [40.0, 49.0, 60.0])
+    desk.say({"order": "disarm"})
+    assert not desk.manual.armed(desk.clock.now_ns())
+
+
+def test_nothing_is_armed_that_may_not_move(looking: Desk):
+    looking.say({"order": "arm"})
+    assert not looking.manual.active
+
+
+@pytest.mark.parametrize(("asked", "is_then"), [(0.0, 0.0), (1.5, 1.5), (1, 1.0), (1.51, 1.0), (-0.1, 1.0), ("2", 1.0)])
+def test_gain_within_its_range(desk: Desk, asked: object, is_then: float):
+    desk.say({"order": "gain", "value": asked})
+    assert desk.params["gain"] == is_then
+    taken = isinstance(asked, (int, float)) and 0.0 <= asked <= 1.5
+    assert [e["event"] for e in desk.recorder.events] == (["compensation gain"] if taken else [])
+
+
+@pytest.mark.parametrize(
+    "nonsense", [b"\xff{", b"[]", b"7", {"order": 5}, {"order": "dance"}, {"order": "jog", "channel": "1"}, {"safe": 1}]
+)
+def test_nonsense_is_dropped(desk: Desk, nonsense: object):
+    desk.say(nonsense, {"order": "gain", "value": 0.5})
+    assert desk.supervisor.state is State.RUNNING
+    assert desk.params["gain"] == 0.5
+
+
+def test_an_eager_page_costs_a_tick_a_few_orders_and_a_gone_one_none(desk: Desk):
+    desk.say(*({"order": "gain", "value": i / 100} for i in range(2 * MAX_ORDERS)))
+    assert desk.params["gain"] == (MAX_ORDERS - 1) / 100
+    desk.page.close()
+    desk.orders.obey_all()
+    assert desk.params["gain"] == (2 * MAX_ORDERS - 1) / 100
+    desk.orders.obey_all()
+    assert list(desk.link.orders()) == []
+
+
+def test_histograms_are_shown_in_turn(desk: Desk):
+    first, second = DurationHistogram(), DurationHistogram()
+    second.add(5, 0)
+    showing = desk.link.show(lambda: {"a": first, "b": second})
+    assert [next(showing) for _ in range(3)] == [False] * 3
+    assert desk.memory.histogram(0).count == 0
+    assert desk.memory.histogram(1).count == 1
+
+
+def test_a_doubt_ends_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: Desk, looking: Desk):
+    for each in (desk, looking):
+        for t_ms in (0, 20, 40):
+            each.incidents.bad_for("supply", True, t_ms * MS, 50.0, "supply 3 V")
+        each.incidents.bad_for("supply", False, 45 * MS, 50.0, "supply 3 V")
+        each.incidents.bad_for("supply", True, 46 * MS, 50.0, "supply 3 V")
+        each.incidents.bad_for("supply", True, 95 * MS, 50.0, "supply 3 V")
+        assert each.supervisor.trip_cause is None, "it was good in between"
+        assert not each.counts.noticed
+        each.incidents.bad_for("supply", True, 96 * MS, 50.0, "supply 3 V")
+    assert desk.supervisor.trip_cause is not None
+    assert desk.supervisor.trip_cause.reason == "supply 3 V"
+    assert looking.supervisor.trip_cause is None
+    assert looking.counts.noticed == {"supply: beyond its limit": 0}
+
+
+@pytest.mark.parametrize(
+    ("error", "reason"),
+    [(HalTimeout("no answer", device="daq"), "daq: no answer"), (HalTimeout("no answer"), "daq: no answer")],
+)
+def test_a_trip_for_a_device_names_it_once(desk: Desk, error: HalTimeout, reason: str):
+    desk.incidents.trip_for("daq", error)
+    assert desk.supervisor.trip_cause is not None
+    assert desk.supervisor.trip_cause.reason == reason
+
+
+@pytest.mark.parametrize(
+    ("error", "code"),
+    [
+        (BenchError("no such key"), Exit.BAD_INPUT),
+        (DeviceNotFound("nobody there"), Exit.DEVICE_MISSING),
+        (OpenFailed("no permission"), Exit.DEVICE_MISSING),
+        (HalTimeout("late"), Exit.FAILED),
+    ],
+)
+def test_exit_codes_of_errors(error: BenchError, code: Exit):
+    assert exit_code_of(error) is code
