@@ -13,7 +13,8 @@ from pydantic import Field
 
 from drivers.imu import lsm6ds3_map
 from drivers.imu.base import Imu, pick_rate
-from drivers.imu.bmx055 import Bmx055, check_addresses
+from drivers.imu.bmx055 import Bmx055
+from drivers.imu.bmx055_addresses import check_addresses
 from drivers.imu.lsm6ds3 import Lsm6ds3
 from drivers.imu.mpu6050 import Mpu6050
 from drivers.options import BusLoad, Options, one_of

@@ -35,15 +35,13 @@ from drivers.imu.base import (
     pick_rate,
     require_mode,
 )
+from drivers.imu.bmx055_addresses import check_addresses
 from drivers.imu.bmx055_mag import TRIM_BYTES, MagTrim, counts
 from drivers.imu.registers import Register, RegisterFile, join, signed
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, HalTimeout
 from hal.types import ChannelInfo, Status, TimeSource
 
-ACCEL_ADDRESSES = (0x18, 0x19)  # SDO1 low, high
-GYRO_ADDRESSES = (0x68, 0x69)  # SDO2 low, high
-MAG_ADDRESSES = (0x10, 0x11, 0x12, 0x13)  # bit 0 is SDO2, bit 1 CSB3
 START_UP_S = 0.03  # gyro; the others need 3 ms
 OFFSET_STEP_G = 1.0 / 128.0
 OFFSET_STEP_DPS = 125.0 / 2048.0
@@ -372,23 +370,6 @@ class Bmx055:
         if new:
             self._field_T[:] = self.trim.field_T(x, y, z, rhall)
             self._mag_due_ns = next_due_ns(self._mag_due_ns, t_ns, self._mag_period_ns)
-
-
-def check_addresses(accel: int, gyro: int, mag: int, name: str) -> None:
-    """``BenchError`` for addresses that no strapping gives. SDO2 serves gyro and magnetometer together."""
-    for what, address, good in (
-        ("accelerometer", accel, ACCEL_ADDRESSES),
-        ("gyro", gyro, GYRO_ADDRESSES),
-        ("magnetometer", mag, MAG_ADDRESSES),
-    ):
-        if address not in good:
-            listed = ", ".join(f"0x{a:02X}" for a in good)
-            raise BenchError(f"{what} address 0x{address:02X} is not one of {listed}", device=name)
-    if gyro & 1 != mag & 1:
-        raise BenchError(
-            f"gyro 0x{gyro:02X} and magnetometer 0x{mag:02X} cannot go together: SDO2 sets the lowest bit of both",
-            device=name,
-        )
 
 
 def _setup(

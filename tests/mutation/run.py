@@ -39,7 +39,10 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
     "daq": (("drivers/daq/di4108.py",), ("tests/wire/drivers/test_di4108_wire.py",)),
-    "e727": (("drivers/piezo/gcs.py",), ("tests/wire/drivers/test_gcs_link.py", "tests/wire/drivers/test_e727_wire.py")),
+    "e727": (
+        ("drivers/piezo/gcs.py",),
+        ("tests/wire/drivers/test_gcs_link.py", "tests/wire/drivers/test_e727_wire.py"),
+    ),
     "can": (("drivers/can_frames.py", "drivers/can_telemetry.py"), ("tests/wire/drivers/test_can_drivers_wire.py",)),
     "motion card": (("drivers/motion_card_protocol.py",), ("tests/wire/drivers/test_motion_card_wire.py",)),
 }
