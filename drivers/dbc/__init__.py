@@ -1,4 +1,8 @@
-"""The CAN frames of the bench, read from ``micron.dbc`` with cantools."""
+"""The CAN frames of the bench, read from ``micron.dbc`` with cantools.
+
+What lives here: the frame table and its loading. What must not: what a frame makes a driver do (``drivers.piezo``,
+``drivers.can_telemetry``); the emulated nodes read the manual, not this file.
+"""
 
 from __future__ import annotations
 

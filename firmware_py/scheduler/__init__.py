@@ -1,4 +1,8 @@
-"""Cooperative scheduler of the firmware: task table, time bases, slack, statistics, real-time settings."""
+"""Cooperative scheduler of the firmware: task table, time bases, slack, statistics, real-time settings.
+
+What lives here: who runs in a tick and in what is left of it, and how long that took; nothing that knows a device.
+What must not: the tasks themselves (``firmware_py.control``), waiting for anything but the next tick.
+"""
 
 from firmware_py.scheduler.histogram import Distribution, DurationHistogram
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
