@@ -44,6 +44,9 @@ def test_the_instrument_runs_on_it(tmp_path):
     text = (home / "micron.toml").read_text().replace('"di4108"', '"linedaq"')
     text = text.replace("calibration/", f"{home}/calibration/").replace('daq0"\n\n', 'daq0"\nbaud = 1_000_000\n\n')
     (tmp_path / "bench.toml").write_text(text)
-    outcome, _ = run_in_process(RunRequest(tmp_path / "bench.toml", 2.0, virtual=True))
-    assert (outcome["devices"]["daq"], outcome["samples"]["lost"]) == ("linedaq 1", 0)
-    assert outcome["safe_state"]["normal"]
+    result, _ = run_in_process(RunRequest(tmp_path / "bench.toml", 2.0, virtual=True))
+    assert (result["devices"]["daq"], result["samples"]["lost"], result["safe_state"]["normal"]) == (
+        "linedaq 1",
+        0,
+        True,
+    )
