@@ -40,13 +40,9 @@ def test_lines_are_scans():
 
 
 def test_the_instrument_runs_on_it(tmp_path):
-    home = Path(benches.__file__).parent
+    home, file = Path(benches.__file__).parent, tmp_path / "bench.toml"
     text = (home / "micron.toml").read_text().replace('"di4108"', '"linedaq"')
     text = text.replace("calibration/", f"{home}/calibration/").replace('daq0"\n\n', 'daq0"\nbaud = 1_000_000\n\n')
-    (tmp_path / "bench.toml").write_text(text)
-    result, _ = run_in_process(RunRequest(tmp_path / "bench.toml", 2.0, virtual=True))
-    assert (result["devices"]["daq"], result["samples"]["lost"], result["safe_state"]["normal"]) == (
-        "linedaq 1",
-        0,
-        True,
-    )
+    file.write_text(text)
+    run, _ = run_in_process(RunRequest(file, 2.0, virtual=True))
+    assert (run["devices"]["daq"], run["samples"]["lost"], run["safe_state"]["normal"]) == ("linedaq 1", 0, True)
