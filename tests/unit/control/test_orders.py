@@ -159,8 +159,8 @@ def test_histograms_are_shown_in_turn(desk: Desk):
     second.add(5, 0)
     showing = desk.link.show(lambda: {"a": first, "b": second})
     assert [next(showing) for _ in range(3)] == [False] * 3
-    assert desk.memory.histogram(0).count == 0
-    assert desk.memory.histogram(1).count == 1
+    assert desk.memory.distribution(0).n == 0
+    assert desk.memory.distribution(1).n == 1
 
 
 def test_a_doubt_ends_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: Desk, looking: Desk):
