@@ -7,7 +7,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 COVERED = hal drivers firmware_py
 
-.PHONY: run test unit realtime test-all lint audit fuzz bench docs pictures wheel coverage mutation quality setup clean
+.PHONY: run test unit realtime speed test-all lint audit fuzz bench docs pictures wheel coverage mutation quality setup clean
 
 run: setup
 	$(BIN)/micron run
@@ -19,6 +19,10 @@ unit: setup
 
 realtime: setup
 	$(BIN)/pytest -m "realtime and not slow" -q
+
+# of the unit tests the one that a tracer would slow down
+speed: setup
+	$(BIN)/pytest -q tests/perf
 
 test-all: test
 	$(BIN)/pytest -m "slow" -q
@@ -65,7 +69,7 @@ wheel: setup
 # the unit tests once more with what they reach: by branch, without kernels (compiled code cannot be traced, their
 # pure-Python twins are tested instead) and without what runs in processes of its own; each room for itself
 coverage: setup quality
-	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --cov --cov-report= --cov-report=html:out/coverage --cov-fail-under=0
+	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --ignore=tests/perf --cov --cov-report= --cov-report=html:out/coverage --cov-fail-under=0
 	for room in $(COVERED); do $(BIN)/coverage report --include="$$room/*" --skip-covered --sort=cover || exit 1; done
 
 # does a test fail when a line is changed? minutes to an hour; make mutation ONLY="safety can" for some of it

@@ -246,6 +246,30 @@ def test_stop_button():
     assert telemetry.button_silent()
 
 
+def test_the_button_is_silent_only_beyond_its_limit():
+    clock = VirtualClock()
+    can = ScriptedCan(clock)
+    telemetry = CanTelemetry(can, clock)
+    clock.burn_ns(1000 * MS)
+    can.arrive(0x080, "0001")
+    telemetry.poll()
+    clock.burn_ns(1500 * MS)
+    assert not telemetry.button_silent()
+    clock.burn_ns(1)
+    assert telemetry.button_silent()
+
+
+def test_telemetry_ends_where_the_frame_does():
+    clock = VirtualClock()
+    can = ScriptedCan(clock)
+    telemetry = CanTelemetry(can, clock)
+    telemetry.send_tremor([6554.0, 6554.0, 6554.0], 656.0)
+    telemetry.send_state(0, 0, 65_536, 65_536, 65_536.0)
+    assert can.sent == [(0x200, "ffff" * 4), (0x201, "0000" + "ffff" * 3)]
+    assert telemetry.sent == 2
+    assert telemetry.receives() == (0x080,)
+
+
 def test_a_babbling_bus_does_not_hold_the_tick():
     clock = VirtualClock()
     can = ScriptedCan(clock)

@@ -266,6 +266,22 @@ def test_digital_outputs_echo_only_when_idle():
         daq.write_digital(4)
 
 
+@pytest.mark.parametrize("bits", [0, 3])
+def test_the_ends_of_the_digital_outputs(bits: int):
+    text = f"dout {bits}\r".encode()
+    daq, port, _ = device(("w", text), ("r", text))
+    daq.write_digital(bits)
+    port.done()
+
+
+@pytest.mark.parametrize("bits", [-1, 4])
+def test_beyond_the_digital_outputs_nothing_is_sent(bits: int):
+    daq, _, _ = device()
+    with pytest.raises(BenchError, match="only bits 0 and 1 are outputs") as caught:
+        daq.write_digital(bits)
+    assert caught.value.device == daq.name
+
+
 def test_stop_drains_what_is_on_its_way():
     daq, port, _ = scanning(("w", b"stop\r"), ("r", scan(1) * 3), ("r", scan(2) + b"stop\r"))
     daq.stop()

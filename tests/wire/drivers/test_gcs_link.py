@@ -127,6 +127,25 @@ def test_an_error_is_asked_for_once_and_found_later():
     link.take_error()
 
 
+def test_what_comes_behind_an_answer_waits_and_an_empty_one_is_none():
+    link, line, _ = loop()
+    link.ask_error()
+    line.arrived = b"0\n10\n"
+    link.take_error()
+    link.ask_error()
+    line.arrived = b"\r"
+    with pytest.raises(ProtocolError, match="error 10 after"):
+        link.take_error()
+    link.ask_error()
+    line.arrived = b"\n"
+    with pytest.raises(ProtocolError, match=r"answer to 'ERR\?' was '.{2}'"):
+        link.take_error()
+    link.ask_error()
+    line.arrived = b"\n"
+    with pytest.raises(ProtocolError, match=r"answer to 'ERR\?' was ''"):
+        link.take_error()
+
+
 def test_an_answer_that_is_late_is_a_lost_link():
     link, line, clock = loop()
     link.take_error()

@@ -14,6 +14,7 @@ from drivers.ble_motion_card import BleMotionCard
 from drivers.imu.base import ImuSample
 from drivers.motion_card import MotionCard
 from drivers.motion_card_protocol import (
+    LONGEST_LINE,
     ActivationButton,
     CardReading,
     LineParser,
@@ -93,6 +94,43 @@ def test_line_of_the_document():
 def test_what_is_no_line(line: bytes):
     with pytest.raises(ValueError, match=r"#:|field|counts|status"):
         decode_line(line, "raw")
+
+
+def test_a_full_battery():
+    assert decode_battery(b"\x64") == 100
+
+
+def test_of_a_stream_without_ends_the_newest_beginning_is_kept():
+    parser = LineParser()
+    parser.feed(LINE)
+    parser.feed(b"#:9:#:8:" + b"x" * LONGEST_LINE)
+    assert parser.discarded_bytes == 8 + LONGEST_LINE, "its last beginning is too long itself"
+    parser.feed(b"x" * LONGEST_LINE + b"#:9:" + LINE[:9])
+    assert parser.discarded_bytes == 8 + 2 * LONGEST_LINE + 4
+    assert parser.feed(LINE[9:]) == [decode_packet(EXAMPLE)]
+    assert parser.bad_frames == 2
+
+
+def test_the_first_half_of_a_beginning_is_kept_too():
+    parser = LineParser()
+    parser.feed(b"x" * LONGEST_LINE + b"#")
+    assert parser.discarded_bytes == LONGEST_LINE
+    assert parser.feed(LINE[1:]) == [decode_packet(EXAMPLE)]
+    assert parser.bad_frames == 0, "it began in the middle"
+
+
+def test_after_a_reconnection_the_middle_of_a_line_is_no_bad_frame():
+    parser = LineParser()
+    parser.feed(LINE + LINE[:5])
+    parser.reset()
+    assert parser.feed(LINE[7:] + LINE) == [decode_packet(EXAMPLE)]
+    assert (parser.frames, parser.bad_frames) == (2, 0)
+
+
+def test_a_card_that_wakes_up_pressed_is_not_in_its_long_press():
+    button = ActivationButton()
+    button.update(True, 0)
+    assert button.update(False, 100 * 1_000_000) == 1
 
 
 def test_starting_in_the_middle_is_no_bad_frame():
