@@ -69,7 +69,7 @@ wheel: setup
 # the unit tests once more with what they reach: by branch, without kernels (compiled code cannot be traced, their
 # pure-Python twins are tested instead) and without what runs in processes of its own; each room for itself
 coverage: setup quality
-	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --ignore=tests/perf --cov --cov-report= --cov-report=html:out/coverage --cov-fail-under=0
+	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q --ignore=tests/perf --cov --cov-report= --cov-fail-under=0
 	for room in $(COVERED); do $(BIN)/coverage report --include="$$room/*" --skip-covered --sort=cover || exit 1; done
 
 # does a test fail when a line is changed? minutes to an hour; make mutation ONLY="safety can" for some of it
