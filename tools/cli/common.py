@@ -27,7 +27,7 @@ JsonOption = Annotated[
 
 def console() -> Console:
     """For people: standard error."""
-    return Console(stderr=True, highlight=False)
+    return Console(stderr=True, highlight=False, emoji=False)
 
 
 def data_console() -> Console:
