@@ -155,7 +155,8 @@ class Session:
             run.reason = outcome["safe_state"]["reason"]
             run.phase = "safe" if outcome["safe_state"]["reached"] else "ended"
             run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
-            run.status = {**run.status, "lost": outcome["samples"]["lost"]}  # what was lost at the very end, too
+            # what was lost, or fell back, at the very end, too
+            run.status |= {"lost": outcome["samples"]["lost"], "fallbacks": outcome["kinematics"]["fallbacks"]}
         else:
             run.phase, run.reason = "failed", failure
             self.note("error", f"the firmware failed: {failure}")
@@ -185,6 +186,8 @@ class Session:
             found.append((kind, f"Safe state, outputs at neutral: {run.reason}."))
         elif run.phase == "running" and self.stale_s() > STALE_S:
             found.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
+        if ticks := run.status.get("fallbacks", 0):
+            found.append(("warn", f"Numeric kinematics: {ticks} ticks fell back to the analytic solution."))
         if self.disk.low:
             found.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
         if self.recorder.active and self.recorder.trouble():

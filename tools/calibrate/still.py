@@ -70,16 +70,16 @@ DRIFT_TOLERANCE = 2e-3
 FIRST_REST_S = 20.0
 
 
-def remove_drift(raw: Array, rate_hz: float, *, allowed: bool) -> tuple[Array, WarmUp]:
+def remove_drift(raw: Array, rate_hz: float, *, allowed: bool, reach: float | None = None) -> tuple[Array, WarmUp]:
     """``raw`` (n, 3) with the drift that its first rest shows taken off, if ``allowed``; InputError if it is not.
 
-    A log whose first rest is shorter than 20 s cannot show a drift and is taken as steady.
+    A log whose first rest is shorter than 20 s cannot show a drift and is taken as steady. ``reach`` is what 1 g reads;
+    without it half the range of the log, which is turned up and down.
     """
     window = max(5, round(0.5 * rate_hz))
     level = quiet_level(raw, window)
     rest = find_poses(raw, window, 3.0 * level, round(FIRST_REST_S * rate_hz)) if level > 0.0 else None
-    reach = float(np.max(np.ptp(raw, axis=0))) / 2.0
-    tolerance = DRIFT_TOLERANCE * reach
+    tolerance = DRIFT_TOLERANCE * (float(np.max(np.ptp(raw, axis=0))) / 2.0 if reach is None else reach)
     if rest is None or len(rest.bounds) == 0:
         return raw, WarmUp(True, 0.0, tolerance, float("inf"))
     first, last = rest.bounds[0]

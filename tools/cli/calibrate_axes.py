@@ -92,7 +92,7 @@ def accelerometer(
     """
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.logs import load_log
-    from tools.calibrate.multi_position import identify_poses
+    from tools.calibrate.multi_position import MultiPosition, identify_poses
     from tools.calibrate.quick import flat, free_fall, turn
     from tools.calibrate.still import remove_drift
 
@@ -103,7 +103,9 @@ def accelerometer(
             return
         log = load_log(recording, rate_hz)
         raw, rate = log.matrix(three(columns)), log.need_rate()
-        raw, warm = remove_drift(raw, rate, allowed=drift is OnDrift.FIT)
+        # lying flat or falling its readings do not reach over 1 g: what 2 mg are is then said by --counts-per-g
+        one_g = counts_per_g if method in (Method.FALL, Method.FLAT) else None
+        raw, warm = remove_drift(raw, rate, allowed=drift is OnDrift.FIT, reach=one_g)
         notes = [warm.text()]
         if method is Method.POSES:
             result = identify_poses(raw, rate, gravity)
@@ -117,6 +119,8 @@ def accelerometer(
             result = free_fall(raw, rate, counts_per_g)
         else:
             result = flat(raw, counts_per_g, up)
+        if not isinstance(result, MultiPosition):
+            notes += result.lines()
         notes.append("missing: " + (", ".join(result.missing) or "nothing"))
         print_parameters(f"accelerometer, {method.value}", result.parameters, notes)
         if out is not None:
