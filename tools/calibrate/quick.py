@@ -25,7 +25,7 @@ FEW_TURN_SAMPLES = 1000
 LARGEST_FLAT_SPREAD_G = 0.05
 LARGEST_FLAT_BIAS_G = 0.5
 LEAST_REACH = 0.8
-"""Range of an axis over the usual one; an axis 35 degrees from the vertical still reads 0.82 g."""
+"""Range of an axis over the largest; an axis 35 degrees from the vertical still reads 0.82 g."""
 POSE_SINE = float(np.sin(np.radians(35.0)))
 UNDITHERED_STEPS = 0.475
 """Half of 95 % of one quantisation step: what a mean of equal readings can be off by."""
@@ -132,15 +132,16 @@ def _extremes(raw: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
 
 def _missing_turns(raw: Array, low: Array, high: Array, bias: Array, scale: Array) -> tuple[str, ...]:
     """Poses that no axis came to; ``low`` and ``high`` are the samples of the extremes."""
-    told = 2.0 * scale >= LEAST_REACH * np.median(2.0 * scale)
+    told = scale >= LEAST_REACH * scale.max()
     force = (raw - bias) / np.where(told, scale, np.inf)  # an axis that is not told counts as zero
     missing: list[str] = []
     for i in np.flatnonzero(~told):
-        # where it stands up the others, which are known, read nothing
+        # where it stands up the others, which are known, read nothing; where one of them does, it reads nothing itself
+        upright = scale[i] >= LEAST_REACH / 2.0 * scale.max()
         words = [
             f"{'xyz'[i]} {word}"
             for word, at in (("up", high), ("down", low))
-            if np.median(np.linalg.norm(force[at[:, i]], axis=1)) > POSE_SINE
+            if not upright or np.median(np.linalg.norm(force[at[:, i]], axis=1)) > POSE_SINE
         ]
         missing += words or [f"{'xyz'[i]} up", f"{'xyz'[i]} down"]
     return tuple(missing)
@@ -161,6 +162,8 @@ def turn(raw: Array) -> QuickResult:
     missing = _missing_turns(raw, low, high, bias, scale)
     axes = [i for i, axis in enumerate("xyz") if not any(pose[0] == axis for pose in missing)]
     spread = 1.4826 * np.hypot(np.median(np.abs(top - up), axis=0), np.median(np.abs(bottom - down), axis=0))
+    if len(axes) < 2:
+        raise InputError(f"missing: {', '.join(missing)}: turn slowly through 360 degrees about two axes")
     wide = float(student.ppf(0.975, len(low) - 1))
     parameters: dict[str, Estimate] = {}
     for i in axes:

@@ -67,6 +67,8 @@ class WarmUp:
 
 DRIFT_TOLERANCE = 2e-3
 """Of the sensor's reach (about 1 g): 2 mg."""
+LARGEST_DRIFT = 0.25
+"""Of that reach: what changes more during a rest is an even turn and no drift."""
 FIRST_REST_S = 20.0
 
 
@@ -83,6 +85,9 @@ def remove_drift(raw: Array, rate_hz: float, *, allowed: bool, reach: float | No
     if rest is None or len(rest.bounds) == 0:
         return raw, WarmUp(True, 0.0, tolerance, float("inf"))
     first, last = rest.bounds[0]
+    means = [part.mean(axis=0) for part in np.array_split(raw[first:last], 16)]
+    if reach is None and float(np.ptp(means, axis=0).max()) > LARGEST_DRIFT / DRIFT_TOLERANCE * tolerance:
+        return raw, WarmUp(True, 0.0, tolerance, float("inf"))
     t = np.arange(len(raw)) / rate_hz
     found = [warm_up(t[first:last], raw[first:last, i], tolerance) for i in range(3)]
     worst = max(found, key=lambda w: abs(w.remaining))

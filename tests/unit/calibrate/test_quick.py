@@ -131,6 +131,17 @@ def test_the_pose_that_a_turn_left_out_is_named_and_nothing_said_of_its_axis() -
     assert turn(log[:2000]).missing == ("z up", "z down")
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_half_a_turn_is_refused_with_the_poses_it_lacks(seed: int) -> None:
+    with pytest.raises(InputError, match="missing: x up, x down, y down: turn slowly"):
+        turn(turned(3000, 40.0, seed)[:1500])
+
+
+def test_an_even_slow_turn_is_no_warm_up() -> None:
+    log = turned(3000, 40.0)[:3000]
+    assert remove_drift(log, 100.0, allowed=False)[1].steady
+
+
 def test_two_axes_that_go_up_together_are_no_turn() -> None:
     wave = np.sin(np.linspace(0.0, 2.0 * np.pi, 1000))
     log = np.stack([wave, wave, np.zeros(1000)], axis=1) * SCALE + BIAS
