@@ -17,6 +17,7 @@ from tools.calibrate.multi_position import Estimate, missing_poses
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
 LARGEST_TURN_RESIDUAL = 0.15
 LEAST_TURN_STEPS = 20.0
 """Range of an axis over the rms change from sample to sample: 600 for a slow turn, 7 for noise."""
@@ -118,7 +119,7 @@ def _one_pose(values: Array) -> dict[str, Estimate]:
     return found
 
 
-def _extremes(raw: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _extremes(raw: Array) -> tuple[Rows, Rows]:
     """(k, 3) samples that are each axis' lowest and highest 0.5 %, by the median of their neighbours.
 
     By its own value a sample would be chosen for its noise, and the scale would come out too large.
@@ -130,7 +131,7 @@ def _extremes(raw: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     return order[:count], order[-count:]
 
 
-def _missing_turns(raw: Array, low: Array, high: Array, bias: Array, scale: Array) -> tuple[str, ...]:
+def _missing_turns(raw: Array, low: Rows, high: Rows, bias: Array, scale: Array) -> tuple[str, ...]:
     """Poses that no axis came to; ``low`` and ``high`` are the samples of the extremes."""
     told = scale >= LEAST_REACH * scale.max()
     force = (raw - bias) / np.where(told, scale, np.inf)  # an axis that is not told counts as zero
@@ -195,7 +196,9 @@ def turn(raw: Array) -> QuickResult:
     if missing:
         named = ", ".join("xyz"[i] for i in range(3) if i not in axes)
         limits.insert(0, f"bias and scale of {named}, and |a|: see missing")
-    design = np.kron(np.eye(len(axes)), [[1.0, 1.0], [1.0, -1.0]])  # reading up and down = bias +- scale
+    design = np.kron(np.eye(len(axes)), [[1.0, 1.0], [1.0, -1.0]]).astype(
+        np.float64
+    )  # reading up and down = bias +- scale
     noise = float(np.max(spread[axes])) / np.sqrt(2.0)
     return _exact("turn", parameters, design, len(raw), noise, missing, tuple(limits), check)
 
