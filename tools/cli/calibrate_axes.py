@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from tools.cli.common import JsonOption, clear_errors, data_console
+from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
@@ -52,16 +52,17 @@ def three(columns: str) -> tuple[str, str, str]:
     return names  # pyright: ignore[reportReturnType]
 
 
-def print_parameters(title: str, parameters: dict, notes: list[str]) -> None:
-    """A table of estimates with their intervals, and lines below it."""
+def print_parameters(title: str, parameters: dict, notes: list[str], json_file: str | None) -> None:
+    """A table of estimates with their intervals, and lines below it; beside JSON on standard output, on the other."""
+    to = console() if json_file == "-" else data_console()
     table = Table(title=title, title_justify="left")
     for heading in ("parameter", "value", "95 % interval"):
         table.add_column(heading, justify="left" if heading == "parameter" else "right")
     for name, e in parameters.items():
         table.add_row(name, f"{e.value:.6g}", f"{e.low:.6g} .. {e.high:.6g}")
-    data_console().print(table)
+    to.print(table)
     for note in notes:
-        data_console().print(note)
+        to.print(note)
 
 
 def accelerometer(
@@ -122,7 +123,7 @@ def accelerometer(
         if not isinstance(result, MultiPosition):
             notes += result.lines()
         notes.append("missing: " + (", ".join(result.missing) or "nothing"))
-        print_parameters(f"accelerometer, {method.value}", result.parameters, notes)
+        print_parameters(f"accelerometer, {method.value}", result.parameters, notes, json_file)
         if out is not None:
             values = {name: e.value for name, e in result.parameters.items()}
             write_text_atomic(
@@ -168,7 +169,7 @@ def _stage(
     ]
     notes.append("missing: " + (", ".join(fit.missing) or "nothing"))
     named = {f"{n}.{k}": e for n, axis in zip("xyz", fit.axes, strict=True) for k, e in axis.parameters.items()}
-    print_parameters(f"accelerometer, stage, {fit.poses} poses", named, notes)
+    print_parameters(f"accelerometer, stage, {fit.poses} poses", named, notes, json_file)
     if out is not None:
         tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
         made_by = f"micron calibrate accelerometer {recording} --method stage"
@@ -225,7 +226,7 @@ def magnetometer(
             )
         else:
             notes.append("the turn between magnetometer and body is not in these data: give --accelerometer-columns")
-        print_parameters("magnetometer", parameters, notes)
+        print_parameters("magnetometer", parameters, notes, json_file)
         if out is not None:
             table = {"matrix": matrix.tolist(), "bias": result.bias.tolist()}
             if offset is not None:

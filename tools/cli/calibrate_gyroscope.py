@@ -49,6 +49,7 @@ def gyroscope(
                 f"condition {result.condition:.1f}",
                 "missing poses: " + (", ".join(result.accelerometer.missing) or "none"),
             ],
+            json_file,
         )
         if out is not None:
             values = {name: e.value for name, e in result.parameters.items()}

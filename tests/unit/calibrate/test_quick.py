@@ -176,3 +176,4 @@ def test_terminal_and_json_say_the_same(tmp_path: Path) -> None:
     assert told["condition"] == pytest.approx(1.0)
     assert told["missing"] == list(FIVE)
     assert told["noise"] == pytest.approx(5.0, rel=0.2)
+    assert json.loads(CliRunner().invoke(app, [*command[:-1], "-"]).stdout) == told
