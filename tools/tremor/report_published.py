@@ -53,7 +53,8 @@ TUNED_MIXED: dict[Method, Mapping[str, Any]] = {
     "ar_kalman": {"wflc": _BAND, "ar": {"walk": 1e-5, "noise": 0.3}},
     "adaptive": {"adaptive": {"cancel_from_hz": (5.0, 7.0), "cancel_to_hz": (13.0, 16.0)}},
 }
-"""As that page did: each family tuned on three records (seeds 211 to 213), by a small grid."""
+"""As that page did, by a small grid, on at most three records: seeds 211 to 213; AR 211 and 212; with voluntary
+motion AR, E-BMFLC and Kalman weights 211 alone."""
 
 
 def tuned(config: TremorConfig, changes: Mapping[str, Any]) -> TremorConfig:
@@ -155,8 +156,9 @@ def section(signals: list[TremorSignal], progress: Callable[[str], None]) -> lis
         "",
         "As on the instrument: settings and band-pass of the instrument (acceleration, 7-13 Hz elliptic, order 6),",
         "which were never meant for displacement. Tuned as there: that page tuned each family on three records;",
-        "so are these, on three others (seeds 211 to 213), by a small grid, behind that page's band-pass (6-14 Hz,",
-        "first order).",
+        "so are these, on at most three others (seeds 211 to 213; AR on two of them, and with voluntary motion AR,",
+        "E-BMFLC and Kalman weights on one alone), by a small grid, behind that page's band-pass (6-14 Hz, first",
+        "order).",
         "The phase of the band-pass is undone in ours; the published WFLC-FLC and BMFLC with Kalman weights are those",
         "with the phase undone. The adaptive method stands beside that page's best, the joint Kalman filter of",
         "voluntary motion and oscillators; on the instrument it takes all of 2 to 20 Hz for what is to be cancelled,",
