@@ -100,11 +100,11 @@ class OutputGuard:
             else:
                 raise SafetyTrip(f"channel {len(next_V)} was commanded to {wish} V", device=self.device)
             step = slew * gap_s
-            if value - last > step:
+            if value > last + step:
                 value = last + step
                 self.slew_limited += 1
                 mask |= bit
-            elif last - value > step:
+            elif value < last - step:
                 value = last - step
                 self.slew_limited += 1
                 mask |= bit

@@ -1,6 +1,9 @@
 """What the accelerometer and the gyroscope die of a BMX055 have in common: power, reset, shadowing, FIFO, NVM.
 
-Source: BMX055 data sheet BST-BMX055-DS000 rev. 1.3. What is not modelled is said in ``bmx055``.
+Source: BMX055 data sheet BST-BMX055-DS000 rev. 1.3.
+
+Model limits
+- Those of ``bmx055``, which is made of these.
 """
 
 from __future__ import annotations

@@ -11,11 +11,12 @@ from scipy.signal import lsim
 
 from tools.mismatch.prove import draw, guests, kernels, noise
 from tools.mismatch.prove.catalog import TABLE, TWINS
-from tools.mismatch.prove.disk import write
+from tools.mismatch.prove.disk import contract_unit, write
 from tools.mismatch.prove.plans import plans as drawn_plans
 from tools.mismatch.prove.plants import Scene, simulate
 from tools.mismatch.prove.proof import generate
 from tools.mismatch.recording_load import load
+from tools.mismatch.units import convert_difference
 
 
 def _case(twin: str, effects: tuple[str, ...], severity: float, seed: int = 3, kind: str = "single") -> draw.Case:
@@ -102,6 +103,8 @@ def test_recordings_hold_no_answer_and_load_as_the_contract_says(tmp_path: Path)
         for out, rms in answers[name]["noise_rms"].items():
             declared = rec.noise[out]
             assert (declared is not None) == answers[name]["noise_declared"]
+            if rec.twin.kind == guests.INSTRUMENT:  # speaks in the recording's units
+                rms = convert_difference(rms, contract_unit(out), rec.unit[out])
             assert declared is None or declared == pytest.approx(rms, rel=1e-6)
 
 

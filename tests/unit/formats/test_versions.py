@@ -18,7 +18,7 @@ from firmware_py.recording.reader import Recording
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH
-from tools.mismatch import recording as twins
+from tools.mismatch import recording_load as twins
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "v1"
 

@@ -208,7 +208,7 @@ def test_user_twin_from_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
         def load(self) -> type:
             return Squarer
 
-    module = importlib.import_module("tools.mismatch.twins.make")
+    module = importlib.import_module("tools.mismatch.twins.core")
     monkeypatch.setattr(module, "user_kinds", lambda: {"squarer": Entry()})
     u = np.linspace(-1, 1, 60)
     rec = recording("squarer", 0.1, {"u": u}, {"y": u}, {}, {"gain": 3.0, "label": "x"})
