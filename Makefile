@@ -39,10 +39,11 @@ audit: setup
 
 # coverage guided, 60 s per parser, one parser per core: make fuzz SECONDS=600 TARGET=own_recording
 SECONDS ?= 60
+SEED    ?= 0
 TARGET  ?= all
 fuzz: setup
 	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[fuzz]'
-	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS)
+	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS) --seed $(SEED)
 
 # installs the peers that it compares with; make bench ONLY="step world" for some of it
 bench: setup

@@ -20,7 +20,7 @@ SMALL_BYTES = 2048
 FILES = 24  # per target
 
 
-def fuzz(name: str, seconds: int) -> None:
+def fuzz(name: str, seconds: int, seed: int) -> None:
     """Does not return."""
     import atheris
 
@@ -34,6 +34,7 @@ def fuzz(name: str, seconds: int) -> None:
     folders = [str(found), *([str(corpus)] if corpus.is_dir() else [])]
     flags = [
         f"-max_total_time={seconds}",
+        f"-seed={seed}",
         f"-artifact_prefix={found.parent}/{name}-",
         "-rss_limit_mb=2048",
         "-timeout=30",
@@ -62,6 +63,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("target", help="a name of tests/fuzz/targets.py, or all")
     parser.add_argument("--seconds", type=int, default=60, help="per target")
+    parser.add_argument("--seed", type=int, default=0, help="0: another one each time; CI looks where it looked before")
     parser.add_argument("--jobs", type=int, default=os.cpu_count() or 1, help="targets at a time")
     parser.add_argument("--collect", action="store_true", help="put small inputs that reached new code into the corpus")
     chosen = parser.parse_args()
@@ -80,7 +82,7 @@ def main() -> int:
         while waiting and len(running) < chosen.jobs:
             child = os.fork()  # the instrumented imports are made once
             if child == 0:
-                fuzz(waiting[0], chosen.seconds)
+                fuzz(waiting[0], chosen.seconds, chosen.seed)
             running[child] = waiting.pop(0)
         child, status = os.wait()
         name = running.pop(child)
