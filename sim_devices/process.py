@@ -42,7 +42,7 @@ POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
 LINGER_NS = 1_000_000_000  # after the death of the firmware
-COUNT_DOWN_NS = 80_000  # a sleeping process wakes so much too late, 50 us on a virtual machine; less waits in a loop
+COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
 
@@ -81,7 +81,7 @@ class WorldProcess:
         self._worst_late_ns = 0
         self._turns = 0
         self.count_down_ns = 0
-        """What is due is waited for in a loop from so long before: for a process that has a real-time policy."""
+        """The end of a transfer is waited for in a loop from so long before: by a process with a real-time policy."""
         self._now_ns = self.world.epoch_ns
 
     def request_stop(self, *_: object) -> None:
@@ -120,9 +120,9 @@ class WorldProcess:
         self._finish()
 
     def _wait(self) -> list[int]:
-        """Filenos with something to read, or none when the next thing is due, to some microseconds."""
+        """Filenos with something to read, or none when the next thing is due."""
         now_ns = self._clock.now_ns()
-        deadline_ns = latest_ns = now_ns + POLL_NS
+        deadline_ns, early_ns = now_ns + POLL_NS, 0
         for face in self._devices:
             due_ns = face.next_event_ns()
             if due_ns is not None and due_ns < deadline_ns:
@@ -130,17 +130,16 @@ class WorldProcess:
         for server in self._i2c.values():
             due_ns = server.reply_ns()
             if due_ns is not None and due_ns < deadline_ns:
-                deadline_ns = due_ns
+                deadline_ns, early_ns = due_ns, self.count_down_ns
         watched = [pty.fileno() for pty in self._all_ptys if pty.fileno() >= 0]
         for server in self._i2c.values():
             watched += server.filenos()
         watched += [can.fileno() for can in self._can.values()]
         watched.append(self._control.fileno())
-        wake_ns = deadline_ns - self.count_down_ns if deadline_ns < latest_ns else deadline_ns
         # select, not epoll: its timeout has a resolution of 1 us instead of 1 ms
-        if ready := select.select(watched, (), (), max(0, wake_ns - now_ns) * 1e-9)[0]:
+        if ready := select.select(watched, (), (), max(0, deadline_ns - early_ns - now_ns) * 1e-9)[0]:
             return ready
-        while self._clock.now_ns() < deadline_ns:
+        while early_ns and self._clock.now_ns() < deadline_ns:
             pass
         return []
 
