@@ -78,7 +78,9 @@ class ScanTicker:
         if self._last_due_ns is None:
             self._last_due_ns = self._clock.now_ns()
         patience_ns = self._period_ns if self._silent else self._silent_after_ns
-        silent_at_ns = self._last_due_ns + patience_ns
+        # a host that was away for so long itself has not waited for the device yet
+        now_ns = self._clock.now_ns()
+        silent_at_ns = (self._last_due_ns if self._last_due_ns + patience_ns > now_ns else now_ns) + patience_ns
         while True:
             left_ns = silent_at_ns - self._clock.now_ns()
             block = self._read(max(0, left_ns) * 1e-9)

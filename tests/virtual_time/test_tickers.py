@@ -88,3 +88,14 @@ def test_a_device_that_never_speaks_still_ticks() -> None:
     clock = VirtualClock(start_ns=10 * MS)
     ticker = scan_ticker(clock)
     assert [(t.k0, t.due_ns // MS) for t in (ticker.wait(), ticker.wait())] == [(2, 13), (3, 14)]
+
+
+def test_a_host_that_was_away_itself_asks_once_more_before_it_blames_the_device() -> None:
+    clock = VirtualClock(start_ns=70 * MS)
+    ticker = scan_ticker(clock, (71.0, 1, 71), (90.5, 2, 89))
+    assert ticker.wait().due_ns == 71 * MS
+    clock.advance_to(90 * MS)  # nothing there yet when the host comes back: the link delivers a moment later
+    assert ticker.wait() == Ticks(18, 2, 89 * MS, MS, TimeSource.DEVICE_CLOCK)
+    clock.advance_to(110 * MS)
+    assert ticker.wait().source is TimeSource.HOST
+    assert clock.now_ns() == 113 * MS
