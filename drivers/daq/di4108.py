@@ -32,8 +32,6 @@ CLOCK_HZ = 60_000_000  # sample-rate dividend; rate per channel = CLOCK_HZ / (sr
 RANGE_CODES = {10.0: 0, 5.0: 1, 2.0: 2, 1.0: 3, 0.5: 4, 0.2: 5}
 SRATE_MIN, SRATE_MAX, DEC_MAX = 375, 65535, 512
 FIFO_SAMPLES = 1024
-FULL_READ = 4095
-"""So many bytes are all that one read of a tty gives: it says nothing that it ended inside a packet."""
 OVERFLOW_TAIL = b"stop 01"
 MISALIGNED_LIMIT = 3  # reads in a row; a tty may split one packet once
 
@@ -223,7 +221,7 @@ class Di4108:
                 self._good = self._end
                 if self._good >= self._scan_bytes:
                     return
-            elif n < FULL_READ:
+            else:
                 self._read_ended_inside_a_packet()
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
 

@@ -289,17 +289,3 @@ def test_stop_drains_what_is_on_its_way():
     daq.close()
     daq.close()
     assert port.closed
-
-
-def test_a_long_backlog_comes_in_full_reads_of_the_tty():
-    """4095 bytes are what one read of a tty gives: that it ends inside a packet says nothing of lost bytes."""
-    values = np.arange(2000, dtype=np.int16)
-    stream = b"".join(scan(int(v)) for v in values)
-    daq, port, _ = scanning(*(("r", stream[i : i + 4095]) for i in range(0, len(stream), 4095)))
-    out, found = np.zeros((1024, 8), dtype=np.int16), list[int]()
-    while len(found) < len(values):
-        block = daq.read_scans(out, 0.01)
-        assert block.n > 0
-        found += out[: block.n, 0].tolist()
-    assert found == values.tolist()
-    port.done()
