@@ -17,12 +17,11 @@ import pytest
 
 from firmware_py.guardian.process import REPORT, describe
 from firmware_py.run_request import RunRequest
-from tests.conftest import PATIENT, copy_of_default_bench
+from tests.conftest import DEFAULT_BENCH
 
 pytestmark = pytest.mark.realtime
 ROOT = Path(__file__).parents[2]
 NEUTRAL_V = 50.0
-STALE_S = 1.0
 
 
 def wait_for(condition: Callable[[], Any], what: str, limit_s: float = 120.0) -> Any:
@@ -48,8 +47,7 @@ class Run:
         self.folder = folder
         request = folder / "request.json"
         # limits of a busy test machine for scans; the guardian's are then twice that for silence, none for death
-        bench = copy_of_default_bench(folder, PATIENT)
-        request.write_text(RunRequest(bench, 60.0, stale_ms=STALE_S * 1e3).to_json(folder))
+        request.write_text(RunRequest(DEFAULT_BENCH, 60.0, stale_ms=300.0).to_json(folder))
         self.process = subprocess.Popen(
             [sys.executable, "-m", "firmware_py.app", str(request)],
             stdout=subprocess.PIPE,
@@ -99,7 +97,7 @@ def test_a_killed_firmware_leaves_neutral_outputs(run: Run, extra_s: float) -> N
 def test_a_firmware_that_stands_still_is_taken_over_and_says_so_when_it_wakes(run: Run, tmp_path: Path) -> None:
     run.wait_until_moving(0.1)
     os.kill(run.process.pid, signal.SIGSTOP)
-    time.sleep(3.0 * STALE_S)
+    time.sleep(0.9)
     os.kill(run.process.pid, signal.SIGCONT)
     assert run.process.stdout is not None
     run.process.stdout.read()
