@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from firmware_py.frame import ACCELEROMETER
+from firmware_py.frame import ACCELEROMETER, LAYOUT
 from hal.compiled import kernel
 
 SENSORS = 6
@@ -207,6 +207,21 @@ class ScanCheck:
         self._pair_step = np.array(limits.pair_step_m_s2)
         self._pair_told = 0
         self._tick = -1
+        self._load_kernels()
+
+    def _load_kernels(self) -> None:
+        """Compile or load now, not when the first scan is there; changes nothing."""
+        last, same, slope, odd = (state.copy() for state in (self._last, self._same, self._slope, self._odd))
+        check_counts(
+            self._counts, self._sensors, last, same, slope, odd, 1, self._jump, self._outlier, self._supply_step,
+            self._lo, self._hi, self.limits.stuck_ticks,
+        )  # fmt: skip
+        window, sums, usual, spread = (state.copy() for state in self._pairs)
+        limits = self.limits
+        check_pairs(
+            np.zeros(LAYOUT.size), PAIR_PLACES, 0, window, sums, usual, spread, self._pair_step, limits.pair_m_s2,
+            TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
+        )  # fmt: skip
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
         """Counts of scan ``tick``: empty, or what is wrong, in words."""
