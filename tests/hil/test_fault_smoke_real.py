@@ -21,7 +21,7 @@ from tests.conftest import DEFAULT_BENCH
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]
 
-HOST = ("host stood still", "lost the outputs", "scans came at once")
+HOST = ("host stood still", "lost the outputs", "scans came at once", "the host did not read")
 TRIES = 3
 
 
