@@ -4,7 +4,7 @@ The converter averages over its conversion, so what is measured must be a mean o
 meanwhile, each with a weight between the shortest and the longest time that it can have been in force: no model of
 the amplifier is needed, only how long it may take to settle. What a healthy output differs by (gain and offset of
 amplifier and divider) is learnt within the tolerance, and a change of it is as suspicious as a difference beyond the
-tolerance. A suspicious reading is looked at once more, on the same channel, before anything is said. Wired to the
+tolerance. A suspicious output is looked at once more before anything is said. Wired to the
 stack's terminals it sees a broken cable too; wired to the amplifier's monitor socket it sees the amplifier only.
 """
 
@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from drivers.adc.ads1115 import ORDER_NS, RATE_TOLERANCE, WAKE_UP_NS, Ads1115
+from drivers.adc.ads1115 import EXCHANGE_NS, ORDER_NS, RATE_TOLERANCE, WAKE_UP_NS, Ads1115
 from hal.contracts import Clock, Float64Array
 from hal.output_guard import OutputGuard
 
@@ -93,35 +93,50 @@ class AmplifierMonitor:
         nominal_ns = (adc.conversion_ns - WAKE_UP_NS) / (1.0 + RATE_TOLERANCE)
         self._longest_ns = round(nominal_ns * (1.0 + RATE_TOLERANCE))
         self._shortest_ns = round(nominal_ns * (1.0 - RATE_TOLERANCE))
-        self._output = 0
-        self._asked_ns = self._started_ns = 0  # the conversion under way began in between
-        self._suspected = False
+        self._output = self._turn = 0  # of the conversion under way; whose turn it was last
+        self._ordered_ns = self._started_ns = 0  # the conversion under way began in between
+        self._suspected = [False] * len(self._channels)
 
     def poll(self) -> str:
-        """Collect what is ready, start the next conversion; empty, or which output does not follow.
+        """Collect what is ready and start the next conversion, in one transfer; empty, or which output does not follow.
 
-        At most two short I2C transfers; never waits. Raises what the bus raises.
+        Which one is next is said before the reading is known: a suspicious output is looked at again after the one that
+        follows it. Never waits. Raises what the bus raises.
         """
-        wrong = ""
-        if self._adc.pending is not None:
-            value_V = self._adc.collect()
-            if value_V is None:
-                return ""
-            wrong = self._judge(value_V * self._ratio)
-        self._asked_ns = self._clock.now_ns()
-        self._adc.start_conversion(self._channels[self._output])
-        self._started_ns = self._clock.now_ns()
-        return wrong
+        asked_ns = self._clock.now_ns()
+        if self._adc.pending is None:
+            self._adc.start_conversion(self._channels[self._turn])
+            self._ordered(self._turn, asked_ns + ORDER_NS)
+            return ""
+        following = self._following()
+        value_V = self._adc.exchange(self._channels[following])
+        if value_V is None:
+            return ""
+        output, window = self._output, self.window()
+        self._ordered(following, asked_ns + EXCHANGE_NS)
+        return self._judge(output, window, value_V * self._ratio)
 
     def forget(self) -> None:
         """Give up the conversion under way: what it saw is not to be compared."""
         self._adc.pending = None
-        self._suspected = False
+        self._suspected = [False] * len(self._channels)
 
     def window(self) -> Window:
         """Of the conversion under way: it began while its order was on the bus, or woke up after it."""
-        early_ns = self._asked_ns + ORDER_NS
-        return Window(early_ns, self._started_ns + WAKE_UP_NS, self._longest_ns, self._shortest_ns)
+        return Window(self._ordered_ns, self._started_ns + WAKE_UP_NS, self._longest_ns, self._shortest_ns)
+
+    def _following(self) -> int:
+        """The output to convert after the one that is being read: a suspected one, else in turn."""
+        for output, suspected in enumerate(self._suspected):
+            if suspected and output != self._output:
+                return output
+        return (self._turn + 1) % len(self._channels)
+
+    def _ordered(self, output: int, ordered_ns: int) -> None:
+        if not self._suspected[output]:
+            self._turn = output
+        self._output = output
+        self._ordered_ns, self._started_ns = ordered_ns, self._clock.now_ns()
 
     def expected_V(self, output: int, window: Window) -> tuple[float, float] | None:
         """Lowest and highest mean of the commands of ``output`` over a conversion; ``None``: not known any more.
@@ -150,19 +165,17 @@ class AmplifierMonitor:
             gone_late_ns, gone_early_ns = since_late_ns, told.offered_ns
         return None  # commands older than those that are kept
 
-    def _judge(self, measured_V: float) -> str:
-        output = self._output
+    def _judge(self, output: int, window: Window, measured_V: float) -> str:
         self.volts[output] = measured_V
         self.readings += 1
-        span = self.expected_V(output, self.window())
+        span = self.expected_V(output, window)
         if span is None or not self._is_odd(output, measured_V, span):
-            self._suspected = False
-            self._output = (output + 1) % len(self._channels)
+            self._suspected[output] = False
             return ""
         self.suspicions += 1
         beyond_V = max(span[0] - measured_V, measured_V - span[1])
-        if not self._suspected and beyond_V < GROSS * self._tolerance_V:
-            self._suspected = True  # and the same output is converted again
+        if not self._suspected[output] and beyond_V < GROSS * self._tolerance_V:
+            self._suspected[output] = True
             return ""
         told = f"{span[0]:.2f} V" if span[1] - span[0] < 0.005 else f"{span[0]:.2f} to {span[1]:.2f} V"
         return (

@@ -53,16 +53,18 @@ class Hmc2003:
     def poll(self) -> bool:
         """One step of the round robin: collect what is ready, start the next axis. True on a new triple.
 
-        At most two short I2C transfers; never waits. The triple is in ``volts``, ``field_T`` and ``t_ns``.
+        One short I2C transfer; never waits. The triple is in ``volts``, ``field_T`` and ``t_ns``.
         """
-        if self._adc.pending is not None:
-            value_V = self._adc.collect()
-            if value_V is None:
-                return False
-            self._fresh[self._axis] = value_V
-            self._axis = (self._axis + 1) % 3
-        self._adc.start_conversion(self._adc_channels[self._axis])
-        if self._axis != 0 or np.isnan(self._fresh[2]):
+        if self._adc.pending is None:
+            self._adc.start_conversion(self._adc_channels[self._axis])
+            return False
+        following = (self._axis + 1) % 3
+        value_V = self._adc.exchange(self._adc_channels[following])
+        if value_V is None:
+            return False
+        self._fresh[self._axis] = value_V
+        self._axis = following
+        if following != 0 or np.isnan(self._fresh[2]):
             return False
         self.volts[:] = self._fresh
         self._fresh[:] = np.nan

@@ -41,6 +41,7 @@ class I2cSocketServer:
         self._due_ns = 0
         self._reply_ns = 0
         self._free_ns = 0
+        self._held: list[tuple[int, bytes]] | None = None
 
     def filenos(self) -> list[int]:
         return [self._listener.fileno(), *self._clients]
@@ -89,6 +90,16 @@ class I2cSocketServer:
                 self._free_ns = due_ns
                 self._answer(fileno, done.value)
 
+    def hold(self) -> None:
+        """Keep answers back until ``release``: for who lets a transfer end a little before its time has come."""
+        if self._held is None:
+            self._held = []
+
+    def release(self) -> None:
+        held, self._held = self._held, None
+        for fileno, answer in held or ():
+            self._say(fileno, answer)
+
     def close(self) -> None:
         self._listener.close()
         for client, _ in self._clients.values():
@@ -105,9 +116,16 @@ class I2cSocketServer:
 
     def _answer(self, fileno: int, result: TransferResult) -> None:
         status, data = result
+        answer = struct.pack("<BH", status, len(data)) + data
+        if self._held is None:
+            self._say(fileno, answer)
+        else:
+            self._held.append((fileno, answer))
+
+    def _say(self, fileno: int, answer: bytes) -> None:
         if fileno in self._clients:
             try:
-                self._clients[fileno][0].sendall(struct.pack("<BH", status, len(data)) + data)
+                self._clients[fileno][0].sendall(answer)
             except OSError:
                 self._drop(fileno)
 

@@ -25,8 +25,9 @@ def start(channel: int) -> tuple[int, object]:
     return (0x48, [("w", START[channel])])
 
 
-def result(data: str) -> tuple[int, object]:
-    return (0x48, [("w", b"\x00"), ("r", bytes.fromhex(data))])
+def exchanged(data: str, channel: int) -> tuple[int, object]:
+    """The conversion register is read, then input ``channel`` ordered, without a STOP in between."""
+    return (0x48, [("w", b"\x00"), ("r", bytes.fromhex(data)), ("w", START[channel])])
 
 
 def test_probe_reads_back_what_it_wrote():
@@ -42,14 +43,18 @@ def test_probe_refuses_another_part():
 
 
 def test_split_phase_never_touches_the_bus_early():
-    adc, bus, clock = make(start(2), result("1388"))
-    assert adc.collect() is None
+    adc, bus, clock = make(start(2), exchanged("1388", 3), exchanged("0001", 0))
+    assert adc.exchange(3) is None
     adc.start_conversion(2)
     clock.burn_ns(1_279_069)  # 1/860 s plus the 10 % of the data sheet
-    assert adc.collect() is None
+    assert adc.exchange(3) is None
     clock.burn_ns(50_001)  # and waking up
-    assert adc.collect() == pytest.approx(5000 * 187.5e-6)
-    assert adc.collect() is None
+    assert adc.exchange(3) == pytest.approx(5000 * 187.5e-6)
+    assert adc.pending == 3
+    clock.burn_ns(1_329_069)
+    assert adc.exchange(0) is None
+    clock.burn_ns(1)
+    assert adc.exchange(0) == pytest.approx(187.5e-6)
     bus.done()
 
 
@@ -57,10 +62,10 @@ def test_split_phase_never_touches_the_bus_early():
     ("data", "volts"), [("7fff", 6.144 * 32767 / 32768), ("8000", -6.144), ("ffff", -187.5e-6), ("0000", 0.0)]
 )
 def test_twos_complement(data: str, volts: float):
-    adc, _, clock = make(start(0), result(data))
+    adc, _, clock = make(start(0), exchanged(data, 0))
     adc.start_conversion(0)
     clock.burn_ns(2_000_000)
-    assert adc.collect() == pytest.approx(volts)
+    assert adc.exchange(0) == pytest.approx(volts)
 
 
 def test_other_gain_and_rate():
@@ -71,14 +76,19 @@ def test_other_gain_and_rate():
 
 
 def test_nack_leaves_nothing_pending():
-    adc, bus, clock = make((0x48, I2cNack("no")), start(1), result("0001"))
+    adc, bus, clock = make((0x48, I2cNack("no")), start(1), (0x48, I2cNack("no")), start(1), exchanged("0001", 2))
     with pytest.raises(I2cNack) as caught:
         adc.start_conversion(1)
     assert caught.value.kind is ErrorKind.NACK_ADDRESS
-    assert adc.collect() is None
+    assert adc.exchange(2) is None
     adc.start_conversion(1)
     clock.burn_ns(2_000_000)
-    assert adc.collect() == pytest.approx(187.5e-6)
+    with pytest.raises(I2cNack):
+        adc.exchange(2)
+    assert adc.exchange(2) is None
+    adc.start_conversion(1)
+    clock.burn_ns(2_000_000)
+    assert adc.exchange(2) == pytest.approx(187.5e-6)
     bus.done()
 
 
@@ -101,7 +111,7 @@ def volts_hex(volts: float) -> str:
 
 
 def triple(*volts: float) -> list[tuple[int, object]]:
-    return [e for i, v in enumerate(volts) for e in (result(volts_hex(v)), start((i + 1) % 3))]
+    return [exchanged(volts_hex(v), (i + 1) % 3) for i, v in enumerate(volts)]
 
 
 def test_round_robin_gives_field_in_tesla():
@@ -136,7 +146,7 @@ def test_set_and_reset_give_the_offset():
 
 def test_offset_measurement_is_bounded():
     class Dead(Ads1115):
-        def collect(self) -> float | None:
+        def exchange(self, channel: int) -> float | None:
             return None
 
     clock = VirtualClock()

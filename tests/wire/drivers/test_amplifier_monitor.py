@@ -83,15 +83,47 @@ def test_a_small_error_is_believed_at_the_second_look_only():
 def test_one_wrong_reading_is_not_believed(monkeypatch: pytest.MonkeyPatch):
     stand = Stand()
     stand.run(100)
-    collect, wrong = Ads1115.collect, [0.06]  # 1.2 V at the output, once
+    exchange, wrong = Ads1115.exchange, [0.06]  # 1.2 V at the output, once
 
-    def disturbed(adc: Ads1115) -> float | None:
-        value_V = collect(adc)
+    def disturbed(adc: Ads1115, channel: int) -> float | None:
+        value_V = exchange(adc, channel)
         return value_V if value_V is None or not wrong else value_V + wrong.pop()
 
-    monkeypatch.setattr(Ads1115, "collect", disturbed)
+    monkeypatch.setattr(Ads1115, "exchange", disturbed)
     assert stand.run(200) == []
     assert stand.monitor.suspicions == 1
+
+
+def test_two_outputs_that_fail_at_once_do_not_hide_each_other():
+    """Each is suspected while the other is looked at again."""
+    stand = Stand()
+    stand.run(100)
+    stand.error_V[:2] = 1.2
+    said = stand.run(40)
+    assert said
+    assert said[0][0] - 100 <= 12
+    assert said[0][1].startswith(("output 1 is", "output 2 is"))
+
+
+def test_every_output_is_looked_at_in_turn_and_a_suspected_one_in_between(monkeypatch: pytest.MonkeyPatch):
+    stand = Stand()
+    stand.run(100)
+    order: list[int] = []
+    exchange = Ads1115.exchange
+
+    def noting(adc: Ads1115, channel: int) -> float | None:
+        order.append(channel)
+        return exchange(adc, channel)
+
+    monkeypatch.setattr(Ads1115, "exchange", noting)
+    stand.run(12)
+    healthy = [(order[0] + i) % 3 for i in range(6)]
+    assert order == healthy
+    stand.error_V[healthy[-1]] = 1.2  # under way already: half of the conversion sees it
+    order.clear()
+    stand.run(6)
+    suspect = healthy[-1]
+    assert order == [(suspect + 1) % 3, suspect, (suspect + 2) % 3]
 
 
 def test_a_command_under_way_may_have_arrived_already():

@@ -47,6 +47,24 @@ def stand(tmp_path: Path) -> Iterator[Stand]:
     stand.server.close()
 
 
+def test_an_answer_that_is_held_is_said_when_it_is_released(stand: Stand) -> None:
+    """The transfer may end before its time has come; the caller must not know."""
+    stand.client.setblocking(False)
+    stand.ask("0c 01 00 0300 31 4000")
+    stand.deliver(1000)
+    stand.server.hold()
+    stand.server.advance_to(1000 + 95_000)
+    assert stand.dac.output_V[0] == 1.25
+    with pytest.raises(BlockingIOError):
+        stand.client.recv(10)
+    stand.server.release()
+    assert stand.client.recv(10) == bytes.fromhex("00 0000")
+    stand.ask("0c 01 00 0300 31 8000")  # released for good
+    stand.deliver(200_000)
+    stand.server.advance_to(300_000)
+    assert stand.client.recv(10) == bytes.fromhex("00 0000")
+
+
 def test_write_answers_after_its_bus_time(stand: Stand) -> None:
     stand.ask("0c 01 00 0300 31 4000")
     stand.deliver(1000)
