@@ -5,6 +5,8 @@ BIN    := $(VENV)/bin
 # one thread per BLAS call: the work is parallel in processes, and oversubscription costs a factor of ten
 export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
+# compiled modules are kept: without them every process of the tests compiles its imports anew
+unexport PYTHONDONTWRITEBYTECODE
 COVERED = hal drivers firmware_py
 
 .PHONY: run test unit realtime speed test-all lint audit fuzz bench docs pictures wheel coverage mutation quality setup clean
