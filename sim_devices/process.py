@@ -147,7 +147,7 @@ class WorldProcess:
         return []
 
     def _be_there_at(self, deadline_ns: int) -> None:
-        """What comes at ``deadline_ns`` is worked out before; at that time it is only said. Nobody is heard meanwhile."""
+        """What comes at ``deadline_ns`` is worked out before; then it is only said. Nobody is heard meanwhile."""
         for server in self._i2c.values():
             server.hold()
         self.world.advance_to(deadline_ns)
