@@ -83,8 +83,8 @@ class WorldProcess:
         self._worst_late_ns = 0
         self._turns = 0
         self.count_down_ns = 0
-        """The end of a transfer, and what a device will say on a serial line, is waited for in a loop from so long before:
-        by a process with a real-time policy."""
+        """The end of a transfer, and what a device will say on a serial line, is waited for in a loop from so long
+        before: by a process with a real-time policy."""
         self._now_ns = self.world.epoch_ns
 
     def request_stop(self, *_: object) -> None:

@@ -92,8 +92,9 @@ class Ads1115:
     def exchange(self, channel: int) -> float | None:
         """Volts of the pending conversion, and in the same transfer the order to convert ``channel`` next.
 
-        ``None`` while there is none or it may still run (then the bus stays untouched). The pointer is written, two bytes are read after a repeated START, and the order follows after another one. After
-        an error nothing is pending: whether the order was heard is not known.
+        ``None`` while there is none or it may still run (then the bus stays untouched). The pointer is written, two
+        bytes are read after a repeated START, and the order follows after another one. After an error nothing is
+        pending: whether the order was heard is not known.
         """
         if self.pending is None or self._clock.now_ns() < self._ready_ns:
             return None
