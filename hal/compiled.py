@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar, cast
@@ -38,11 +38,28 @@ def _files_of(dotted: str, root: Path) -> Iterator[Path]:
             yield file
 
 
+def _when_imported(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
+    """The statements that run when a module is imported, without those for type checkers alone."""
+    for node in body:
+        if isinstance(node, ast.If):
+            if not (isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"):
+                yield from _when_imported(node.body)
+            yield from _when_imported(node.orelse)
+        elif isinstance(node, ast.Try):
+            for part in (node.body, node.orelse, node.finalbody, *(handler.body for handler in node.handlers)):
+                yield from _when_imported(part)
+        else:
+            yield node
+
+
 @cache
 def imported_sources(file: Path, root: Path = ROOT) -> frozenset[Path]:
-    """Our own files that ``file`` imports by absolute name, type-only imports included."""
+    """Our own files that ``file`` imports by absolute name when it is imported itself.
+
+    An import within a function is not seen, and need not be: no kernel can use one.
+    """
     found: set[Path] = set()
-    for node in ast.walk(ast.parse(file.read_bytes())):
+    for node in _when_imported(ast.parse(file.read_bytes()).body):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:

@@ -16,7 +16,6 @@ from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.plant.scanner import Scanner
 from sim_devices.plant.stack_twin import StackTwins
 from sim_devices.plant.unit import start_temperature_C
-from sim_devices.twin_file import load_twin
 from sim_devices.world import Plant
 
 
@@ -50,6 +49,8 @@ def stack_twins(config: EmulationConfig, description: Mapping[str, Any]) -> Stac
                 f"[emulation] twin: device '{name}' (e727) measures the stacks while it runs, a corrected twin runs on "
                 "whole records; use a bench with an amplifier without sensor"
             )
+    from sim_devices.twin_file import load_twin  # brings the whole catalogue of effects; most benches have no twin
+
     folder = Path(description.get("folder", "."))
     files = (config.twin,) * 3 if isinstance(config.twin, str) else config.twin
     twins = [load_twin((folder / file).resolve()) for file in files]

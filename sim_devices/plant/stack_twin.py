@@ -8,6 +8,7 @@ is refused by ``plant_factory``); the current that couples into the magnetometer
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,9 @@ from numpy.typing import NDArray
 from hal.compiled import kernel
 from hal.errors import BenchError
 from sim_devices.plant.manipulator import tip_displacement
-from sim_devices.twin_file import FileTwin
+
+if TYPE_CHECKING:
+    from sim_devices.twin_file import FileTwin
 
 Array = NDArray[np.float64]
 

@@ -31,6 +31,19 @@ def test_only_our_own_packages_are_followed(tmp_path: Path):
     assert imported_sources(top, tmp_path) == {tmp_path / "firmware_py" / "middle.py"}
 
 
+def test_what_is_imported_only_for_types_or_within_a_function_is_not_followed(tmp_path: Path):
+    top = tree(tmp_path)
+    top.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "try:\n    from hal.inner import X\nexcept ImportError:\n    X = 0\n"
+        "if TYPE_CHECKING:\n    from hal.other import Y\n"
+        "else:\n    import firmware_py.room\n"
+        "def later():\n    from firmware_py import middle\n"
+    )
+    room = tmp_path / "firmware_py" / "room" / "__init__.py"
+    assert imported_sources(top, tmp_path) == {tmp_path / "hal" / "inner.py", room}
+
+
 def test_division_by_zero_is_a_number_and_not_an_exception():
     @kernel
     def ratio(a: float, b: float) -> float:
