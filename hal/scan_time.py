@@ -3,9 +3,17 @@
 The earliest arrivals carry the least transport delay, so the line through them is the device clock on the
 host's time base (the idea of NTP's minimum filter). What remains is the constant minimum delay of the
 transport: a scan is stamped late by that much, never early.
+
+A clock that steps shows as arrivals that are all later, or some earlier, than the line. That cannot be told from a
+transport or a host that has become slower, nor can a step of a tenth of a period from what they vary by.
 """
 
 from __future__ import annotations
+
+SHIFT = 0.15
+"""Of a period (USB is polled every 125 us): arrivals that are off the line by so much are no jitter if they all are,"""
+SHIFT_ARRIVALS = 10
+"""so many in a row; the loop's tasks repeat after as many ticks, and one of them leaves the host free."""
 
 
 class ScanTimeline:
@@ -30,6 +38,12 @@ class ScanTimeline:
         self._skew_ns = 0.0
         self._least_ns = 0.0
         self._in_window = 0
+        self._late_in_a_row = 0
+
+    @property
+    def shifted(self) -> bool:
+        """The last arrivals are all late, or the last one is early, by more than a part of a period."""
+        return self._late_in_a_row >= SHIFT_ARRIVALS
 
     @property
     def next_seq(self) -> int:
@@ -55,6 +69,10 @@ class ScanTimeline:
             # while starting, an earlier arrival corrects the start at once
             self._offset_ns += late_ns
             self._least_ns = late_ns = 0.0
+        if late_ns < -SHIFT * self.dt_ns:
+            self._late_in_a_row = SHIFT_ARRIVALS
+        else:
+            self._late_in_a_row = self._late_in_a_row + 1 if late_ns > SHIFT * self.dt_ns else 0
         self._arrivals += n
         self._in_window += n
         lost = 0

@@ -23,6 +23,8 @@ class Status(IntFlag):
     SATURATED = 2
     GAP = 4
     STALE = 8
+    SHIFTED = 16
+    """Scans come at another time than their clock says: it stepped, or their way has become longer."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,8 @@ filter, ps, start, stop, "Binary stream output formats", "Internal FIFO overflow
 
 The binary stream has no sync word: a scan is where the count from ``start`` says it is. Packets are sent whole,
 so a read that ends inside a packet again and again means lost bytes, and is an error rather than a shift of
-all channels by one byte.
+all channels by one byte. Not so while a backlog comes in, which is faster than the device scans: one read of a tty
+gives at most 4095 bytes, and what refills it stops anywhere. Nor are the pieces of one packet lost bytes.
 """
 
 from __future__ import annotations
@@ -33,7 +34,9 @@ RANGE_CODES = {10.0: 0, 5.0: 1, 2.0: 2, 1.0: 3, 0.5: 4, 0.2: 5}
 SRATE_MIN, SRATE_MAX, DEC_MAX = 375, 65535, 512
 FIFO_SAMPLES = 1024
 OVERFLOW_TAIL = b"stop 01"
-MISALIGNED_LIMIT = 3  # reads in a row; a tty may split one packet once
+MISALIGNED_LIMIT = 3  # reads in a row; a tty may split one packet
+MISALIGNED_PACKETS = 2.0  # and for so long, in times that the device takes for a packet
+BUFFER_BYTES = 1 << 18  # the device's FIFO and all that a kernel keeps of a serial line
 
 
 def scan_rate(rate_hz: float) -> tuple[int, int, float]:
@@ -79,12 +82,13 @@ class Di4108:
         self._info: ScanInfo | None = None
         self._scanning = False
         self._digital_bits = 0
-        self._buf = bytearray(1 << 16)
+        self._buf = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buf)
         self._words = np.frombuffer(self._buf, dtype="<i2")
         self._width = 0
         self._scan_bytes = 0
         self._packet_bytes = 16
+        self._byte_ns = 1e6
         self._timeline = ScanTimeline(1e6)
         self._dt_ns = 0
         self._arrival_ns = 0
@@ -92,6 +96,9 @@ class Di4108:
         self._good = 0  # of these, bytes known to be aligned
         self._received = 0  # bytes since start
         self._misaligned = 0
+        self._misaligned_ns = 0  # arrival of the first
+        self._late_ns = 0.0  # of the last read; only its changes mean something
+        self._in_doubt = False  # a backlog's reads end anywhere: the first one after it that does not tells
         self._overflowed = False
 
     # identity and configuration
@@ -145,6 +152,7 @@ class Di4108:
         self._packet_bytes = 16 << code
         self._timeline = ScanTimeline(1e9 / rate_hz)
         self._dt_ns = round(1e9 / rate_hz)
+        self._byte_ns = 1e9 / rate_hz / self._scan_bytes
         self._info = ScanInfo(
             rate_hz=rate_hz,
             channels=tuple(channels),
@@ -172,7 +180,7 @@ class Di4108:
         self._end = 0
         self._good = 0
         self._received = 0
-        self._misaligned = 0
+        self._misaligned, self._in_doubt = 0, False
         self._overflowed = False
         self._timeline.restart()
         self._port.write(b"start 0\r", self._answer_timeout_s)
@@ -203,6 +211,8 @@ class Di4108:
         self.scans += n
         self.lost += lost
         status = Status.GAP if lost else Status.OK
+        if self._timeline.shifted:
+            status |= Status.SHIFTED
         return ScanBlock(n, t0_ns, self._dt_ns, seq0, TimeSource.DEVICE_CLOCK, status, lost)
 
     def _receive(self, timeout_s: float) -> None:
@@ -210,36 +220,56 @@ class Di4108:
         now_ns = self._clock.now_ns()
         limit_ns = now_ns + round(timeout_s * 1e9)
         while not self._overflowed:
+            if self._end == BUFFER_BYTES:
+                self._raise_backlog()
             n = self._port.read_into(self._view[self._end :], timeout_s)
             if n == 0:
                 return
             self._arrival_ns = now_ns = self._clock.now_ns()
             self._end += n
             self._received += n
-            if self._received % self._packet_bytes == 0:
-                self._misaligned = 0
+            late_ns = now_ns - self._received * self._byte_ns
+            catching_up = late_ns < self._late_ns - self._packet_bytes * self._byte_ns
+            self._late_ns = late_ns
+            if self._received % self._packet_bytes:
+                self._read_ended_inside_a_packet(catching_up)
+            elif not (catching_up and self._in_doubt):
+                self._misaligned, self._in_doubt = 0, False
                 self._good = self._end
                 if self._good >= self._scan_bytes:
                     return
-            else:
-                self._read_ended_inside_a_packet()
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
 
-    def _read_ended_inside_a_packet(self) -> None:
-        if self._view[: self._end].tobytes().endswith(OVERFLOW_TAIL):
+    def _read_ended_inside_a_packet(self, catching_up: bool) -> None:
+        if self._view[max(0, self._end - len(OVERFLOW_TAIL)) : self._end] == OVERFLOW_TAIL:
             self._overflowed = True
             self._scanning = False
             self._end -= len(OVERFLOW_TAIL)
             self._good = self._end
             return
+        if catching_up:
+            self._in_doubt = True
+            return
+        if self._misaligned == 0:
+            self._misaligned_ns = self._arrival_ns
         self._misaligned += 1
-        if self._misaligned > MISALIGNED_LIMIT:
+        lasted = (self._arrival_ns - self._misaligned_ns) / (self._packet_bytes * self._byte_ns)
+        if self._misaligned > MISALIGNED_LIMIT and lasted >= MISALIGNED_PACKETS:
             raise ProtocolError(
                 f"{self._misaligned} reads in a row ended inside a packet of {self._packet_bytes} bytes: bytes "
                 "were lost and channels cannot be told apart; start the scan again",
                 kind=ErrorKind.FRAMING,
                 device=self.name,
             )
+
+    def _raise_backlog(self) -> None:
+        lost = self._timeline.due_by(self._clock.now_ns())
+        raise Overrun(
+            f"a backlog of more than {BUFFER_BYTES // 1024} kB: the host stood still, and its {lost} scans are given "
+            "up; start the scan again",
+            device=self.name,
+            lost=lost,
+        )
 
     def _raise_overrun(self) -> None:
         lost = self._timeline.due_by(self._clock.now_ns())

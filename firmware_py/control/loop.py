@@ -43,7 +43,7 @@ from firmware_py.scheduler.task import BackgroundSpec, TickInfo
 from firmware_py.scheduler.ticker import ScanTicker, Ticks
 from hal.contracts import Clock
 from hal.errors import HalError
-from hal.types import ScanBlock, TimeSource
+from hal.types import ScanBlock, Status, TimeSource
 
 MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
@@ -223,6 +223,8 @@ class InstrumentLoop:
         self._block = block
         if block.n:
             self._last_scan_ns = block.t0_ns + (block.n - 1) * block.dt_ns
+            if block.status & Status.SHIFTED:
+                self.incidents.notice(f"scans of {self._devices.daq.name} come at another time than their clock says")
         self.counts.received += block.n
         if block.lost:
             self.incidents.notice("scans were lost")

@@ -57,6 +57,8 @@ class Parity:
 
     def step(self, parity: NDArray[np.float64]) -> Verdict:
         off = parity - self.usual
+        if self._single:
+            off[1] = 0.0
         if self._ticks < LEARN_TICKS:  # the first ones are what is usual
             self._ticks += 1
             self.usual += off / self._ticks

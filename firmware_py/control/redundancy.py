@@ -26,6 +26,7 @@ class Redundancy:
         self, stages: Stages, check: ScanCheck, supervisor: Supervisor, incidents: Incidents, labels: tuple[str, ...]
     ) -> None:
         self._sensing = stages.sensing
+        self._told = stages.frame[PARITY : PARITY + len(PARITIES)]
         self._check = check
         self._supervisor = supervisor
         self._incidents = incidents
@@ -75,6 +76,7 @@ class Redundancy:
         louder = self._sensing.leave_out(axis, parity.usual)
         self._check.ignore(axis)
         parity.restart(self._null())
+        self._told[self._parities() :] = 0.0
         text = f"{why}: left out, sensing goes on without it; noise of the tip's acceleration times {louder:.2f}"
         self._incidents.notice(text)
         self._incidents.note({"event": "axis left out", "reason": text})

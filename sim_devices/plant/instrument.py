@@ -151,9 +151,11 @@ class Instrument:
         """Fault hook: the sensors' supply is ``part`` of what it was when the unit was built, from the next step on."""
         self._plant[0]["supply_V"] = self._supply_V * part
 
-    def redraw_noise(self, seed: int) -> None:
-        """From the next block on the noise is another: what a run would have been on another day."""
-        self._rng = stream(seed, "instrument.noise.redrawn")
+    def hush(self) -> None:
+        """No noise from now on; the hand goes on as before."""
+        self._quiet = True
+        self._noise[:] = 0.0
+        self._slow[:] = 0.0
 
     def motion(self) -> BodyMotion:
         """Of the body at the last step; the specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""

@@ -47,7 +47,7 @@ def serial_line() -> tuple[Fault, ...]:
 
 
 def daq_device() -> tuple[Fault, ...]:
-    step = "less than a period is what a USB packet may be late by; the time line follows it"
+    step = "arrivals vary by as much; the time line follows it"
     small = "100 ppm of a sample period is 0.1 us a tick; the time line follows it"
     return (
         Fault("daq: unplugged", InWorld("unplug", "daq"), "safe state", ("daq",)),
@@ -56,7 +56,8 @@ def daq_device() -> tuple[Fault, ...]:
         Fault("daq: FIFO overflow", InWorld("overflow", "daq"), "safe state", ("overflow",)),
         Fault("daq: crystal 100 ppm fast", InWorld("clock=100", "daq"), "harmless", why=small, redraws=True),
         Fault("daq: crystal 100 ppm slow", InWorld("clock=-100", "daq"), "harmless", why=small, redraws=True),
-        Fault("daq: clock steps by 0.4 ms", InWorld("clock_step=400", "daq"), "cannot be seen", redraws=True, why=step),
+        Fault("daq: clock steps by 0.1 ms", InWorld("clock_step=100", "daq"), "cannot be seen", redraws=True, why=step),
+        Fault("daq: clock steps by 0.4 ms", InWorld("clock_step=400", "daq"), "noticed", ("daq",), redraws=True),
         Fault("daq: clock steps by 2.5 ms", InWorld("clock_step=2500", "daq"), "noticed", ("daq",), redraws=True),
         Fault("daq: another model at start", InWorld("model=2108", "daq"), "refused", ("DI-4108",), at_start=True),
         Fault("daq: does not answer at start", InWorld("freeze", "daq"), "refused", ("daq",), at_start=True),

@@ -57,8 +57,8 @@ How = InWorld | OnBus | OnHost | Kill | OutOfMemory
 class Fault:
     """``names``: one of these must be in the message. ``at_start``: it is there before the bench is opened.
 
-    ``redraws``: the fault also shifts when samples are taken, so they carry other noise; the tip may then stray as
-    far as it would with other noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
+    ``redraws``: the fault also shifts when samples are taken, so they carry other noise; how far it takes the tip
+    is seen without noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
     ``effect``: how much it disturbs a real bench, by the scale of the HIL tests (0 reads .. 4 motion); 9 is for the
     emulated world only. ``why``: for what cannot be seen, comes late or is harmless. ``redundant``: what is expected of
     a bench with more than six axes, where that is something else. ``part``: what a message says that isolates the

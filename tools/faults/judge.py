@@ -89,10 +89,10 @@ def judge(
     seed: int,
     seen: Seen,
     reference_m: NDArray[np.float64],
-    other_noise_m: NDArray[np.float64] | None = None,
+    tip_m: NDArray[np.float64] | None = None,
 ) -> Observation:
-    """``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms; ``other_noise_m``: the same
-    with other noise from the strike on, for faults that redraw the noise."""
+    """``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms. ``tip_m``: what to compare with
+    it instead of the tip that was seen: for faults that redraw the noise both are of runs without noise."""
     outcome = seen.outcome
     safe = outcome["safe_state"]
     reason = str(safe["reason"])
@@ -100,15 +100,12 @@ def judge(
     confirmed = bool(safe["reached"])
     noticed = {what: t_ns for what, t_ns in outcome["noticed"].items() if t_ns >= seen.strike_ns}
     first = min(noticed, key=noticed.__getitem__) if noticed else ""
-    n = min(len(seen.tip_m), len(reference_m))
-    away_m = np.linalg.norm(seen.tip_m[:n] - reference_m[:n], axis=1)
+    path_m = seen.tip_m if tip_m is None else tip_m
+    n = min(len(seen.tip_m), len(path_m), len(reference_m))
+    away_m = np.linalg.norm(path_m[:n] - reference_m[:n], axis=1)
     t_ns = seen.t_ns[:n]
     before = (t_ns >= seen.strike_ns) & (t_ns <= decided_ns)
-    limit_m = np.full(n, MOVED_M)
-    if other_noise_m is not None:
-        m = min(n, len(other_noise_m))
-        limit_m[:m] += np.maximum.accumulate(np.linalg.norm(other_noise_m[:m] - reference_m[:m], axis=1))
-    moved = np.flatnonzero(before & (away_m > limit_m))
+    moved = np.flatnonzero(before & (away_m > MOVED_M))
     neutral = neutral_ms(seen.demands, decided_ns) if confirmed else None
     samples = outcome["samples"]
     counted = samples["received"] + samples["lost"] + samples["unread"] + 1  # and the one under way

@@ -1,7 +1,8 @@
 """One hand, one seed, every fault: a run in virtual time that forks at the instant of the strike.
 
 The way to the strike is the same for all faults, bit for bit, so it is gone once; then a child process per fault
-breaks something and goes on to the end of its own run. The first child breaks nothing: it is the reference.
+breaks something and goes on to the end of its own run. The first child breaks nothing: it is the reference. Faults that
+shift when samples are taken would be compared with other noise; their tip is taken from a pair of runs without noise.
 """
 
 from __future__ import annotations
@@ -140,19 +141,29 @@ def observe_running(
     at_ns = round(strike_s(seed) * 1e9)
     answers: list[Any] = []
     me = _Child()
+    shifting = [fault for fault in faults if fault.redraws]
+    references = [(False, None, max(fault.watch_s for fault in faults))]
+    if shifting:
+        references.append((True, None, max(fault.watch_s for fault in shifting)))
+    runs: list[tuple[bool, Fault | None, float]] = [
+        *references,
+        *((True, fault, fault.watch_s) for fault in shifting),
+        *((False, fault, fault.watch_s) for fault in faults),
+    ]
 
     def at_strike(_: int) -> None:
-        longest_s = max(fault.watch_s for fault in faults)
-        references = [(lambda: None, longest_s), (lambda: far.world.world.plant.redraw_noise(seed), longest_s)]
-        strikes = [(lambda f=fault: far.strike(f.how, seed), fault.watch_s) for fault in faults]
-        for strike, watch_s in [*references, *strikes]:
+        for quiet, fault, watch_s in runs:
             if me.fork(answers):
-                strike()
+                if quiet:
+                    far.world.world.plant.hush()
+                if fault is not None:
+                    far.strike(fault.how, seed)
                 if "firmware" in far.processes.dead:
                     me.answer(far.after_death(at_ns, watch_s))
                 far.clock.at(at_ns + round(watch_s * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
                 return
-            done()
+            if fault is not None and not quiet:
+                done()
         raise _AllStruck
 
     def open_hook(opened: OpenBench) -> None:
@@ -173,10 +184,17 @@ def observe_running(
             raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
         assert truth is not None
         me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans()))
-    reference, other_noise, *seen_of = answers
+    of = {(quiet, fault and fault.name): seen for (quiet, fault, _), seen in zip(runs, answers, strict=True)}
     return [
-        judge(fault.name, point, seed, seen, reference.tip_m, other_noise.tip_m if fault.redraws else None)
-        for fault, seen in zip(faults, seen_of, strict=True)
+        judge(
+            fault.name,
+            point,
+            seed,
+            of[False, fault.name],
+            of[fault.redraws, None].tip_m,
+            of[True, fault.name].tip_m if fault.redraws else None,
+        )
+        for fault in faults
     ]
 
 

@@ -86,3 +86,26 @@ def test_due_by_counts_what_has_not_come():
     assert line.due_by(99 * MS) == 0
     line.stamp(1, 10 * MS)
     assert line.due_by(17 * MS + 1) == 7
+
+
+@pytest.mark.parametrize("step_us", [-400, -200, 200, 400])
+def test_a_clock_that_steps_is_told_within_ten_arrivals(step_us: int):
+    line, told = ScanTimeline(float(MS)), list[int]()
+    for k in range(3000):
+        line.stamp(1, (5 + k) * MS + (step_us * 1000 if k >= 2000 else 0))
+        if line.shifted:
+            told.append(k)
+    assert told[0] == (2009 if step_us > 0 else 2000)
+
+
+def test_neither_jitter_nor_a_stall_nor_a_slow_crystal_is_a_step():
+    rng = np.random.default_rng(2)
+    line = ScanTimeline(float(MS))
+    late_us = rng.exponential(50.0, 20_000)
+    late_us[::7] = 2500.0  # some come with the next one but one
+    arrival_ns = np.maximum.accumulate((np.arange(20_000) * MS * (1 + 100e-6) + late_us * 1000).astype(np.int64))
+    told = 0
+    for k in range(20_000):
+        line.stamp(1, int(arrival_ns[k]))
+        told += line.shifted
+    assert told == 0

@@ -111,6 +111,17 @@ def test_one_parity_tells_that_but_not_which(config: SensingConfig):
     assert Verdict.FOUND not in verdicts
 
 
+def test_what_the_second_combination_said_last_is_no_contradiction_when_there_is_one_left(config: SensingConfig):
+    """The stage does not fill it any more: the frame kept what had found the axis, and a quiet run was ended by it."""
+    stage = Sensing(config)
+    parity = Parity(stage.params["null"][0])
+    verdicts = [parity.step(np.zeros(2)) for _ in range(200)]
+    stage.leave_out(1, parity.usual)
+    parity.restart(stage.params["null"][0])
+    verdicts += [parity.step(np.array([0.6 * LIMIT, 0.95 * LIMIT])) for _ in range(30)]
+    assert set(verdicts) == {Verdict.AGREED}
+
+
 def test_what_contradicts_from_the_beginning_is_not_usual(config: SensingConfig):
     null = Sensing(config).params["null"][0]
     wrong = np.zeros(8)

@@ -224,13 +224,15 @@ def test_overflow_tail_in_two_pieces():
 
 def test_a_lost_byte_never_shifts_channels():
     whole = [scan(7, 7, 7, 7, 7, 7, 7, 7)] * 8
-    daq, port, _ = scanning(("r", whole[0]), *(("r", w if i else w[1:]) for i, w in enumerate(whole)))
+    broken = [whole[0], whole[1][1:], *whole[2:]]
+    daq, port, clock = scanning(*(e for k, w in enumerate(broken) for e in (("at", (10 + k) * MS), ("r", w))))
     out = np.zeros((8, 8), dtype=np.int16)
     assert daq.read_scans(out, 0.01).n == 1
     # a read_scans goes on reading while it has nothing it can trust: here until the fourth suspicious read
     with pytest.raises(ProtocolError, match="bytes were lost") as caught:
         daq.read_scans(out, 0.001)
     assert caught.value.kind is ErrorKind.FRAMING
+    assert clock.now_ns() == (10 + 4) * MS
     assert port.script  # it gave up before all of the stream had passed
 
 
@@ -289,3 +291,74 @@ def test_stop_drains_what_is_on_its_way():
     daq.close()
     daq.close()
     assert port.closed
+
+
+def everything(daq: Di4108, reads: int) -> list[int]:
+    """Input 0 of all scans that come within ``reads`` reads; all inputs of a scan must be alike."""
+    out, found = np.zeros((1024, 8), dtype=np.int16), list[int]()
+    for _ in range(reads):
+        n = daq.read_scans(out, 0.001).n
+        assert (out[:n] == out[:n, :1]).all(), "channels were shifted"
+        found += out[:n, 0].tolist()
+    return found
+
+
+def alike(k: int) -> bytes:
+    return scan(*(k,) * 8)
+
+
+@pytest.mark.parametrize("piece", [1, 2, 7, 16, 250, 4095])
+def test_a_backlog_comes_in_pieces_that_end_anywhere(piece: int):
+    """The host stood still for 3 s; one read of a tty gives at most 4095 bytes, one byte more is there 5 us later."""
+    scans = 3001 if piece > 100 else 501
+    stream = b"".join(alike(k) for k in range(1, scans))
+    pieces = [stream[i : i + piece] for i in range(0, len(stream), piece)]
+    backlog = [e for i, p in enumerate(pieces) for e in (("at", 3010 * MS + i * 5000), ("r", p))]
+    begins = 3011 + len(pieces) * 5000 // MS
+    after = [e for k in range(9) for e in (("at", (begins + k) * MS), ("r", alike(scans + k)))]
+    daq, port, _ = scanning(("at", 10 * MS), ("r", alike(0)), *backlog, *after)
+    assert everything(daq, len(pieces) + 20) == list(range(scans + 9))
+    port.done()
+
+
+def test_a_packet_may_come_byte_by_byte():
+    stream = b"".join(alike(k) for k in range(50))
+    daq, port, _ = scanning(
+        *(e for i in range(len(stream)) for e in (("at", 10 * MS + i * 62_500), ("r", stream[i : i + 1])))
+    )
+    assert everything(daq, 60) == list(range(50))
+    port.done()
+
+
+@pytest.mark.parametrize("lost", [5, 4000, 4095, 20_000, 47_990])
+def test_a_byte_lost_in_a_backlog_is_known_behind_it_and_shifts_nothing(lost: int):
+    stream = b"".join(alike(k) for k in range(1, 3001))
+    stream = stream[:lost] + stream[lost + 1 :]
+    backlog = [("r", stream[i : i + 4095]) for i in range(0, len(stream), 4095)]
+    after = [e for k in range(3001, 3020) for e in (("at", (10 + k) * MS), ("r", alike(k)))]
+    daq, _, clock = scanning(("at", 10 * MS), ("r", alike(0)), ("at", 3010 * MS), *backlog, *after)
+    found = list[int]()
+    with pytest.raises(ProtocolError, match="bytes were lost"):
+        found += everything(daq, 30)
+    assert clock.now_ns() <= (3010 + 4) * MS
+
+
+def test_more_backlog_than_there_is_room_for_is_an_overrun():
+    stream = b"".join(alike(k % 3000) for k in range(1, 16_500))
+    daq, _, _ = scanning(
+        ("at", 10 * MS),
+        ("r", alike(0)),
+        ("at", 16_510 * MS),
+        *(("r", stream[i : i + 4095]) for i in range(0, 264_000, 4095)),
+    )
+    with pytest.raises(Overrun, match="backlog of more than 256 kB") as caught:
+        everything(daq, 3)
+    assert caught.value.lost == 16_500
+
+
+def test_a_clock_that_steps_is_told_in_the_blocks():
+    times = [(10 + k) * MS + (400_000 if k >= 300 else 0) for k in range(320)]
+    daq, _, _ = scanning(*(e for k, t_ns in enumerate(times) for e in (("at", t_ns), ("r", scan(k)))))
+    out = np.zeros((8, 8), dtype=np.int16)
+    told = [k for k in range(320) if daq.read_scans(out, 0.01).status & Status.SHIFTED]
+    assert told == list(range(309, 320))
