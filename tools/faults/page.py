@@ -29,7 +29,8 @@ run without the fault (same hand, same noise, bit for bit the same until the str
 also shift when samples are taken would meet other noise: their tip is that of two more runs, both without noise from
 the strike on. Unsafe: a demand that arrives at the amplifier beyond 0..100 V or faster than 20 V/ms, or a channel that
 is not neutral 21 ms after the decision although the report says that it is; a report that says "neutral NOT confirmed"
-makes no such claim. Uncounted: scans that the device took and that are neither received, nor reported lost, nor unread at the end.
+makes no such claim. Uncounted: scans that the device took and that are neither
+received, nor reported lost, nor unread at the end.
 
 ## What is not seen, or too late
 
