@@ -241,7 +241,7 @@ class Di4108:
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
 
     def _read_ended_inside_a_packet(self, catching_up: bool) -> None:
-        if self._view[max(0, self._end - len(OVERFLOW_TAIL)) : self._end] == OVERFLOW_TAIL:
+        if bytes(self._view[max(0, self._end - len(OVERFLOW_TAIL)) : self._end]) == OVERFLOW_TAIL:
             self._overflowed = True
             self._scanning = False
             self._end -= len(OVERFLOW_TAIL)
