@@ -7,9 +7,13 @@ standard deviations from which the seed draws one physical unit: the same seed i
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from hal.errors import BenchError
+from hal.validation import describe_validation_error
 
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
@@ -314,3 +318,11 @@ class EmulationConfig(_Table):
     more_axes: tuple[MoreAxis, ...] = Field(default=(), max_length=2)
     twin: str | tuple[str, str, str] | None = None
     """Corrected twin (``micron mismatch apply``) in place of the stacks, or one for each; relative to the bench."""
+
+
+def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
+    """The checked ``[emulation]`` table; ``BenchError`` names each wrong key."""
+    try:
+        return EmulationConfig.model_validate(description["emulation"])
+    except ValidationError as error:
+        raise BenchError(describe_validation_error(error, "[emulation]")) from error

@@ -6,25 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from hal.errors import BenchError
-from hal.validation import describe_validation_error
-from sim_devices.config import EmulationConfig
+from sim_devices.config import EmulationConfig, emulation_config
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
 from sim_devices.plant.scanner import Scanner
 from sim_devices.plant.stack_twin import StackTwins
 from sim_devices.plant.unit import start_temperature_C
 from sim_devices.world import Plant
-
-
-def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
-    """The checked ``[emulation]`` table; ``BenchError`` names each wrong key."""
-    try:
-        return EmulationConfig.model_validate(description["emulation"])
-    except ValidationError as error:
-        raise BenchError(describe_validation_error(error, "[emulation]")) from error
 
 
 def make_plant(description: Mapping[str, Any], hand_file: str | None, hand_scale: float | None) -> Plant:

@@ -1,6 +1,6 @@
 """The emulated world as a process of its own, in real time: ``python -m sim_devices.process JOB.json``.
 
-The job file (written by ``sim_devices.register``) holds the bench description and where to put things. The
+The job file (written by ``sim_devices.process_world``) holds the bench description and where to put things. The
 process serves each serial bus on a pty, each I2C bus on a Unix socket, each CAN bus on UDP multicast (or, with
 ``sim://NAME?via=slcan``, as a serial adapter on a pty) and writes their URIs to ``endpoints.json`` when it is
 ready. It obeys fault commands on ``control.sock``; on SIGTERM or when its parent is gone it writes ``truth.npz``

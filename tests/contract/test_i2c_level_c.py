@@ -19,7 +19,8 @@ from hal.backends.open import open_i2c
 from hal.clock import MonotonicClock
 from hal.errors import I2cNack
 from hal.types import I2cRead, I2cWrite
-from sim_devices.register import ProcessWorld, provider
+from sim_devices.process_world import ProcessWorld
+from sim_devices.register import provider
 from tests.contract.imu_contract import CHIPS, DESCRIPTION, check_imu
 
 ROOT = Path(__file__).resolve().parents[2]

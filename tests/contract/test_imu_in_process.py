@@ -9,7 +9,8 @@ import pytest
 
 from hal.clock import VirtualClock
 from hal.contracts import I2cBus
-from sim_devices.register import LockstepWorld, provider
+from sim_devices.lockstep_world import LockstepWorld
+from sim_devices.register import provider
 from tests.contract.imu_contract import CHIPS, DESCRIPTION, check_imu
 
 

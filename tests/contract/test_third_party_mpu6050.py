@@ -18,7 +18,8 @@ import pytest
 from hal.clock import VirtualClock
 from hal.contracts import I2cBus
 from hal.types import I2cRead, I2cWrite
-from sim_devices.register import LockstepWorld, provider
+from sim_devices.lockstep_world import LockstepWorld
+from sim_devices.register import provider
 
 DESCRIPTION: dict[str, Any] = {
     "format": 1,

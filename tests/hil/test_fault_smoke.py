@@ -12,7 +12,7 @@ from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
 from hal.clock import VirtualClock
-from sim_devices.register import LockstepWorld
+from sim_devices.lockstep_world import LockstepWorld
 from tests.conftest import DEFAULT_BENCH
 
 FAULT_AFTER_NS = 1_500_000_000  # the run proper has begun by then

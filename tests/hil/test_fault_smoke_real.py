@@ -16,7 +16,7 @@ import pytest
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench
-from sim_devices.register import ProcessWorld
+from sim_devices.process_world import ProcessWorld
 from tests.conftest import DEFAULT_BENCH
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(240)]

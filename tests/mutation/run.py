@@ -12,6 +12,7 @@ import json
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
 from collections import Counter
@@ -48,10 +49,9 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
 }
 
 
-def prepare(name: str) -> Path:
-    """A copy of the tree with mutmut's settings for one group."""
+def prepare(name: str, folder: Path) -> None:
+    """A copy of the tree in ``folder`` with mutmut's settings for one group."""
     files, tests = GROUPS[name]
-    folder = OUT / name.replace(" ", "_")
     shutil.rmtree(folder, ignore_errors=True)
     for package in PACKAGES:
         shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
@@ -67,19 +67,29 @@ def prepare(name: str) -> Path:
     }
     lines = "\n".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
     (folder / "pyproject.toml").write_text(f"{project}\n[tool.mutmut]\n{lines}\n", encoding="utf-8")
-    return folder
 
 
-def mutate(folder: Path, processes: int) -> dict[str, dict[str, int]]:
-    """Exit code of each mutant by file, and ``run.log``. Raises SystemExit where mutmut itself failed."""
+def mutate(folder: Path, processes: int, seconds: float | None) -> dict[str, dict[str, int | None]]:
+    """Exit code of each mutant by file, None where ``seconds`` ended before it, and ``run.log``.
+
+    Raises SystemExit where mutmut itself failed. What an earlier run in ``folder`` has tried is not tried again.
+    """
     command = [str(Path(sys.executable).with_name("mutmut")), "run", "--max-children", str(processes)]
     with (folder / "run.log").open("w") as log:
-        done = subprocess.run(command, cwd=folder, env=_environment(), stdout=log, stderr=log, check=False)
+        process = subprocess.Popen(
+            command, cwd=folder, env=_environment(), stdout=log, stderr=log, start_new_session=True
+        )
+        try:
+            failed = process.wait(seconds) != 0
+        except subprocess.TimeoutExpired:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+            failed = False
     found = {
         str(meta.relative_to(folder / "mutants").with_suffix("")): json.loads(meta.read_text())["exit_code_by_key"]
         for meta in sorted((folder / "mutants").rglob("*.py.meta"))
     }
-    if done.returncode or not found or any(code is None for codes in found.values() for code in codes.values()):
+    if failed or not found:
         raise SystemExit(f"mutmut did not finish; see {folder / 'run.log'}")
     return found
 
@@ -110,21 +120,34 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("groups", nargs="*", metavar="GROUP", help=f"of: {', '.join(GROUPS)}; default: all")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--seconds", type=float, help="end each group after so long; the rest with --resume")
+    parser.add_argument("--resume", action="store_true", help="go on where a run of the same tree was ended")
     chosen = parser.parse_args()
     unknown = [name for name in chosen.groups if name not in GROUPS]
     if unknown:
         parser.error(f"no group {', '.join(unknown)}; there are: {', '.join(GROUPS)}")
     OUT.mkdir(parents=True, exist_ok=True)
-    print("| group | file | mutants | noticed | not noticed | of them wording |\n|---|---|---|---|---|---|", flush=True)
+    print(
+        "| group | file | mutants | tried | noticed | not noticed | of them wording |\n" + "|---" * 7 + "|", flush=True
+    )
     survivors: list[str] = []
     total: Counter[str] = Counter()
     for name in chosen.groups or GROUPS:
-        folder = prepare(name)
-        for file, codes in mutate(folder, chosen.processes).items():
+        folder = OUT / name.replace(" ", "_")
+        if not (chosen.resume and folder.is_dir()):
+            prepare(name, folder)
+        for file, codes in mutate(folder, chosen.processes, chosen.seconds).items():
             left = [mutant for mutant, code in codes.items() if code in (SURVIVED, UNREACHED)]
             diffs = diffs_of(folder, left)
             wording = sum(map(is_wording, diffs))
-            counts = {"mutants": len(codes), "noticed": len(codes) - len(left), "left": len(left), "wording": wording}
+            tried = sum(code is not None for code in codes.values())
+            counts = {
+                "mutants": len(codes),
+                "tried": tried,
+                "noticed": tried - len(left),
+                "left": len(left),
+                "wording": wording,
+            }
             total += Counter(counts)
             print(f"| {name} | `{file}` | {' | '.join(map(str, counts.values()))} |", flush=True)
             survivors += sorted(diffs, key=is_wording)

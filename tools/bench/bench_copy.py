@@ -9,7 +9,8 @@ from pathlib import Path
 
 from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
-from sim_devices.plant_factory import emulation_config, stack_twins
+from sim_devices.config import emulation_config
+from sim_devices.plant_factory import stack_twins
 from tools.output import write_text_atomic
 
 _LIST = re.compile(r"^calibration\s*=\s*\[.*?\][^\n]*$", re.MULTILINE | re.DOTALL)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
@@ -16,13 +16,10 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.faults.campaign import run_campaign, totals
-from tools.faults.catalogue import faults as catalogue
-from tools.faults.drift_bound import drift_bounds
-from tools.faults.fault import Fault
-from tools.faults.page import Beside, markdown
-from tools.faults.points import POINTS
 from tools.output import check_writable, write_json, write_text_atomic
+
+if TYPE_CHECKING:
+    from tools.faults.fault import Fault
 
 
 def faults(
@@ -46,6 +43,11 @@ def faults(
 
     Example: micron faults --seeds 20 --out docs/reliability.md
     """
+    from tools.faults.campaign import run_campaign, totals
+    from tools.faults.drift_bound import drift_bounds
+    from tools.faults.page import Beside, markdown
+    from tools.faults.points import POINTS
+
     with clear_errors():
         check_writable(json_file, out)
         path = bench_path(bench)
@@ -96,6 +98,8 @@ def faults(
 
 
 def _chosen(option: str, text: str) -> list[Fault]:
+    from tools.faults.catalogue import faults as catalogue
+
     chosen = [fault for fault in catalogue() if text.lower() in fault.name.lower()]
     if not chosen:
         raise InputError(

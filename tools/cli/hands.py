@@ -14,7 +14,6 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
-from tools.reports.hands import HandRow, markdown, run_hands
 
 
 def hands(
@@ -30,6 +29,8 @@ def hands(
 
     Example: micron hands --out docs/first-results.md
     """
+    from tools.reports.hands import HandRow, markdown, run_hands
+
     with clear_errors():
         check_writable(json_file, out)
         if not data.is_dir():

@@ -1,53 +1,126 @@
-"""Entry point: the list of commands, ``--version``, and nothing else."""
+"""Entry point: the list of commands, ``--version``, and nothing else.
+
+A command's modules are imported when it is called, not to print the list: with all of them, physics, kernels and
+statistics included, ``micron --help`` took seconds. What the list says of a command is the first sentence of its own
+help (a test compares them).
+"""
 
 from __future__ import annotations
 
-from importlib.metadata import version
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
-from tools.cli import (
-    bench,
-    calibrate,
-    diagnose,
-    doctor,
-    endoscope,
-    faults,
-    hands,
-    imu,
-    manipulator,
-    mismatch,
-    noise,
-    placement,
-    read,
-    recordings,
-    replay,
-    reproduce,
-    run,
-    sensing,
-    simulate,
-    soak,
-    tremor,
-)
+# name -> where it is, and its line in the list
+COMMANDS = {
+    "run": ("run:run", "Run the instrument in closed loop and report what was left of the tremor."),
+    "simulate": (
+        "simulate:simulate_command",
+        "Simulate the closed loop without wires, tens of times faster than real time; the same figures as micron run.",
+    ),
+    "bench": ("bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."),
+    "replay": (
+        "replay:replay",
+        "Run the firmware over a recording and compare every estimate and command with the recorded one, bit for bit.",
+    ),
+    "doctor": (
+        "doctor:doctor",
+        "What this machine offers, what the bench asks for, what is missing and how to get it.",
+    ),
+    "hands": (
+        "hands:hands",
+        "Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.",
+    ),
+    "faults": ("faults:faults", "Break the emulated instrument in every way of the catalogue, and print what it did."),
+    "soak": (
+        "soak:soak",
+        "Run the closed loop for very long in virtual time: memory, what is left of the tremor, every counter by "
+        "eighths.",
+    ),
+    "reproduce": ("reproduce:reproduce", "Compute published figures again and print them beside ours."),
+    "noise": (
+        "noise:noise",
+        "Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.",
+    ),
+    "placement": (
+        "placement:placement",
+        "Positions and directions with the least angular (or tip) noise, checked against the propositions of 004.",
+    ),
+    "recover": (
+        "recordings:recover",
+        "Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).",
+    ),
+    "export": (
+        "recordings:export",
+        "Write a recording as csv, npz, parquet, or the recording folder that the mismatch engine reads.",
+    ),
+    "scan": (
+        "diagnose:scan",
+        "Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.",
+    ),
+    "read": (
+        "read:read",
+        "One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.",
+    ),
+    "scope": (
+        "diagnose:scope",
+        "The analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.",
+    ),
+    "latency": (
+        "diagnose:latency",
+        "How late a 1 kHz loop is on this machine: bare, with a pty, as the firmware; with and without real time.",
+    ),
+    "ramp": (
+        "diagnose:ramp",
+        "A staircase on the outputs, over their full range, with read-back. Exit 1 when a stair is off.",
+    ),
+    "capture": (
+        "diagnose:capture",
+        "Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.",
+    ),
+    "can": ("diagnose:can", "CAN buses of a bench."),
+    "golden": ("diagnose:golden", "Golden transcripts."),
+    "log": ("diagnose:log", "The log of a running bench."),
+    "calibrate": ("calibrate:calibrate", "Identify sensors and stacks from calibration recordings."),
+    "endoscope": ("endoscope:endoscope", "Steer a field of view with a motion card (document 002, chapter 6)."),
+    "imu": ("imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
+    "manipulator": ("manipulator:app", "The three-legged manipulator at the tip."),
+    "mismatch": ("mismatch:app", "Where simulation and recording differ, and which physics is missing."),
+    "sensing": ("sensing:app", "Error budgets of the sensing stage on emulated sensors."),
+    "tremor": ("tremor:app", "Recorded hands: inspect them, train on them, evaluate estimators."),
+}
 
-app = typer.Typer(
-    name="micron",
-    help="Firmware and bench of a handheld instrument that cancels tremor. Start with: micron run",
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="rich",
-    pretty_exceptions_enable=False,
-)
+
+def load(name: str) -> Any:
+    """The command ``name`` with its modules, as typer makes it."""
+    module, _, attribute = COMMANDS[name][0].partition(":")
+    found = getattr(import_module(f"tools.cli.{module}"), attribute)
+    around = typer.Typer(rich_markup_mode="rich")
+    if isinstance(found, typer.Typer):
+        around.add_typer(found, name=name)
+    else:
+        around.command(name)(found)
+    return typer.main.get_group(around).commands[name]
+
+
+class OnDemand(TyperGroup):
+    """Its commands are lines of help until one is called."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
+        name, line, rest = super().resolve_command(ctx, args)
+        return name, line if name is None else load(name), rest
 
 
 def _version(wanted: bool) -> None:
     if wanted:
+        from importlib.metadata import version
+
         typer.echo(f"micron {version('micron-bench')}")
         raise typer.Exit
 
 
-@app.callback()
 def options(
     show_version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
@@ -56,35 +129,17 @@ def options(
     """Firmware and bench of a handheld instrument that cancels tremor. Start with: micron run"""
 
 
-app.command("run")(run.run)
-app.command("simulate")(simulate.simulate_command)
-app.command("bench")(bench.bench)
-app.command("replay")(replay.replay)
-app.command("doctor")(doctor.doctor)
-app.command("hands")(hands.hands)
-app.command("faults")(faults.faults)
-app.command("soak")(soak.soak)
-app.command("reproduce")(reproduce.reproduce)
-app.command("noise")(noise.noise)
-app.command("placement")(placement.placement)
-app.command("recover")(recordings.recover)
-app.command("export")(recordings.export)
-app.command("scan")(diagnose.scan)
-app.command("read")(read.read)
-app.command("scope")(diagnose.scope)
-app.command("latency")(diagnose.latency)
-app.command("ramp")(diagnose.ramp)
-app.command("capture")(diagnose.capture)
-app.add_typer(diagnose.can, name="can")
-app.add_typer(diagnose.golden, name="golden")
-app.add_typer(diagnose.log, name="log")
-app.add_typer(calibrate.calibrate, name="calibrate")
-app.add_typer(endoscope.endoscope, name="endoscope")
-app.add_typer(imu.imu, name="imu")
-app.add_typer(manipulator.app, name="manipulator")
-app.add_typer(mismatch.app, name="mismatch")
-app.add_typer(sensing.app, name="sensing")
-app.add_typer(tremor.app, name="tremor")
+app = typer.Typer(
+    name="micron",
+    cls=OnDemand,
+    callback=options,
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode="rich",
+    pretty_exceptions_enable=False,
+)
+for _name, (_, _says) in COMMANDS.items():
+    app.command(_name, help=_says)(lambda: None)
 
 
 def main() -> None:

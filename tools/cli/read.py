@@ -13,7 +13,7 @@ from tools.output import check_writable, write_json
 def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: JsonOption = None) -> None:
     """One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.
 
-    Example: micron read --bench benches/lab.toml
+    Example: micron read --bench lab.toml
     """
     from tools.diagnose.opened import opened_bench
     from tools.diagnose.read import read_sensors

@@ -1,9 +1,10 @@
-"""The whole command as one click object: what the documentation's page of commands is made from."""
+"""The whole command as one click object: what the documentation's page of commands and the tests are made from."""
 
 from __future__ import annotations
 
 import typer
 
-from tools.cli.main import app
+from tools.cli.main import COMMANDS, app, load
 
-micron = typer.main.get_command(app)
+micron = typer.main.get_group(app)
+micron.commands.update({name: load(name) for name in COMMANDS})

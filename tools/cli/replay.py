@@ -8,8 +8,6 @@ from typing import Annotated
 
 import typer
 
-from firmware_py.control.replay import replay_recording
-from firmware_py.recording.reader import Recording
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.output import check_writable, write_json
 
@@ -22,6 +20,9 @@ def replay(
 
     Example: micron replay out/run.mcap
     """
+    from firmware_py.control.replay import replay_recording
+    from firmware_py.recording.reader import Recording
+
     with clear_errors():
         check_writable(json_file)
         opened = Recording(recording)

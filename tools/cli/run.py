@@ -12,14 +12,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.live import Live
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.spinner import Spinner
 from rich.table import Table
 
-from firmware_py.app import run_in_process
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import REPORT, describe
 from firmware_py.inject import check_injections, parse_injection
@@ -31,8 +29,6 @@ from tools.cli.tremor_evaluate import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.output import write_text_atomic as write_text
-from tools.reports.run_report import html_page, picture, print_report, save_picture
-from tools.reports.tremor_figures import tremor_figures
 
 GUARDIAN_S = 3.0
 SETTLE_S = 2.0
@@ -106,6 +102,9 @@ def run(
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)
             return
+        # only now: the firmware did not wait for what draws
+        from tools.reports.run_report import html_page, picture, print_report, save_picture
+
         result = complete_result(outcome, truth)
         if truth is not None and result["tremor"]["reduction_percent"] is not None:
             png = picture(truth, result)
@@ -137,6 +136,8 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
         "voluntary": {"gain": None, "delay_ms": None},
     }
     if truth is not None and outcome["armed_ns"] is not None:
+        from tools.reports.tremor_figures import tremor_figures
+
         scored = tremor_figures(truth, from_ns=outcome["armed_ns"] + round(SETTLE_S * 1e9), to_ns=outcome["safe_ns"])
         if scored is not None:
             figures = scored.to_json()
@@ -144,6 +145,8 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
 
 
 def _run_virtual(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    from firmware_py.app import run_in_process
+
     with Progress(
         TextColumn("virtual time"), BarColumn(), TextColumn("{task.fields[state]}"), TimeRemainingColumn(),
         console=console(), transient=True,
@@ -180,6 +183,8 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
         truth_file = runtime_dir / "truth.npz"
         truth = None
         if truth_file.exists():
+            import numpy as np
+
             with np.load(truth_file, allow_pickle=False) as archive:
                 truth = {name: archive[name] for name in archive.files}
         return outcome, truth

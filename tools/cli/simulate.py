@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
@@ -13,10 +13,11 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.cli.run import complete_result
-from tools.closed_loop.simulate import COMMAND_DELAY_S, SimulatedRun, simulate
 from tools.errors import InputError
 from tools.output import check_writable, write_json
-from tools.reports.run_report import headline, picture, save_picture, tremor_table
+
+if TYPE_CHECKING:
+    from tools.closed_loop.simulate import SimulatedRun
 
 
 def simulate_command(
@@ -29,8 +30,8 @@ def simulate_command(
         float | None, typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz.")
     ] = None,
     delay_us: Annotated[
-        float, typer.Option(help="From scan to command; the default is what the default bench's wires take.")
-    ] = 1e6 * COMMAND_DELAY_S,
+        float | None, typer.Option(help="From scan to command; the default is what the default bench's wires take.")
+    ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
     json_file: JsonOption = None,
     image: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = None,
@@ -41,6 +42,10 @@ def simulate_command(
 
     Example: micron simulate --seconds 60 --json -
     """
+    from tools.closed_loop.simulate import COMMAND_DELAY_S, simulate
+    from tools.reports.run_report import headline, picture, save_picture, tremor_table
+
+    delay_s = COMMAND_DELAY_S if delay_us is None else 1e-6 * delay_us
     with clear_errors():
         check_writable(json_file, image)
         if scale is not None and hand is None:
@@ -53,11 +58,11 @@ def simulate_command(
         ) as progress:
             bar = progress.add_task("simulate", total=seconds)
             run = simulate(
-                opened, seconds, seed=seed, hand_file=hand, hand_scale=scale, delay_s=1e-6 * delay_us,
+                opened, seconds, seed=seed, hand_file=hand, hand_scale=scale, delay_s=delay_s,
                 on_time=lambda done_s: progress.update(bar, completed=done_s),
             )  # fmt: skip
         took_s = time.process_time() - started_s
-        result = complete_result(_outcome(run, file, seconds, delay_us), run.truth)
+        result = complete_result(_outcome(run, file, seconds, delay_s), run.truth)
         if image is not None:
             save_picture(picture(run.truth, result), image)
         people = console()
@@ -67,12 +72,12 @@ def simulate_command(
         write_json(result, json_file)
 
 
-def _outcome(run: SimulatedRun, bench: Path, seconds: float, delay_us: float) -> dict[str, object]:
+def _outcome(run: SimulatedRun, bench: Path, seconds: float, delay_s: float) -> dict[str, object]:
     return {
         "command": "simulate",
         "bench": str(bench),
         "seconds": seconds,
-        "command_delay_us": delay_us,
+        "command_delay_us": 1e6 * delay_s,
         "started_ns": run.started_ns,
         "armed_ns": run.armed_ns,
         "safe_ns": run.safe_ns,

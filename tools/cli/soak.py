@@ -13,8 +13,6 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.faults.long_page import block, with_block
-from tools.faults.long_run import with_wires, without_wires
 from tools.output import check_writable, write_json, write_text_atomic
 
 
@@ -36,6 +34,9 @@ def soak(
 
     Example: micron soak --seconds 28800 --without-wires --out docs/long-runs.md
     """
+    from tools.faults.long_page import block, with_block
+    from tools.faults.long_run import with_wires, without_wires
+
     with clear_errors():
         check_writable(json_file, out)
         name = "wires" if wires else "bare"

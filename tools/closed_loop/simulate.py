@@ -17,10 +17,10 @@ from firmware_py.frame import LAYOUT
 from firmware_py.records import Record, new_record
 from firmware_py.sensing.config import SensingConfig
 from hal.bench import BenchFile
+from sim_devices.config import emulation_config
 from sim_devices.plant.blocks import PlantBlocks
 from sim_devices.plant.kernel import STEP_S, STEPS_PER_MS, advance, outputs_later
 from sim_devices.plant.recorded_hand import make_hand
-from sim_devices.plant_factory import emulation_config
 from tools.closed_loop.kernel import WIRES, closed_loop
 from tools.errors import InputError
 

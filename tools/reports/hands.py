@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from hal.bench import BenchFile
+from sim_devices.config import emulation_config
 from sim_devices.plant.recorded_hand import make_hand
-from sim_devices.plant_factory import emulation_config
 from tools.closed_loop.simulate import SimulatedRun, simulate
 from tools.reports.hand_limits import Swing, causal_um, known_tremor_um, strongest
 from tools.reports.tremor_figures import TremorFigures, tremor_figures

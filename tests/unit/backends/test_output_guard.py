@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hal.clock import VirtualClock
-from hal.errors import SafetyTrip
-from hal.output_guard import RAMP_STEPS, OutputGuard
+from hal.errors import ErrorKind, SafetyTrip
+from hal.output_guard import RAMP_STEPS, TOLD, OutputGuard, Told
 from hal.types import OutputLimit
 
 LIMIT = OutputLimit(lo_V=5.0, hi_V=95.0, slew_V_per_s=2000.0, safe_V=50.0)
@@ -84,3 +84,133 @@ def test_a_ramp_that_was_held_up_makes_up_no_faster_than_the_slew_limit():
         out.sent()
         parts.append(round((58.0 - out.last_V[0]) / 0.5))
     assert parts == [1, 2, 4, 8, 12, 13]
+
+
+def test_wishes_in_numbers():
+    out, clock = guard()
+    for wish, next_V, mask, clipped, slew_limited in (
+        ((51.0, 52.0), [51.0, 52.0], 0b00, 0, 0),  # 2 V are what a millisecond allows
+        ((60.0, 49.0), [53.0, 50.0], 0b11, 0, 2),
+        ((52.0, 50.0), [52.0, 50.0], 0b00, 0, 2),
+        ((4.0, 50.0), [50.0, 50.0], 0b01, 1, 3),
+        ((0.0, 99.0), [48.0, 52.0], 0b11, 3, 5),
+        ((48.0, 1e6), [48.0, 54.0], 0b10, 4, 6),
+    ):
+        clock.burn_ns(1_000_000)
+        assert out.admit(np.array(wish)) == mask
+        out.sent()
+        assert out.last_V == out.next_V == pytest.approx(next_V)
+        assert (out.clipped, out.slew_limited) == (clipped, slew_limited)
+
+
+def test_the_limits_themselves_are_allowed():
+    out, clock = guard()
+    out.start_from([5.0, 95.0])
+    clock.burn_ns(1_000_000)
+    assert out.admit(np.array([5.0, 95.0])) == 0
+    assert (out.next_V, out.clipped) == ([5.0, 95.0], 0)
+
+
+def test_the_edge_of_the_slew_limit_is_allowed():
+    out, clock = guard()
+    clock.burn_ns(1_000_000)
+    assert out.admit(np.array([52.0, 48.0])) == 0
+    assert out.slew_limited == 0
+
+
+def refused(out: OutputGuard, wish: list[float]) -> SafetyTrip:
+    with pytest.raises(SafetyTrip) as caught:
+        out.admit(np.array(wish))
+    return caught.value
+
+
+def test_a_new_guard_is_not_armed_and_has_done_nothing():
+    out = OutputGuard("out", [LIMIT, LIMIT], VirtualClock())
+    assert (out.armed, out.writes, out.clipped, out.slew_limited, list(out.told)) == (False, 0, 0, 0, [])
+    error = refused(out, [50.0, 50.0])
+    assert (error.device, "not armed: call arm() first" in str(error)) == ("out", True)
+    assert out.ramp()  # it is where a ramp ends
+    assert out.next_V == [50.0, 50.0]
+
+
+@pytest.mark.parametrize("wish", [[50.0], [50.0, float("nan")]])
+def test_a_refusal_names_its_device(wish: list[float]):
+    assert refused(guard()[0], wish).device == "out"
+
+
+def test_what_was_sent_is_told_with_its_times_and_counted():
+    out, clock = guard()
+    for _ in range(2):
+        clock.burn_ns(1_000_000)
+        out.admit(np.array([51.0, 50.0]))
+        offered_ns = clock.now_ns()
+        clock.burn_ns(300_000)
+        out.sent(ago_ns=100_000)
+    assert out.told[-1] == Told(offered_ns, offered_ns + 200_000, (51.0, 50.0))
+    # the allowance grows from when it was sent: 0.1 ms ago and 0.4 ms more
+    clock.burn_ns(400_000)
+    out.admit(np.array([60.0, 50.0]))
+    assert out.next_V[0] == pytest.approx(52.0)
+    out.not_before(clock.now_ns() + 70_000)
+    out.sent()
+    assert out.told[-1].offered_ns == clock.now_ns() + 70_000
+    assert out.writes == 3
+    out.ramp()
+    out.sent()
+    assert out.writes == 3  # steps of a ramp are nobody's wish
+    for _ in range(TOLD):
+        out.sent()
+    assert len(out.told) == TOLD
+
+
+def test_a_ramp_begins_where_the_last_wish_was():
+    out, clock = guard()
+    clock.burn_ns(4_000_000)
+    out.admit(np.array([58.0, 50.0]))
+    out.sent()
+    assert not out.ramp()
+    assert out.armed is False
+    assert out.next_V == [57.5, 50.0]
+
+
+def test_a_step_that_did_not_go_out_is_offered_again_with_the_time_lost():
+    out, clock = guard()
+    clock.burn_ns(7_000_000)
+    out.start_from([58.0, 50.0])
+    out.ramp()
+    assert out.next_V[0] == 57.5
+    clock.burn_ns(2_000_000)
+    out.ramp()
+    assert out.next_V[0] == 56.5
+
+
+def test_a_late_ramp_ends_at_the_safe_state_and_not_beyond():
+    out, clock = guard()
+    out.start_from([58.0, 50.0])  # 0.5 V a step, 4 steps at once: 1, 5, 9, 13, 17 of 16
+    seen = []
+    for _ in range(5):
+        done = out.ramp()
+        out.sent()
+        clock.burn_ns(100_000_000)
+        seen.append((out.last_V[0], done))
+    assert seen == [(57.5, False), (55.5, False), (53.5, False), (51.5, False), (50.0, True)]
+
+
+def test_one_step_at_a_time_where_the_slew_limit_allows_less():
+    out, clock = guard()
+    out.start_from([95.0, 50.0])  # 45 V in 16 steps: 2.8 V each, and 2 V are allowed
+    out.ramp()
+    out.sent()
+    clock.burn_ns(5_000_000)
+    out.ramp()
+    assert out.next_V[0] == pytest.approx(95.0 - 2 * 45.0 / 16)
+
+
+def test_a_failed_self_test_disarms():
+    out, _ = guard()
+    out.require(True, "nothing")
+    assert out.armed
+    with pytest.raises(SafetyTrip, match="self-test failed: the reading") as caught:
+        out.require(False, "the reading")
+    assert out.armed is False
+    assert (caught.value.kind, caught.value.device) == (ErrorKind.SAFETY, "out")

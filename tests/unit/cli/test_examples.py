@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import re
 import shlex
+import subprocess
+import sys
 from collections.abc import Iterator
 
 import click
 import pytest
-import typer
 
-from tools.cli.main import app
+from tools.cli.main import COMMANDS, app
+from tools.cli.reference import micron
 
 EXAMPLE = re.compile(r"Examples?:\s*((?:micron .*\n?\s*)+)")
 
@@ -24,7 +26,7 @@ def commands(group: click.Command, path: tuple[str, ...] = ()) -> Iterator[tuple
         yield from commands(command, (*path, name))
 
 
-ALL = {" ".join(path): (path, command) for path, command in commands(typer.main.get_command(app))}
+ALL = {" ".join(path): (path, command) for path, command in commands(micron)}
 
 
 def refusal(command: click.Command, name: str, given: list[str]) -> str:
@@ -54,3 +56,25 @@ def test_a_bare_call_helps():
     assert "micron" in result.output
     assert "run" in result.output
     assert result.exit_code in (0, 2)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_the_list_says_what_the_help_says(name: str):
+    own = micron.commands[name].help or ""
+    assert COMMANDS[name][1] == " ".join(own.split("\n\n")[0].split())
+
+
+def test_commands_that_need_no_kernels_start_without_them():
+    """Seconds on every call: ``--help``, ``doctor``, and what ``scan`` needs in its own process."""
+    script = """
+import sys
+from contextlib import suppress
+from tools.cli.main import app
+for words in ([], ["--help"], ["run", "--help"], ["doctor", "--json", "-"]):
+    with suppress(SystemExit):
+        app(words)
+import sim_devices.process_world, sim_devices.register, tools.diagnose.scan
+assert not {"numba", "scipy", "matplotlib"} & set(sys.modules), sorted(sys.modules)
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-300:]

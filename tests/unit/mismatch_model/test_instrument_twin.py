@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from hal.bench import load_bench
+from sim_devices.config import emulation_config
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
-from sim_devices.plant_factory import emulation_config
 from tests.conftest import DEFAULT_BENCH
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.recording import RecordingError

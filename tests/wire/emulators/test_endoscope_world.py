@@ -12,7 +12,9 @@ import serial
 from hal.clock import VirtualClock
 from hal.errors import BenchError, I2cNack
 from hal.types import I2cRead, I2cWrite
-from sim_devices.register import LockstepWorld, ProcessWorld, provider
+from sim_devices.lockstep_world import LockstepWorld
+from sim_devices.process_world import ProcessWorld
+from sim_devices.register import provider
 
 MS = 1_000_000
 

@@ -12,7 +12,8 @@ from hal.bench import load_bench
 from hal.clock import VirtualClock
 from hal.errors import BenchError, BusError, Closed, Disconnected, ErrorKind, I2cNack
 from hal.types import CanFrame, I2cRead, I2cWrite
-from sim_devices.register import LockstepWorld, provider
+from sim_devices.lockstep_world import LockstepWorld
+from sim_devices.register import provider
 from tests.wire.emulators.fake_plant import FakePlant
 
 MS = 1_000_000

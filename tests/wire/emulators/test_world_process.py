@@ -16,7 +16,8 @@ from hal.backends import open_can, open_i2c, open_serial
 from hal.bench import load_bench
 from hal.errors import BenchError, Disconnected, I2cNack
 from hal.types import CanFrame, I2cRead, I2cWrite
-from sim_devices.register import ProcessWorld, provider
+from sim_devices.process_world import ProcessWorld
+from sim_devices.register import provider
 
 pytestmark = pytest.mark.realtime
 BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"

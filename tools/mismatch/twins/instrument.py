@@ -22,11 +22,10 @@ from scipy.interpolate import CubicSpline
 
 from hal.bench import load_bench
 from hal.errors import BenchError
-from sim_devices.config import EmulationConfig
+from sim_devices.config import EmulationConfig, emulation_config
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
-from sim_devices.plant_factory import emulation_config
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.units import convert, same_dimension

@@ -1,0 +1,138 @@
+"""The emulated world in real time, seen from the firmware's process: starts it, names its buses, fetches its truth."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hal.errors import BenchError, DeviceNotFound, Disconnected, HalTimeout
+
+if TYPE_CHECKING:  # the physics and its kernels are the other process's
+    from sim_devices.world import Truth
+
+START_S = 180.0  # the first start of all compiles the plant
+STOP_S = 20.0
+
+
+class ProcessWorld:
+    """A world in real time, in a process of its own. ``runtime_dir`` holds its sockets, log and truth."""
+
+    def __init__(
+        self,
+        description: dict[str, Any],
+        runtime_dir: Path,
+        hand_file: str | None,
+        hand_scale: float | None,
+        plant: str,
+    ) -> None:
+        runtime_dir.mkdir(parents=True, exist_ok=True)
+        self._dir = Path(tempfile.mkdtemp(prefix="world-", dir=runtime_dir))
+        # a Unix socket's path has at most 107 characters, however deep the runtime directory is
+        self._sockets = Path(tempfile.mkdtemp(prefix="micron-"))
+        job = {
+            "description": description,
+            "runtime_dir": str(self._dir),
+            "socket_dir": str(self._sockets),
+            "parent": os.getpid(),
+            "hand_file": hand_file,
+            "hand_scale": hand_scale,
+            "plant": plant,
+        }
+        job_path = self._dir / "job.json"
+        job_path.write_text(json.dumps(job), encoding="utf-8")
+        self._log = self._dir / "world.log"
+        with self._log.open("wb") as log:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "sim_devices.process", str(job_path)],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                cwd=Path(__file__).resolve().parents[1],
+            )
+        self._endpoints = self._await_endpoints()
+
+    @property
+    def pid(self) -> int:
+        """Of the world's process, for tests that kill it."""
+        return self._process.pid
+
+    def endpoint(self, bus: str) -> str:
+        """URI of ``bus`` for the ordinary adapters."""
+        return self._endpoints[bus]
+
+    def alive(self) -> bool:
+        return self._process.poll() is None
+
+    def stop(self) -> None:
+        """End the process; when this returns the truth is on disk. Idempotent."""
+        if self.alive():
+            self._process.send_signal(signal.SIGTERM)
+        try:
+            self._process.wait(STOP_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+        shutil.rmtree(self._sockets, ignore_errors=True)
+
+    def truth(self) -> Truth:
+        """Physical truth. After ``stop``. Raises ``Disconnected`` when the process was killed before it could write."""
+        path = self._dir / "truth.npz"
+        if not path.exists():
+            raise Disconnected(f"the emulated world was killed and left no truth; its log: {self._tail()}")
+        with np.load(path) as data:
+            return {name: data[name] for name in data.files}
+
+    def statistics(self) -> dict[str, float]:
+        """After ``stop``: ``worst_late_us`` (how late the world ran at worst), ``turns`` of its loop, ``cpu_s``."""
+        path = self._dir / "world.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+    def inject(self, fault: str, target: str = "") -> None:
+        """Do one of ``sim_devices.faults.FAULTS`` in the running process; ``ValueError`` says why not."""
+        with tempfile.TemporaryDirectory(prefix="micron-") as folder:
+            sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+            with contextlib.closing(sock):
+                sock.bind(str(Path(folder) / "reply.sock"))
+                sock.settimeout(5.0)
+                try:
+                    sock.connect(str(self._sockets / "control.sock"))
+                    sock.send(json.dumps({"fault": fault, "target": target}).encode())
+                    answer = json.loads(sock.recv(4096))
+                except TimeoutError as error:
+                    raise HalTimeout("the emulated world does not answer on its control socket") from error
+                except OSError as error:
+                    raise Disconnected("the emulated world is gone") from error
+        if not answer["ok"]:
+            raise ValueError(answer["error"])
+
+    def _await_endpoints(self) -> dict[str, str]:
+        path = self._dir / "endpoints.json"
+        deadline = time.monotonic() + START_S
+        while not path.exists():
+            if not self.alive():
+                shutil.rmtree(self._sockets, ignore_errors=True)
+                refusal = self._dir / "error.txt"
+                if refusal.exists():
+                    raise BenchError(refusal.read_text(encoding="utf-8"))
+                raise BenchError(f"the emulated world did not start: {self._tail()}")
+            if time.monotonic() > deadline:
+                self.stop()
+                raise DeviceNotFound(f"the emulated world was not ready in {START_S:.0f} s: {self._tail()}")
+            time.sleep(0.01)
+        return json.loads(path.read_text(encoding="utf-8"))["endpoints"]
+
+    def _tail(self) -> str:
+        lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+        return lines[-1] if lines else "(empty log)"

@@ -1,0 +1,156 @@
+"""The worked example of each command's help does what it says: run to the letter, on inputs made as the guides say.
+
+Options are added in two cases: virtual time where the example means the bench in front of you, and fewer seconds.
+What is not run here is in ``NOT_RUN`` with what tests it instead.
+"""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+from sim_devices.plant.lab import main as lab
+from tests.unit.calibrate.test_gyroscope import log
+from tests.unit.cli.test_examples import ALL, EXAMPLE
+from tools.cli.main import app
+
+BENCHES = Path(__file__).parents[3] / "benches"
+ADDED = {
+    "run": "--seconds 3 --record out/run.mcap",
+    "can dump": "--virtual",
+    "capture": "--virtual",
+    "imu evaluate": "--seconds 5",
+    "ramp": "--virtual",
+    "scan": "--virtual",
+    "scope": "--virtual --seconds 0.5",
+}
+OF_A_RUN = ("export", "recover", "replay")
+# over two seconds each: `make test-all`
+SLOW = (
+    "calibrate piezo",
+    "endoscope tables",
+    "imu evaluate",
+    "mismatch apply",
+    "mismatch diagnose",
+    "sensing budget",
+    "tremor budget",
+    "tremor evaluate",
+    "tremor inspect",
+)
+NOT_RUN = {
+    "bench": "serves until Ctrl-C: tests/bench starts it as a user does",
+    "endoscope play": "a person steers: tests/unit/endoscope/test_synthetic_user.py steers it",
+    "faults": "hours: tests/unit/faults and tests/hil/test_fault_smoke.py run single faults",
+    "hands": "minutes for each hand: tests/unit/reports",
+    "latency": "real time by what it is: tests/unit/cli/test_diagnose.py",
+    "log follow": "needs a running bench: tests/bench/test_listen.py",
+    "mismatch prove": "an hour: tests/mismatch runs single cases",
+    "mismatch real": "minutes, and a record of its own: tests/mismatch",
+    "read": "needs an installed package: tests/examples installs two",
+    "reproduce": "minutes: tests/reproduction runs each row's figures",
+    "soak": "hours: tests/unit/faults/test_long_page.py and tests/virtual_time",
+    "tremor report": "many minutes over every recorded hand: tests/unit/tremor_tools/test_report.py",
+    "tremor train": "minutes of training: tests/unit/tremor_tools",
+}
+
+
+def example(name: str) -> str:
+    """The line of the help, with what is added to it, without ``micron``."""
+    found = EXAMPLE.search(ALL[name][1].help or "")
+    assert found is not None
+    return f"{found.group(1).strip().splitlines()[0].removeprefix('micron ')} {ADDED.get(name, '')}"
+
+
+def call(name: str) -> Result:
+    return CliRunner().invoke(app, shlex.split(example(name), comments=True))
+
+
+def logs() -> None:
+    """``log.npz``: turns between poses; ``turned.npz``: a field from every side; ``rest.npz``: white noise."""
+    force, rate = log(30)
+    columns = {f"{s}_{a}_raw": v[:, i] for s, v in (("acc", force), ("gyro", rate)) for i, a in enumerate("xyz")}
+    np.savez("log.npz", t_s=np.arange(len(force)) / 100.0, **columns)
+    rng = np.random.default_rng(1)
+    way = rng.standard_normal((400, 3))
+    field = 400.0 * way / np.linalg.norm(way, axis=1)[:, None] + [20.0, -30.0, 5.0] + rng.standard_normal((400, 3))
+    np.savez("turned.npz", **{f"mag_{a}_raw": field[:, i] for i, a in enumerate("xyz")})
+    np.savez("rest.npz", x=rng.standard_normal(20_000))
+
+
+def stacks() -> None:
+    for axis in range(3):
+        assert lab(["piezo", "--axis", str(axis), "--profile", "set", "--out", f"out/stack{axis}"]) == 0
+
+
+def recorded_stack(folder: str) -> None:
+    assert lab(["piezo", "--profile", "sawtooth", "--rate-hz", "5", "--seconds", "4", "--out", folder]) == 0
+
+
+def diagnosed() -> None:
+    recorded_stack("rec")
+    done = CliRunner().invoke(app, ["mismatch", "diagnose", "rec", "--json", "rec.json"])
+    assert done.exit_code == 0, done.output
+
+
+MADE: dict[str, Callable[[], object]] = {
+    "calibrate accelerometer": logs,
+    "calibrate gyroscope": logs,
+    "calibrate magnetometer": logs,
+    "calibrate manipulator": lambda: lab(["manipulator", "--per-axis", "4", "--out", "out/scan"]),
+    "calibrate piezo": stacks,
+    "calibrate positions": lambda: lab(["pivot", "--seconds", "14", "--out", "out/pivot"]),
+    "calibrate sensors": lambda: lab(["tumble", "--positions", "24", "--seconds", "1", "--out", "out/tumble"]),
+    "golden diff": lambda: call("capture"),
+    "mismatch apply": diagnosed,
+    "mismatch diagnose": lambda: recorded_stack("recordings/stack"),
+    "noise": logs,
+}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One second of the default bench."""
+    folder = tmp_path_factory.mktemp("recording")
+    files = ["--record", str(folder / "run.mcap"), "--picture", str(folder / "run.png")]
+    done = CliRunner().invoke(app, ["run", "--virtual", "--seconds", "1", *files])
+    assert done.exit_code == 0, done.output
+    return folder / "run.mcap"
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder as a new user has it: the benches, and ``out``."""
+    shutil.copytree(BENCHES, tmp_path / "here" / "benches")
+    (tmp_path / "here" / "out").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
+
+
+def test_each_example_is_run_or_it_is_said_why_not() -> None:
+    assert set(NOT_RUN) <= set(ALL)
+    assert not set(NOT_RUN) & {*SLOW, *ADDED, *MADE}
+
+
+RUN = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in sorted(set(ALL) - set(NOT_RUN))]
+
+
+@pytest.mark.parametrize("name", RUN)
+def test_the_worked_example_works(name: str, place: Path, request: pytest.FixtureRequest) -> None:
+    if name.startswith("tremor ") and name != "tremor budget":
+        (place.parent / "shared").mkdir()
+        (place.parent / "shared" / "data").symlink_to(request.getfixturevalue("shared_data"))
+    if name in OF_A_RUN:
+        shutil.copy(request.getfixturevalue("recording"), "out")
+    MADE.get(name, lambda: None)()
+    done = call(name)
+    assert done.exit_code == 0, done.output
+    for word in shlex.split(example(name), comments=True):
+        made = place / word
+        if word.startswith("out/") and made.suffix:
+            assert made.stat().st_size > 0
