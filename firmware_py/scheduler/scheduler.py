@@ -19,19 +19,24 @@ from firmware_py.scheduler.task import BackgroundSpec, TaskSpec, TickInfo
 from firmware_py.scheduler.ticker import Ticks
 from hal.contracts import Clock
 
+LATEST_END = 1.15
+"""Of a period, from when the tick was due: a task that may wait does so if it could end later."""
+
 
 class _LiveTask:
     """A task with its counters."""
 
     __slots__ = (
         "budget_ns", "catch_up", "cpu", "cpu_in", "deadline_ns", "duration", "errors", "fn", "ignored_runs",
-        "last_error", "lateness", "overruns", "runs", "skipped", "slips", "spec",
+        "last_error", "lateness", "may_wait", "overruns", "put_off", "runs", "skipped", "slips", "spec", "waited",
     )  # fmt: skip
 
     def __init__(self, spec: TaskSpec) -> None:
         self.spec = spec
         self.fn = spec.fn
         self.catch_up = spec.catch_up
+        self.may_wait = spec.may_wait
+        self.waited = 0  # ticks, since it was due
         self.budget_ns = spec.budget_ns
         self.deadline_ns = spec.deadline_ns
         self.duration = DurationHistogram()
@@ -41,6 +46,7 @@ class _LiveTask:
 
     def clear(self) -> None:
         self.runs = self.ignored_runs = self.skipped = self.overruns = self.slips = self.errors = 0
+        self.put_off = 0
         self.cpu_in = 0  # runs until the next one whose CPU time is taken
         self.last_error = ""
         for histogram in (self.duration, self.lateness, self.cpu):
@@ -89,6 +95,8 @@ class Scheduler:
         self._due = [self._due_at(index, self._tasks) for index in range(self._hyperperiod)]
         late = [task for task in self._tasks if task.catch_up]
         self._due_late = [self._due_at(index, late) for index in range(self._hyperperiod)]
+        self._waiting: list[_LiveTask] = []  # put off to the next full tick
+        self._done_by_ns = round(LATEST_END * period_ns)
         self._last_scan: int | None = None  # newest tick that the catch_up tasks have seen
         self._last_full = -1  # newest tick that all tasks have seen
         self._tick_duration = DurationHistogram()
@@ -119,8 +127,29 @@ class Scheduler:
         info = TickInfo(k, due_ns, started_ns, k - last_full - 1)
         scan_info = info if info.skipped == lost else TickInfo(k, due_ns, started_ns, lost)
         self._ticks += 1
-        self._run(self._due[k % self._hyperperiod], info, scan_info)
+        due = self._due[k % self._hyperperiod]
+        if self._waiting:
+            due = self._with_waiting(due)
+        self._run(due, info, scan_info)
         return info
+
+    def _with_waiting(self, due: tuple[_LiveTask, ...]) -> tuple[_LiveTask, ...]:
+        """What was put off comes last; a task that is due again meanwhile runs once."""
+        waiting, self._waiting = self._waiting, []
+        for task in waiting:
+            if task in due:
+                task.skipped += 1
+        return (*due, *(task for task in waiting if task not in due))
+
+    def _put_off(self, task: _LiveTask, due_ns: int) -> bool:
+        """Whether ``task``, which may wait, must."""
+        if task.waited >= task.may_wait or self._now_ns() + task.budget_ns <= due_ns + self._done_by_ns:
+            task.waited = 0
+            return False
+        task.waited += 1
+        task.put_off += 1
+        self._waiting.append(task)
+        return True
 
     def catch_up(self, due_ns: int, k: int) -> TickInfo:
         """Run only the ``catch_up`` tasks for a scan that arrived late and is not the newest."""
@@ -166,6 +195,9 @@ class Scheduler:
         done = 0
         try:
             for task in due:
+                if task.may_wait and self._put_off(task, due_ns):
+                    done += 1
+                    continue
                 task_info = scan_info if task.catch_up else info
                 task.runs += 1
                 if task.cpu_in or ignored:
@@ -216,6 +248,7 @@ class Scheduler:
         error.add_note(f"raised by task {failed.spec.name!r} in tick {k}")
         for task in due[done + 1 :]:
             task.skipped += 1
+            task.waited = 0
 
     @property
     def skipped_ticks(self) -> int:
@@ -272,6 +305,7 @@ class Scheduler:
                     runs=task.runs,
                     ignored_runs=task.ignored_runs,
                     skipped=task.skipped,
+                    put_off=task.put_off,
                     overruns=task.overruns,
                     slips=task.slips,
                     errors=task.errors,

@@ -11,7 +11,7 @@ from firmware_py.scheduler.histogram import Distribution
 class TaskSnapshot:
     """One task since the last ``reset``.
 
-    ``skipped``: releases that never ran; ``overruns``: runs longer than the budget; ``slips``: runs that ended
+    ``skipped``: releases that never ran; ``put_off``: how often it had to wait a tick; ``overruns``: runs longer than the budget; ``slips``: runs that ended
     after the deadline; ``errors``: runs that raised. ``ignored_runs`` belong to announced one-offs and are in
     none of the figures except ``runs``. ``cpu`` is thread CPU time of a sample of the runs.
     """
@@ -23,6 +23,7 @@ class TaskSnapshot:
     runs: int
     ignored_runs: int
     skipped: int
+    put_off: int
     overruns: int
     slips: int
     errors: int
@@ -44,6 +45,7 @@ class TaskSnapshot:
             "lateness_us": self.lateness.as_dict(),
             "overruns": self.overruns,
             "skipped": self.skipped,
+            "put_off": self.put_off,
             "slips": self.slips,
             "errors": self.errors,
             "last_error": self.last_error,

@@ -60,7 +60,7 @@ def tremor_table(result: Mapping[str, Any]) -> Table:
 def task_table(result: Mapping[str, Any]) -> Table:
     """Every task against its budget."""
     table = Table(title="Tasks", title_justify="left")
-    for column in ("task", "Hz", "runs", "budget us", "p50", "p99", "p99.9", "max", "cpu p50", "over", "skipped"):
+    for column in ("task", "Hz", "runs", "budget us", "p50", "p99", "p99.9", "max", "cpu p50", "over", "skipped", "put off"):
         table.add_column(column, justify="left" if column == "task" else "right")
     for name, task in result["tasks"].items():
         duration, cpu = task["duration_us"], task["cpu_us"]
@@ -73,6 +73,7 @@ def task_table(result: Mapping[str, Any]) -> Table:
             _number(cpu["p50"]),
             str(task["overruns"]),
             str(task["skipped"]),
+            str(task["put_off"]),
         )
     return table
 
