@@ -60,7 +60,8 @@ def tremor_table(result: Mapping[str, Any]) -> Table:
 def task_table(result: Mapping[str, Any]) -> Table:
     """Every task against its budget."""
     table = Table(title="Tasks", title_justify="left")
-    for column in ("task", "Hz", "runs", "budget us", "p50", "p99", "p99.9", "max", "cpu p50", "over", "skipped", "put off"):
+    figures = ("budget us", "p50", "p99", "p99.9", "max", "cpu p50", "over", "skipped", "put off")
+    for column in ("task", "Hz", "runs", *figures):
         table.add_column(column, justify="left" if column == "task" else "right")
     for name, task in result["tasks"].items():
         duration, cpu = task["duration_us"], task["cpu_us"]
