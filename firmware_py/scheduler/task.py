@@ -52,7 +52,9 @@ class TaskSpec:
         if not self.budget_us > 0.0:
             raise BenchError(f"{where}: budget_us is {self.budget_us}; a run takes time, promise more than 0")
         if self.may_wait < 0 or (self.may_wait and self.catch_up):
-            raise BenchError(f"{where}: may_wait is {self.may_wait}; 0 or more, and 0 for a task that must see every scan")
+            raise BenchError(
+                f"{where}: may_wait is {self.may_wait}; 0 or more, and 0 for a task that must see every scan"
+            )
         if not self.deadline_us >= self.budget_us:
             raise BenchError(
                 f"{where}: deadline_us {self.deadline_us} is shorter than budget_us {self.budget_us}: "
