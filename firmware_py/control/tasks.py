@@ -22,7 +22,7 @@ MAGNETOMETER_PHASES = (0, 3, 6)
 VERIFY_PHASES = (1, 4, 8)  # in ticks that leave the bus free for it
 MONITOR_PHASES = (1, 4, 7, 9)
 MAY_WAIT_TICKS = 3
-"""For what uses the bus of the outputs beside them, and for telemetry: rather a little later than the next command late."""
+"""For what shares the bus with the outputs, and for telemetry: rather these a little late than the next command."""
 VERIFY_BESIDE_MONITOR = (8,)  # tick 15 of 20 stays free for background work
 
 Work = Callable[[TickInfo], object]
@@ -49,7 +49,14 @@ def task_table(works: Works, tick_hz: int, budget_us: Mapping[str, float]) -> li
     period_us = 1e6 / tick_hz
 
     def task(
-        name: str, work: Work, order: int, divider: int = 1, phase: int = 0, *, catch_up: bool = False, may_wait: int = 0
+        name: str,
+        work: Work,
+        order: int,
+        divider: int = 1,
+        phase: int = 0,
+        *,
+        catch_up: bool = False,
+        may_wait: int = 0,
     ) -> None:
         limit_us = budget[name.partition("_")[0]]
         table.append(TaskSpec(name, work, divider, phase, order, limit_us, period_us, catch_up, may_wait))
