@@ -20,14 +20,14 @@ def time_constants(dt: float, span: float) -> tuple[float, ...]:
 def modes(x: Array, dt: float, taus: Sequence[float], rest: float, starts: tuple[int, ...]) -> Array:
     """Relaxation of each mode towards x from ``rest``, (n, modes): tau z' = x - z, z(start) = rest."""
     at = np.array(starts)
-    out = np.empty((x.size, len(taus)))
-    begin = np.empty_like(x)
-    k = np.arange(x.size)
-    since = k - at[np.searchsorted(at, k, side="right") - 1]
-    begin = x[k - since]
+    out = np.empty((len(taus), x.size))
     for j, tau in enumerate(taus):
-        out[:, j] = low_pass(x, dt, tau, at) + (rest - begin) * np.exp(-since * dt / tau)
-    return out
+        out[j] = low_pass(x, dt, tau, at)
+        for a, b in zip(starts, (*starts[1:], x.size), strict=True):
+            # e^-45 is nothing beside one
+            felt = min(b, a + int(45 * tau / dt) + 2)
+            out[j, a:felt] += (rest - x[a]) * np.exp(-np.arange(felt - a) * (dt / tau))
+    return out.T
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:

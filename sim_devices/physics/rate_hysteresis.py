@@ -31,11 +31,10 @@ def _columns(x: Array, dt: float, tau: float, settings: Settings, starts: tuple[
     e = np.concatenate(
         [stops(x, np.array(thresholds(half, N_PLAYS)), rest, at), dahl(x, wide, np.zeros(N_DAHL), rest, at)], axis=1
     )
-    fast = e[:, ::2]
-    v = speed(x, dt, usual)[:, None]
-    late = np.stack([low_pass(np.ascontiguousarray(c), dt, tau, at) for c in fast.T], axis=1)
-    lag = (low_pass(x, dt, tau, at) - x)[:, None]
-    return np.concatenate([e, fast * v, late - fast, lag], axis=1)
+    fast = e.T[::2]
+    late = np.stack([low_pass(c, dt, tau, at) - c for c in np.ascontiguousarray(fast)])
+    lag = low_pass(x, dt, tau, at) - x
+    return np.concatenate([e.T, fast * speed(x, dt, usual), late, lag[None]]).T
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:

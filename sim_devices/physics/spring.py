@@ -70,7 +70,7 @@ def _cog_parts(settings: Settings) -> Parts:
 
 def _cog_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     a = 2 * np.pi * x / q[0]
-    return np.stack([np.sin(a), np.cos(a), np.sin(2 * a), np.cos(2 * a)], axis=1)
+    return np.stack([np.sin(a), np.cos(a), np.sin(2 * a), np.cos(2 * a)]).T
 
 
 def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tuple[float, float]]:

@@ -124,7 +124,7 @@ def smooth(x: Array, width: int) -> Array:
 
 def affine_misfit(candidate: Array, measured: Array) -> float:
     """Sum of squares left when ``a + b candidate`` is fitted to the measured samples."""
-    return least_squares(np.stack([np.ones(candidate.size), candidate], axis=1), measured)[1]
+    return least_squares(np.stack([np.ones(candidate.size), candidate]).T, measured)[1]
 
 
 def rank_starts(

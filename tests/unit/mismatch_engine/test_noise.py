@@ -83,3 +83,13 @@ def test_repeats_under_a_warm_up() -> None:
     found = repeat_floor(u + drift + rng.standard_normal(N), u[:, None])
     assert found is not None
     assert found[0] == pytest.approx(1.0, rel=0.05)
+
+
+def test_peaks_of_a_mode_that_swells_are_no_spikes() -> None:
+    rng = np.random.default_rng(8)
+    t = np.arange(N) / RATE
+    swell = np.exp(6.0 * np.sin(2 * np.pi * 0.31 * t))
+    mode = swell * np.sin(2 * np.pi * 115.0 * t)  # few samples to a period: a running median cuts its peaks
+    e = mode + 0.01 * rng.standard_normal(N)
+    assert np.count_nonzero(clip_spikes(e) != e) > 20
+    assert spectral_floor(e, RATE)[0] == pytest.approx(0.01, rel=0.1)

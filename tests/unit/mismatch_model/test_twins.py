@@ -19,7 +19,14 @@ from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins import make
 from tools.mismatch.twins.feedback import run_feedback
-from tools.mismatch.twins.linear import discretise, free_response, run_output, run_states, start_state
+from tools.mismatch.twins.linear import (
+    discretise,
+    felt_at_most,
+    free_response,
+    run_output,
+    run_states,
+    start_state,
+)
 
 Array = NDArray[np.float64]
 AXIS = {"force": "N", "position": "m", "velocity": "m/s"}
@@ -255,3 +262,29 @@ def test_free_responses_are_kept_while_they_are_felt() -> None:
     x0 = np.array([[0.3, -2.0]])
     whole = free_response(d.ad, row, 5000) @ x0[0]
     np.testing.assert_allclose(state.response(x0, "y", 5000), whole, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_states_of_every_order_are_those_of_the_recursion(order: int) -> None:
+    rng = np.random.default_rng(order)
+    a = rng.standard_normal((order, order)) - 3 * np.eye(order)
+    d = discretise(a, rng.standard_normal(order), 0.05, "linear")
+    u, starts, x0 = rng.standard_normal(40), np.array([0, 25]), rng.standard_normal((2, order))
+    want = np.empty((40, order))
+    for k in range(40):
+        if k in starts:
+            x = x0[starts.tolist().index(k)]
+        else:
+            x = d.ad @ x + d.g0 * u[k - 1] + d.g1 * u[k]
+        want[k] = x
+    np.testing.assert_allclose(run_states(d.ad, d.g0, d.g1, u, x0, starts), want, atol=1e-12)
+
+
+def test_a_free_response_is_computed_no_further_than_it_can_be_felt() -> None:
+    for poles in ([0.9, 0.9, 0.9], [0.999], [0.5, -0.99]):
+        ad = np.diag(poles) + np.diag(np.ones(len(poles) - 1), 1)  # a Jordan chain where they repeat
+        n = felt_at_most(ad, 100_000)
+        free = np.abs(free_response(ad, np.ones(len(poles)), 100_000)).max(axis=1)
+        assert free[n:].max(initial=0.0) < 1e-12 * free.max()
+        assert n < 100_000
+    assert felt_at_most(np.array([[1.0]]), 777) == 777

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
-from sim_devices.physics.hysteresis import dahl, relays, stops
+from sim_devices.physics.hysteresis import dahl, relays, risen, stops
 
 Array = NDArray[np.float64]
 ONE = np.zeros(1, np.int64)
@@ -164,3 +164,8 @@ def test_memory_is_cleared_at_starts() -> None:
 def test_compiled_equals_python(kernel: Callable[..., Array], args: tuple[object, ...]) -> None:
     x = np.cumsum(np.random.default_rng(0).standard_normal(120)) * 0.2
     np.testing.assert_allclose(kernel(x, *args), kernel.py_func(x, *args), atol=1e-13)  # pyright: ignore
+
+
+def test_short_and_long_steps_of_smooth_elements_are_one_formula() -> None:
+    y = np.concatenate([np.geomspace(1e-9, 0.03, 200), np.linspace(0.03, 5.0, 50)])
+    assert [risen(v) for v in y] == pytest.approx(-np.expm1(-y), rel=1e-14)

@@ -12,8 +12,9 @@ from scipy.stats import norm
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.families import EXACT
-from tools.mismatch.engine.fit import Fit, covariance, residuals
+from tools.mismatch.engine.fit import Fit, residuals
 from tools.mismatch.engine.identifiability import detection, experiment
+from tools.mismatch.engine.intervals import covariance
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.parsimony import Rule, as_good
 from tools.mismatch.engine.problem import Problem

@@ -2,7 +2,7 @@
 
 Variable projection (Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973) with a damped Gauss-Newton search over
 the nonlinear parameters, noise-weighted over outputs, outliers bounded by Huber's weights. Base parameters are
-always free. Intervals come from the block-clustered sandwich, so coloured residuals do not make them too narrow.
+always free. On a long recording the search begins on its first part, when that shows all that the inputs do.
 """
 
 from __future__ import annotations
@@ -149,18 +149,25 @@ def _step_size(p: Free, v: float) -> float:
     return min(typical, 0.01 * wide) if np.isfinite(wide) else typical
 
 
+def moved_a_little(model: Model, theta: Array, i: int) -> Array:
+    """``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
+    p = model.parameters[i]
+    z, h = _forward(p, theta[i]), _step_size(p, theta[i])
+    shifted = theta.copy()
+    shifted[i] = _backward(p, z + h)
+    if shifted[i] == theta[i]:
+        shifted[i] = _backward(p, z - h)
+    return shifted
+
+
 def _slopes(projected: _Projected, theta: Array, residual: Array) -> Array:
     """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences."""
     model = projected.model
     out = np.zeros((residual.size, len(projected.free)))
     for c, i in enumerate(projected.free):
         p = model.parameters[i]
-        z, h = _forward(p, theta[i]), _step_size(p, theta[i])
-        shifted = theta.copy()
-        shifted[i] = _backward(p, z + h)
-        if shifted[i] == theta[i]:
-            shifted[i] = _backward(p, z - h)
-        moved = _forward(p, shifted[i]) - z
+        shifted = moved_a_little(model, theta, i)
+        moved = _forward(p, shifted[i]) - _forward(p, theta[i])
         if moved != 0.0:
             out[:, c] = (projected.evaluate(shifted)[0] - residual) / moved
     return out
@@ -293,43 +300,41 @@ def fit(
     """
     outputs = model.together(touched) if keep is not None and touched else problem.twin.outputs
     rows = max(1, problem.fit_rows.size // max(1, stride))
-    few = min(rows, max(LEAST_ROWS, rows // 3))
+    opening = problem.opening if model.nonlinear and all(p.effect.name in OPENING for p in model.placed) else None
+    ground = opening or problem
     evaluations = 0
     give_up = False
     best = list(starts[:1])
     if model.nonlinear and (len(starts) > 1 or np.isfinite(hopeless)):
-        projected = _Projected(problem, model, outputs, few)
-        ranked: list[tuple[float, int, Array]] = []
-        for i, theta in enumerate(starts[: 3 * tries]):
-            residual, solved = projected.evaluate(theta)
-            cost = float(residual @ residual)
-            ranked.append((cost if np.isfinite(cost) else np.inf, i, solved))
-        ranked.sort(key=lambda r: (r[0], r[1]))
-        tried: list[tuple[float, int, Array]] = []
-        for _, i, theta in ranked[:tries]:
-            theta, cost = _search(projected, theta, 4, 1e-3)
-            tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
-        tried.sort(key=lambda r: (r[0], r[1]))
-        best = [t[2] for t in tried[:2]]
+        few = min(rows, max(LEAST_ROWS, rows // 3), ground.fit_rows.size)
+        tried, evaluations = _coarsely(_Projected(ground, model, outputs, few), starts, tries)
+        best = [t[1] for t in tried[:2]]
         if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
-        give_up = tried[0][0] / max(1.0, projected.usual_count) > hopeless
-        evaluations += projected.evaluations
+        if opening is not None and np.isfinite(hopeless):
+            # what it leaves of the opening says nothing about the whole
+            projected = _Projected(problem, model, outputs, few)
+            residual, _ = projected.evaluate(best[0])
+            left = float(residual @ residual) / max(1.0, projected.usual_count)
+        else:
+            left = tried[0][0]
+        give_up = left > hopeless
     found: tuple[float, Array] | None = None
     for theta in best[:1] if give_up else best:
-        projected = _Projected(problem, model, outputs, rows)
         cost = np.inf
-        for round_ in range(0 if give_up else rounds):
-            theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)
-            if not np.isfinite(cost):
-                break
-            if round_ + 1 < rounds:
-                projected.reweight(residuals(problem, model, theta, outputs))
-        evaluations += projected.evaluations
+        if not give_up:
+            least = min(rows, ground.fit_rows.size)
+            theta, cost, count = _finely(ground, model, outputs, theta, least, iterations, rounds, tolerance)
+            evaluations += count
         if found is None or (np.isfinite(cost) and cost < found[0]):
             found = (cost, theta)
     assert found is not None
     cost, theta = found
+    if opening is not None and not give_up and np.isfinite(cost):
+        theta, cost, count = _finely(problem, model, outputs, theta, rows, 6, rounds, tolerance)
+        evaluations += count
+    elif give_up and opening is not None:
+        _, theta = _Projected(problem, model, outputs, rows).evaluate(theta)
     residual = residuals(problem, model, theta, outputs)
     if keep is not None:
         residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
@@ -337,61 +342,59 @@ def fit(
     return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
 
 
+OPENING = frozenset(
+    (
+        "hysteresis", "rate_dependent_hysteresis", "creep", "backlash", "dead_zone", "saturation", "slew_limit",
+        "static_nonlinearity", "first_order_lag", "resonance", "dead_time", "channel_delay", "misalignment",
+        "soft_iron", "cross_axis_nonlinearity", "scale_factor_variation", "coulomb_friction", "stribeck_friction",
+        "cubic_stiffness", "cogging", "centripetal_acceleration", "sensor_position_error",
+    )
+)  # fmt: skip
+"""Effects that follow the inputs: where these are the same, so are they. What happens in time (drifts, steps, clocks,
+lines, lost samples) or follows a context may not have happened yet in the first part of a recording.
+"""
+
+
+def _coarsely(projected: _Projected, starts: Sequence[Array], tries: int) -> tuple[list[tuple[float, Array]], int]:
+    """(cost per usual sample, theta), best first, of the best ``tries`` starts after a few steps; evaluations."""
+    ranked: list[tuple[float, int, Array]] = []
+    for i, theta in enumerate(starts[: 3 * tries]):
+        residual, solved = projected.evaluate(theta)
+        cost = float(residual @ residual)
+        ranked.append((cost if np.isfinite(cost) else np.inf, i, solved))
+    ranked.sort(key=lambda r: (r[0], r[1]))
+    tried: list[tuple[float, int, Array]] = []
+    for _, i, theta in ranked[:tries]:
+        theta, cost = _search(projected, theta, 4, 1e-3)
+        tried.append((cost if np.isfinite(cost) else np.inf, i, theta))
+    tried.sort(key=lambda r: (r[0], r[1]))
+    size = max(1.0, projected.usual_count)
+    return [(cost / size, theta) for cost, _, theta in tried], projected.evaluations
+
+
+def _finely(
+    problem: Problem,
+    model: Model,
+    outputs: Sequence[str],
+    theta: Array,
+    rows: int,
+    iterations: int,
+    rounds: int,
+    tolerance: float,
+) -> tuple[Array, float, int]:
+    """(theta, cost, evaluations) after a search on ``rows`` and another with outliers weighed down."""
+    projected = _Projected(problem, model, outputs, rows)
+    cost = np.inf
+    for round_ in range(rounds):
+        theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)
+        if not np.isfinite(cost):
+            break
+        if round_ + 1 < rounds:
+            projected.reweight(residuals(problem, model, theta, outputs))
+    return theta, cost, projected.evaluations
+
+
 def fit_base(problem: Problem) -> Fit:
     """The base parameters alone, from where the engineer believes them to be."""
     model = problem.base()
     return fit(problem, model, [model.start(problem.recording)])
-
-
-def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
-    """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters)."""
-    model, theta = fitted.model, fitted.theta
-    rows = problem.fit_rows[:: max(1, stride)]
-    design = model.design(problem.view, theta)
-    outputs = problem.twin.outputs
-    sensitivity = {o: np.zeros((rows.size, theta.size)) for o in outputs}
-    for o in outputs:
-        for i, j in enumerate(design.linear[o]):
-            sensitivity[o][:, j] = design.columns[o][rows, i]
-    here = model.simulate(problem.view, theta) if model.nonlinear else {}
-    for i in model.nonlinear:
-        p = model.parameters[i]
-        h = _step_size(p, theta[i])
-        shifted = theta.copy()
-        shifted[i] = _backward(p, _forward(p, theta[i]) + h)
-        if shifted[i] == theta[i]:
-            shifted[i] = _backward(p, _forward(p, theta[i]) - h)
-        moved = shifted[i] - theta[i]
-        if moved == 0.0:
-            continue
-        there = model.simulate(problem.view, shifted)
-        for o in outputs:
-            sensitivity[o][:, i] = (there[o][rows] - here[o][rows]) / moved
-    return np.concatenate([sensitivity[o] / problem.sigma(o) for o in outputs])
-
-
-def covariance(problem: Problem, fitted: Fit) -> Array:
-    """Block-clustered sandwich covariance of theta (Liang and Zeger, Biometrika 73, 1986), never below the one
-    that white residuals would give.
-    """
-    stride = max(1, problem.fit_rows.size * len(problem.twin.outputs) // 200_000)
-    j = jacobian(problem, fitted, stride)
-    rows = problem.fit_rows[::stride]
-    r = np.concatenate([fitted.residual[o][rows] / problem.sigma(o) for o in problem.twin.outputs])
-    limit = HUBER * robust_scale(r, 0.0)
-    r = np.clip(r, -limit, limit)
-    size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
-    js = j / size
-    bread = np.linalg.pinv(js.T @ js, rcond=1e-12)
-    block = np.zeros(rows.size, int)
-    for b, (start, stop) in enumerate(problem.fit_blocks):
-        block[(rows >= start) & (rows < stop)] = b
-    blocks = np.tile(block, len(problem.twin.outputs))
-    scores = np.zeros((len(problem.fit_blocks), j.shape[1]))
-    np.add.at(scores, blocks, js * r[:, None])
-    meat = scores.T @ scores * (len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
-    sandwich = bread @ meat @ bread
-    plain = bread * float(np.mean(r * r))
-    inflate = np.sqrt(np.maximum(np.diag(plain), 1e-300) / np.maximum(np.diag(sandwich), 1e-300))
-    sandwich = sandwich * np.outer(np.maximum(inflate, 1.0), np.maximum(inflate, 1.0))
-    return sandwich / np.outer(size, size)

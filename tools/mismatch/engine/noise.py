@@ -52,9 +52,8 @@ def clip_spikes(e: Array, threshold: float = 15.0) -> Array:
     rough = e - smooth
     second = np.diff(e, 2) / np.sqrt(6.0)
     scale = 1.4826 * max(float(np.median(np.abs(rough))), float(np.median(np.abs(second))))
-    if scale == 0.0:
-        return e
-    return np.where(np.abs(rough) > threshold * scale, smooth, e)
+    spikes = np.abs(rough) > threshold * scale
+    return np.where(spikes, smooth, e) if scale > 0.0 and spikes.any() else e
 
 
 def lattice_step(y: Array) -> float:
@@ -90,8 +89,21 @@ def _band_levels(e: Array, rate_hz: float) -> tuple[Array, Array, int]:
 
 
 def spectral_floor(e: Array, rate_hz: float) -> tuple[float, float, bool]:
-    """White level of a residual ``e`` (n,): (rms, standard error, does the spectrum fall to its very end)."""
-    e = clip_spikes(np.asarray(e, float))
+    """White level of a residual ``e`` (n,): (rms, standard error, does the spectrum fall to its very end).
+
+    Spikes are taken out where that lowers the level: each is white by itself. Where it raises the level no spikes were
+    taken but the peaks of a signal whose amplitude varies, and the cuts are broad-band.
+    """
+    e = np.asarray(e, float)
+    found = _level_of(e, rate_hz)
+    clipped = clip_spikes(e)
+    if clipped is e:
+        return found
+    without = _level_of(clipped, rate_hz)
+    return min(found, without, key=lambda f: f[0])
+
+
+def _level_of(e: Array, rate_hz: float) -> tuple[float, float, bool]:
     if e.size < 32 or not np.any(np.diff(e)):
         rough = np.diff(e)
         rms = float(np.std(rough)) / np.sqrt(2) if rough.size else 0.0

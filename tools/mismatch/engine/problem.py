@@ -108,6 +108,21 @@ class Problem:
     def measured(self) -> dict[str, Array]:
         return {o: self.view.measured(o) for o in self.twin.outputs}
 
+    @cached_property
+    def opening(self) -> Problem | None:
+        """The same problem on the first part of a long recording, when that shows the whole range and the fastest
+        rate of every input: what runs freely from the first sample is there exactly what it is in the whole.
+        """
+        n = self.recording.n
+        signals = [*self.recording.inputs.values()]
+        samples = LEAST_OPENING
+        while samples <= n // 3:
+            rows = int(np.searchsorted(self.index[self.fit_rows], samples))
+            if rows > samples // 3 and all(_shows(x[:samples], x) for x in signals):
+                return replace(self, recording=_first(self.recording, samples), split=self.split.first(samples))
+            samples *= 2
+        return None
+
     def sigma(self, output: str) -> float:
         return self.floors[output].rms if output in self.floors else 1.0
 
@@ -137,6 +152,25 @@ class Problem:
 
     def base(self) -> Model:
         return Model(self.twin)
+
+
+LEAST_OPENING = 15_000
+"""Samples of the first part of a recording that a search may be started on."""
+
+
+def _shows(part: Array, whole: Array) -> bool:
+    """Does a part of a signal reach nearly all of its range and of its fastest rate."""
+    if float(np.ptp(part)) < 0.97 * float(np.ptp(whole)):
+        return False
+    some, every = (float(np.quantile(np.abs(np.diff(x)), 0.999)) for x in (part, whole))
+    return some >= 0.95 * every
+
+
+def _first(recording: Recording, samples: int) -> Recording:
+    signals = {
+        kind: {s: x[:samples] for s, x in getattr(recording, kind).items()} for kind in ("inputs", "outputs", "context")
+    }
+    return replace(recording, t=recording.t[:samples], **signals)
 
 
 def spread(rows: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:

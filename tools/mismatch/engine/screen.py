@@ -121,7 +121,8 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     design = model.design(problem.view, theta, outputs, ground.samples)
     n_old = {p.name for p in current.model.parameters}
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
-    moved = model.simulate(problem.view, theta, outputs) if model.nonlinear else None
+    # the design at these parameters holds the simulation, too
+    moved = {o: design.constant[o] + design.columns[o] @ theta[list(design.linear[o])] for o in outputs}
     # a start on another base: what that base does without the effect is not the effect's share
     base = current.theta.copy()
     base[: model.n_base] = theta[: model.n_base]
@@ -155,9 +156,9 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
         shift.append((without[o][rows] - here) / s if without is not None else np.zeros(rows.size))
         old.append(np.column_stack([columns(old_linear), ground.bends[o] / s]))
         extra = [columns(new_linear)]
-        if moved is not None:
-            extra.append(((moved[o][rows] - here) / s)[:, None])
-            extra += [((p[o][rows] - moved[o][rows]) / s)[:, None] for p in pushed]
+        if model.nonlinear:
+            extra.append(((moved[o] - here) / s)[:, None])
+            extra += [((p[o][rows] - moved[o]) / s)[:, None] for p in pushed]
         new.append(np.column_stack(extra))
     e, base, more = np.concatenate(target), np.concatenate(old), np.concatenate(new)
     if not (np.all(np.isfinite(base)) and np.all(np.isfinite(more))):

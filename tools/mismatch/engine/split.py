@@ -31,6 +31,11 @@ class Split:
     def held_out_mask(self) -> NDArray[np.bool_]:
         return _mask(self.n, self.held_out)
 
+    def first(self, samples: int) -> Split:
+        """The same split of the first ``samples`` alone."""
+        spans = (self.fit, self.held_out, self.blocks, self.fit_blocks)
+        return Split(samples, *(tuple((a, min(b, samples)) for a, b in s if a < samples) for s in spans), self.own)
+
 
 def _mask(n: int, spans: tuple[Span, ...]) -> NDArray[np.bool_]:
     mask = np.zeros(n, bool)

@@ -289,6 +289,8 @@ class DynamicTwin:
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
 
         def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
+            if not forces:
+                return run_states(d.ad, d.g0, d.g1, drive, x0, first)
             return run_feedback(
                 d.ad, d.g0, d.g1, cp, cv, drive, held, sub, run.dt / sub, x0, first, stop,
                 packed.friction, packed.spring, packed.cogging, packed.thresholds, packed.memory, dry,

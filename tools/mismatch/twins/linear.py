@@ -69,6 +69,31 @@ def run_states(ad, g0, g1, u, x0, starts):
             out[k, 0] = p
             out[k, 1] = q
         return out
+    if s == 3:
+        a = ad.copy()
+        b = g0.copy()
+        c = g1.copy()
+        p = 0.0
+        q = 0.0
+        r = 0.0
+        at = 0
+        for k in range(n):
+            if at < starts.size and k == starts[at]:
+                p = x0[at, 0]
+                q = x0[at, 1]
+                r = x0[at, 2]
+                at += 1
+            else:
+                before = u[k - 1]
+                v = b[0] * before + c[0] * u[k] + a[0, 0] * p + a[0, 1] * q + a[0, 2] * r
+                w = b[1] * before + c[1] * u[k] + a[1, 0] * p + a[1, 1] * q + a[1, 2] * r
+                r = b[2] * before + c[2] * u[k] + a[2, 0] * p + a[2, 1] * q + a[2, 2] * r
+                p = v
+                q = w
+            out[k, 0] = p
+            out[k, 1] = q
+            out[k, 2] = r
+        return out
     x = np.zeros(s)
     y = np.zeros(s)
     at = 0
@@ -131,6 +156,15 @@ def free_response(ad: Array, c: Array, length: int) -> Array:
     return out
 
 
+def felt_at_most(ad: Array, longest: int) -> int:
+    """Samples after which a free response has decayed below 1e-12 of its largest for sure, ``longest`` at most."""
+    slowest = float(np.max(np.abs(np.linalg.eigvals(ad)), initial=0.0))
+    if slowest >= 1.0:
+        return longest
+    # repeated poles grow by powers of time before they decay
+    return min(longest, 50 * (ad.shape[0] + 1) + int(42.0 * ad.shape[0] / -np.log(max(slowest, 1e-12))))
+
+
 def _while_felt(free: Array, window: int) -> Array:
     """Free responses up to where they have decayed below 1e-12 of their largest, at least over ``window``."""
     size = np.abs(free).max(axis=1, initial=0.0)
@@ -191,6 +225,7 @@ def start_state(
         return found
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
     longest = max(b - a for a, b in spans) if whole else window
+    longest = max(window, felt_at_most(ad, longest))
     free = {o: _while_felt(free_response(ad, c, longest), window) for o, c in rows.items()}
     windows = tuple(min(window, b - a) for a, b in spans)
     weight = dict.fromkeys(rows, 1.0)
