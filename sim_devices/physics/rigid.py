@@ -28,7 +28,7 @@ def centripetal_row(w: Array, axis: int) -> Array:
 
 def tangential_row(w: Array, axis: int, dt: float) -> Array:
     """Row i of [alpha]x, (n, 3): axis . (alpha x r) = row @ r, alpha by central differences of the rate."""
-    alpha = np.gradient(w, dt, axis=0)
+    alpha = np.gradient(w, dt, axis=0, edge_order=2)
     j, k = (axis + 1) % 3, (axis + 2) % 3
     row = np.zeros_like(w)
     row[:, k] = alpha[:, j]

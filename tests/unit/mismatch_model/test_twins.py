@@ -194,8 +194,8 @@ def test_cluster_against_rigid_body() -> None:
     )  # fmt: skip
     want = f + np.cross(alpha, r)
     got = as_given(rec)
-    np.testing.assert_allclose(got["accel_1x"][2:-2], want[2:-2, 0], atol=2e-4)
-    np.testing.assert_allclose(got["accel_1z"][2:-2], want[2:-2, 2], atol=2e-4)
+    np.testing.assert_allclose(got["accel_1x"], want[:, 0], atol=2e-4)
+    np.testing.assert_allclose(got["accel_1z"], want[:, 2], atol=2e-4)
     effect = EFFECTS["centripetal_acceleration"]
     model = Model(make(rec), sites(make(rec), rec, effect))
     theta = model.start(rec)

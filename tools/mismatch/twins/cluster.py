@@ -89,7 +89,7 @@ class ClusterTwin:
         for rate_axis, arm, sign in ((j, r[k], 1.0), (k, r[j], -1.0)):
             rate = used.get(f"angular_rate_{'xyz'[rate_axis]}")
             if rate is not None and arm != 0.0:
-                a += sign * arm * np.gradient(rate.value, dt)
+                a += sign * arm * np.gradient(rate.value, dt, edge_order=2)
         return a
 
     def human(self, theta: Array) -> Sequence[Human]:
