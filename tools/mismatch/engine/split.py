@@ -33,8 +33,11 @@ class Split:
 
     def first(self, samples: int) -> Split:
         """The same split of the first ``samples`` alone."""
-        spans = (self.fit, self.held_out, self.blocks, self.fit_blocks)
-        return Split(samples, *(tuple((a, min(b, samples)) for a, b in s if a < samples) for s in spans), self.own)
+
+        def of(spans: tuple[Span, ...]) -> tuple[Span, ...]:
+            return tuple((a, min(b, samples)) for a, b in spans if a < samples)
+
+        return Split(samples, of(self.fit), of(self.held_out), of(self.blocks), of(self.fit_blocks), self.own)
 
 
 def _mask(n: int, spans: tuple[Span, ...]) -> NDArray[np.bool_]:
