@@ -97,7 +97,9 @@ def run_in_process(
             sense_only=request.sense_only,
         )
         if on_status is not None and live is not None:
-            on_status({"event": "devices", "identities": devices.identities, "histograms": list(loop.histograms())})
+            on_status(
+                {"event": "devices", "identities": devices.identities, "histograms": list(loop.shown.histograms())}
+            )
         report = RealtimeReport()
         summary: RecordingSummary | None = None
         try:

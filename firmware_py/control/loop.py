@@ -21,23 +21,21 @@ from firmware_py.control.plausibility import ScanCheck
 from firmware_py.control.redundancy import Redundancy
 from firmware_py.control.safety import FINISHED, State, Supervisor
 from firmware_py.control.stages import Stages
+from firmware_py.control.status import LoopStatus
 from firmware_py.control.tasks import Works, task_table
 from firmware_py.control.watch import Watch
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import (
     CLIP,
     CLIP_YIELD,
-    COMMAND,
     COUNTS,
     STATUS,
     TICK,
     TIME,
-    TREMOR_AMPLITUDE,
     TREMOR_FREQUENCY,
     FrameStatus,
 )
 from firmware_py.live.link import LiveLink
-from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.scheduler import Scheduler
 from firmware_py.scheduler.task import BackgroundSpec, TickInfo
 from firmware_py.scheduler.ticker import ScanTicker, Ticks
@@ -108,7 +106,7 @@ class InstrumentLoop:
         self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
         if live is not None:
-            background.append(BackgroundSpec("histograms", lambda: live.show(self.histograms), 30.0))
+            background.append(BackgroundSpec("histograms", lambda: live.show(self.shown.histograms), 30.0))
         works = Works(
             sense=self._sense,
             estimate=self._estimate,
@@ -122,6 +120,9 @@ class InstrumentLoop:
         )
         tasks = task_table(works, tick_hz, config.budget_us)
         self.scheduler = Scheduler(tasks, clock, period_ns=self._period_ns, background=background)
+        self.shown = LoopStatus(
+            stages, self.counts, self.supervisor, self.manual, self.scheduler, clock, for_page=live is not None
+        )
 
     @property
     def error(self) -> HalError | None:
@@ -353,14 +354,11 @@ class InstrumentLoop:
         assert telemetry is not None
         frame, state = self._frame, int(self.supervisor.state)
         telemetry.heartbeat.state = state
-        telemetry.send_tremor(self._amplitude_um(), float(frame[TREMOR_FREQUENCY]))
+        telemetry.send_tremor(self.shown.amplitude_um(), float(frame[TREMOR_FREQUENCY]))
         scheduler = self.scheduler
         telemetry.send_state(
             state, int(frame[STATUS]), self.counts.lost, scheduler.skipped_ticks, scheduler.worst_tick_ns * 1e-3
         )
-
-    def _amplitude_um(self) -> list[float]:
-        return [1e6 * float(v) for v in self._frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
 
     def _report_status(self) -> Generator[bool, None, None]:
         assert self._on_status is not None
@@ -370,40 +368,5 @@ class InstrumentLoop:
             k = self._ticks.k0 if self._ticks is not None else 0
             if k >= next_k:
                 next_k = k + every
-                self._on_status(self.status())
+                self._on_status(self.shown.numbers())
             yield False
-
-    def histograms(self) -> dict[str, DurationHistogram]:
-        """Every live histogram, sample to command first."""
-        return {"sample to command": self.counts.latency, **self.scheduler.histograms()}
-
-    def status(self) -> dict[str, object]:
-        """A few numbers for the eye."""
-        frame = self._frame
-        latency = self.counts.latency.distribution()
-        bench: dict[str, object] = {}
-        if self._live is not None:
-            now_ns = self._clock.now_ns()
-            trip = self.supervisor.trip_cause
-            bench = {
-                "now_ns": now_ns,
-                "reason": trip.reason if trip is not None else "",
-                "manual": "armed" if self.manual.armed(now_ns) else "returning" if self.manual.active else "off",
-                "gain": float(self.stages.actuation.params["gain"][0]),
-                "samples": self.counts.received,
-                "commands": self.counts.commands,
-                "clipped": self.counts.clipped,
-                "magnetometer_errors": self.counts.magnetometer_errors,
-                "tasks": self.scheduler.task_counts(),
-            }
-        return {
-            **bench,
-            "t_s": float(frame[TIME]),
-            "state": self.supervisor.state.name.lower().replace("_", " "),
-            "amplitude_um": self._amplitude_um(),
-            "frequency_hz": [float(v) for v in frame[TREMOR_FREQUENCY : TREMOR_FREQUENCY + 3]],
-            "command_V": [float(v) for v in frame[COMMAND : COMMAND + 3]],
-            "latency_us": [latency.p50_us, latency.p99_us],
-            "lost": self.counts.lost,
-            "skipped": self.scheduler.skipped_ticks,
-        }

@@ -1,0 +1,75 @@
+"""What the loop shows while it runs: a few numbers for the eye, the histograms for the page. Looks, changes nothing."""
+
+from __future__ import annotations
+
+from firmware_py.control.incidents import LoopCounts
+from firmware_py.control.manual import ManualDrive
+from firmware_py.control.safety import Supervisor
+from firmware_py.control.stages import Stages
+from firmware_py.frame import COMMAND, TIME, TREMOR_AMPLITUDE, TREMOR_FREQUENCY
+from firmware_py.scheduler.histogram import DurationHistogram
+from firmware_py.scheduler.scheduler import Scheduler
+from hal.contracts import Clock
+
+
+class LoopStatus:
+    """Of a loop's parts. ``for_page``: the numbers that only the bench page shows are there, too."""
+
+    def __init__(
+        self,
+        stages: Stages,
+        counts: LoopCounts,
+        supervisor: Supervisor,
+        manual: ManualDrive,
+        scheduler: Scheduler,
+        clock: Clock,
+        *,
+        for_page: bool,
+    ) -> None:
+        self._stages = stages
+        self._frame = stages.frame
+        self._counts = counts
+        self._supervisor = supervisor
+        self._manual = manual
+        self._scheduler = scheduler
+        self._clock = clock
+        self._for_page = for_page
+
+    def amplitude_um(self) -> list[float]:
+        """Of the tremor, x, y, z."""
+        return [1e6 * float(v) for v in self._frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
+
+    def histograms(self) -> dict[str, DurationHistogram]:
+        """Every live histogram, sample to command first."""
+        return {"sample to command": self._counts.latency, **self._scheduler.histograms()}
+
+    def numbers(self) -> dict[str, object]:
+        """As JSON values, under the names of the bench page."""
+        frame = self._frame
+        latency = self._counts.latency.distribution()
+        return {
+            **(self._page_numbers() if self._for_page else {}),
+            "t_s": float(frame[TIME]),
+            "state": self._supervisor.state.name.lower().replace("_", " "),
+            "amplitude_um": self.amplitude_um(),
+            "frequency_hz": [float(v) for v in frame[TREMOR_FREQUENCY : TREMOR_FREQUENCY + 3]],
+            "command_V": [float(v) for v in frame[COMMAND : COMMAND + 3]],
+            "latency_us": [latency.p50_us, latency.p99_us],
+            "lost": self._counts.lost,
+            "skipped": self._scheduler.skipped_ticks,
+        }
+
+    def _page_numbers(self) -> dict[str, object]:
+        now_ns = self._clock.now_ns()
+        trip, manual, counts = self._supervisor.trip_cause, self._manual, self._counts
+        return {
+            "now_ns": now_ns,
+            "reason": trip.reason if trip is not None else "",
+            "manual": "armed" if manual.armed(now_ns) else "returning" if manual.active else "off",
+            "gain": float(self._stages.actuation.params["gain"][0]),
+            "samples": counts.received,
+            "commands": counts.commands,
+            "clipped": counts.clipped,
+            "magnetometer_errors": counts.magnetometer_errors,
+            "tasks": self._scheduler.task_counts(),
+        }
