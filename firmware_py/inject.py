@@ -6,6 +6,7 @@ nothing is injected without a limit that somebody has named.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
@@ -35,6 +36,18 @@ PROBABILITIES = (
     "loss", "corruption", "write_corruption", "duplication", "reorder", "truncation", "delay", "nack",
 )  # fmt: skip
 KEYS = tuple(f.name for f in fields(FaultPlan))
+FOR_EVER = ("for_s", "silent_for_s", "reconnect_after_s")
+"""Times that may be inf."""
+ONLY_ON = {
+    "nack": ("i2c",),
+    "write_corruption": ("i2c",),
+    "reorder": ("serial", "can"),
+    "truncation": ("serial", "can"),
+    "bus_off_after_s": ("can",),
+    "babble_hz": ("can",),
+    "error_frames_hz": ("can",),
+}
+"""Kinds of bus on which a key does anything; the others do on all."""
 FORM = "write --inject BUS:KEY=VALUE[,KEY=VALUE], or BUS@0x0C:KEY=VALUE for one I2C device"
 
 Wrap = Callable[[str, Port, Clock], Port]
@@ -63,8 +76,17 @@ def parse_injection(text: str) -> Injection:
         number = _number(text, key, value)
         if not (number >= 0.0 and (key not in PROBABILITIES or number <= 1.0)):
             raise BenchError(f"--inject {text!r}: {key} is {'0 to 1' if key in PROBABILITIES else '0 or more'}")
+        if math.isinf(number) and key not in FOR_EVER:
+            raise BenchError(f"--inject {text!r}: {key} is a finite number")
         values[key] = int(number) if key == "seed" else number
-    return Injection(bus, FaultPlan(**values), int(_number(text, "address", address)) if at else None)
+    return Injection(bus, FaultPlan(**values), _address(text, address) if at else None)
+
+
+def _address(text: str, address: str) -> int:
+    try:
+        return int(address, 0)
+    except ValueError:
+        raise BenchError(f"--inject {text!r}: {address!r} is not an I2C address such as 0x0C") from None
 
 
 def _number(text: str, key: str, value: str) -> float:
@@ -86,13 +108,17 @@ def effect_of(description: BenchDescription, injection: Injection) -> int:
 
 
 def check_injections(bench: BenchFile, injections: Sequence[Injection], max_effect: int | None) -> None:
-    """Raises ``BenchError`` for a bus that is not there, and for a real one that may not be disturbed so much."""
+    """Raises ``BenchError`` for a fault that would do nothing (no such bus, device, or key on such a bus; a second plan
+    for a bus), and for a real bus that may not be disturbed so much."""
     description = bench.description
-    for injection in injections:
+    for k, injection in enumerate(injections):
         spec = description.bus.get(injection.bus)
         if spec is None:
             known = ", ".join(description.bus)
             raise BenchError(f"{bench.path}: --inject: there is no bus '{injection.bus}'; buses are {known}")
+        if any(other.bus == injection.bus for other in injections[:k]):
+            raise BenchError(f"--inject: two plans for bus '{injection.bus}'; put all keys into one, divided by commas")
+        _check_kind(description, injection, spec.kind)
         effect = effect_of(description, injection)
         if spec.uri.startswith(SIM_SCHEME) or (max_effect is not None and effect <= max_effect):
             continue
@@ -101,6 +127,23 @@ def check_injections(bench: BenchFile, injections: Sequence[Injection], max_effe
             f"{bench.path}: bus '{injection.bus}' is real ({spec.uri}) and a fault on it has effect {effect} "
             f"({'motion' if effect == MOTION else 'reads and configures'}), but {given}: take the tip away from "
             f"everything and give --max-effect {effect}, or use an emulated bench"
+        )
+
+
+def _check_kind(description: BenchDescription, injection: Injection, kind: str) -> None:
+    for key, kinds in ONLY_ON.items():
+        if getattr(injection.plan, key) != getattr(FaultPlan(), key) and kind not in kinds:
+            raise BenchError(
+                f"--inject: {key} does nothing on bus '{injection.bus}', which is {kind}; "
+                f"it is for {' and '.join(kinds)}"
+            )
+    if injection.only is None:
+        return
+    there = sorted({d.address for d in description.device.values() if d.bus == injection.bus and d.address is not None})
+    if injection.only not in there:
+        known = ", ".join(f"0x{address:02X}" for address in there) or "none, it is no I2C bus"
+        raise BenchError(
+            f"--inject: there is no device 0x{injection.only:02X} on bus '{injection.bus}'; addresses are {known}"
         )
 
 

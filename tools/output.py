@@ -62,11 +62,13 @@ def write_json(result: Any, destination: str | None) -> None:
         write_text_atomic(Path(destination), text)
 
 
-def check_writable(*destinations: str | Path | None) -> None:
-    """Refuse a result file in a folder that is not there before any work is done."""
+def check_writable(*destinations: str | Path | None, folders: bool = False) -> None:
+    """Refuse a result file in a folder that is not there, or that is a folder (unless ``folders``), before any work."""
     for destination in destinations:
         if destination is None or str(destination) == "-":
             continue
+        if not folders and Path(destination).is_dir():
+            raise InputError(f"{destination}: this is a folder; name a file in it")
         parent = Path(destination).absolute().parent
         if not parent.is_dir():
             raise InputError(f"{destination}: the folder {parent} does not exist; create it first")

@@ -284,7 +284,8 @@ def capture(
     from tools.diagnose.golden import capture as record
 
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file)
+        check_writable(out, folders=True)
         if out.exists():
             raise InputError(f"{out}: is there already; a golden transcript is not overwritten")
         counts = record(bench_path(bench), out, seconds, virtual=virtual)

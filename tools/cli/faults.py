@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -59,8 +60,8 @@ def faults(
                 raise InputError("--keep needs a committed tree: results of changed files would be taken for its own")
         others = [(Path(text.partition("#")[0]), text.partition("#")[2]) for text in beside or []]
         benches = [(path, _chosen("--only", only)), *((file, _chosen("--beside", text)) for file, text in others)]
-        for file, _ in benches:
-            _emulated(file)
+        for file, chosen in benches:
+            _emulated(file, chosen)
         with Progress(
             TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console(), transient=True
         ) as progress:
@@ -108,8 +109,18 @@ def _chosen(option: str, text: str) -> list[Fault]:
     return chosen
 
 
-def _emulated(path: Path) -> None:
+def _emulated(path: Path, chosen: Sequence[Fault]) -> None:
     description = load_bench(path).description
+    daq = description.device.get("daq")
+    if daq is None or daq.driver != "di4108" or "piezo" not in description.device:
+        raise InputError(
+            f"{path}: the campaign breaks an instrument with a DI-4108 named 'daq' and an amplifier named 'piezo'; "
+            f"this bench has {', '.join(description.device)}"
+        )
+    there = {*description.device, *description.bus}
+    for fault in chosen:
+        if (part := fault.part_of_bench) and part not in there:
+            raise InputError(f"{path}: '{fault.name}' breaks '{part}', which is not on this bench; choose with --only")
     if len(description.emulated_buses()) < len(description.bus):
         raise InputError(
             f"{path}: the campaign runs on emulated benches only; use a bench of sim:// buses, or one fault at a time "

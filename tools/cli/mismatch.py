@@ -60,7 +60,7 @@ def _check_targets(*files: str | Path | None) -> None:
 def _check_folder(folder: Path | None, option: str = "--out") -> None:
     if folder is None:
         return
-    check_writable(folder)
+    check_writable(folder, folders=True)
     if folder.exists() and not folder.is_dir():
         raise InputError(f"{option} {folder}: is a file; name a folder")
     if not os.access(folder if folder.exists() else folder.absolute().parent, os.W_OK):

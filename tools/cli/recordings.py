@@ -50,7 +50,8 @@ def export(
     Example: micron export out/run.mcap --out out/run.csv
     """
     with clear_errors():
-        check_writable(json_file, out)
+        check_writable(json_file)
+        check_writable(out, folders=True)
         recording = Recording(file)
         report = export_recording(recording, out, overwrite=overwrite)
         for note in report.notes:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import json
 import re
 import shutil
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -220,12 +222,17 @@ def _in_parallel(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[list[O
         for task in tasks:
             yield _one(*task)
         return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_die_with_parent) as pool:
         waiting: set[Future[list[Observation]]] = {pool.submit(_one, *task) for task in tasks}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
+
+
+def _die_with_parent() -> None:
+    """A campaign that is killed leaves no workers behind: they would wait for work for ever."""
+    ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
 
 
 def _spread(times_ms: Sequence[float | None]) -> dict[str, float | None]:

@@ -78,6 +78,15 @@ class Fault:
     redundant: Expected | None = None
     part: str = ""
 
+    @property
+    def part_of_bench(self) -> str:
+        """The bus or device that is broken; empty for what is on every bench."""
+        if isinstance(self.how, OnBus):
+            return self.how.bus
+        if isinstance(self.how, InWorld) and not self.how.target.isdigit():
+            return self.how.target
+        return ""
+
     def with_redundancy(self) -> Fault:
         """The same on a bench that can do without an axis."""
         return self if self.redundant is None else replace(self, expected=self.redundant, why=LEFT_OUT)

@@ -45,11 +45,33 @@ def test_a_plan_is_read_as_it_is_written():
         ("daq0:loss=nan", "loss is 0 to 1"),
         ("daq0:delay_s=-1", "delay_s is 0 or more"),
         ("daq0:loss=often", "'often' is not a number"),
+        ("daq0:seed=inf", "seed is a finite number"),
+        ("daq0:delay_s=inf", "delay_s is a finite number"),
+        ("i2c0@DAC:nack=1", "'DAC' is not an I2C address"),
     ],
 )
 def test_what_is_not_understood_is_named(text: str, says: str):
     with pytest.raises(BenchError, match=says):
         parse_injection(text)
+
+
+def test_for_ever_is_a_time():
+    assert parse_injection("daq0:loss=1,for_s=inf").plan.for_s == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("texts", "says"),
+    [
+        (("i2c0@0x7F:nack=0.1",), "no device 0x7F on bus 'i2c0'; addresses are 0x0C, 0x48, 0x49"),
+        (("daq0@0x0C:loss=0.1",), "no device 0x0C on bus 'daq0'; addresses are none, it is no I2C bus"),
+        (("daq0:nack=0.1",), "nack does nothing on bus 'daq0', which is serial; it is for i2c"),
+        (("i2c0:truncation=0.1",), "truncation does nothing on bus 'i2c0', which is i2c; it is for serial and can"),
+        (("daq0:loss=0.1", "daq0:corruption=0.1"), "two plans for bus 'daq0'"),
+    ],
+)
+def test_a_fault_that_would_do_nothing_is_refused(texts: tuple[str, ...], says: str):
+    with pytest.raises(BenchError, match=says):
+        check_injections(load_bench(DEFAULT_BENCH), [parse_injection(text) for text in texts], None)
 
 
 @pytest.mark.parametrize(
