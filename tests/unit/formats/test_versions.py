@@ -15,6 +15,9 @@ from firmware_py.control.config import load_firmware_config
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.sensing.noise_file import noise_table
+from firmware_py.tremor.cascade_file import load_network
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH
@@ -61,6 +64,27 @@ def test_a_calibration_without_a_version_is_refused(tmp_path: Path):
     text = (GOLDEN / "calibration.toml").read_text().replace("format = 1", "")
     with pytest.raises(BenchError, match="format = 1 is missing"):
         load_firmware_config(load_bench(bench_with(tmp_path, text)), {})
+
+
+def test_noise_of_version_1_arrives_and_a_later_one_is_named(tmp_path: Path):
+    table = noise_table(GOLDEN / "noise.json", SensingConfig())
+    np.testing.assert_allclose(table["axis_drift_m_s2"], 1e-3, rtol=1e-12)  # 1e-4 sqrt(100 s)
+    later = tmp_path / "noise.json"
+    later.write_text((GOLDEN / "noise.json").read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(BenchError, match=r"noise\.json: noise file needs format = 1"):
+        noise_table(later, SensingConfig())
+
+
+def test_weights_of_version_1_open_with_their_values_and_a_later_one_is_named(tmp_path: Path):
+    network = load_network(GOLDEN / "cascade.json")
+    assert (network.window, network.spacing, network.scale, network.centred) == (3, 2, 5e-5, True)
+    assert network.kinds == ("sigmoid", "bessel")
+    np.testing.assert_array_equal(network.hidden[1], [0.1, 0.2, 0.3, 0.4, -0.5, 0.0])
+    np.testing.assert_array_equal(network.output, [0.0, 1.0, -1.0, 0.5, 0.25, 0.125])
+    later = tmp_path / "cascade.json"
+    later.write_text((GOLDEN / "cascade.json").read_text().replace('"format": 1', '"format": 2'))
+    with pytest.raises(BenchError, match=r"cascade\.json: format: .*micron tremor train"):
+        load_network(later)
 
 
 def test_a_twin_of_version_1_opens_and_a_later_one_is_named(tmp_path: Path):
