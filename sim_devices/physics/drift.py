@@ -74,6 +74,33 @@ def find_steps(residual: Array, keep: np.ndarray) -> tuple[list[int], float, flo
     return refined, top, min(1.0, explained / power) if power > 0 else 0.0
 
 
+LEAST_HEIGHT = 5.0  # standard errors of a step in the joint fit of all
+
+
+def paying_steps(residual: Array, keep: np.ndarray, cuts: Sequence[int], signal: Array) -> list[int]:
+    """Steps that stand when all are fitted together with the level and the gain of ``signal`` (n,).
+
+    Base parameters that a step has bent leave a swing all over the record, which segmentation takes for small steps.
+    """
+    cuts = list(cuts)
+    e = residual[keep]
+    while len(cuts) > 1:
+        rows = np.flatnonzero(keep)
+        columns = np.column_stack([np.ones(rows.size), signal[keep], *((rows >= c).astype(float) for c in cuts)])
+        size = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+        columns = columns / size
+        gram = np.linalg.pinv(columns.T @ columns, rcond=1e-10)
+        height = gram @ (columns.T @ e)
+        left = e - columns @ height
+        error = max(long_run_rms(left), 1e-300) * np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        weight = np.abs(height[2:]) / error[2:]
+        weakest = int(np.argmin(weight))
+        if weight[weakest] > LEAST_HEIGHT:
+            break
+        del cuts[weakest]
+    return cuts
+
+
 def _refine(residual: Array, keep: np.ndarray, at: int, size: int) -> int:
     """The sample where two means around ``at`` part best."""
     reach = max(4 * size, 40)
@@ -85,6 +112,7 @@ def _refine(residual: Array, keep: np.ndarray, at: int, size: int) -> int:
 
 def _step_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     cuts, _, _ = find_steps(residual, ctx.keep)
+    cuts = paying_steps(residual, ctx.keep, cuts, ctx.to_output(x))
     if ctx.everywhere is not None:
         # that there is a step is known from the mask; where in a gap of it, only the gap can say
         cuts = [_in_gap(ctx.everywhere, ctx.keep, c) for c in cuts]

@@ -127,6 +127,8 @@ def relays(x, lo, hi, count, starts):
     return out.T
 
 
+WIDE = (1.3, 1.65)  # half ranges
+N_STOPS = N_PLAYS + len(WIDE)
 N_DAHL = 7
 N_GRID = 8
 MASING = ("stops", "dahl", "dahl_stops")
@@ -172,7 +174,8 @@ def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tupl
     """Columns of one form (n, k), every one without memory of what lies before a start."""
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
-    radii = np.array(thresholds(half, N_PLAYS))
+    # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
+    radii = np.array([*thresholds(half, N_PLAYS), *(f * half for f in WIDE)])
     wide = half * np.geomspace(0.05, 4.0, N_DAHL)
     match form:
         case "stops":
@@ -187,7 +190,7 @@ def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tupl
         case "stops_bent":
             e = stops(x, radii, rest, at)
             z = np.clip((x - 0.5 * (lo + hi)) / half, -1.1, 1.1)[:, None]
-            some = e[:, 1::2]
+            some = e[:, 1:N_PLAYS:2]
             return np.concatenate([e, some * z, some * z * z], axis=1)
         case _:
             return relays(x, lo, hi, N_GRID, at)
@@ -196,11 +199,11 @@ def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tupl
 def width_of(form: str) -> int:
     """Number of columns of a form."""
     return {
-        "stops": N_PLAYS,
+        "stops": N_STOPS,
         "dahl": N_DAHL,
-        "dahl_stops": N_DAHL + N_PLAYS,
+        "dahl_stops": N_DAHL + N_STOPS,
         "dahl_skewed": 3 * N_DAHL,
-        "stops_bent": 2 * N_PLAYS,
+        "stops_bent": N_STOPS + 2 * (N_PLAYS // 2),
         "relays": N_GRID * (N_GRID + 1) // 2,
     }[form]
 
@@ -253,15 +256,18 @@ def loop_width(y_of: Array, turns: int) -> float:
     """Largest distance of the two branches over the last of ``turns`` equal cycles, relative to the span."""
     n = y_of.size // turns
     last = y_of[-n:]
-    up, down = last[: n // 2 + 1], last[n // 2 :]
-    m = min(up.size, down.size)
+    # sample i on the way up meets sample n - i on the way down
+    up, down = last[1 : n // 2 + 1], last[n // 2 :][::-1]
     span = float(np.ptp(last)) or 1.0
-    return float(np.max(np.abs(up[:m] - down[::-1][:m])) / span)
+    return float(np.max(np.abs(up - down)) / span)
+
+
+CYCLE = 200  # samples; even, so that both branches pass the same places
 
 
 def test_cycle(lo: float, hi: float) -> Array:
-    """Three slow triangles over the range, 201 samples a cycle."""
-    t = np.arange(603) / 201.0
+    """Three slow triangles over the range."""
+    t = np.arange(3 * CYCLE) / CYCLE
     return lo + (hi - lo) * (1 - np.abs(2 * (t % 1.0) - 1))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,13 +88,23 @@ def _excited(x: Array, ctx: Context, f: Array) -> NDArray[np.bool_]:
     return bad
 
 
+def mean_turn(z: NDArray[Any], whole: NDArray[np.bool_]) -> float:
+    """Mean turns from one window to the next of the phasors ``z`` (m,), where both are ``whole``."""
+    pair = whole[1:] & whole[:-1]
+    turned = complex(np.sum(z[1:][pair] * np.conj(z[:-1][pair])))
+    return float(np.angle(turned)) / (2 * np.pi) if turned else 0.0
+
+
 def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Settings:
     """How many knots the amplitude and phase need: as coarse as their wander allows."""
     span = ctx.dt * ctx.t.size
     width = max(10 / f0, span / 200)
     knots = 1
     if span > 8 * width:
-        z, whole = carrier(ctx.t, residual, f0, width), carrier_kept(ctx.keep, ctx.dt, width)
+        whole = carrier_kept(ctx.keep, ctx.dt, width)
+        # off its frequency a steady line seems to wander: the mean turn from window to window is taken off first
+        f0 += mean_turn(carrier(ctx.t, residual, f0, width), whole) / width
+        z = carrier(ctx.t, residual, f0, width)
         power = float(np.mean(np.abs(z[whole]) ** 2)) if whole.sum() > 8 else 0.0
         if power > 0:
             # noise of one window from second differences; what varies beyond it is wander
@@ -172,8 +183,16 @@ def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     h = len(orders)
     w = p[1:].reshape(2 * h, knots)
     amplitudes = np.sqrt(np.mean(w[0::2] ** 2 + w[1::2] ** 2, axis=1))
+    at = np.array(settings["knots_s"])
+    turns = 0.0
+    if knots > 1:
+        # sin w1 + cos w2 with slow w: the phase that the amplitudes carry is frequency, too
+        z = w[1] - 1j * w[0]
+        weight = np.minimum(np.abs(z[1:]), np.abs(z[:-1]))
+        step = np.angle(z[1:] * np.conj(z[:-1])) / (2 * np.pi * np.diff(at))
+        turns = float(np.sum(weight * step) / max(float(np.sum(weight)), 1e-300))
     return (
-        Human("frequency_Hz", float(p[0]), "Hz"),
+        Human("frequency_Hz", float(p[0]) + turns, "Hz"),
         *(Human(f"amplitude_{int(i)}", float(a), "{out}") for i, a in zip(orders, amplitudes, strict=True)),
     )
 

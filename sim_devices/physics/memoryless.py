@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -252,7 +253,7 @@ def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     )
 
 
-SLEW_LIMIT = Effect(
+_UNEVEN_SLEW = Effect(
     name="slew_limit",
     summary="rate of change limited",
     kind="nonlinear",
@@ -266,6 +267,39 @@ SLEW_LIMIT = Effect(
     guess=_slew_guess,
     apply=_slew_apply,
     report=_slew_report,
+)
+
+
+def _even_parts(settings: Settings) -> Parts:
+    up, _, lag = _slew_parts(settings).nonlinear
+    return Parts((replace(up, name="rate"), lag))
+
+
+def _both_ways(q: Array) -> Array:
+    return np.array([q[0], q[0], q[1]])
+
+
+def _even_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return _slew_apply(x, ctx, _both_ways(q), settings)
+
+
+def _even_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return [(up, lag) for up, _, lag in _slew_guess(x, residual, ctx, settings)]
+
+
+def _even_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return _slew_report(_both_ways(p), settings, scale)
+
+
+# one rate both ways comes first: edges of one direction then speak for the other
+SLEW_LIMIT = replace(
+    _UNEVEN_SLEW,
+    parts=_even_parts,
+    equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r,\, r\right)",
+    guess=_even_guess,
+    apply=_even_apply,
+    report=_even_report,
+    variants=(_UNEVEN_SLEW,),
 )
 
 # -- quantisation -----------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.hysteresis import dahl, loop_width, stops, test_cycle, thresholds
+from sim_devices.physics.hysteresis import CYCLE, dahl, loop_width, stops, test_cycle, thresholds
 from sim_devices.physics.lag import low_pass
 from sim_devices.physics.statistics import smooth
 
@@ -81,10 +81,12 @@ def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     out: list[Human] = []
     for name, factor in (("slow", 0.05), ("fast", 2.0)):
         # a triangle of slope factor * usual
-        dt = (hi - lo) / (0.5 * 201) / (factor * usual)
+        dt = (hi - lo) / (0.5 * CYCLE) / (factor * usual)
         y = scale * x + _columns(x, dt, p[0], settings, (0,)) @ p[1:]
         out.append(Human(f"loop_width_share_{name}", loop_width(y, 3), "1"))
-    return (*out, Human("time_constant_s", float(p[0]), "s"))
+    widths = [h.value for h in out]
+    change = abs(widths[1] - widths[0]) / max(*widths, 1e-12)
+    return (*out, Human("change_with_speed", float(change), "1"), Human("time_constant_s", float(p[0]), "s"))
 
 
 RATE_DEPENDENT_HYSTERESIS = Effect(
@@ -103,4 +105,6 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     guess=_guess,
     basis=_basis,
     report=_report,
+    # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it
+    limits={"change_with_speed": (0.08, np.inf)},
 )

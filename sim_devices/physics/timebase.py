@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -35,6 +36,23 @@ def resample(x, first, step):
         c = x[i + 1]
         d = x[i + 2] if i + 2 < n else 2 * x[n - 1] - x[n - 2]
         y[k] = b + 0.5 * s * (c - a + s * (2 * a - 5 * b + 4 * c - d + s * (3 * (b - c) + d - a)))
+    return y
+
+
+@kernel
+def resample_straight(x, first, step):
+    """The same on straight lines between samples, as a held or played-back signal runs; edges are held."""
+    n = x.size
+    y = np.empty(n)
+    for k in range(n):
+        p = first + step * k
+        if p <= 0.0:
+            y[k] = x[0]
+        elif p >= n - 1:
+            y[k] = x[n - 1]
+        else:
+            i = int(p)
+            y[k] = x[i] + (p - i) * (x[i + 1] - x[i])
     return y
 
 
@@ -71,6 +89,15 @@ def _delay_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return resample(x, -q[0] / ctx.dt, 1.0)
 
 
+def _straight_delay_parts(settings: Settings) -> Parts:
+    # a name of its own: twin files tell forms by their parameters
+    return Parts((replace(_delay_parts(settings).nonlinear[0], name="late_s"),))
+
+
+def _straight_delay_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return resample_straight(x, -q[0] / ctx.dt, 1.0)
+
+
 def _delay_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     bounds = _delay_parts(settings).nonlinear[0]
     longest = int(bounds.hi / ctx.dt)
@@ -91,7 +118,9 @@ def _delay_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]
 
 _DELAY_SOURCE = "A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, 3rd ed., section 4.5; Keys 1981"
 
-DEAD_TIME = Effect(
+_STRAIGHT = r"y(t) = x(t - T),\; x \text{ straight between samples}"
+
+_SMOOTH_DELAY = Effect(
     name="dead_time",
     summary="pure delay",
     kind="linear",
@@ -107,8 +136,11 @@ DEAD_TIME = Effect(
     report=_delay_report,
 )
 
+# an edge within one sample is late by a straight line or by a curve, and that alone may look like a lag
+_STRAIGHT_DELAY = replace(_SMOOTH_DELAY, parts=_straight_delay_parts, equation=_STRAIGHT, apply=_straight_delay_apply)
+DEAD_TIME = replace(_SMOOTH_DELAY, variants=(_STRAIGHT_DELAY,))
 
-CHANNEL_DELAY = Effect(
+_SMOOTH_CHANNEL = Effect(
     name="channel_delay",
     summary="one channel late against the others",
     kind="linear",
@@ -124,6 +156,11 @@ CHANNEL_DELAY = Effect(
     report=_delay_report,
     sites=("output",),
 )
+
+_STRAIGHT_CHANNEL = replace(
+    _SMOOTH_CHANNEL, parts=_straight_delay_parts, equation=_STRAIGHT, apply=_straight_delay_apply
+)
+CHANNEL_DELAY = replace(_SMOOTH_CHANNEL, variants=(_STRAIGHT_CHANNEL,))
 
 
 # -- clock skew -------------------------------------------------------------------------------------
@@ -194,7 +231,7 @@ def _skew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (Human("skew_ppm", float(p[0]), "ppm"),)
 
 
-CLOCK_SKEW = Effect(
+_SMOOTH_SKEW = Effect(
     name="clock_skew",
     summary="one clock runs fast or slow against the other",
     kind="linear",
@@ -210,6 +247,23 @@ CLOCK_SKEW = Effect(
     report=_skew_report,
     sites=("output",),
 )
+
+
+def _straight_skew_parts(settings: Settings) -> Parts:
+    return Parts((replace(_skew_parts(settings).nonlinear[0], name="apart_ppm"),))
+
+
+def _straight_skew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return resample_straight(x, 0.0, 1.0 + 1e-6 * q[0])
+
+
+_STRAIGHT_SKEW = replace(
+    _SMOOTH_SKEW,
+    parts=_straight_skew_parts,
+    equation=r"y(t) = x\left((1 + \epsilon)\,t\right),\; x \text{ straight between samples}",
+    apply=_straight_skew_apply,
+)
+CLOCK_SKEW = replace(_SMOOTH_SKEW, variants=(_STRAIGHT_SKEW,))
 
 
 # -- dropped samples --------------------------------------------------------------------------------
@@ -259,8 +313,9 @@ def best_shifts(costs, price):
 
 
 @kernel
-def shift_costs(x, y, window, shifts):
-    """Sum of squares (windows, shifts) of y less the shifted x about its mean in each window of ``window`` samples."""
+def shift_costs(x, y, window, shifts, local):
+    """Sum of squares (windows, shifts) of y less the shifted x in each window of ``window`` samples, about the
+    window's own mean where ``local``."""
     n = x.size
     count = n // window
     out = np.empty((count, shifts.size))
@@ -273,19 +328,39 @@ def shift_costs(x, y, window, shifts):
                 d = y[k] - x[min(max(k + shifts[j], 0), n - 1)]
                 total += d
                 square += d * d
-            out[i, j] = max(square - total * total / window, 0.0)
+            out[i, j] = max(square - total * total / window, 0.0) if local else square
     return out
 
 
 MOST_SHIFT = 60
 MOST_DROPS = 40
+MOST_SLOW = 12  # events that a signal without bends within a window can vouch for
 
 
 def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], float, float]:
     """Where a record lost or repeats samples, by the cheapest path of shifts over windows.
 
-    (samples, total shift from there on, share of the error explained, sum of squares left).
+    (samples, total shift from there on, share of the error explained, sum of squares left). First with the mean of
+    every window left to slower effects; of a signal that hardly bends within a window nothing is left then, so once
+    more with the level of the whole record alone, which is taken when it explains far more with a few events.
     """
+    found = _path_of_shifts(model, measured, True)
+    slow = _path_of_shifts(model, measured, False)
+    if not 0 < len(slow[0]) <= MOST_SLOW:
+        return found
+    left, left_slow = (_squares_left(model, measured, f[0], f[1]) for f in (found, slow))
+    return slow if left_slow < 0.5 * left else found
+
+
+def _squares_left(model: Array, measured: Array, at: Sequence[int], total: Sequence[int]) -> float:
+    """Sum of squares that a shifted model leaves when its gain and level are free."""
+    moved = shift_by(model, np.array(at, np.int64), np.array(total, np.int64))
+    a, b = moved - moved.mean(), measured - measured.mean()
+    return float(b @ b) - float(a @ b) ** 2 / max(float(a @ a), 1e-300)
+
+
+def _path_of_shifts(model: Array, measured: Array, local: bool) -> tuple[list[int], list[int], float, float]:
+    """``find_drops`` with the mean of every window left out (``local``) or only that of the record."""
     n = model.size
     y = measured - measured.mean()
     x = model - model.mean()
@@ -298,12 +373,18 @@ def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], flo
         return [], [], 0.0, np.inf
     shifts = np.arange(-MOST_SHIFT, MOST_SHIFT + 1)
     shifts = shifts[np.abs(shifts) < n // 8]
-    # the local mean is left to slower effects
-    costs = shift_costs(x, y, window, shifts)
+    costs = shift_costs(x, y, window, shifts, local)
     zero = int(np.flatnonzero(shifts == 0)[0])
     floor = robust_rms(np.sqrt(costs.min(axis=1) / window)) + float(np.median(np.sqrt(costs.min(axis=1) / window)))
     price = 30.0 * floor * floor + 0.3 * float(np.median(costs.min(axis=1)))
     path, best = best_shifts(costs, price)
+    if not local:
+        # neighbouring samples of coloured noise agree on a shift: the price is that of their long-run variance
+        k = np.arange(count * window)
+        left = (y[k] - x[np.clip(k + np.repeat(shifts[path], window), 0, n - 1)]).reshape(count, window).mean(axis=1)
+        long_run = 0.5 * window * robust_rms(np.diff(left)) ** 2
+        if long_run > floor * floor:
+            path, best = best_shifts(costs, price * long_run / (floor * floor))
     before = float(costs[:, zero].sum())
     change = np.flatnonzero(np.diff(path)) + 1
     if not change.size or change.size > MOST_DROPS or before <= 0:

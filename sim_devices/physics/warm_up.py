@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -95,6 +96,36 @@ def _late_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     )
 
 
+def _one_parts(settings: Settings) -> Parts:
+    both = _warm_parts(settings)
+    return Parts(both.nonlinear[:1], both.weights[:1])
+
+
+def _one_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.exp(-ctx.t / q[0])[:, None]
+
+
+def _one_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    p = _warm_parts(settings).nonlinear[0]
+    k = thin(ctx.keep, 4000)
+    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    tried: list[tuple[float, float]] = []
+    for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
+        column = _one_basis(x, ctx, np.array([tau]), settings)[k]
+        tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(tau)))
+    tried.sort()
+    return tuple((tau,) for _, tau in tried[:2])
+
+
+def _one_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    span = settings["time"][1]
+    return (
+        Human("drift_over_record", float(p[1] * np.expm1(-span / p[0])), "{out}"),
+        Human("time_constant_s", float(p[0]), "s"),
+        Human("slow_amplitude", float(-p[1]), "{out}"),
+    )
+
+
 _LATE = Effect(
     name="thermal_drift",
     summary="warm-up that sets in late: slow, then faster, then settled (logistic)",
@@ -114,7 +145,7 @@ _LATE = Effect(
     sites=("output",),
 )
 
-THERMAL_DRIFT = Effect(
+_TWO = Effect(
     name="thermal_drift",
     summary="warm-up: slow, exponential-like, no temperature recorded",
     kind="add",
@@ -130,5 +161,15 @@ THERMAL_DRIFT = Effect(
     report=_warm_report,
     driven=False,
     sites=("output",),
-    variants=(_LATE,),
+)
+
+# two exponentials fitted to one leave both times loose: the simplest that serves has the interval that holds
+THERMAL_DRIFT = replace(
+    _TWO,
+    parts=_one_parts,
+    equation=r"y = x + a\,e^{-t/\tau}",
+    guess=_one_guess,
+    basis=_one_basis,
+    report=_one_report,
+    variants=(_TWO, _LATE),
 )

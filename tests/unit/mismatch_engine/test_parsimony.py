@@ -64,7 +64,7 @@ def test_creep_that_takes_all_of_the_mean_away_is_no_creep(share: float, refused
 def test_late_warm_up_is_met_by_the_logistic_form() -> None:
     t = np.arange(4000) * 0.01
     residual = 0.8 / (1 + np.exp(-(t - 18.0) / 2.5))
-    late = EFFECTS["thermal_drift"].variants[0]
+    late = EFFECTS["thermal_drift"].variants[1]
     ctx = Context(t, 0.01, {}, "displacement", "displacement")
     settings = late.prepare(t, residual, ctx)
     middle, width = late.guess(np.sin(t), residual, ctx, settings)[0]

@@ -22,6 +22,7 @@ from sim_devices.physics.timebase import (
     delay_by_correlation,
     find_drops,
     resample,
+    resample_straight,
     shift_by,
     shift_costs,
 )
@@ -177,7 +178,15 @@ def test_shift_costs_equal_python() -> None:
     rng = np.random.default_rng(5)
     x, y = rng.standard_normal(90), rng.standard_normal(90)
     shifts = np.array([-7, 0, 3])
-    costs = shift_costs(x, y, 20, shifts)
-    np.testing.assert_allclose(costs, shift_costs.py_func(x, y, 20, shifts), atol=1e-12)
     d = y[20:40] - x[23:43]
-    assert costs[1, 2] == pytest.approx(float(np.sum((d - d.mean()) ** 2)))
+    for local, least in ((True, float(np.sum((d - d.mean()) ** 2))), (False, float(np.sum(d**2)))):
+        costs = shift_costs(x, y, 20, shifts, local)
+        np.testing.assert_allclose(costs, shift_costs.py_func(x, y, 20, shifts, local), atol=1e-12)
+        assert costs[1, 2] == pytest.approx(least)
+
+
+def test_straight_resampling_equals_python_and_interpolation() -> None:
+    x = np.random.default_rng(9).standard_normal(80)
+    found = resample_straight(x, -1.3, 1.01)
+    np.testing.assert_allclose(found, resample_straight.py_func(x, -1.3, 1.01), atol=1e-12)
+    np.testing.assert_allclose(found, np.interp(-1.3 + 1.01 * np.arange(80), np.arange(80), x), atol=1e-12)

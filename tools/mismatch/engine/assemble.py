@@ -11,6 +11,7 @@ from scipy.stats import norm
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
+from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.families import EXACT
 from tools.mismatch.engine.fit import Fit, residuals
 from tools.mismatch.engine.identifiability import detection, experiment
@@ -37,7 +38,7 @@ from tools.mismatch.engine.revise import reduced
 from tools.mismatch.engine.score import compare, held_rms, misfits, paired_t
 from tools.mismatch.engine.select import Selection
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.engine.unexplained import Leftover, about
+from tools.mismatch.engine.unexplained import Leftover, about, lone_event
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model, Placed
 
@@ -63,12 +64,13 @@ def human_values(problem: Problem, fitted: Fit) -> dict[str, dict[str, Parameter
         gradient[:, i] = (moved - flat) / (shifted[i] - theta[i])
     gradient = np.nan_to_num(gradient)
     spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, cov, gradient), 0.0))
+    read_off = {p.label: half_widths(problem, fitted, k) for k, p in enumerate(model.placed)}
     out: dict[str, dict[str, ParameterValue]] = {}
     i = 0
     for label, group in values.items():
         out[label] = {}
         for h in group:
-            half = 1.96 * float(spread[i])
+            half = max(1.96 * float(spread[i]), read_off.get(label, {}).get(h.name, 0.0))
             out[label][h.name] = ParameterValue(h.value, h.unit, (h.value - half, h.value + half))
             i += 1
     return out
@@ -240,6 +242,8 @@ def decide(
     if any(v.real and v.ratio > 1.05 for v in left.values()):
         p = min((d.p_value for v in left.values() for d in v.follows), default=1.0)
         return "unexplained", p
+    if any(lone_event(problem, base, o) for o in left):
+        return "unexplained", 1e-6
     loud = [o for o, v in left.items() if v.ratio > LOUD and ljung_box(base.residual[o][problem.held_rows]) < 1e-6]
     if loud:
         return "unexplained", 1e-6

@@ -57,6 +57,19 @@ class Whitener:
         """Samples at the start of a stretch that cannot be whitened."""
         return int(max(self.lags.size, self.scales.max(initial=0)))
 
+    def spectrum(self, cycles: Array) -> Array:
+        """Power (k,) of the residual at ``cycles`` (k,) per sample; its mean over -1/2..1/2 is the mean square."""
+        back = -2j * np.pi * np.asarray(cycles)
+        answer = np.ones(back.size, complex)
+        for i, a in enumerate(self.lags):
+            answer -= a * np.exp(back * (i + 1))
+        for s, w in zip(self.scales, self.weights, strict=True):
+            at = np.exp(back)
+            with np.errstate(all="ignore"):
+                mean = np.where(np.abs(1 - at) > 1e-9, at * (1 - at**s) / (s * (1 - at)), 1.0)
+            answer -= w * mean
+        return self.innovation_rms**2 / np.maximum(np.abs(answer) ** 2, 1e-4)
+
     def apply(self, x: Array) -> Array:
         """Whitened copy of one stretch ``x`` (n,) or (n, k) without its first ``warm_up`` samples."""
         warm = self.warm_up

@@ -9,7 +9,7 @@ import numpy as np
 
 from tools.mismatch.engine.fit import Fit, residuals
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import added, size
+from tools.mismatch.engine.revise import added, beyond_limits, size
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Trial
@@ -38,11 +38,7 @@ def key_of(p: Placed) -> tuple[str, ...]:
 
 def in_disguise(trial: Trial) -> bool:
     """Whether a report figure of the fitted effect is beyond what its physics can be."""
-    limits = trial.placed.effect.limits
-    if not limits or trial.fitted is None:
-        return False
-    found = trial.fitted.model.human(trial.fitted.theta)[trial.label]
-    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
+    return trial.fitted is not None and beyond_limits(trial.fitted, trial.placed)
 
 
 FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")

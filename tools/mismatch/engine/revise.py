@@ -17,6 +17,8 @@ from tools.mismatch.simulate_start import prepare, starts
 
 Array = np.ndarray
 
+OTHER = 0.02  # share of what an effect takes that the right name may cost where the fitted figures rule this one out
+
 
 def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
     """The fit without one of its effects, everything else fitted again."""
@@ -125,6 +127,11 @@ def simplify_pass(
         limit = tie * room + 0.02 + shape * taken
         elsewhere = {p.effect.name for p in held}
         order = sorted(enumerate(pool), key=lambda r: (r[1].effect.name not in elsewhere, size(r[1]), r[0]))
+        if beyond_limits(fitted, placed):
+            # a second effect has joined since, and what is left for this one is other physics: the likeliest first
+            limit = max(limit, 2.0 * room + OTHER * taken)
+            akin = placed.effect.confusable_with
+            order.sort(key=lambda r: akin.index(r[1].effect.name) if r[1].effect.name in akin else len(akin))
         passed: list[tuple[int, float, int, Fit]] = []
         tried = 0
         for i, rival in order:
@@ -147,6 +154,15 @@ def simplify_pass(
             fitted = _reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
             changed.append(k)
     return fitted, changed
+
+
+def beyond_limits(fitted: Fit, placed: Placed) -> bool:
+    """Whether a report figure of a fitted effect is beyond what its physics can be."""
+    limits = placed.effect.limits
+    if not limits:
+        return False
+    found = fitted.model.human(fitted.theta)[placed.label]
+    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
 
 
 def size(placed: Placed) -> int:

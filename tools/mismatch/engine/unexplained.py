@@ -58,6 +58,21 @@ def leftover(
     return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
 
 
+def lone_event(problem: Problem, fitted: Fit, output: str, *, louder: float = 20.0, smooth: float = 0.6) -> bool:
+    """Whether one block, fitted or held out, is far louder than all others and its residual runs on from sample to
+    sample: no stationary noise does that, and no fit that sees it once can say what it was.
+    """
+    r = fitted.residual[output]
+    blocks = [r[a:b] for a, b in (*problem.fit_blocks, *problem.held_blocks) if b - a >= 8]
+    if len(blocks) < 12:
+        return False
+    energy = np.array([float(np.mean(e**2)) for e in blocks])
+    usual = float(np.quantile(energy, 0.9))
+    e = blocks[int(np.argmax(energy))]
+    runs_on = float(e[1:] @ e[:-1]) / max(float(e @ e), 1e-300)
+    return float(energy.max()) > louder * max(usual, problem.sigma(output) ** 2) and runs_on > smooth
+
+
 SHAPELESS = frozenset(("random_walk", "step_shift", "spikes", "dropped_samples"))
 """Effects made of events or of levels read off the data: they imitate anything that changes in time."""
 

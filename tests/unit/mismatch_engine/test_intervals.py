@@ -1,0 +1,112 @@
+"""Intervals that hold: colour, few blocks, instants, one exponential, parameters that the data do not move."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+from scipy.stats import t as student
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.engine.assemble import human_values
+from tools.mismatch.engine.colour import Whitener, fit_whitener
+from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.intervals import covariance, few_blocks
+from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.split import own_split
+from tools.mismatch.engine.trial import extended
+from tools.mismatch.engine.unexplained import lone_event
+
+Array = np.ndarray
+
+
+def stack(extra: Array, rate_hz: float = 100.0):
+    """A stack with ``extra`` (n,) on top of what its command makes."""
+    u = 50 + 30 * wave(np.random.default_rng(5), extra.size)
+    parameters: dict[str, object] = {"gain_um_per_V": 0.125, "offset_um": 0.0}
+    return recording("piezo_stack", {"command": u}, {"displacement": 0.125 * u + extra}, parameters, rate_hz=rate_hz)
+
+
+def test_the_spectrum_of_a_whitener_has_the_power_of_what_it_was_fitted_to() -> None:
+    e = lfilter([1.0], [1.0, -0.7], np.random.default_rng(1).standard_normal(20_000))
+    found = fit_whitener(e)
+    cycles = (np.arange(4096) + 0.5) / 4096 - 0.5
+    assert float(np.mean(found.spectrum(cycles))) == pytest.approx(float(np.var(e)), rel=0.05)
+    one = Whitener(1.0, np.array([0.7]))
+    assert one.spectrum(np.array([0.0]))[0] == pytest.approx(1 / 0.3**2)
+
+
+def test_a_parameter_thatfew_blocks_carry_has_students_interval() -> None:
+    moved = np.zeros((48, 2))
+    moved[:4, 0] = 1.0
+    moved[:, 1] = 1.0
+    wide = few_blocks(moved)
+    np.testing.assert_allclose(wide, [student.ppf(0.975, 4) / 1.96, student.ppf(0.975, 48) / 1.96])
+
+
+def test_slow_noise_widens_the_interval_of_a_level() -> None:
+    rng = np.random.default_rng(4)
+    white = rng.standard_normal(3000)
+    slow = lfilter([1.0], [1.0, -0.95], white)
+    half: dict[str, float] = {}
+    for name, e in (("white", white / white.std()), ("slow", slow / slow.std())):
+        problem, _, base = prepared(stack(0.02 * e), 0.3, 0, False)
+        offset = [p.name for p in base.model.parameters].index("offset_um")
+        half[name] = float(np.sqrt(covariance(problem, base)[offset, offset]))
+    # a mean of AR(1) noise: sqrt((1 + a) / (1 - a)) = 6.2 times as wide
+    assert 3.5 < half["slow"] / half["white"] < 9.0
+
+
+def test_what_the_data_do_not_move_is_as_wide_as_its_bounds() -> None:
+    problem, _, base = prepared(stack(0.02 * np.random.default_rng(2).standard_normal(3000)), 0.3, 0, False)
+    place = places(problem, (EFFECTS["slew_limit"],), ())[0]
+    placed = replace(place, settings={"rates": (1e3, 1e5), "time": (0.01,)})
+    model, theta = extended(problem, base, placed)
+    rate = next(i for i, p in enumerate(model.parameters) if p.name.endswith(".rate"))
+    theta[rate] = 1e5  # above everything that the command does
+    sd = float(np.sqrt(covariance(problem, replace(base, model=model, theta=theta))[rate, rate]))
+    p = model.parameters[rate]
+    assert 1.96 * sd == pytest.approx(0.5 * (p.hi - p.lo), rel=1e-3)
+
+
+def test_the_instant_of_a_step_has_an_interval() -> None:
+    n, at = 3000, 17.0
+    rng = np.random.default_rng(8)
+    t = np.arange(n) / 100.0
+    problem, _, base = prepared(stack(0.1 * (t >= at) + 0.05 * rng.standard_normal(n)), 0.3, 0, False)
+    place = places(problem, (EFFECTS["step_shift"],), ())[0]
+    placed = replace(place, settings={"times_s": (at,), "time": (0.01, 30.0)})
+    model, theta = extended(problem, base, placed)
+    theta[-2:] = 0.005, 0.1
+    fitted = replace(
+        base, model=model, theta=theta, residual={"displacement": 0.05 * rng.standard_normal(problem.index.size)}
+    )
+    low, high = human_values(problem, fitted)[placed.label]["time1_s"].ci95
+    # two samples and eleven times (0.05 / 0.1)^2, 10 ms each, either way
+    assert 0.5 * (high - low) == pytest.approx(0.0475 + 0.0025, abs=0.02)
+
+
+def test_a_fit_part_has_some_of_what_is_seldom() -> None:
+    n = 6000
+    x = 0.1 * np.random.default_rng(3).standard_normal((n, 1))
+    for a in range(300, n, 1000):
+        x[a : a + 40] += 5.0
+    split = own_split(x)
+    seldom = x[:, 0] > 2.0
+    share = float((seldom & split.held_out_mask()).sum() / seldom.sum())
+    assert 0.1 < share < 0.6
+
+
+def test_one_loud_stretch_that_runs_on_is_an_event_and_noise_is_none() -> None:
+    rng = np.random.default_rng(6)
+    noise = 0.02 * rng.standard_t(4, 3000)
+    problem, _, base = prepared(stack(noise), 0.3, 0, False)
+    assert not lone_event(problem, base, "displacement")
+    bump = noise.copy()
+    a = problem.split.held_out[0][0] + 20
+    bump[a : a + 60] += 1.0 * np.hanning(60)
+    problem, _, base = prepared(stack(bump), 0.3, 0, False)
+    assert lone_event(problem, base, "displacement")

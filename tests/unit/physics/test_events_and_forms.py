@@ -1,0 +1,115 @@
+"""Events read off the data, and forms of one effect that differ where a record tells them apart."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_devices.physics import hysteresis
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.drift import paying_steps
+from sim_devices.physics.effect import Context
+from sim_devices.physics.hysteresis import loop_width, stops
+from sim_devices.physics.memoryless import slew
+from sim_devices.physics.timebase import find_drops
+
+DT = 0.002
+
+
+def context(n: int) -> Context:
+    return Context(np.arange(n) * DT, DT, {}, "command")
+
+
+@pytest.mark.parametrize("name", ["dead_time", "channel_delay"])
+def test_a_played_back_signal_is_late_on_straight_lines(name: str) -> None:
+    x = np.repeat([0.0, 1.0, -1.0, 0.5], 25)
+    straight = EFFECTS[name].variants[0]
+    assert straight.apply is not None
+    late = straight.apply(x, context(x.size), np.array([0.4 * DT]), {})
+    k = np.arange(x.size)
+    np.testing.assert_allclose(late, np.interp(k - 0.4, k, x), atol=1e-12)
+    names = [{p.name for p in e.parts({}).nonlinear} for e in (EFFECTS[name], straight)]
+    assert names[0].isdisjoint(names[1])  # twin files tell the forms by these
+
+
+def test_a_clock_that_runs_apart_on_straight_lines() -> None:
+    x = np.random.default_rng(1).standard_normal(400)
+    straight = EFFECTS["clock_skew"].variants[0]
+    assert straight.apply is not None
+    k = np.arange(x.size)
+    found = straight.apply(x, context(x.size), np.array([500.0]), {})
+    np.testing.assert_allclose(found, np.interp(k * (1 + 5e-4), k, x), atol=1e-12)
+
+
+@pytest.mark.parametrize("colour", [0.0, 0.8])
+def test_lost_samples_show_in_a_signal_without_bends(colour: float) -> None:
+    rng = np.random.default_rng(3)
+    n = 6000
+    k = np.arange(n + 10)
+    slow = np.sin(2 * np.pi * k / 1700) + 0.4 * np.sin(2 * np.pi * k / 640 + 1)
+    at = (900, 2500, 4300)
+    shift = np.searchsorted(at, k[:n], side="right")
+    noise = rng.standard_normal(n)
+    for i in range(1, n):
+        noise[i] += colour * noise[i - 1]
+    measured = slow[k[:n] + shift] + 0.0008 * noise / noise.std()
+    found, total, share, _ = find_drops(slow[:n], measured)
+    assert total == [1, 2, 3]
+    assert np.max(np.abs(np.array(found) - at)) < 120
+    assert share > 0.8
+
+
+def test_steps_that_the_gain_explains_are_none() -> None:
+    rng = np.random.default_rng(2)
+    n = 4000
+    signal = np.sin(2 * np.pi * np.arange(n) / 1300)
+    residual = 0.4 * signal + 2.0 * (np.arange(n) >= 2500) + 0.5 * rng.standard_normal(n)
+    keep = np.ones(n, bool)
+    keep[1000:1200] = False
+    assert paying_steps(residual, keep, [330, 650, 2500, 3300], signal) == [2500]
+
+
+def test_one_slew_rate_holds_both_ways() -> None:
+    effect = EFFECTS["slew_limit"]
+    x = np.repeat([0.0, 1.0, 0.0], 200)
+    assert effect.apply is not None
+    y = effect.apply(x, context(x.size), np.array([5.0, 1e-6]), {})
+    np.testing.assert_allclose(y, slew(x, 5.0 * DT, 5.0 * DT, 1.0, np.array([0])), atol=1e-9)
+    assert np.max(np.abs(np.diff(y))) == pytest.approx(5.0 * DT)
+
+
+def test_a_line_has_no_loop_and_a_play_its_own() -> None:
+    x = hysteresis.test_cycle(-1.0, 1.0)
+    assert loop_width(x, 3) == pytest.approx(0.0, abs=1e-12)
+    r = np.array([0.1])
+    play = x - stops(x, r, -1.0, np.array([0]))[:, 0]
+    # the branches of a play of radius r lie 2 r apart; its span is the input's less 2 r
+    assert loop_width(play, 3) == pytest.approx(0.2 / 1.8, rel=1e-6)
+
+
+def test_a_record_that_starts_at_an_extreme_has_elements_that_slip_once() -> None:
+    effect = EFFECTS["hysteresis"]
+    assert effect.basis is not None
+    x = np.concatenate([np.linspace(1, -1, 300), np.linspace(-1, 1, 300), np.linspace(1, -1, 300)])
+    settings = {"range": (-1.0, 1.0), "rest": (1.0,), "form": (0.0,)}
+    columns = effect.basis(x, context(x.size), np.empty(0), settings)
+    # a Maxwell element of 1.5 half ranges: slips on the first way, sticks for ever after
+    element = stops(x, np.array([1.5]), 1.0, np.array([0]))[:, 0]
+    a = np.column_stack([np.ones(x.size), x, columns])
+    left = element - a @ np.linalg.lstsq(a, element, rcond=None)[0]
+    assert np.std(left) < 0.05 * np.std(element - np.polyval(np.polyfit(x, element, 1), x))
+
+
+def test_memory_that_no_speed_changes_is_not_called_rate_dependent() -> None:
+    limits = EFFECTS["rate_dependent_hysteresis"].limits
+    settings = {"usual_slope": (1.0,), "rest": (0.0,), "range": (-1.0, 1.0), "time": (1e-3, 10.0)}
+    effect = EFFECTS["rate_dependent_hysteresis"]
+    parts = effect.parts(settings)
+    p = np.zeros(1 + len(parts.weights))
+    p[0], p[3] = 0.01, 0.1
+    assert effect.report is not None
+    low, high = limits["change_with_speed"]
+    still = {h.name: h.value for h in effect.report(p, settings, 1.0)}["change_with_speed"]
+    assert still < low
+    p[13] = 0.1  # the weight that grows with speed
+    assert low < {h.name: h.value for h in effect.report(p, settings, 1.0)}["change_with_speed"] < high
