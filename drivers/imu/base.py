@@ -310,3 +310,20 @@ def require_mode(mode: Mode | None, wanted: Mode, name: str) -> None:
     """``BenchError`` unless the sensor was started in ``wanted``."""
     if mode != wanted:
         raise BenchError(f"started in mode {mode!r}; this call needs start(mode={wanted!r})", device=name)
+
+
+class CountingImu:
+    """``lost`` and ``stale`` since ``start`` of a chip that is either asked for each sample or empties its FIFO."""
+
+    def __init__(self) -> None:
+        self._counter = SampleCounter()
+        self._timeline = FifoTimeline()
+        self._mode: Mode | None = None
+
+    @property
+    def lost(self) -> int:
+        return self._timeline.lost if self._mode == "fifo" else self._counter.lost
+
+    @property
+    def stale(self) -> int:
+        return self._counter.stale

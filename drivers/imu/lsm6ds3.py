@@ -20,14 +20,13 @@ from drivers.imu.base import (
     RAD_PER_DEG,
     STANDARD_GRAVITY,
     AxisTest,
-    FifoTimeline,
+    CountingImu,
     ImuBlock,
     ImuOffsets,
     ImuSample,
     ImuSetup,
     Mode,
     PowerMode,
-    SampleCounter,
     SelfTestReport,
     imu_channels,
     pick_bandwidth,
@@ -51,7 +50,7 @@ GYRO_LIMITS_DPS = (150.0, 700.0)  # G_ST at 2000 deg/s
 SELF_TEST_SAMPLES = 5
 
 
-class Lsm6ds3:
+class Lsm6ds3(CountingImu):
     """One chip. ``setup`` says what it does, ``lost`` and ``stale`` count since ``start``."""
 
     def __init__(self, bus: I2cBus, clock: Clock, address: int = 0x6A, *, name: str = "imu") -> None:
@@ -62,22 +61,12 @@ class Lsm6ds3:
         self._clock = clock
         self._chip = RegisterFile(bus, clock, address, name)
         self._burst = self._chip.burst(m.STATUS_REG, STATUS_TO_DATA + FRAME.size)
-        self._counter = SampleCounter()
-        self._timeline = FifoTimeline()
+        super().__init__()
         self._configured = False
-        self._mode: Mode | None = None
         self._gyro_on = True
         self._offsets = ImuOffsets()
         self._accel_offset = np.zeros(3)
         self._gyro_offset = np.zeros(3)
-
-    @property
-    def lost(self) -> int:
-        return self._timeline.lost if self._mode == "fifo" else self._counter.lost
-
-    @property
-    def stale(self) -> int:
-        return self._counter.stale
 
     def probe(self) -> str:
         self._chip.identify(m.WHO_AM_I, "LSM6DS3")

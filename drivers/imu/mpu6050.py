@@ -18,14 +18,13 @@ from drivers.imu.base import (
     RAD_PER_DEG,
     STANDARD_GRAVITY,
     AxisTest,
-    FifoTimeline,
+    CountingImu,
     ImuBlock,
     ImuOffsets,
     ImuSample,
     ImuSetup,
     Mode,
     PowerMode,
-    SampleCounter,
     SelfTestReport,
     imu_channels,
     offset_counts,
@@ -51,7 +50,7 @@ TRIM_LIMIT = 14.0  # PS 6.1, 6.2: +-14 % of the factory trim
 SELF_TEST_SAMPLES = 20
 
 
-class Mpu6050:
+class Mpu6050(CountingImu):
     """One chip. ``setup`` says what it does, ``lost`` and ``stale`` count since ``start``."""
 
     def __init__(self, bus: I2cBus, clock: Clock, address: int = 0x68, *, name: str = "imu") -> None:
@@ -62,21 +61,11 @@ class Mpu6050:
         self._clock = clock
         self._chip = RegisterFile(bus, clock, address, name)
         self._burst = self._chip.burst(m.INT_STATUS, 1 + FRAME.size)
-        self._counter = SampleCounter()
-        self._timeline = FifoTimeline()
+        super().__init__()
         self._configured = False
-        self._mode: Mode | None = None
         self._gyro_on = True
         self._temperature_on = True
         self._factory: tuple[int, int, int] | None = None
-
-    @property
-    def lost(self) -> int:
-        return self._timeline.lost if self._mode == "fifo" else self._counter.lost
-
-    @property
-    def stale(self) -> int:
-        return self._counter.stale
 
     def probe(self) -> str:
         self._chip.identify(m.WHO_AM_I, "MPU-6050")

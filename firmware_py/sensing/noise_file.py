@@ -17,6 +17,7 @@ from firmware_py.frame import XYZ
 from firmware_py.sensing.calibration import reading_names
 from firmware_py.sensing.config import DRIFT_S, STANDARD_GRAVITY, SensingConfig
 from hal.errors import BenchError
+from hal.validation import describe_validation_error
 
 FLAT = 2.0 * log(2.0) / pi
 """Allan variance of flicker noise over B^2 (IEEE 952)."""
@@ -64,9 +65,8 @@ def noise_table(path: Path, config: SensingConfig) -> dict[str, Any]:
     except (UnicodeDecodeError, json.JSONDecodeError) as error:
         raise BenchError(f"{path}: not the JSON of `micron noise --json`: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(part) for part in first["loc"])
-        raise BenchError(f"{path}: not the JSON of `micron noise --json`: {where}: {first['msg']}") from error
+        where = f"{path}: not the JSON of `micron noise --json`"
+        raise BenchError(describe_validation_error(error, where)) from error
     if found.format != 1 or found.scale != 1.0:
         raise BenchError(f"{path}: noise file needs format = 1 and scale = 1 (units come from the columns' names)")
     least_s = LEAST_RC_TIMES / config.cutoff_rad_s

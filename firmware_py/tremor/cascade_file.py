@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from firmware_py.tremor.cascade import CascadeNetwork
 from hal.errors import BenchError
+from hal.validation import describe_validation_error
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -61,9 +62,8 @@ def load_network(path: Path) -> CascadeNetwork:
     try:
         file = _File.model_validate_json(text)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(p) for p in first["loc"]) or "the file"
-        raise BenchError(f"{path}: {where}: {first['msg']}; make it again with 'micron tremor train'") from None
+        wrong = describe_validation_error(error, str(path))
+        raise BenchError(f"{wrong}\nmake it again with 'micron tremor train'") from None
     wide = 1 + file.window + len(file.kinds)
     hidden = np.zeros((len(file.kinds), wide))
     if len(file.hidden) != len(file.kinds):

@@ -9,25 +9,21 @@ Model limits
 from __future__ import annotations
 
 from sim_devices.added import Surroundings
+from sim_devices.devices.acting import ActingFace
 
 
-class LineFace:
-    """Wire face of one device. ``due_ns``: when it acts by itself next. ``frozen`` is a hook for faults."""
+class LineFace(ActingFace):
+    """Wire face of one device."""
 
     def __init__(self, around: Surroundings) -> None:
         self.around = around
         self.unread = 0
-        self.frozen = False
-        self.due_ns: int | None = None
         self._heard, self._said = b"", bytearray()
 
     # ------------------------------------------------------------------ for the device to override
 
     def hear(self, words: list[str], t_ns: int) -> None:
         """One line of the host, its words; never empty."""
-
-    def act(self, t_ns: int) -> None:
-        """What it does at ``due_ns``, which is now; sets the next one."""
 
     # ------------------------------------------------------------------
 
@@ -48,11 +44,3 @@ class LineFace:
         said = bytes(self._said[:max_bytes])
         del self._said[:max_bytes]
         return said
-
-    def next_event_ns(self) -> int | None:
-        return None if self.frozen else self.due_ns
-
-    def advance_to(self, t_ns: int) -> None:
-        while self.due_ns is not None and self.due_ns <= t_ns and not self.frozen:
-            now_ns, self.due_ns = self.due_ns, None
-            self.act(now_ns)

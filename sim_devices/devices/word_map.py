@@ -13,14 +13,15 @@ from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 from sim_devices.added import Surroundings
+from sim_devices.devices.acting import ActingFace
 
 RESET = 0x06  # general call
 
 
-class WordFace:
+class WordFace(ActingFace):
     """Wire face of one chip. ``power_up`` are its registers, ``read_only`` those that the host cannot change.
 
-    ``due_ns``: when it acts by itself next. ``nack_address``, ``nack_data``, ``frozen`` are hooks for faults.
+    ``nack_address`` and ``nack_data`` are hooks for faults.
     """
 
     power_up: Mapping[int, int] = MappingProxyType({})
@@ -28,12 +29,12 @@ class WordFace:
 
     def __init__(self, around: Surroundings) -> None:
         self.around = around
-        self.nack_address = self.nack_data = self.frozen = False
+        self.nack_address = self.nack_data = False
         self._reset(around.start_ns)
 
     def _reset(self, t_ns: int) -> None:
         self.words: dict[int, int] = dict(self.power_up)
-        self.due_ns: int | None = None
+        self.due_ns = None
         self._pointer = 0
         self.was_reset(t_ns)
 
@@ -48,18 +49,7 @@ class WordFace:
     def was_written(self, register: int, t_ns: int) -> None:
         """An effect of writing ``register``."""
 
-    def act(self, t_ns: int) -> None:
-        """What it does at ``due_ns``, which is now; sets the next one."""
-
     # ------------------------------------------------------------------ wire face
-
-    def next_event_ns(self) -> int | None:
-        return None if self.frozen else self.due_ns
-
-    def advance_to(self, t_ns: int) -> None:
-        while self.due_ns is not None and self.due_ns <= t_ns and not self.frozen:
-            now_ns, self.due_ns = self.due_ns, None
-            self.act(now_ns)
 
     def acknowledges(self) -> bool:
         return not self.nack_address

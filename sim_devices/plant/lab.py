@@ -27,6 +27,7 @@ from pydantic import ValidationError
 
 from hal.compiled import kernel
 from hal.errors import BenchError
+from hal.validation import describe_validation_error
 from sim_devices.config import EmulationConfig, HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
 from sim_devices.plant.kernel import STEP_S, TRUTH_COLUMNS, begin, outputs
@@ -269,9 +270,7 @@ def load_config(bench: Path | None, unit: int | None) -> EmulationConfig:
     try:
         return EmulationConfig.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(v) for v in first["loc"])
-        raise LabError(f"{bench or '--unit'}: [emulation] {where}: {first['msg']}") from error
+        raise LabError(describe_validation_error(error, f"{bench or '--unit'}: [emulation]")) from error
 
 
 def in_place(config: EmulationConfig, bench: Path | None, axis: int, given: Path | None) -> FileTwin | None:

@@ -58,15 +58,21 @@ def pivot_path(seconds: float, seed: int) -> Array:
 
 
 @kernel
+def sense_at(p, s, node, noise, slow):
+    """One millisecond of a hand that is not moved by what is sensed: node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
+    copy(node, s["pose"])
+    s["step"] += STEPS_PER_MS
+    room(p, s, slow)
+    copy(noise, s["noise"])
+    sense(p, s, s["noise"])
+
+
+@kernel
 def record(plant, state, nodes, noise, slow, first, held, analog, magnet):
     """``analog`` (n, 8) and ``magnet`` (n, 3) V as the converters give them, from hand nodes (n, 18)."""
     p, s = plant[0], state[0]
     for k in range(nodes.shape[0]):
-        copy(nodes[k], s["pose"])
-        s["step"] += STEPS_PER_MS
-        room(p, s, slow[k])
-        copy(noise[k], s["noise"])
-        sense(p, s, s["noise"])
+        sense_at(p, s, nodes[k], noise[k], slow[k])
         outputs(p, s, 0.0)
         for i in range(8):
             analog[k, i] = LSB_V * min(max(np.round(s["daq_V"][i] / LSB_V), -32768.0), 32767.0)

@@ -14,6 +14,7 @@ import pytest
 from firmware_py.recording.reader import Recording
 from tests.bench.conftest import Server, bench_server, go, opened_page
 from tests.conftest import DEFAULT_BENCH
+from tests.recording_text import stack_channels
 
 pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
 
@@ -26,17 +27,6 @@ rate_hz = 200.0
 kind = "piezo_stack"
 [twin.parameters]
 gain_um_per_V = 0.12
-[[channels]]
-column = "command_V"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "displacement_um"
-role = "output"
-signal = "displacement"
-unit = "um"
-noise_rms = 0.02
 """
 
 
@@ -106,7 +96,7 @@ def test_the_emulated_motion_card_steers_the_game(page: Any):
 def test_a_diagnosis_from_the_page_and_its_twin_on_the_emulated_bench(page: Any, server: Server, artefacts: Path):
     folder = server.recordings / "stack"
     folder.mkdir()
-    (folder / "recording.toml").write_text(RECORDING)
+    (folder / "recording.toml").write_text(RECORDING + stack_channels("command_V", "displacement_um", 0.02))
     rng = np.random.default_rng(1)
     command = 50.0 + 20.0 * np.sin(np.arange(800) / 200.0 * 2.0 * np.pi * 3.0) + rng.standard_normal(800)
     displacement = 0.15 * command + 0.02 * rng.standard_normal(800)

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from hal.validation import describe_validation_error
 from tools.errors import InputError
 from tools.placement.configurations import (
     Placement,
@@ -74,11 +75,7 @@ def load_configuration(given: str, noise_mg: float) -> tuple[Placement, NDArray[
     try:
         file = ConfigurationFile.model_validate(table)
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(v) for v in first["loc"])
-        raise InputError(
-            f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
-        ) from error
+        raise InputError(describe_validation_error(error, str(path))) from error
     places = np.array(file.positions_mm) * 1e-3 if file.positions_mm else np.array(file.positions_m)
     own = np.full(len(file.axes), noise)
     if file.noise_mg is not None:

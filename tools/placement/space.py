@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from hal.validation import describe_validation_error
 from tools.errors import InputError
 
 Vector = tuple[float, float, float]
@@ -61,11 +62,7 @@ def load_space(path: Path) -> Space:
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: {error}") from error
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(str(v) for v in first["loc"])
-        raise InputError(
-            f"{path}: {where + ': ' if where else ''}{first['msg'].removeprefix('Value error, ')}"
-        ) from error
+        raise InputError(describe_validation_error(error, str(path))) from error
 
 
 def space_004(packages: int = 3, axes_per_package: int = 2) -> Space:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,21 +36,23 @@ def trials() -> list[Trial]:
     """All trials that are there."""
     found = []
     for entry in meta("broad")["files"]:
-        with np.load(data_folder() / "broad" / entry["name"]) as data:
-            rate, force, field, truth = (
-                np.ascontiguousarray(
-                    np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64)
-                )
-                for stem, axes, unit in (
-                    ("gyro", "xyz", "_rad_s"),
-                    ("acc", "xyz", "_m_s2"),
-                    ("mag", "xyz", "_uT"),
-                    ("opt_quat", "wxyz", ""),
-                )
-            )
-            counts = data["movement"].astype(bool)
-        found.append(Trial(entry["name"][:2], rate, force, field, truth, counts, entry))
+        found.append(read_trial(data_folder() / "broad" / entry["name"], entry))
     return found
+
+
+def read_trial(path: Path, entry: dict[str, Any]) -> Trial:
+    """One file of the set; ``entry`` is what its meta.toml says of it."""
+    with np.load(path) as data:
+        rate, force, field, truth = (
+            np.ascontiguousarray(np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64))
+            for stem, axes, unit in (
+                ("gyro", "xyz", "_rad_s"),
+                ("acc", "xyz", "_m_s2"),
+                ("mag", "xyz", "_uT"),
+                ("opt_quat", "wxyz", ""),
+            )
+        )
+        return Trial(path.name[:2], rate, force, field, truth, data["movement"].astype(bool), entry)
 
 
 def vqf_errors_deg(trial: Trial) -> tuple[float, float, float] | None:

@@ -19,7 +19,8 @@ from firmware_py.sensing.stage import Sensing, sense_kernel
 from hal.compiled import kernel
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import NODE_S, Hand
-from sim_devices.plant.kernel import NOISES, SLOW_NOISES, STEPS_PER_MS, TRUTH_COLUMNS, begin, copy, outputs, room, sense
+from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin, outputs
+from sim_devices.plant.lab_motion import sense_at
 from sim_devices.plant.rigid_body import quaternion
 from sim_devices.plant.sensors import sensor_unit
 from sim_devices.plant.streams import stream
@@ -62,11 +63,7 @@ def scene_kernel(plant, state, nodes, noise, slow, magnet_uT, first, sense_state
     p, s = plant[0], state[0]
     iron = p["hard_iron_G"].copy()
     for k in range(nodes.shape[0]):
-        copy(nodes[k], s["pose"])
-        s["step"] += STEPS_PER_MS
-        room(p, s, slow[k])
-        copy(noise[k], s["noise"])
-        sense(p, s, s["noise"])
+        sense_at(p, s, nodes[k], noise[k], slow[k])
         for i in range(3):
             p["hard_iron_G"][i] = iron[i] + 0.01 * magnet_uT[k, i]
         outputs(p, s, 0.0)

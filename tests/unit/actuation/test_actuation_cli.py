@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 from firmware_py.actuation.config import ActuationConfig, StackConfig
 from sim_devices.plant.lab import main as lab
+from tests.recording_text import stack_channels
 from tools.calibrate.piezo import identify_stack
 from tools.calibrate.piezo_excitation import excitation_V
 from tools.calibrate.piezo_prediction import command, predict, simulate, tremor_profile_um
@@ -34,18 +35,6 @@ kind = "piezo_stack"
 [twin.parameters]
 gain_um_per_V = 0.15
 offset_um = 0.0
-
-[[channels]]
-column = "command_V"
-role = "input"
-signal = "command"
-unit = "V"
-
-[[channels]]
-column = "displacement_um"
-role = "output"
-signal = "displacement"
-unit = "um"
 """
 
 
@@ -65,7 +54,7 @@ def stack(tmp_path: Path) -> Path:
     folder.mkdir()
     drive, z = stack_recording(0.01)
     np.savez(folder / "data.npz", command_V=drive, displacement_um=z)
-    (folder / "recording.toml").write_text(TOML)
+    (folder / "recording.toml").write_text(TOML + stack_channels("command_V", "displacement_um"))
     return folder
 
 

@@ -26,7 +26,7 @@ from firmware_py.frame import (
 from firmware_py.records import attributes
 from hal.errors import BenchError
 from tests.unit.actuation.truth import tip_from_strokes
-from tests.unit.pure_python import without_compiler
+from tests.unit.pure_python import assert_kernel_is_python
 
 
 def trembling(n: int, size: float = 25e-6) -> np.ndarray:
@@ -209,11 +209,7 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     twins = frames.copy()
     config = ActuationConfig(ramp_s=0.01, slew_V_per_s=3000.0)
     run(config, frames)
-    without_compiler(monkeypatch)
-    twin = Actuation(config)
-    for frame in twins:
-        stage.actuate_kernel(frame, attributes(twin.state), attributes(twin.params))
-    np.testing.assert_allclose(twins, frames, rtol=1e-9, atol=1e-18)
+    assert_kernel_is_python(monkeypatch, stage, "actuate_kernel", Actuation(config), twins, frames, atol=1e-18)
 
 
 def test_reset_is_a_new_start() -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tests.recording_text import stack_channels
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_load import load, on_grid
 
@@ -15,22 +16,12 @@ data = "data.npz"
 time_column = "t_s"
 [twin]
 kind = "piezo_stack"
-[[channels]]
-column = "u"
-role = "input"
-signal = "command"
-unit = "V"
-[[channels]]
-column = "z"
-role = "output"
-signal = "displacement"
-unit = "um"
 """
 
 
 def write(folder: Path, t: np.ndarray) -> Path:
     np.savez(folder / "data.npz", t_s=t, u=np.sin(3 * t), z=np.cos(3 * t))
-    (folder / "recording.toml").write_text(TEXT)
+    (folder / "recording.toml").write_text(TEXT + stack_channels("u", "z"))
     return folder
 
 

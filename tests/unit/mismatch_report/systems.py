@@ -5,25 +5,15 @@ from pathlib import Path
 
 import numpy as np
 
+from tests.recording_text import stack_channels
+
 RATE_HZ = 100.0
 NOISE_UM = 0.01
 Change = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 TWIN = 'kind = "piezo_stack"\n[twin.parameters]\ngain_um_per_V = 0.125\noffset_um = -1.0\n'
-CHANNELS = """
-[[channels]]
-column = "u"
-role = "input"
-signal = "command"
-unit = "V"
 
-[[channels]]
-column = "z"
-role = "output"
-signal = "displacement"
-unit = "um"
-noise_rms = 0.01
-"""
+CHANNELS = stack_channels("u", "z", NOISE_UM)
 
 
 def recording(folder: Path, *, change: Change, seed: int = 1, samples: int = 1500, twin: str = TWIN) -> Path:

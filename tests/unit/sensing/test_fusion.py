@@ -15,7 +15,7 @@ from firmware_py.sensing import fusion_filters
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
 from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
 from firmware_py.sensing.quaternion import from_matrix
-from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
+from tools.reproduce.broad_trials import read_trial
 
 Array = NDArray[np.float64]
 RATE_HZ = 100.0
@@ -223,17 +223,8 @@ def test_broad_errors_are_the_published_ones(shared_data: Path, trial: str) -> N
     """Same parameters, same start, same error: the published figures have four decimals."""
     folder = shared_data / "broad"
     entry = next(f for f in tomllib.loads((folder / "meta.toml").read_text())["files"] if f["name"].startswith(trial))
-    with np.load(folder / entry["name"]) as data:
-        rate, force, field, truth = (
-            np.stack([data[f"{stem}_{c}{unit}"] for c in axes], axis=1).astype(float)
-            for stem, axes, unit in (
-                ("gyro", "xyz", "_rad_s"),
-                ("acc", "xyz", "_m_s2"),
-                ("mag", "xyz", "_uT"),
-                ("opt_quat", "wxyz", ""),
-            )
-        )
-        counts = data["movement"].astype(bool)
+    read = read_trial(folder / entry["name"], entry)
+    rate, force, field = read.rate, read.force, read.field
     # the authors begin with the inverse of the first sample's attitude, heading turned by 180 degrees
     up, anti = force[0], np.cross(np.cross(force[0], -field[0]), force[0])
     start = np.zeros(4)
@@ -245,8 +236,8 @@ def test_broad_errors_are_the_published_ones(shared_data: Path, trial: str) -> N
     ):
         fusion = Fusion(config, 1.0 / 0.0035)
         fusion.restart(start)
-        total, _, _ = rms_errors_deg(east_north_up(fusion.run(rate, force, field)), truth, counts)
+        total, _, _ = read.errors_deg(fusion.run(rate, force, field))
         assert total == pytest.approx(entry[f"{method}_rmse_deg"], abs=5e-4)
     if trial == "02":
         q = gyroscope_attitude(rate, force, field, 1.0 / 0.0035, "madgwick")
-        assert rms_errors_deg(east_north_up(q), truth, counts)[0] < 3.0
+        assert read.errors_deg(q)[0] < 3.0

@@ -19,7 +19,7 @@ from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.redundant_rate import redundant_params, redundant_rate_step, redundant_state
 from firmware_py.sensing.stage import Sensing
 from hal.errors import BenchError
-from tests.unit.pure_python import without_compiler
+from tests.unit.pure_python import assert_kernel_is_python, without_compiler
 from tests.unit.sensing.rigid_body import Motion, frames_of, hand_motion, rc_filter
 
 PLACES = ((0.0101, -0.0101, 0.0), (-0.0101, 0.0101, 0.0), (0.0042, 0.0042, 0.116), (0.013, 0.0, 0.06))
@@ -95,11 +95,7 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     rows = frames(trembling(0.05), config, seed=1)
     twins = rows.copy()
     run(rows, config)
-    without_compiler(monkeypatch)
-    twin = Sensing(config)
-    for row in twins:
-        stage.sense_kernel(row, attributes(twin.state), attributes(twin.params))
-    np.testing.assert_allclose(twins, rows, rtol=1e-9, atol=1e-12)
+    assert_kernel_is_python(monkeypatch, stage, "sense_kernel", Sensing(config), twins, rows, atol=1e-12)
 
 
 def test_the_rate_filter_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:

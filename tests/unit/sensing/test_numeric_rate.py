@@ -14,7 +14,7 @@ from firmware_py.sensing.numeric_kinematics import back_substitute, fold_row, so
 from firmware_py.sensing.stage import Sensing
 from hal.errors import BenchError
 from tests.unit.allocations import allocations
-from tests.unit.pure_python import without_compiler
+from tests.unit.pure_python import assert_kernel_is_python, without_compiler
 from tests.unit.sensing.rigid_body import AXES, POSITIONS, RATE_HZ, frames_of, hand_motion
 
 Array = np.ndarray
@@ -174,11 +174,7 @@ def test_the_numeric_step_is_the_same_in_plain_python_and_allocates_nothing(monk
     for frame in frames[31:]:
         sensing.step(frame)
     assert allocations() - first == one * len(frames[31:])
-    without_compiler(monkeypatch)
-    twin = Sensing(NUMERIC)
-    for frame in twins:
-        stage.sense_kernel(frame, attributes(twin.state), attributes(twin.params))
-    np.testing.assert_allclose(twins, frames, rtol=1e-9, atol=1e-12)
+    assert_kernel_is_python(monkeypatch, stage, "sense_kernel", Sensing(NUMERIC), twins, frames, atol=1e-12)
 
 
 def test_another_name_is_refused() -> None:

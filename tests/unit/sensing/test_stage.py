@@ -7,13 +7,12 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from firmware_py.frame import COUNTS, INVALID, LAYOUT, RESTARTED, SATURATED, STATUS, TICK, TIP_ACCELERATION
-from firmware_py.records import attributes
 from firmware_py.sensing import stage
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.stage import Sensing
 from firmware_py.sensing.translation import displacement_response
 from hal.errors import BenchError
-from tests.unit.pure_python import without_compiler
+from tests.unit.pure_python import assert_kernel_is_python
 from tests.unit.sensing.rigid_body import RATE_HZ, TIP, Motion, frames_of, hand_motion, rc_filter
 
 
@@ -182,11 +181,7 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     twins = frames.copy()
     config = SensingConfig(align_s=0.02)
     run(frames, config)
-    without_compiler(monkeypatch)
-    twin = Sensing(config)
-    for frame in twins:
-        stage.sense_kernel(frame, attributes(twin.state), attributes(twin.params))
-    np.testing.assert_allclose(twins, frames, rtol=1e-9, atol=1e-12)
+    assert_kernel_is_python(monkeypatch, stage, "sense_kernel", Sensing(config), twins, frames, atol=1e-12)
 
 
 def test_reset_is_a_new_start() -> None:

@@ -18,12 +18,11 @@ from firmware_py.frame import (
     TREMOR_AMPLITUDE,
     TREMOR_FREQUENCY,
 )
-from firmware_py.records import attributes
 from firmware_py.tremor import stage
 from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.stage import Tremor
 from hal.errors import BenchError
-from tests.unit.pure_python import without_compiler
+from tests.unit.pure_python import assert_kernel_is_python
 from tests.unit.tremor.synthetic import RATE_HZ
 
 METHODS = ("kalman", "wflc_flc")
@@ -119,11 +118,7 @@ def test_kernel_and_python_agree(method: str, monkeypatch: pytest.MonkeyPatch) -
     twins = frames.copy()
     config = TremorConfig(method=method, settle_s=0.01)
     run(config, frames)
-    without_compiler(monkeypatch)
-    twin = Tremor(config)
-    for frame in twins:
-        stage.estimate_kernel(frame, attributes(twin.state), attributes(twin.params))
-    np.testing.assert_allclose(twins, frames, rtol=1e-7, atol=1e-15)
+    assert_kernel_is_python(monkeypatch, stage, "estimate_kernel", Tremor(config), twins, frames, rtol=1e-7, atol=1e-15)
 
 
 def test_reset_is_a_new_start() -> None:

@@ -11,14 +11,28 @@ from hal.middleware.trace import read_transcript
 from hal.types import CanFrame, CanStats, I2cOp, I2cWrite, PortInfo
 
 
-class ScriptedSerial:
+class SilentSerial:
+    """What a test's serial port does without being asked about it."""
+
+    closed = False
+
+    def drain_input(self) -> int:
+        return 0
+
+    def info(self) -> PortInfo:
+        return PortInfo("scripted://", "script", emulated=True)
+
+    def close(self) -> None:
+        self.closed = True
+
+
+class ScriptedSerial(SilentSerial):
     """Script entries: ``("w", b"...")`` expected writes, ``("r", b"...")`` one read, ``("wait",)`` a timeout,
     ``("at", t_ns)`` bench time of what follows, ``("raise", error)`` the next read fails."""
 
     def __init__(self, clock: VirtualClock, script: Sequence[tuple[object, ...]]) -> None:
         self.clock = clock
         self.script = deque(script)
-        self.closed = False
 
     def write(self, data: bytes, timeout_s: float) -> None:
         self._times()
@@ -54,15 +68,6 @@ class ScriptedSerial:
             t_ns = self.script.popleft()[1]
             assert isinstance(t_ns, int)
             self.clock.advance_to(t_ns)
-
-    def drain_input(self) -> int:
-        return 0
-
-    def info(self) -> PortInfo:
-        return PortInfo("scripted://", "script", emulated=True)
-
-    def close(self) -> None:
-        self.closed = True
 
     def done(self) -> None:
         assert not self.script, f"left over: {list(self.script)}"

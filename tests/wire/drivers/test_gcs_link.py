@@ -7,17 +7,16 @@ import pytest
 from drivers.piezo.gcs import ERRORS, LONGEST_REPLY, GcsLink
 from hal.clock import VirtualClock
 from hal.errors import HalTimeout, ProtocolError
-from hal.types import PortInfo
-from tests.wire.drivers.scripted_ports import ScriptedSerial
+from tests.wire.drivers.scripted_ports import ScriptedSerial, SilentSerial
 
 MS = 1_000_000
 
 
-class Line:
+class Line(SilentSerial):
     """A port that takes ``room`` bytes at once and gives what the test lets arrive."""
 
     def __init__(self, room: int = 1000) -> None:
-        self.room, self.sent, self.arrived, self.closed = room, b"", b"", False
+        self.room, self.sent, self.arrived = room, b"", b""
 
     def write(self, data: bytes, timeout_s: float) -> None:
         taken = data[: self.room]
@@ -31,15 +30,6 @@ class Line:
         n = min(len(buf), len(self.arrived))
         buf[:n], self.arrived = self.arrived[:n], self.arrived[n:]
         return n
-
-    def drain_input(self) -> int:
-        return 0
-
-    def info(self) -> PortInfo:
-        return PortInfo("scripted://", "script", emulated=True)
-
-    def close(self) -> None:
-        self.closed = True
 
 
 def scripted(*script: tuple[object, ...]) -> GcsLink:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,21 +11,16 @@ import numpy as np
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Force, Run, Signal, fold, remember
+from tools.mismatch.twins.head import ScaledOutputs
 
 _NEXT = ((1, 2), (2, 0), (0, 1))
 
 
 @dataclass(frozen=True)
-class ClusterTwin:
+class ClusterTwin(ScaledOutputs):
     """theta = bias of every output, then scale of every output (0 and 1 as given: the contract has neither, but
     every accelerometer does). Positions are not base parameters: a wrong one is ``sensor_position_error``."""
 
-    kind: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    chain: tuple[Stage, ...]
-    parameters: tuple[Parameter, ...]
     positions: Mapping[str, tuple[float, float, float]]
     static: bool = True
     apart: bool = True
@@ -50,19 +45,6 @@ class ClusterTwin:
             "location": (float(sorted(self.positions).index(where)),),
             "locations": (float(len(self.positions)),),
         }
-
-    def sensitivity(self, output: str, theta: Array) -> float:
-        """See Twin."""
-        return float(theta[len(self.outputs) + self.outputs.index(output)])
-
-    def input_gain(self, signal: str, theta: Array) -> float:
-        """See Twin."""
-        return 1.0
-
-    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
-        """See Twin."""
-        gain = self.sensitivity(output, theta)
-        return lambda change: gain * change
 
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool

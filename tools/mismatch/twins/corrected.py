@@ -13,27 +13,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from sim_devices.physics.effect import Array, Human, Parameter
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
+from tools.mismatch.twins.head import Head
 
 MOST_FREE = 3  # weights of an effect that are re-fitted one by one
 
 
 @dataclass(frozen=True)
-class CorrectedTwin:
+class CorrectedTwin(Head):
     """``inner`` is the core twin with its effects at ``found`` (its own theta). ``of[j]`` is the parameter of this
     twin that moves parameter ``j`` of the inner model, ``factor[j]`` says that it does so by multiplying it.
     """
 
-    kind: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    chain: tuple[Stage, ...]
-    parameters: tuple[Parameter, ...]
     inner: Model
     found: tuple[float, ...]
     of: tuple[int, ...]

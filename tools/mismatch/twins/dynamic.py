@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from sim_devices.physics.effect import Array, Human
 from tools.mismatch.twins.base import Force, Run, Signal, remember
 from tools.mismatch.twins.feedback import Rows, pack, run_feedback
+from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import Discrete, Hold, StartState, discretise, run_states, start_state
 
 CONSTANT = ""  # the input "1"
@@ -40,19 +41,13 @@ class Plant:
 
 
 @dataclass(frozen=True)
-class DynamicTwin:
+class DynamicTwin(Head):
     """Common part; ``plant_of(theta)`` builds the plant from the nonlinear base parameters.
 
     ``groups``: outputs that share one state, with their state rows. ``fixed_free(n)`` is the response to the
     engineer's own start state, used when no sample may set it.
     """
 
-    kind: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    chain: tuple[Stage, ...]
-    parameters: tuple[Parameter, ...]
     hold: Hold
     links: tuple[Link, ...]
     groups: tuple[Mapping[str, int], ...]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,22 +10,17 @@ import numpy as np
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Force, Run, Signal, fold
+from tools.mismatch.twins.head import ScaledOutputs
 
 
 @dataclass(frozen=True)
-class StaticTwin:
+class StaticTwin(ScaledOutputs):
     """``y_o = offset_o + scale_o * x_drive(o)``; theta = all offsets, then all scales.
 
     ``names`` are the contract's (offset, scale). ``given`` (outputs, 2) holds the engineer's numbers, NaN where
     missing: those are estimated by least squares.
     """
 
-    kind: str
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    chain: tuple[Stage, ...]
-    parameters: tuple[Parameter, ...]
     drives: Mapping[str, str]
     names: tuple[str, str]
     given: tuple[tuple[float, float], ...]
@@ -59,19 +54,6 @@ class StaticTwin:
     def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
         """See Twin."""
         return {"axis": ("xyz".find(output[-1]),)} if "_" in output else {}
-
-    def sensitivity(self, output: str, theta: Array) -> float:
-        """See Twin."""
-        return float(theta[len(self.outputs) + self.outputs.index(output)])
-
-    def input_gain(self, signal: str, theta: Array) -> float:
-        """See Twin."""
-        return 1.0
-
-    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
-        """See Twin."""
-        gain = self.sensitivity(output, theta)
-        return lambda change: gain * change
 
     def respond(
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
