@@ -59,7 +59,7 @@ def pivot_path(seconds: float, seed: int) -> Array:
 
 @kernel
 def sense_at(p, s, node, noise, slow):
-    """One millisecond of a hand that is not moved by what is sensed: node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
+    """A millisecond of the sensors: hand node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
     copy(node, s["pose"])
     s["step"] += STEPS_PER_MS
     room(p, s, slow)

@@ -19,7 +19,7 @@ from firmware_py.sensing.stage import Sensing, sense_kernel
 from hal.compiled import kernel
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.hand import NODE_S, Hand
-from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin, outputs
+from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin, copy, outputs
 from sim_devices.plant.lab_motion import sense_at
 from sim_devices.plant.rigid_body import quaternion
 from sim_devices.plant.sensors import sensor_unit
