@@ -25,6 +25,14 @@ def test_it_takes_fewer_than_120_lines_of_code_tests_included(name: str):
     assert sum(len(p.read_text(encoding="utf-8").splitlines()) for p in (HERE / name).glob("*.py")) < 120
 
 
+@pytest.mark.parametrize("name", GUIDES)
+def test_the_guide_says_how_many_lines_each_file_has(name: str):
+    tried = re.search(r"Tried: ([^.]+)\.", GUIDES[name].read_text(encoding="utf-8"))
+    assert tried is not None
+    counts = [len(p.read_text(encoding="utf-8").splitlines()) for p in (HERE / name).glob("*.py")]
+    assert {str(n) for n in counts} <= set(re.findall(r"\d+", tried.group(1)))
+
+
 @pytest.mark.parametrize("file", sorted(HERE.glob("*/pyproject.toml")), ids=lambda file: file.parent.name)
 def test_all_of_its_modules_are_installed(file: Path):
     """Without the list, setuptools refuses a folder that holds more than one module, tests included."""

@@ -1,5 +1,7 @@
 """It is a bench, the instrument works on it in virtual time, and a slip in it is named before anything is opened."""
 
+from pathlib import Path
+
 import pytest
 
 from drivers.specs import check_devices
@@ -8,9 +10,11 @@ from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
 
+HERE = Path(__file__).parent
 
-def test_the_instrument_runs_on_it(installed):
-    outcome, truth = run_in_process(RunRequest(installed / "bench.toml", 2.0, virtual=True))
+
+def test_the_instrument_runs_on_it():
+    outcome, truth = run_in_process(RunRequest(HERE / "bench.toml", 2.0, virtual=True))
     assert set(outcome["devices"]) == {"daq", "piezo"}
     assert outcome["samples"]["lost"] == 0
     assert outcome["safe_state"]["normal"]
@@ -26,7 +30,7 @@ def test_the_instrument_runs_on_it(installed):
         ("address = 0x0C", "adress = 0x0C", r"adress\] unknown key; check the spelling"),
     ],
 )
-def test_a_slip_is_named(installed, tmp_path, right, wrong, message):
-    (tmp_path / "bench.toml").write_text((installed / "bench.toml").read_text().replace(right, wrong))
+def test_a_slip_is_named(tmp_path, right, wrong, message):
+    (tmp_path / "bench.toml").write_text((HERE / "bench.toml").read_text().replace(right, wrong))
     with pytest.raises(BenchError, match=message):
         check_devices(load_bench(tmp_path / "bench.toml").description, "bench.toml")

@@ -1,5 +1,6 @@
 """Driver and emulator against the data sheet's bytes, each alone; then the emulated room over the bus to degrees."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -38,8 +39,8 @@ def test_the_emulator_answers_as_the_data_sheet_says():
     assert words == ["8000", "0220", "0117", "8000", "2220", "0220", "f380"]
 
 
-def test_the_room_is_read_over_the_bus(installed):
-    with opened_bench(installed / "bench.toml", virtual=True) as bench:
+def test_the_room_is_read_over_the_bus():
+    with opened_bench(Path(__file__).with_name("bench.toml"), virtual=True) as bench:
         (value,) = read_sensors(bench)
         true_C = bench.world.truth()["temperature_C"][-1]
     assert value.value == pytest.approx(true_C, abs=1 / 128)
