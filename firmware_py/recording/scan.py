@@ -29,7 +29,10 @@ _MAX_CHUNK_BYTES = 1 << 26  # a damaged size must not make us ask for gigabytes
 _FRAME = struct.Struct("<BQ")
 _CHUNK_HEADER = struct.Struct("<QQQI")  # start, end, size, crc; then the compression as a counted string
 _ZSTD_NAME = b"\x04\x00\x00\x00zstd"
-_PARSE_ERRORS = (McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, RecordingError)
+_PARSE_ERRORS = (
+    McapError, CRCValidationError, zstandard.ZstdError, struct.error, ValueError, OverflowError, RecordingError,
+)  # fmt: skip
+"""Of these ``OverflowError``: a length of 64 bits, which no file can have."""
 
 
 @dataclass(frozen=True, slots=True)
