@@ -4,16 +4,23 @@ The earliest arrivals carry the least transport delay, so the line through them 
 host's time base (the idea of NTP's minimum filter). What remains is the constant minimum delay of the
 transport: a scan is stamped late by that much, never early.
 
-A clock that steps shows as arrivals that are all later, or some earlier, than the line. That cannot be told from a
-transport or a host that has become slower, nor can a step of a tenth of a period from what they vary by.
+A clock that steps shows as arrivals that are all off the line, most of them by the same. A host that is busy is late by
+this and that; a transport that has become slower by the same every time cannot be told from a step, nor can a step
+of a tenth of a period from what arrivals vary by.
 """
 
 from __future__ import annotations
 
+from collections import deque
+
 SHIFT = 0.15
 """Of a period (USB is polled every 125 us): arrivals that are off the line by so much are no jitter if they all are,"""
-SHIFT_ARRIVALS = 10
-"""so many in a row; the loop's tasks repeat after as many ticks, and one of them leaves the host free."""
+SHIFT_ARRIVALS = 12
+"""so many in a row (the loop's tasks repeat after 10 ticks),"""
+SHIFT_ALIKE = 8
+"""of which so many are"""
+SHIFT_SPREAD = 0.05
+"""of a period alike, which those of a busy host are not."""
 
 
 class ScanTimeline:
@@ -38,12 +45,15 @@ class ScanTimeline:
         self._skew_ns = 0.0
         self._least_ns = 0.0
         self._in_window = 0
-        self._late_in_a_row = 0
+        self._off = deque[float](maxlen=SHIFT_ARRIVALS)  # lateness of arrivals in a row that are off the line
 
     @property
     def shifted(self) -> bool:
-        """The last arrivals are all late, or the last one is early, by more than a part of a period."""
-        return self._late_in_a_row >= SHIFT_ARRIVALS
+        """The last arrivals were all off the line, and most of them alike."""
+        if len(self._off) < SHIFT_ARRIVALS:
+            return False
+        near_ns = min(self._off) + SHIFT_SPREAD * self.dt_ns
+        return sum(late_ns <= near_ns for late_ns in self._off) >= SHIFT_ALIKE
 
     @property
     def next_seq(self) -> int:
@@ -69,10 +79,10 @@ class ScanTimeline:
             # while starting, an earlier arrival corrects the start at once
             self._offset_ns += late_ns
             self._least_ns = late_ns = 0.0
-        if late_ns < -SHIFT * self.dt_ns:
-            self._late_in_a_row = SHIFT_ARRIVALS
-        else:
-            self._late_in_a_row = self._late_in_a_row + 1 if late_ns > SHIFT * self.dt_ns else 0
+        if abs(late_ns) > SHIFT * self.dt_ns:
+            self._off.append(late_ns)
+        elif self._off:
+            self._off.clear()
         self._arrivals += n
         self._in_window += n
         lost = 0

@@ -89,13 +89,23 @@ def test_due_by_counts_what_has_not_come():
 
 
 @pytest.mark.parametrize("step_us", [-400, -200, 200, 400])
-def test_a_clock_that_steps_is_told_within_ten_arrivals(step_us: int):
+def test_a_clock_that_steps_is_told_within_twelve_arrivals(step_us: int):
     line, told = ScanTimeline(float(MS)), list[int]()
     for k in range(3000):
         line.stamp(1, (5 + k) * MS + (step_us * 1000 if k >= 2000 else 0))
         if line.shifted:
             told.append(k)
-    assert told[0] == (2009 if step_us > 0 else 2000)
+    assert told[0] == 2011
+
+
+def test_a_host_that_is_busy_for_seconds_is_no_step():
+    rng = np.random.default_rng(4)
+    line, told = ScanTimeline(float(MS)), 0
+    for k in range(20_000):
+        late_us = 20.0 if k < 2000 else 200.0 + rng.exponential(300.0)
+        line.stamp(1, 5 * MS + k * MS + round(late_us * 1000))
+        told += line.shifted
+    assert told < 20  # of 18 000: the line follows the host, and eight of twelve are seldom alike
 
 
 def test_neither_jitter_nor_a_stall_nor_a_slow_crystal_is_a_step():

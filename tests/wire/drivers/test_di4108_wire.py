@@ -361,4 +361,4 @@ def test_a_clock_that_steps_is_told_in_the_blocks():
     daq, _, _ = scanning(*(e for k, t_ns in enumerate(times) for e in (("at", t_ns), ("r", scan(k)))))
     out = np.zeros((8, 8), dtype=np.int16)
     told = [k for k in range(320) if daq.read_scans(out, 0.01).status & Status.SHIFTED]
-    assert told == list(range(309, 320))
+    assert told == list(range(311, 320))
