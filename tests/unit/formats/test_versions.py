@@ -83,7 +83,7 @@ def test_weights_of_version_1_open_with_their_values_and_a_later_one_is_named(tm
     np.testing.assert_array_equal(network.output, [0.0, 1.0, -1.0, 0.5, 0.25, 0.125])
     later = tmp_path / "cascade.json"
     later.write_text((GOLDEN / "cascade.json").read_text().replace('"format": 1', '"format": 2'))
-    with pytest.raises(BenchError, match=r"cascade\.json: format: .*micron tremor train"):
+    with pytest.raises(BenchError, match=r"cascade\.json: \[format\] "):
         load_network(later)
 
 
