@@ -331,7 +331,7 @@ def fit(
     assert found is not None
     cost, theta = found
     if opening is not None and not give_up and np.isfinite(cost):
-        theta, cost, count = _finely(problem, model, outputs, theta, rows, 6, rounds, tolerance)
+        theta, cost, count = _finely(problem, model, outputs, theta, rows, 10, rounds, tolerance)
         evaluations += count
     elif give_up and opening is not None:
         _, theta = _Projected(problem, model, outputs, rows).evaluate(theta)

@@ -110,8 +110,8 @@ class Problem:
 
     @cached_property
     def opening(self) -> Problem | None:
-        """The same problem on the first part of a long recording, when that shows the whole range and the fastest
-        rate of every input: what runs freely from the first sample is there exactly what it is in the whole.
+        """The same problem on the first part of a long recording, when that shows most of the range and rates
+        of every input: what runs freely from the first sample is there exactly what it is in the whole.
         """
         n = self.recording.n
         signals = [*self.recording.inputs.values()]
@@ -120,7 +120,7 @@ class Problem:
             rows = int(np.searchsorted(self.index[self.fit_rows], samples))
             if rows > samples // 3 and all(_shows(x[:samples], x) for x in signals):
                 return replace(self, recording=_first(self.recording, samples), split=self.split.first(samples))
-            samples *= 2
+            samples += samples // 3
         return None
 
     def sigma(self, output: str) -> float:
@@ -159,11 +159,11 @@ LEAST_OPENING = 15_000
 
 
 def _shows(part: Array, whole: Array) -> bool:
-    """Does a part of a signal reach nearly all of its range and of its fastest rate."""
-    if float(np.ptp(part)) < 0.97 * float(np.ptp(whole)):
+    """Does a part of a signal reach most of its range and move about as fast. A search ends on the whole anyway."""
+    if float(np.ptp(part)) < 0.8 * float(np.ptp(whole)):
         return False
-    some, every = (float(np.quantile(np.abs(np.diff(x)), 0.999)) for x in (part, whole))
-    return some >= 0.95 * every
+    some, every = (float(np.quantile(np.abs(np.diff(x)), 0.99)) for x in (part, whole))
+    return some >= 0.8 * every
 
 
 def _first(recording: Recording, samples: int) -> Recording:
