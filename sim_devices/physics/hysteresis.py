@@ -215,10 +215,8 @@ def choose_form(x: Array, residual: Array, ctx: Context, lo: float, hi: float, f
     straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
     best: tuple[float, str] | None = None
     for form in forms:
-        e = columns(x, form, lo, hi, float(x[0]), ctx.starts)
-        if ctx.through is not None:
-            e = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in e.T], axis=1)
-        a = np.column_stack([straight, e[index]])
+        e = columns(x, form, lo, hi, float(x[0]), ctx.starts).T
+        a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
         left = 0.0
         for out in (0, 1):
             w = least_squares(a[fold != out], residual[index][fold != out], 1e-6)[0]

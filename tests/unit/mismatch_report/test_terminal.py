@@ -89,3 +89,13 @@ def test_a_folder_is_one_table():
     lines = out.getvalue().splitlines()
     assert " ".join(lines[1].split()) == "a missing physics creep displacement (um) 0.41 0.023 0.02 8"
     assert lines[3:] == ["Without a report", "b [1]: b.toml: no [twin] with a 'kind'"]
+
+
+def test_a_folder_on_eighty_columns_keeps_its_figures_whole():
+    row = Row("long-name", "/x/a", missing_physics().to_json()).cells
+    figures = {"recalibrated": "0.00992", "fitted": "0.00431", "noise": "0.00426", "seconds": "12"}
+    out = io.StringIO()
+    Console(file=out, width=80, highlight=False).print(batch_report([{**row, "physics": "first order lag", **figures}]))
+    text = out.getvalue()
+    assert all(f" {value} " in text for value in figures.values())
+    assert "first order" in text

@@ -20,6 +20,7 @@ Array = NDArray[np.float64]
 
 HUBER = 4.0
 LEAST_ROWS = 2000  # that a coarse search looks at
+MOST_ROWS = 300_000  # that any search looks at
 
 
 @dataclass(frozen=True)
@@ -299,7 +300,7 @@ def fit(
     shares no parameter with the outputs ``touched``; only these are fitted then.
     """
     outputs = model.together(touched) if keep is not None and touched else problem.twin.outputs
-    rows = max(1, problem.fit_rows.size // max(1, stride))
+    rows = min(max(1, problem.fit_rows.size // max(1, stride)), MOST_ROWS)
     opening = problem.opening if model.nonlinear and all(p.effect.name in OPENING for p in model.placed) else None
     ground = opening or problem
     evaluations = 0

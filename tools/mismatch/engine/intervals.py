@@ -17,12 +17,12 @@ def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
     """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters)."""
     model, theta = fitted.model, fitted.theta
     rows = problem.fit_rows[:: max(1, stride)]
-    design = model.design(problem.view, theta)
+    design = model.design(problem.view, theta, samples=problem.index[rows])
     outputs = problem.twin.outputs
     sensitivity = {o: np.zeros((rows.size, theta.size)) for o in outputs}
     for o in outputs:
         for i, j in enumerate(design.linear[o]):
-            sensitivity[o][:, j] = design.columns[o][rows, i]
+            sensitivity[o][:, j] = design.columns[o][:, i]
     here = model.simulate(problem.view, theta) if model.nonlinear else {}
     for i in model.nonlinear:
         shifted = moved_a_little(model, theta, i)

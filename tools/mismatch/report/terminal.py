@@ -188,7 +188,11 @@ def print_report(report: Report, console: Console) -> None:
 def batch_report(rows: Sequence[dict[str, str]]) -> RenderableType:
     """One line per recording of a folder (see ``batch.Row.cells``), then those without a report and why."""
     t = _table("recording", "verdict", "physics", "worst output", "re-fit", "fitted", "noise", "s", left=4)
-    t.columns[1].no_wrap = t.columns[3].no_wrap = True
+    t.padding = (0, 1, 0, 0)
+    for column in t.columns:
+        # words break between words, figures never: eight columns on a terminal of eighty
+        column.no_wrap = column.header not in ("physics", "worst output")
+    t.columns[2].min_width = t.columns[3].min_width = 12
     failed: list[RenderableType] = []
     for row in rows:
         if row["error"]:

@@ -180,7 +180,7 @@ def keep_all(n: int) -> NDArray[np.bool_]:
     return np.ones(n, np.bool_)
 
 
-MEMO_BYTES = 1 << 29  # what one view remembers of unchanged columns
+MEMO_BYTES = 1 << 28  # what one view remembers of unchanged columns
 
 
 def remember(memo: dict[object, object], key: object, make: Callable[[], Array]) -> Array:
