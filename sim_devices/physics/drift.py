@@ -268,9 +268,10 @@ def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return hats(ctx.t, np.array(settings.get("knots_s", (0.0, 1.0))))
 
 
-def growth(residual: Array, keep: np.ndarray) -> float:
-    """How the mean square difference of neighbouring block means grows from blocks of n/64 to n/16: about 4 for a
-    walk, 1/4 for noise that forgets within a block, near 1 for noise that forgets within n/60.
+def growth(residual: Array, keep: np.ndarray, short: int = 64, long: int = 16) -> float:
+    """How the mean square difference of neighbouring block means grows from blocks of n / ``short`` to n / ``long``: by
+    the ratio of the lengths (4) for a walk, its inverse for noise that forgets within a block, its square for what is
+    smooth, near 1 for noise that forgets within n/60. 0 where nothing can be said.
     """
     n = residual.size
     total = np.concatenate([[0.0], np.cumsum(np.where(keep, residual, 0.0))])
@@ -286,17 +287,20 @@ def growth(residual: Array, keep: np.ndarray) -> float:
         d = (total[at + 2 * m] - total[at + m]) / c1 - (total[at + m] - total[at]) / c0
         return float(np.mean(d * d))
 
-    short, long = level(max(2, n // 64)), level(max(4, n // 16))
-    return long / short if short > 0 and np.isfinite(long) else 4.0
+    near, far = level(max(2, n // short)), level(max(4, n // long))
+    return far / near if near > 0 and np.isfinite(far) else 0.0
 
 
 LEAST_GROWTH = 1.7
+MOST_GROWTH = 24.0  # from n/512 to n/64: a walk has 8, what is smooth 64
 
 
 def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
     white, walk, z, _ = increments(residual, ctx.keep, ctx.dt)
-    if growth(residual, ctx.keep) < LEAST_GROWTH:
+    if 0.0 < growth(residual, ctx.keep) < LEAST_GROWTH:
         return Signature(1.0, 0.0, "stationary: it forgets within a fraction of the record")
+    if residual.size >= 2048 and growth(residual, ctx.keep, 512, 64) > MOST_GROWTH:
+        return Signature(1.0, 0.0, "smooth: a walk is rough at every scale")
     e = residual[ctx.keep]
     power = float(np.var(e))
     share = min(1.0, max(0.0, 1 - white**2 / power)) if power > 0 else 0.0

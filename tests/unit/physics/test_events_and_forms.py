@@ -113,3 +113,16 @@ def test_memory_that_no_speed_changes_is_not_called_rate_dependent() -> None:
     assert still < low
     p[13] = 0.1  # the weight that grows with speed
     assert low < {h.name: h.value for h in effect.report(p, settings, 1.0)}["change_with_speed"] < high
+
+
+def test_a_smooth_drift_is_no_random_walk_and_a_walk_is_one() -> None:
+    n = 4000
+    rng = np.random.default_rng(12)
+    t = np.arange(n) / n
+    ctx = context(n)
+    test = EFFECTS["random_walk"].test
+    assert test is not None
+    noise = 0.02 * rng.standard_normal(n)
+    walk = np.cumsum(rng.standard_normal(n))
+    assert test(t, walk / walk.std() + noise, ctx).p_value < 1e-7
+    assert test(t, np.sin(2 * np.pi * 3 * t) + 0.5 * np.cos(2 * np.pi * 5.3 * t) + noise, ctx).p_value == 1.0
