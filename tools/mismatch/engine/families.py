@@ -125,7 +125,8 @@ def beside_flexible(
         specific = [
             t
             for t in trials
-            if t.fitted is not None and t.comparison is not None and t.comparison.z > z and t.comparison.gain > 0.04
+            if t.fitted is not None and t.comparison is not None and not t.refused
+            and t.comparison.z > z and t.comparison.gain > 0.04
             and t.placed.effect.claims is None and t.name not in LOOSE and size(t.placed) <= 5
             and set(t.placed.outputs) & set(outputs) and not in_disguise(t)
         ]  # fmt: skip

@@ -206,7 +206,9 @@ def pair_search(
     problem: Problem, current: Fit, trials: Sequence[Trial], *, z: float, gain: float, most: int = 5
 ) -> tuple[Fit, tuple[Trial, Trial]] | None:
     """Two effects together where none pays alone: the most promising by their one-step share, all pairs of them."""
-    hopeful = sorted((t for t in trials if t.fitted is not None), key=lambda t: -t.candidate.share)
+    # what takes samples out of the comparison makes any pair look good
+    models = (t for t in trials if t.fitted is not None and not t.refused and t.placed.effect.claims is None)
+    hopeful = sorted(models, key=lambda t: -t.candidate.share)
     chosen: list[Trial] = []
     for t in hopeful:
         if all(t.name != c.name for c in chosen):

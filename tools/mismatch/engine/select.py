@@ -66,7 +66,7 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
         # no tail, however heavy, puts most of a record's energy into a few neighbours
         most = p < 1e-4 and share > 0.8
         return (p < rule.p_tested and share > 0.2) or most or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
-    if trial.candidate.tested and trial.candidate.p_value > 1e-3:
+    if trial.refused:
         return False
     if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess or in_disguise(trial):
         return False
@@ -236,7 +236,10 @@ def second_thoughts(
     """Swaps, then pruning; the accepted trials follow."""
     taken = sum(misfits(problem, base).values()) - sum(misfits(problem, current).values())
     current, changed = swap_pass(problem, current, rivals, least=0.01 * taken)
-    seen = sorted((t for t in first if t.placed.effect.claims is None), key=lambda t: (-t.candidate.share, t.label))
+    seen = sorted(
+        (t for t in first if t.placed.effect.claims is None and not t.refused),
+        key=lambda t: (-t.candidate.share, t.label),
+    )
     top = {
         o: max((t.candidate.share for t in seen if o in t.placed.outputs), default=0.0) for o in problem.twin.outputs
     }

@@ -24,6 +24,7 @@ LEAST_FITS = 3  # per output, whatever their share
 MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
+LEAST_P = 1e-3
 PARALLEL_WORK = 4_000_000  # samples times candidates above which processes pay
 TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is accepted is fitted on every row
 
@@ -47,6 +48,11 @@ class Trial:
     @property
     def name(self) -> str:
         return self.placed.effect.name
+
+    @property
+    def refused(self) -> bool:
+        """Whether the effect's own test finds nothing of it: then no fit, alone or with others, makes it a name."""
+        return self.candidate.tested and self.candidate.p_value > LEAST_P
 
     @property
     def improvement(self) -> float:
