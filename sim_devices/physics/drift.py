@@ -292,15 +292,18 @@ def growth(residual: Array, keep: np.ndarray, short: int = 64, long: int = 16) -
 
 
 LEAST_GROWTH = 1.7
-MOST_GROWTH = 24.0  # from n/512 to n/64: a walk has 8, what is smooth 64
+CLEAR_GROWTH = 5.5  # from n/512 to n/64: a walk has 8,
+MOST_GROWTH = 24.0  # what is smooth 64
 
 
 def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
     white, walk, z, _ = increments(residual, ctx.keep, ctx.dt)
-    if 0.0 < growth(residual, ctx.keep) < LEAST_GROWTH:
-        return Signature(1.0, 0.0, "stationary: it forgets within a fraction of the record")
-    if residual.size >= 2048 and growth(residual, ctx.keep, 512, 64) > MOST_GROWTH:
+    # many short blocks say more than few long ones, from which base parameters have taken their part
+    short = growth(residual, ctx.keep, 512, 64) if residual.size >= 2048 else 0.0
+    if short > MOST_GROWTH:
         return Signature(1.0, 0.0, "smooth: a walk is rough at every scale")
+    if short < CLEAR_GROWTH and 0.0 < growth(residual, ctx.keep) < LEAST_GROWTH:
+        return Signature(1.0, 0.0, "stationary: it forgets within a fraction of the record")
     e = residual[ctx.keep]
     power = float(np.var(e))
     share = min(1.0, max(0.0, 1 - white**2 / power)) if power > 0 else 0.0

@@ -13,6 +13,7 @@ from tests.unit.mismatch_engine.cases import bouc_wen, recording, wave
 from tools.mismatch.engine.assemble import beyond_form
 from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.revise import pair_search
 from tools.mismatch.engine.score import Comparison
 from tools.mismatch.engine.screen import Candidate, places
 from tools.mismatch.engine.select import acceptable, search
@@ -126,3 +127,30 @@ def test_a_gain_on_a_reading_of_several_inputs_follows_its_context() -> None:
     first = lead(problem, base, "accel_1z")
     assert first is not None
     assert (first.signal, first.feature) == ("pressure", "cross product")
+
+
+def test_what_a_louder_output_hid_is_looked_at_again() -> None:
+    rng = np.random.default_rng(7)
+    n = 2400
+    t = np.arange(n) / 100.0
+    f = np.column_stack([np.sin(0.9 * t + 2 * np.sin(0.31 * t + k)) for k in range(3)])
+    turned = {"x": 0.0012 * f[:, 1], "y": 0.002 * f[:, 2], "z": 0.08 * f[:, 0] - 0.05 * f[:, 1]}
+    inputs = {f"specific_force_{a}": f[:, i] for i, a in enumerate("xyz")}
+    outputs = {
+        f"voltage_{a}": 1.5 + 0.3 * (f[:, i] + turned[a]) + 0.0003 * rng.standard_normal(n) for i, a in enumerate("xyz")
+    }
+    parameters: dict[str, object] = {"bias_V": 1.5, "scale_V_per_g": 0.3}
+    rec = recording("accelerometer", inputs, outputs, parameters, rate_hz=100.0)
+    rivals = ("random_walk", "scale_factor_variation", "cross_axis_nonlinearity", "creep", "hysteresis", "resonance")
+    assert set(found(rec, "misalignment", *rivals)) == {"misalignment"}
+
+
+def test_a_line_above_half_the_rate_is_in_no_pair() -> None:
+    rng = np.random.default_rng(3)
+    u = 50 + 30 * wave(rng, 1500)
+    problem, _, base = prepared(stack(0.125 * u + 0.02 * rng.standard_normal(u.size), u, rate_hz=50.0), 0.3, 0, False)
+    place = places(problem, (EFFECTS["mains_interference"],), ())[0]
+    trial = Trial(place, Candidate(place, 0.6, 1.0, True, ()), base, None, {}, np.empty((0, 0)), 0)
+    assert trial.refused
+    assert pair_search(problem, base, [trial, trial], z=0.0, gain=0.0) is None
+    assert not replace(trial, candidate=Candidate(place, 0.6, 1e-9, True, ())).refused

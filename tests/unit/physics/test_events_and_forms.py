@@ -126,3 +126,17 @@ def test_a_smooth_drift_is_no_random_walk_and_a_walk_is_one() -> None:
     walk = np.cumsum(rng.standard_normal(n))
     assert test(t, walk / walk.std() + noise, ctx).p_value < 1e-7
     assert test(t, np.sin(2 * np.pi * 3 * t) + 0.5 * np.cos(2 * np.pi * 5.3 * t) + noise, ctx).p_value == 1.0
+
+
+def test_a_walk_whose_slow_part_was_fitted_away_is_still_one() -> None:
+    n = 4000
+    rng = np.random.default_rng(12)
+    walk = np.cumsum(rng.standard_normal(n))
+    t = np.linspace(-1, 1, n)
+    waves = np.column_stack([np.cos(np.pi * k * np.arange(n) / n) for k in range(14)])
+    bent = walk - waves @ np.linalg.lstsq(waves, walk, rcond=None)[0]
+    test = EFFECTS["random_walk"].test
+    assert test is not None
+    assert test(t, bent / bent.std() + 0.02 * rng.standard_normal(n), context(n)).p_value < 1e-3
+    brief = np.convolve(rng.standard_normal(n), np.exp(-np.arange(60) / 12), "same")
+    assert test(t, brief, context(n)).p_value == 1.0

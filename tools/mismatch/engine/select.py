@@ -173,7 +173,10 @@ def search(
             current = fit(problem, current.model, [current.theta], iterations=6)
             steps[-1] = replace(refined, fitted=current, misfits=misfits(problem, current))
         touched = set(best.placed.outputs)
-        known = {k: t for k, t in known.items() if decoupled and not touched & set(t.placed.outputs)}
+        # what looked hopeless beside a louder output is looked at again now that this one is quieter
+        known = {
+            k: t for k, t in known.items() if decoupled and t.fitted is not None and not touched & set(t.placed.outputs)
+        }
     if steps and steps[0].name in FLEXIBLE:
         parted = part_flexible(problem, base, steps[0], first)
         if parted is not None:
