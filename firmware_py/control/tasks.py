@@ -9,14 +9,14 @@ from firmware_py.scheduler.task import TaskSpec, TickInfo
 
 BUDGETS_US: Mapping[str, float] = {
     "sense": 60.0,
-    "estimate": 30.0,
+    "estimate": 50.0,
     "actuate": 520.0,  # 390 us of bus time at 400 kHz
     "publish": 30.0,
-    "magnetometer": 350.0,  # 212 us of bus time
+    "magnetometer": 330.0,  # 212 us of bus time
     "supervise": 300.0,
     "telemetry": 300.0,
     "verify": 340.0,  # 260 us of bus time
-    "monitor": 350.0,  # 212 us of bus time
+    "monitor": 330.0,  # 212 us of bus time
 }
 MAGNETOMETER_PHASES = (0, 3, 6)
 VERIFY_PHASES = (1, 4, 8)  # in ticks that leave the bus free for it

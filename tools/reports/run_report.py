@@ -58,11 +58,12 @@ def tremor_table(result: Mapping[str, Any]) -> Table:
 
 
 def task_table(result: Mapping[str, Any]) -> Table:
-    """Every task against its budget."""
-    table = Table(title="Tasks", title_justify="left")
-    figures = ("budget us", "p50", "p99", "p99.9", "max", "cpu p50", "over", "skipped", "put off")
+    """Every task against its budget, times in us; whole on eighty columns."""
+    title = "Tasks: us of budget and runs; CPU of a run; runs over budget, releases skipped, times put off"
+    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
+    figures = ("budget", "p50", "p99", "p99.9", "max", "cpu", "over", "skip", "off")
     for column in ("task", "Hz", "runs", *figures):
-        table.add_column(column, justify="left" if column == "task" else "right")
+        table.add_column(column, justify="left" if column == "task" else "right", no_wrap=True)
     for name, task in result["tasks"].items():
         duration, cpu = task["duration_us"], task["cpu_us"]
         table.add_row(
@@ -70,8 +71,8 @@ def task_table(result: Mapping[str, Any]) -> Table:
             _number(task["rate_hz"], "{:g}"),
             str(task["runs"]),
             _number(task["budget_us"], "{:g}"),
-            *(_number(duration[key]) for key in ("p50", "p99", "p99_9", "max")),
-            _number(cpu["p50"]),
+            *(_number(duration[key], "{:.0f}") for key in ("p50", "p99", "p99_9", "max")),
+            _number(cpu["p50"], "{:.0f}"),
             str(task["overruns"]),
             str(task["skipped"]),
             str(task["put_off"]),
