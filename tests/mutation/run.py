@@ -29,6 +29,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         tuple(f"firmware_py/scheduler/{name}.py" for name in ("scheduler", "ticker", "task", "background", "check")),
         (
             "tests/virtual_time/test_scheduler.py",
+            "tests/virtual_time/test_scheduler_counts.py",
             "tests/virtual_time/test_tickers.py",
             "tests/virtual_time/test_background.py",
         ),

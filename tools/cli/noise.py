@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.table import Table
@@ -11,6 +11,9 @@ from rich.table import Table
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+
+if TYPE_CHECKING:
+    from tools.calibrate.logs import SensorLog
 
 
 def noise(
@@ -53,7 +56,7 @@ def noise(
         log = load_log(recording, rate_hz)
         if bench is not None:
             log = calibrated_log(log, bench)
-        names = column or [name for name in log.columns if name not in (log.time_column, "t_ns")]
+        names = column or _columns(log)
         if log.gaps:
             console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")
         rate = log.need_rate()
@@ -90,3 +93,19 @@ def noise(
             },
             json_file,
         )
+
+
+def _columns(log: SensorLog) -> list[str]:
+    """What is analysed when nobody says what."""
+    import numpy as np
+
+    names = [name for name in log.columns if name not in (log.time_column, "t_ns")]
+    if {"tick", "volts_0"} <= set(names):
+        console().print(f"{log.path}: of micron run: the converter's inputs; others by --column or --bench")
+        names = [name for name in names if name.startswith("volts_")]
+    still = [name for name in names if np.ptp(log.matrix((name,))) == 0.0]
+    if still:
+        console().print(f"{log.path}: left out, they never change: {', '.join(still)}")
+    if len(still) == len(names):
+        raise InputError(f"{log.path}: no column changes: a frozen sensor has no noise to identify")
+    return [name for name in names if name not in still]
