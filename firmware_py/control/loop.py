@@ -17,7 +17,7 @@ from firmware_py.control.field_input import FieldInput
 from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
-from firmware_py.control.plausibility import ScanCheck
+from firmware_py.control.plausibility import ScanCheck, turns_of_pairs
 from firmware_py.control.redundancy import Redundancy
 from firmware_py.control.safety import FINISHED, State, Supervisor
 from firmware_py.control.stages import Stages
@@ -96,12 +96,13 @@ class InstrumentLoop:
         if devices.magnetometer is not None:
             limit_ms, outlier_V = config.safety.magnetometer_ms, config.plausibility.magnetometer_outlier_V
             self._field = FieldInput(devices.magnetometer, self.incidents, self.counts, limit_ms, outlier_V)
-        wired = devices.sensing_table
+        wired, sensing = devices.sensing_table, stages.configs.sensing
         watched = [*wired["channels"], wired["supply_channel"], wired["temperature_channel"]]
         columns = [column for column in watched if column is not None]
         self._check = ScanCheck(
-            config.plausibility, wired["lsb_V"], columns, devices.scan_labels, sensors=len(wired["channels"])
-        )
+            config.plausibility, wired["lsb_V"], columns, devices.scan_labels, sensors=len(wired["channels"]),
+            mix=turns_of_pairs(sensing.axis_positions(), np.array(sensing.axes)),
+        )  # fmt: skip
         self._redundancy = Redundancy(stages, self._check, self.supervisor, self.incidents, devices.scan_labels)
         self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []

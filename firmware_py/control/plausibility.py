@@ -4,7 +4,9 @@ Six axes and six unknowns leave no parity while the instrument moves (ERRATA no.
 its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails; and of axes that point the
 same way at two places the slow parts must agree, because turning hands do not accelerate for long. Natural figures
 (three hands, nine runs of 15 s): second differences up to 2.8 mV; parallel axes never beyond 5 times their spread plus
-0.07 m/s^2 (z: 0.016).
+0.07 m/s^2 (z: 0.016). A hand hardly turns the instrument about its own axis: what the two long pairs (x and y, 116 mm
+apart) say of the other turns explains the difference of the short one (z, 20 mm) to its noise (nine runs of 56 s:
+0.0095 m/s^2 rms whatever the hand, never beyond 0.043; with the turns 0.030 and 0.146 in a rough hand).
 """
 
 from __future__ import annotations
@@ -31,8 +33,8 @@ class PlausibilityLimits(BaseModel):
     ``outlier_V``: second difference of an accelerometer's readings, ``magnetometer_outlier_V``: of the magnetometer's
     (10 ms apart), ``supply_step_V``: change of the supply's from tick to tick; all three are noticed only.
     ``pair_m_s2``: parallel axes may not differ by more on average over ``pair_s``. What
-    they differ by at once, against their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` (of x, z, y:
-    1.3 rad/s^2 over the distance of the two) plus PAIR_SPREADS times their usual spread.
+    they differ by at once, against their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` (of x and y:
+    1.3 rad/s^2 over the distance of the two; z: 6 rad/s^2 about the instrument) plus PAIR_SPREADS times their spread.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -45,7 +47,7 @@ class PlausibilityLimits(BaseModel):
     outlier_V: float = Field(default=0.005, gt=0.0)
     supply_step_V: float = Field(default=0.004, gt=0.0)
     magnetometer_outlier_V: float = Field(default=0.01, gt=0.0)
-    pair_step_m_s2: tuple[float, float, float] = (0.15, 0.05, 0.15)
+    pair_step_m_s2: tuple[float, float, float] = (0.15, 0.03, 0.15)
     pair_memory_s: float = Field(default=5.0, gt=0.0)
 
 
@@ -53,6 +55,7 @@ NO_SLOPE = 1 << 40
 TICK_S = 0.001
 SPREAD_S = 1.0
 PAIR_SPREADS = 6.0
+SQUARE = 0.5  # sine between two levers
 PAIR_PLACES = np.array([(i, j) for i, j, _ in PAIRS])
 
 
@@ -124,10 +127,28 @@ def check_counts(
     return found
 
 
+def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) combinations of the pairs' differences to watch: each as it is, but the pair with the shortest lever
+    without the turns across the instrument that the two others tell. ``positions_m``, ``axes`` (6, 3): order of AXES.
+
+    A difference is (r_i - r_j) x s . alpha (ERRATA, section 5: cluster); alpha along z, the instrument, is taken for 0.
+    """
+    mix = np.eye(len(PAIRS))
+    lever = np.array([np.cross(positions_m[i] - positions_m[j], axes[i])[:2] for i, j, _ in PAIRS])
+    short = int(np.linalg.norm(lever, axis=1).argmin())
+    long = [k for k in range(len(PAIRS)) if k != short]
+    if abs(np.linalg.det(lever[long])) > SQUARE * float(np.linalg.norm(lever[long], axis=1).prod()):
+        told = np.linalg.solve(lever[long].T, lever[short])
+        if float(np.abs(told).max()) < 1.0:  # else the others' noise is more than is gained
+            mix[short, long] = -told
+    return mix
+
+
 @kernel
 def check_pairs(
     frame: NDArray[np.float64],
     places: NDArray[np.int64],
+    mix: NDArray[np.float64],
     looks: int,
     window: NDArray[np.float64],
     sums: NDArray[np.float64],
@@ -143,7 +164,9 @@ def check_pairs(
     row = looks % n
     found = 0
     for k in range(len(places)):
-        apart = frame[ACCELEROMETER + places[k, 0]] - frame[ACCELEROMETER + places[k, 1]]
+        apart = 0.0
+        for m in range(len(places)):
+            apart += mix[k, m] * (frame[ACCELEROMETER + places[m, 0]] - frame[ACCELEROMETER + places[m, 1]])
         sums[k] += apart - window[row, k]
         window[row, k] = apart
         if looks < n:
@@ -173,7 +196,7 @@ class ScanCheck:
     """Looks at every scan, before it is believed.
 
     ``columns``: places in a scan of the ``sensors`` accelerometer axes (AXES order), then of the supply and the
-    temperature where they are wired; ``labels`` names them for people.
+    temperature where they are wired; ``labels`` names them for people; ``mix``: see ``turns_of_pairs``.
     """
 
     def __init__(
@@ -184,6 +207,7 @@ class ScanCheck:
         labels: Sequence[str],
         *,
         sensors: int = SENSORS,
+        mix: NDArray[np.float64] | None = None,
     ) -> None:
         self.channel = -1
         """Which input the last finding was of."""
@@ -204,6 +228,7 @@ class ScanCheck:
             np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3))
         )
         self._looks = 0
+        self._mix = np.eye(len(PAIRS)) if mix is None else mix
         self._pair_step = np.array(limits.pair_step_m_s2)
         self._pair_told = 0
         self._tick = -1
@@ -219,8 +244,8 @@ class ScanCheck:
         window, sums, usual, spread = (state.copy() for state in self._pairs)
         limits = self.limits
         check_pairs(
-            np.zeros(LAYOUT.size), PAIR_PLACES, 0, window, sums, usual, spread, self._pair_step, limits.pair_m_s2,
-            TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
+            np.zeros(LAYOUT.size), PAIR_PLACES, self._mix, 0, window, sums, usual, spread, self._pair_step,
+            limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
         )  # fmt: skip
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
@@ -276,8 +301,8 @@ class ScanCheck:
         """
         state, limits = self._pairs, self.limits
         found = check_pairs(
-            frame, PAIR_PLACES, self._looks, state.window, state.sums, state.usual, state.spread, self._pair_step,
-            limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
+            frame, PAIR_PLACES, self._mix, self._looks, state.window, state.sums, state.usual, state.spread,
+            self._pair_step, limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
         )  # fmt: skip
         self._looks += 1
         if found == 0:
