@@ -100,11 +100,11 @@ def _csv(path: Path, names: list[str]) -> dict[str, Array]:
                 if header.count(name) > 1:
                     raise RecordingError(f"{path}: line 1: column '{name}' appears twice; rename one")
             use = [header.index(n) for n in names]
-            if not (rest := f.readlines(1)):
+            if not (first := next((line for line in f if line.strip()), "")):
                 raise RecordingError(f"{path}: a header and no samples")
             try:
                 data = np.loadtxt(
-                    itertools.chain(rest, f),
+                    itertools.chain([first], f),
                     delimiter=delimiter,
                     usecols=use,
                     ndmin=2,

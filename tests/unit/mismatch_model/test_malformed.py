@@ -69,6 +69,7 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "empty descriptor": ("", None, r"recording\.toml: format must be 1"),
     "empty data": (GOOD, b"", r"data\.csv: no column 'command_mV'; the file has: none"),
     "header alone": (GOOD, "command_mV,z,temp\n", r"data\.csv: a header and no samples"),
+    "empty lines alone": (GOOD, "command_mV,z,temp\n\n  \n", r"data\.csv: a header and no samples"),
     "one sample": (GOOD, numbers(1), r"data\.csv: 1 samples; at least 50"),
     "UTF-16": (GOOD, "command_mV,z,temp\n1,2,3\n".encode("utf-16"), r"data\.csv: not a UTF-8 text file"),
     "a picture": (GOOD, bytes(range(256)) * 20, r"data\.csv: not a UTF-8 text file"),
