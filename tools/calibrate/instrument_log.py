@@ -18,7 +18,7 @@ from firmware_py.sensing.calibration import calibrate, calibrate_magnetometer, c
 from firmware_py.sensing.config import SensingConfig
 from hal.bench import load_bench
 from hal.compiled import kernel
-from tools.calibrate.logs import SensorLog
+from tools.calibrate.logs import SensorLog, what_there_is
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -80,6 +80,6 @@ def instrument_readings(log: SensorLog, config: SensingConfig) -> tuple[Array, A
     if names[0] not in log.columns:
         raise InputError(
             f"{log.path}: no recording of the instrument: neither analog_V_0 ..., volts_0 ... nor {names[0]} ... is "
-            f"there; there are: {', '.join(log.columns)}"
+            f"there; {what_there_is(log.columns)}"
         )
     return log.matrix(names), log.matrix(tuple(f"magnetometer_{axis}" for axis in XYZ))

@@ -7,6 +7,7 @@ dimensions in an .npz become columns ``name_0``, ``name_1``, ...
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -43,7 +44,7 @@ class SensorLog:
         """(n, len(names)); ``InputError`` names a column that is missing or not finite."""
         for name in names:
             if name not in self.columns:
-                raise InputError(f"{self.path}: no column '{name}'; there are: {', '.join(self.columns)}")
+                raise InputError(f"{self.path}: no column '{name}'; {what_there_is(self.columns)}")
         data = np.stack([self.columns[name] for name in names], axis=1)
         if not np.all(np.isfinite(data)):
             row, column = np.argwhere(~np.isfinite(data))[0]
@@ -54,6 +55,12 @@ class SensorLog:
         if self.rate_hz is None:
             raise InputError(f"{self.path}: no time column and no rate_hz beside it; give --rate-hz")
         return self.rate_hz
+
+
+def what_there_is(columns: Collection[str], most: int = 16) -> str:
+    """For a message: the names, the first of them where there are many."""
+    more = f" and {len(columns) - most} more" if len(columns) > most else ""
+    return f"there are: {', '.join(list(columns)[:most])}{more}"
 
 
 def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:

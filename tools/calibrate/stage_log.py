@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.calibrate.logs import load_log
+from tools.calibrate.logs import load_log, what_there_is
 from tools.errors import InputError
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ class StageLog:
         """(n, len(names)); ``InputError`` names a column that is missing."""
         for name in names:
             if name not in self.columns:
-                raise InputError(f"{self.path}: no column '{name}'; there are: {', '.join(self.columns)}")
+                raise InputError(f"{self.path}: no column '{name}'; {what_there_is(self.columns)}")
         return np.stack([self.columns[name] for name in names], axis=1)
 
 
@@ -51,7 +51,10 @@ def load_stage_log(path: Path, rate_hz: float | None = None) -> StageLog:
     names = next((pair for pair in ANGLES if all(name in log.columns for name in pair)), None)
     if names is None:
         wanted = " or ".join("/".join(pair) for pair in ANGLES)
-        raise InputError(f"{log.path}: no stage angles ({wanted}); there are: {', '.join(log.columns)}")
+        raise InputError(
+            f"{log.path}: no stage angles ({wanted}); {what_there_is(log.columns)}. Without stages: micron bench "
+            "guides you through poses by hand"
+        )
     angles = log.matrix(names)
     if names[0].endswith("_deg"):
         angles = np.radians(angles)
