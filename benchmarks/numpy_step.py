@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.control.stages import Stages
 from firmware_py.frame import LAYOUT
 from firmware_py.records import attributes
-from firmware_py.sensing.error_state import BIAS, DISTURBANCE, ERRORS, RATE, TURN, VELOCITY
+from firmware_py.sensing.error_state_records import BIAS, DISTURBANCE, ERRORS, RATE, TURN, VELOCITY
 
 Array = NDArray[np.float64]
 AT = {column.name: column.start if column.size == 1 else column.span for column in LAYOUT}

@@ -28,12 +28,8 @@ from firmware_py.sensing.attitude_params import (
     quaternion_kalman_params,
 )
 from firmware_py.sensing.config import SensingConfig
-from firmware_py.sensing.error_state import (
-    ERROR_STATE,
-    ERROR_STATE_STATE,
-    error_state_step,
-    start_errors,
-)
+from firmware_py.sensing.error_state import error_state_step, start_errors
+from firmware_py.sensing.error_state_records import ERROR_STATE, ERROR_STATE_STATE
 from firmware_py.sensing.quaternion import from_matrix, rotate_by, to_matrix
 from firmware_py.sensing.quaternion_kalman import (
     QUATERNION_KALMAN,

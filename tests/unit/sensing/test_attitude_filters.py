@@ -8,7 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.records import attributes
 from firmware_py.sensing.attitude_params import gyroscope_error_state
-from firmware_py.sensing.error_state import ERROR_STATE, ERROR_STATE_STATE, ERRORS, propagate_errors
+from firmware_py.sensing.error_state import propagate_errors
+from firmware_py.sensing.error_state_records import ERROR_STATE, ERROR_STATE_STATE, ERRORS
 from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
 from firmware_py.sensing.triad import triad, triad_covariance
 
