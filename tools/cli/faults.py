@@ -18,6 +18,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+from tools.stamp import revision_and_day
 
 if TYPE_CHECKING:
     from tools.faults.fault import Fault
@@ -84,7 +85,7 @@ def faults(
         if out is not None:
             asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
             command = f"micron faults --seeds {seeds}{asked} --out {out}"
-            write_text_atomic(out, markdown(rows, command, revision, bounds, besides))
+            write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
         if json_file != "-":
             _print(rows, total)
         more = [

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+from tools.stamp import revision_and_day
 
 
 def hands(
@@ -42,7 +42,7 @@ def hands(
         ) as progress:
             task = progress.add_task("starting")
             rows.extend(run_hands(file, data, seconds, lambda text: progress.update(task, description=text)))
-        page = markdown(rows, seconds, git_revision() or "unknown")
+        page = markdown(rows, seconds, revision_and_day())
         if out is not None:
             write_text_atomic(out, page)
         if json_file != "-":

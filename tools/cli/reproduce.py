@@ -10,10 +10,10 @@ import typer
 from rich.markup import escape
 from rich.table import Table as RichTable
 
-from firmware_py.recording.revision import git_revision
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+from tools.stamp import revision_and_day
 
 
 def reproduce(
@@ -81,6 +81,6 @@ def reproduce(
             show(tables[-1])
         if out is not None:
             command = f"micron reproduce {' '.join(names)} --out {out}"
-            write_text_atomic(out, markdown(tables, command, git_revision() or "unknown"))
+            write_text_atomic(out, markdown(tables, command, revision_and_day()))
         results = [table.as_dict() for table in tables]
         write_json(results[0] if len(results) == 1 else {"format": 1, "tables": results}, json_file)

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+from tools.stamp import revision_and_day
 
 
 def soak(
@@ -57,7 +57,7 @@ def soak(
                 run = without_wires(path, seconds, on_time=on_time)
         asked = f"--seconds {seconds:g} " + (f"--start-ns {start_ns} " if start_ns else "")
         command = f"micron soak {asked}{'' if wires else '--without-wires '}--out {out or 'FILE'}"
-        text = block(run, command, git_revision() or "unknown")
+        text = block(run, command, revision_and_day())
         if out is not None:
             write_text_atomic(out, with_block(out, name, text))
         if json_file != "-":

@@ -28,14 +28,14 @@ def report(
 
     Example: micron tremor report --section evaluate --out docs/tremor-on-real-hands.md
     """
-    from firmware_py.recording.revision import git_revision
+    from tools.stamp import revision_and_day
     from tools.tremor.report import renewed
     from tools.tremor.report import report as make
 
     with clear_errors():
         check_writable(out)
         with console().status("starting") as status:
-            revision = git_revision() or "unknown"
+            revision = revision_and_day()
             if section is None:
                 page = make(data, revision, status.update)
             elif out is None or not out.is_file():
