@@ -211,6 +211,13 @@ def beyond_form(selection: Selection) -> float:
 
 LOUD = 9.0
 """Mean square over noise variance that no colour of noise accounts for, even when nothing is known to follow it."""
+OF_THE_CLOCK = frozenset(
+    (
+        "clock_skew", "dropped_samples", "thermal_drift", "random_walk", "step_shift", "spikes", "mains_interference",
+        "vibration",
+    )
+)  # fmt: skip
+"""Effects that come with time or grow with it; all others are driven by recorded signals."""
 
 
 def decide(
@@ -389,22 +396,23 @@ def assemble(
 
 
 def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[DependsOn]) -> list[DependsOn]:
-    """What the first named effect follows by its nature comes first: the context signal that it needs, or time for what
-    comes from outside. Its strength is the share of the residual that the effects took.
+    """What the first named effect follows by its nature comes first: the context signal that it needs, time for what
+    comes from outside, recorded signals for what these drive (slow motion goes with some course in time as well). Its
+    strength is the share of the residual that the effects took.
     """
     first = fitted.model.placed[0]
     effect = first.effect
     context = [s for s in about(effect) if s in problem.recording.context]
-    if not context and effect.driven:
-        return list(depends)
     o = first.outputs[0]
-    share = 1 - compare_ratio(problem, fitted, o) / max(compare_ratio(problem, base, o), 1e-12)
-    if context:
-        found = [d for d in depends if d.signal == context[0]]
-        lead = found[0] if found else DependsOn(context[0], "value", max(share, 0.0))
-    else:
-        found = [d for d in depends if d.signal == "time"]
-        lead = found[0] if found else DependsOn("time", "time itself", max(share, 0.0))
+    if not context and effect.name not in OF_THE_CLOCK:
+        drive = problem.twin.drive(o) or problem.twin.inputs[0]
+        moved = [d for d in depends if d.signal != "time"] or [DependsOn(drive, "value", 0.0)]
+        return [*moved, *(d for d in depends if d.signal == "time")]
+    signal, feature = (context[0], "value") if context else ("time", "time itself")
+    lead = next((d for d in depends if d.signal == signal), None)
+    if lead is None:
+        share = 1 - compare_ratio(problem, fitted, o) / max(compare_ratio(problem, base, o), 1e-12)
+        lead = DependsOn(signal, feature, max(share, 0.0))
     return [lead, *(d for d in depends if d is not lead)]
 
 
