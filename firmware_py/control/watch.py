@@ -84,10 +84,17 @@ class Watch:
         name = self._devices.amplifier.name
         try:
             if wrong := self._devices.verify_output():
-                self._incidents.trip(f"{name}: {wrong}; check its supply and the bus")
+                self._incidents.trip(f"{name}: {self._taken() or f'{wrong}; check its supply and the bus'}")
         except HalError as error:
             self._incidents.error = error
             self._incidents.trip_for(name, error)
+
+    def _taken(self) -> str:
+        """What a stall of this process looks like from an output that the guardian has moved meanwhile."""
+        heart = self._devices.guardian
+        if heart is None or not heart.taken_ns:
+            return ""
+        return "the host stood still: the guardian has the outputs and takes them to neutral"
 
     def monitor_output(self, info: TickInfo) -> None:
         """Task, 400 Hz: what arrives at the stacks must be what was told."""
@@ -100,7 +107,7 @@ class Watch:
         deaf, reason = False, ""
         try:
             if wrong := monitor.poll():
-                self._incidents.trip(f"{name}: {wrong}")
+                self._incidents.trip(f"{name}: {self._taken() or wrong}")
         except HalError as error:
             deaf, reason = True, f"{monitor.name}: {error}"
             monitor.forget()
