@@ -104,6 +104,44 @@ def test_an_error_behind_a_task_that_was_put_off_is_laid_at_the_right_door(bench
     assert counted.task("patient").put_off == 1
 
 
+def test_who_waited_once_may_wait_again_after_it_ran(bench: Bench) -> None:
+    scheduler = bench.scheduler(
+        bench.task("late", cost_us=2000.0, budget_us=500.0),
+        bench.task("patient", divider=2, order=1, budget_us=200.0, cost_us=10.0, may_wait=1),
+    )
+    for k in range(0, 40, 4):  # every fourth tick, late each time; due at each
+        bench.clock.advance_to(10 * k * MS)
+        scheduler.tick(10 * k * MS, k)
+    counted = scheduler.snapshot().task("patient")
+    # put off, due again and run, put off, ...: once skipped for each time it was put off
+    assert (counted.put_off, counted.runs) == (5, 5)
+    assert counted.skipped == 5 + 9  # and one release in each of nine gaps
+
+
+def test_a_skip_by_an_error_is_no_waiting(bench: Bench) -> None:
+    failing = {"now": False}
+
+    def may_fail(info: object) -> None:
+        if failing["now"]:
+            raise ZeroDivisionError
+
+    scheduler = bench.scheduler(
+        bench.task("late", cost_us=2000.0, budget_us=500.0),
+        TaskSpec("bad", may_fail, 1, 0, 1, 10.0, 1000.0),
+        bench.task("patient", order=2, budget_us=200.0, cost_us=10.0, may_wait=1),
+    )
+    at(bench, scheduler, 0)
+    bench.clock.advance_to(10 * MS)
+    failing["now"] = True
+    with pytest.raises(ZeroDivisionError):
+        scheduler.tick(10 * MS, 1)
+    failing["now"] = False
+    bench.clock.advance_to(20 * MS)
+    scheduler.tick(20 * MS, 2)
+    counted = scheduler.snapshot().task("patient")
+    assert (counted.put_off, counted.runs) == (2, 0)  # it waits anew
+
+
 def test_announced_one_offs_are_one_tick_and_their_gaps_add_up(bench: Bench) -> None:
     scheduler = bench.scheduler(bench.task("t", cost_us=lambda k: 20.0 + k))
     at(bench, scheduler, 0)
@@ -116,7 +154,10 @@ def test_announced_one_offs_are_one_tick_and_their_gaps_add_up(bench: Bench) -> 
     (warm_up,) = scheduler.snapshot().ignored
     assert (warm_up.ticks, warm_up.skipped_ticks) == (2, 3)
     assert (warm_up.worst_tick_us, warm_up.worst_lateness_us) == (25.0, 7.0)
-    assert (scheduler.snapshot().task("t").runs, scheduler.snapshot().task("t").ignored_runs) == (4, 2)
+    scheduler.ignore_next("on time")
+    at(bench, scheduler, 7)
+    assert scheduler.snapshot().ignored[1].worst_lateness_us == 0.0
+    assert (scheduler.snapshot().task("t").runs, scheduler.snapshot().task("t").ignored_runs) == (5, 3)
 
 
 def test_histograms_by_name_say_when_the_worst_was(bench: Bench) -> None:
@@ -153,6 +194,8 @@ def test_three_generators_take_turns() -> None:
     scheduler.tick(0, 0)
     assert scheduler.run_slack(750 * US) == 7
     assert "".join(turns) == "abcabca"
+    assert scheduler.run_slack(950 * US) == 2
+    assert "".join(turns[7:]) == "bc"  # who had the last turn is not the first next time
     assert [b.overruns for b in scheduler.snapshot().background] == [0, 0, 0]  # exactly what was promised
     assert [b.worst_step_us for b in scheduler.snapshot().background] == [100.0] * 3
     assert [b.last_error for b in scheduler.snapshot().background] == [""] * 3
@@ -193,14 +236,14 @@ def test_small_budgets_and_a_deadline_that_is_the_budget_are_allowed(bench: Benc
 
 
 def restarting(clock: VirtualClock) -> ScanTicker:
-    """A device that begins to count anew, twice."""
-    return scan_ticker(clock, (10.0, 1, 10), (11.0, 1, 11), (12.0, 2, 3), (14.0, 1, 5), (15.0, 1, 2))
+    """A device that begins to count anew, twice; scan 5 of its second count is lost."""
+    return scan_ticker(clock, (10.0, 1, 10), (11.0, 1, 11), (12.0, 2, 3), (14.0, 1, 6), (15.0, 1, 2))
 
 
 def test_numbers_go_on_when_the_device_counts_anew() -> None:
     clock = VirtualClock(start_ns=9 * MS)
     ticker = restarting(clock)
-    assert [(t.k0, t.n) for t in (ticker.wait() for _ in range(5))] == [(0, 1), (1, 1), (2, 2), (4, 1), (5, 1)]
+    assert [(t.k0, t.n) for t in (ticker.wait() for _ in range(5))] == [(0, 1), (1, 1), (2, 2), (5, 1), (6, 1)]
     assert ticker.rebased == 2
 
 
