@@ -55,6 +55,9 @@ NO_SLOPE = 1 << 40
 TICK_S = 0.001
 SPREAD_S = 1.0
 PAIR_SPREADS = 6.0
+TOGETHER_V = 0.0008
+"""A supply that sags by 1 % bends every axis by 1 to 2 mV within two scans; noise bends each its way, 0.4 mV rms."""
+TOGETHER_TICKS = 100
 SQUARE = 0.5  # sine between two levers
 PAIR_PLACES = np.array([(i, j) for i, j, _ in PAIRS])
 
@@ -83,6 +86,7 @@ def check_counts(
     same: NDArray[np.int64],
     slope: NDArray[np.int64],
     odd: NDArray[np.int64],
+    together: NDArray[np.int64],
     steps: int,
     jump: int,
     outlier: int,
@@ -96,8 +100,10 @@ def check_counts(
     ``last``, ``same`` (n,) are the state: the last counts (``same[0] < 0`` before the first scan) and how often they
     have come in a row. ``steps``: ticks since the last scan that was seen. ``slope`` (n,): last change or NO_SLOPE.
     ``odd`` (n,) counts readings out of line: a second difference beyond ``outlier``, a step of the supply.
+    ``together`` (2,): scans since all but three of the noisy inputs bent the same way at once; how many counts that is.
     """
-    found = 0
+    found, up, down = 0, 0, 0
+    together[0] += steps
     first = same[0] < 0
     for i in range(len(counts)):
         c = np.int64(counts[i])
@@ -120,10 +126,14 @@ def check_counts(
             change = c - last[i]
             if i < noisy:
                 odd[i] += slope[i] != NO_SLOPE and abs(change - slope[i]) > outlier
+                up += slope[i] != NO_SLOPE and change - slope[i] > together[1]
+                down += slope[i] != NO_SLOPE and slope[i] - change > together[1]
             elif i == noisy:
                 odd[i] += abs(change) > supply_step
             slope[i] = change
         last[i] = c
+    if max(up, down) >= noisy - 3:
+        together[0] = 0
     return found
 
 
@@ -221,6 +231,7 @@ class ScanCheck:
         self._counts, self._last = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int64)
         self._same = np.full(n, -1, dtype=np.int64)
         self._slope, self._odd = np.full(n, NO_SLOPE), np.zeros(n, dtype=np.int64)
+        self._together = np.array([NO_SLOPE, round(TOGETHER_V / lsb_V)])
         self._told = 0
         self._outlier, self._supply_step = round(limits.outlier_V / lsb_V), round(limits.supply_step_V / lsb_V)
         self._jump, self._lo, self._hi = round(limits.jump_V / lsb_V), *(round(v / lsb_V) for v in limits.rail_V)
@@ -238,8 +249,8 @@ class ScanCheck:
         """Compile or load now, not when the first scan is there; changes nothing."""
         last, same, slope, odd = (state.copy() for state in (self._last, self._same, self._slope, self._odd))
         check_counts(
-            self._counts, self._sensors, last, same, slope, odd, 1, self._jump, self._outlier, self._supply_step,
-            self._lo, self._hi, self.limits.stuck_ticks,
+            self._counts, self._sensors, last, same, slope, odd, self._together.copy(), 1, self._jump, self._outlier,
+            self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
         )  # fmt: skip
         window, sums, usual, spread = (state.copy() for state in self._pairs)
         limits = self.limits
@@ -258,8 +269,8 @@ class ScanCheck:
         supply = self._supply
         supply_before = 0 if supply is None else int(self._last[supply])
         found = check_counts(
-            self._counts, self._sensors, self._last, self._same, self._slope, self._odd, steps, self._jump,
-            self._outlier, self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
+            self._counts, self._sensors, self._last, self._same, self._slope, self._odd, self._together, steps,
+            self._jump, self._outlier, self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
         )  # fmt: skip
         if not found:
             return ""
@@ -277,6 +288,11 @@ class ScanCheck:
 
     def _quiet(self, tick: int) -> int:
         return (self._lo + self._hi) // 2 + tick % 2
+
+    @property
+    def stepped_together(self) -> bool:
+        """Not long ago nearly all axes bent the same way at once, as they do when their supply steps."""
+        return bool(self._together[0] <= TOGETHER_TICKS)
 
     def odd(self) -> str:
         """Which input has been out of line since the last call: nothing that ends a run, but somebody should know."""

@@ -62,6 +62,8 @@ class Redundancy:
             return ""
         if not self._supervisor.may_move:
             return "the accelerometer axes (acc) contradict each other" if verdict is Verdict.UNCLEAR else ""
+        if verdict is Verdict.FOUND and self._check.stepped_together:
+            return "the accelerometer axes (acc) stepped together, and contradict each other: check their supply"
         if verdict is Verdict.FOUND:
             self._leave_out(parity.axis, f"{self._labels[parity.axis]} contradicts the other axes")
             return ""

@@ -127,6 +127,26 @@ def test_a_step_of_the_supply_by_one_percent_is_noticed():
     assert made.odd() == "supply stepped"
 
 
+def test_a_supply_that_sags_bends_all_axes_together_and_one_axis_does_not():
+    """1 % of each reading behind a filter of 15 Hz; the sag comes anywhere within a scan."""
+    for within in (0.05, 0.5, 0.95):
+        late_ms = np.maximum(0.0, np.arange(300) - 150 + within)
+        part = 1.0 - np.exp(-late_ms / 10.6)
+        rng = np.random.default_rng(7)
+        volts = LEVEL_V - 0.01 * LEVEL_V * part[:, None] + 0.0001 * rng.standard_normal((300, 8))
+        made = check()
+        assert findings(made, np.round(volts / LSB_V).astype(np.int16)) == []
+        assert not made.stepped_together  # 150 scans ago
+        made = check()
+        findings(made, np.round(volts[:170] / LSB_V).astype(np.int16))
+        assert made.stepped_together
+        alone = LEVEL_V + 0.0001 * rng.standard_normal((300, 8))
+        alone[:, 3] -= 0.025 * part
+        made = check()
+        findings(made, np.round(alone[:170] / LSB_V).astype(np.int16))
+        assert not made.stepped_together
+
+
 def test_a_new_difference_of_parallel_axes_is_noticed_and_an_old_one_is_not():
     made, frame = check(), LAYOUT.new_frame()
     rng = np.random.default_rng(4)
@@ -191,7 +211,10 @@ def test_kernel_and_python_agree():
     for function in (check_counts, check_counts.py_func):  # type: ignore[attr-defined]
         last, same = np.zeros(8, dtype=np.int64), np.full(8, -1, dtype=np.int64)
         slope, odd = np.full(8, NO_SLOPE), np.zeros(8, dtype=np.int64)
-        results.append([function(row, 6, last, same, slope, odd, 1, 197, 33, 26, 2621, 30147, 20) for row in rows])
+        together = np.array([NO_SLOPE, 6])
+        results.append(
+            [function(row, 6, last, same, slope, odd, together, 1, 197, 33, 26, 2621, 30147, 20) for row in rows]
+        )
         counted.append(odd.tolist())
     assert results[0] == results[1]
     assert counted[0] == counted[1]
