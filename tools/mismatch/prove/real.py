@@ -184,7 +184,9 @@ def document(rows: Sequence[RealRow]) -> str:
         published = "; ".join(f"{p.figure:g} ({p.what})" for p in r.real.published)
         cells = [_figure(r.rms(k)) for k in ("base_rms", "recalibrated_rms", "fitted_rms", "noise_floor_rms")]
         left, floor = r.rms("fitted_rms"), r.rms("noise_floor_rms")
-        cells.append(f"{left / floor:.1f}" if left is not None and floor else "")
+        ratio = left / floor if left is not None and floor else None
+        # a recording without broad-band noise (filtered by those who made it) has no floor to read
+        cells.append("" if ratio is None else f"{ratio:.1f}" if ratio < 1000.0 else "> 1000")
         lines.append(
             f"| {r.real.name} | {r.real.unit} | {' | '.join(cells)} | {published} | {r.said()} | {r.cpu_s:.0f} "
             f"| {r.revision[:8]} |"
