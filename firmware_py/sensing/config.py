@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from math import pi
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -176,10 +175,6 @@ class SensingConfig(BaseModel):
     def cutoff_rad_s(self) -> float:
         """Corner of the RC filter behind every accelerometer axis (15.07 Hz, ERRATA 27)."""
         return 1.0 / (self.filter_ohm * self.filter_farad)
-
-    @property
-    def cutoff_hz(self) -> float:
-        return self.cutoff_rad_s / (2.0 * pi)
 
     def axis_positions(self) -> NDArray[np.float64]:
         """Position of each axis, shape (N, 3), m."""

@@ -138,11 +138,6 @@ class Di4108:
     # ------------------------------------------------------------------ truth face
 
     @property
-    def scan_period_ns(self) -> float:
-        """True time between scans, crystal error included."""
-        return self._num / self._den * self._conversions
-
-    @property
     def fifo_samples(self) -> int:
         """Samples that the host has not read yet."""
         return (len(self._out) + len(self._partial) + self.unread) // 2

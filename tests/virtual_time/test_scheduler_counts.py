@@ -232,6 +232,26 @@ def test_small_budgets_and_a_deadline_that_is_the_budget_are_allowed(bench: Benc
         bench.task("named", budget_us=0.0)
 
 
+def test_the_edges_of_the_check_are_allowed(bench: Bench) -> None:
+    step = BackgroundSpec("bg", lambda: iter(()), worst_step_us=900.0)
+    bench.scheduler(bench.task("t", budget_us=100.0), background=[step])
+    bench.scheduler(bench.task("slow", divider=10_000))
+    with pytest.raises(BenchError, match=r"30000 ticks \(slow 10000, odd 3\)"):
+        bench.scheduler(bench.task("slow", divider=10_000), bench.task("odd", divider=3))
+
+
+def test_background_before_the_first_tick_has_none() -> None:
+    def steps():
+        raise ZeroDivisionError
+        yield True
+
+    task = TaskSpec("t", lambda info: None, 1, 0, 0, 100.0, 1000.0)
+    scheduler = Scheduler([task], VirtualClock(), background=[BackgroundSpec("bg", steps, worst_step_us=50.0)])
+    with pytest.raises(ZeroDivisionError):
+        scheduler.run_slack(MS)
+    assert scheduler.snapshot().background[0].last_error[:8] == "tick -1:"
+
+
 # -- time bases ------------------------------------------------------------------------------------------
 
 

@@ -93,11 +93,6 @@ def _answers(bench: OpenBench, bus: str, address: int, ops: list[I2cOp]) -> bool
     return True
 
 
-def message_name(can_id: int) -> str:
-    """Of our database; empty for an id that is not in it."""
-    return _names().get(can_id, "")
-
-
 def _names() -> dict[int, str]:
     return {message.frame_id: message.name for message in getattr(load_database(), "messages", ())}
 

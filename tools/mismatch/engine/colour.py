@@ -147,21 +147,6 @@ def autocovariance(e: Array, lags: int) -> Array:
     return np.fft.irfft(spectrum, size)[: min(lags, n - 1) + 1] / n
 
 
-def effective_samples(e: Array) -> float:
-    """How many independent samples the mean of ``e`` is worth.
-
-    Long-run variance by Sokal's automatic window (Sokal 1996, section 3): summed until the lag exceeds six
-    integrated correlation times.
-    """
-    gamma = autocovariance(e, e.size // 3)
-    if gamma[0] <= 0:
-        return float(e.size)
-    time = 0.5 + np.cumsum(gamma[1:] / gamma[0])
-    window = np.nonzero(np.arange(1, time.size + 1) >= 6 * time)[0]
-    tau = time[window[0]] if window.size else time[-1]
-    return float(np.clip(e.size / (2 * max(tau, 0.5)), 2.0, e.size))
-
-
 def ljung_box(e: Array, lags: int = 25) -> float:
     """p-value of whiteness (Ljung and Box, Biometrika 65, 1978)."""
     from scipy.stats import chi2

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import t as student
 
 from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
 from tools.mismatch.engine.fit import Fit, robust_scale
@@ -108,11 +107,6 @@ def paired_t(a: Array, b: Array) -> float:
     d = np.sum(a - b, axis=1)
     spread = float(np.std(d, ddof=1)) if d.size > 1 else 0.0
     return float(np.mean(d) / (spread / np.sqrt(d.size))) if spread > 0 else 0.0
-
-
-def paired_p(t: float, blocks: int) -> float:
-    """One-sided p-value of a paired t."""
-    return float(student.sf(t, max(blocks - 1, 1)))
 
 
 def whiteners(problem: Problem, fitted: Fit) -> dict[str, Whitener]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
 from tools.mismatch.recording import Recording
@@ -173,11 +172,6 @@ def fold(signal: Signal, theta: Array, gain: float = 1.0) -> Signal:
         value += theta[j] / gain * c
     key = tuple((j, float(theta[j] / gain)) for j in signal.columns)
     return Signal(value, {}, (*signal.token, key))
-
-
-def keep_all(n: int) -> NDArray[np.bool_]:
-    """A mask that keeps everything."""
-    return np.ones(n, np.bool_)
 
 
 MEMO_BYTES = 1 << 28  # what one view remembers of unchanged columns
