@@ -137,7 +137,8 @@ def test_each_example_is_run_or_it_is_said_why_not() -> None:
     assert not set(NOT_RUN) & {*SLOW, *ADDED, *MADE}
 
 
-RUN = [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in sorted(set(ALL) - set(NOT_RUN))]
+LONG = (pytest.mark.slow, pytest.mark.timeout(900))
+RUN = [pytest.param(name, marks=LONG) if name in SLOW else name for name in sorted(set(ALL) - set(NOT_RUN))]
 
 
 @pytest.mark.parametrize("name", RUN)
