@@ -209,3 +209,10 @@ def test_small_real_proof(tmp_path: Path) -> None:
     # the effect outside the vocabulary runs unjudged: today this one is taken for a step shift (seed 1, case 5)
     for measure in ("named_severity_4_up", "pairs_both_named", "controls_verdict_right"):
         assert s[measure][0] == s[measure][1] > 0, measure
+
+
+def test_the_page_says_what_a_stopped_run_left_out() -> None:
+    proof = {"cases": [{}] * 3, "asked": 9}
+    assert page._count(proof) == "the first 3 of 9"
+    assert page._count({**proof, "left_out": ["r001 (an FMU)"]}) == "the first 4 of 9 without r001 (an FMU)"
+    assert page._count({"cases": [{}] * 3}) == "3"

@@ -36,7 +36,9 @@ def _share(got: int, of: int) -> str:
 def _count(p: Mapping[str, Any]) -> str:
     """How many cases, and of how many when the run was stopped before its end."""
     n = len(p["cases"])
-    return f"the first {n} of {p['asked']}" if p.get("asked", n) != n else str(n)
+    skipped = p.get("left_out", [])
+    without = f" without {', '.join(skipped)}" if skipped else ""
+    return f"the first {n + len(skipped)} of {p['asked']}{without}" if p.get("asked", n) != n else str(n)
 
 
 def _totals(s: Mapping[str, Any]) -> list[str]:
