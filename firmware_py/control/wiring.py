@@ -220,9 +220,10 @@ def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tup
     clock = bench.clock
     common = {"neutral_V": options.neutral_V, "slew_V_per_s": options.slew_V_per_s, "name": name}
     match options:
-        case DacAmplifierOptions(gain=gain, lo_V=lo_V, hi_V=hi_V):
+        case DacAmplifierOptions(gain=gain, lo_V=lo_V, hi_V=hi_V, read_back=read_back):
             bus, address = bench.i2c(_bus(spec)), spec.address or 0x0C
-            amplifier = DacAmplifier(bus, clock, address, gain=gain, lo_V=lo_V, hi_V=hi_V, **common)
+            limits = {"gain": gain, "lo_V": lo_V, "hi_V": hi_V}
+            amplifier = DacAmplifier(bus, clock, address, read_back=read_back, **limits, **common)
         case E727Options(lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz):
             amplifier = E727(bench.serial(_bus(spec)), clock, lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz, **common)
         case CanAmplifierOptions():

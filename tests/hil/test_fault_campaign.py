@@ -45,6 +45,17 @@ def test_answers_are_as_expected_and_nothing_is_unsafe_or_uncounted(tmp_path: Pa
     assert total["uncounted_samples"] == 0
 
 
+def test_a_bench_that_reads_back_knows_of_a_wrong_bit_at_once(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH.with_name("micron-read-back.toml"), POINTS[1], tmp_path)
+    fault = next(f for f in faults() if f.name == "output bus: a bit wrong in every transfer")
+    (o,) = observe_running(bench, "typical", [fault], 1)
+    assert o.answer == "safe state"
+    assert "was told" in o.message
+    assert "check the wires of the bus" in o.message
+    assert o.detect_ms is not None
+    assert o.detect_ms < 3.0
+
+
 def test_a_bench_with_a_broken_sensor_does_not_start(tmp_path: Path):
     bench = write_bench(DEFAULT_BENCH, POINTS[0], tmp_path)
     fault = next(fault for fault in faults() if fault.name == "sensor: wire broken at start")

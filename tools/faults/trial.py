@@ -184,6 +184,8 @@ def observe_running(
             raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
         assert truth is not None
         me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans()))
+    if any("SIGTERM" in str(seen.outcome["safe_state"]["reason"]) for seen in answers):
+        raise SystemExit("the campaign was ended from outside")  # the run heard it, and took it for its operator
     of = {(quiet, fault and fault.name): seen for (quiet, fault, _), seen in zip(runs, answers, strict=True)}
     return [
         judge(
