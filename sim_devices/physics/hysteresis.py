@@ -128,7 +128,6 @@ def relays(x, lo, hi, count, starts):
 
 
 WIDE = (1.3, 1.65)  # half ranges
-N_STOPS = N_PLAYS + len(WIDE)
 N_DAHL = 7
 N_GRID = 8
 MASING = ("stops", "dahl", "dahl_stops")
@@ -170,12 +169,16 @@ def turning_points(x: Array, least: float) -> list[float]:
     return out
 
 
-def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tuple[int, ...]) -> Array:
-    """Columns of one form (n, k), every one without memory of what lies before a start."""
+def columns(
+    x: Array, form: str, lo: float, hi: float, rest: float, starts: tuple[int, ...], wide_too: bool = False
+) -> Array:
+    """Columns of one form (n, k), every one without memory of what lies before a start. ``wide_too``: with elements of
+    more than half the range.
+    """
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
     # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
-    radii = np.array([*thresholds(half, N_PLAYS), *(f * half for f in WIDE)])
+    radii = np.array([*thresholds(half, N_PLAYS), *(f * half for f in WIDE if wide_too)])
     wide = half * np.geomspace(0.05, 4.0, N_DAHL)
     match form:
         case "stops":
@@ -196,14 +199,20 @@ def columns(x: Array, form: str, lo: float, hi: float, rest: float, starts: tupl
             return relays(x, lo, hi, N_GRID, at)
 
 
-def width_of(form: str) -> int:
+def slips_once(lo: float, hi: float, rest: float) -> bool:
+    """Whether a record that begins at ``rest`` makes the widest elements slip; else they are only a gain."""
+    return max(hi - rest, rest - lo) > WIDE[0] * 0.5 * (hi - lo)
+
+
+def width_of(form: str, wide_too: bool = False) -> int:
     """Number of columns of a form."""
+    more = len(WIDE) if wide_too else 0
     return {
-        "stops": N_STOPS,
+        "stops": N_PLAYS + more,
         "dahl": N_DAHL,
-        "dahl_stops": N_DAHL + N_STOPS,
+        "dahl_stops": N_DAHL + N_PLAYS + more,
         "dahl_skewed": 3 * N_DAHL,
-        "stops_bent": N_STOPS + 2 * (N_PLAYS // 2),
+        "stops_bent": 2 * N_PLAYS + more,
         "relays": N_GRID * (N_GRID + 1) // 2,
     }[form]
 
@@ -215,7 +224,7 @@ def choose_form(x: Array, residual: Array, ctx: Context, lo: float, hi: float, f
     straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
     best: tuple[float, str] | None = None
     for form in forms:
-        e = columns(x, form, lo, hi, float(x[0]), ctx.starts).T
+        e = columns(x, form, lo, hi, float(x[0]), ctx.starts, slips_once(lo, hi, float(x[0]))).T
         a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
         left = 0.0
         for out in (0, 1):
@@ -232,7 +241,12 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
     form = choose_form(x, residual, ctx, lo, hi, MASING if one_loop(x, ctx.keep) else FORMS)
-    return {"range": (lo, hi), "rest": (float(x[0]),), "form": (float(FORMS.index(form)),)}
+    wide = float(slips_once(lo, hi, float(x[0])))
+    return {"range": (lo, hi), "rest": (float(x[0]),), "form": (float(FORMS.index(form)),), "wide": (wide,)}
+
+
+def _wide(settings: Settings) -> bool:
+    return settings.get("wide", (0.0,))[0] > 0.0
 
 
 def _form(settings: Settings) -> str:
@@ -240,14 +254,14 @@ def _form(settings: Settings) -> str:
 
 
 def _parts(settings: Settings) -> Parts:
-    n = width_of(_form(settings))
+    n = width_of(_form(settings), _wide(settings))
     unit = "{out}" if _form(settings) == "relays" else "{out}/{in}"
     return Parts((), tuple(Parameter(f"w{i + 1}", unit, scale=0.1) for i in range(n)), 0.05 * np.eye(n))
 
 
 def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
-    return columns(x, _form(settings), lo, hi, settings.get("rest", (0.0,))[0], ctx.starts)
+    return columns(x, _form(settings), lo, hi, settings.get("rest", (0.0,))[0], ctx.starts, _wide(settings))
 
 
 def loop_width(y_of: Array, turns: int) -> float:
@@ -272,7 +286,7 @@ def test_cycle(lo: float, hi: float) -> Array:
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     lo, hi = settings["range"]
     x = test_cycle(lo, hi)
-    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,)) @ p
+    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,), _wide(settings)) @ p
     return (Human("loop_width_share", loop_width(y, 3), "1"),)
 
 

@@ -163,7 +163,8 @@ def test_sites_and_reasons() -> None:
     assert "dead_time" in why_not(twin, rec, EFFECTS["channel_delay"])
     body = accelerometer()
     delays = sites(make(body), body, EFFECTS["channel_delay"])
-    assert [p.target for p in delays] == ["voltage_x", "voltage_y", "voltage_z"]
+    # both forms of a delay, each once per output
+    assert [p.target for p in delays] == 2 * ["voltage_x", "voltage_y", "voltage_z"]
     kinds = {p.site for p in sites(make(oscillator()), oscillator(), EFFECTS["hysteresis"])}
     assert kinds == {"input", "output", "feedback"}
 

@@ -91,7 +91,9 @@ def test_a_record_that_starts_at_an_extreme_has_elements_that_slip_once() -> Non
     effect = EFFECTS["hysteresis"]
     assert effect.basis is not None
     x = np.concatenate([np.linspace(1, -1, 300), np.linspace(-1, 1, 300), np.linspace(1, -1, 300)])
-    settings = {"range": (-1.0, 1.0), "rest": (1.0,), "form": (0.0,)}
+    settings = {"range": (-1.0, 1.0), "rest": (1.0,), "form": (0.0,), "wide": (1.0,)}
+    assert hysteresis.slips_once(-1.0, 1.0, 1.0)
+    assert not hysteresis.slips_once(-1.0, 1.0, 0.1)
     columns = effect.basis(x, context(x.size), np.empty(0), settings)
     # a Maxwell element of 1.5 half ranges: slips on the first way, sticks for ever after
     element = stops(x, np.array([1.5]), 1.0, np.array([0]))[:, 0]
