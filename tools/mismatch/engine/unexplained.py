@@ -60,10 +60,13 @@ def leftover(
 
 def lone_event(problem: Problem, fitted: Fit, output: str, *, louder: float = 20.0, smooth: float = 0.6) -> bool:
     """Whether one block, fitted or held out, is far louder than all others and its residual runs on from sample to
-    sample: no stationary noise does that, and no fit that sees it once can say what it was.
+    sample: no stationary noise does that, and no fit that sees it once can say what it was. Where a simulation starts,
+    its state is not known: the first twentieth of the record, and twins that start afresh everywhere, are left out.
     """
+    if problem.twin.restart:
+        return False
     r = fitted.residual[output]
-    blocks = [r[a:b] for a, b in (*problem.fit_blocks, *problem.held_blocks) if b - a >= 8]
+    blocks = [r[a:b] for a, b in (*problem.fit_blocks, *problem.held_blocks) if b - a >= 8 and a > r.size // 20]
     if len(blocks) < 12:
         return False
     energy = np.array([float(np.mean(e**2)) for e in blocks])
