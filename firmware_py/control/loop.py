@@ -107,7 +107,7 @@ class InstrumentLoop:
         self._watch = Watch(devices, config, self._frame, self._check, self.supervisor, self.incidents)
         background = [BackgroundSpec("status", self._report_status, 150.0)] if on_status else []
         if live is not None:
-            background.append(BackgroundSpec("histograms", lambda: live.show(self.shown.histograms), 30.0))
+            background.append(BackgroundSpec("histograms", lambda: live.show(lambda: self.shown.histograms()), 30.0))
         works = Works(
             sense=self._sense,
             estimate=self._estimate,
