@@ -42,7 +42,7 @@ POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
 LINGER_NS = 1_000_000_000  # after the death of the firmware
-COUNT_DOWN_NS = 80_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
+COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
 

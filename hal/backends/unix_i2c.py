@@ -3,15 +3,11 @@
 Request: u8 address, u8 number of segments, i64 LE monotonic time of the request in ns, then per segment u8 kind (0
 write, 1 read), u16 LE length and, for a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus
 error), u16 LE length, the bytes of all read segments. One request is one transfer. A real adapter begins when it is
-asked; the time is there so that an emulated one need not charge for the wake-up of its process. Nor does the firmware
-pay for its own: a processor that was halted for the transfer takes 30 to 60 us to come back (an adapter's interrupt
-handler would be there at once), so it is awake a little before the answer is due and looks for it.
+asked; the time is there so that an emulated one need not charge for the wake-up of its process.
 """
 
 from __future__ import annotations
 
-import contextlib
-import select
 import socket
 import struct
 import time
@@ -24,8 +20,6 @@ from hal.types import I2cOp, I2cWrite, PortInfo
 _HEAD = struct.Struct("<BBq")
 _SEGMENT = struct.Struct("<BH")
 _REPLY = struct.Struct("<BH")
-AWAKE_NS = 80_000
-"""Before and after the answer is due: how long it is looked for without sleeping."""
 
 
 class UnixI2c:
@@ -34,7 +28,6 @@ class UnixI2c:
     def __init__(self, path: str, speed_hz: int = 400_000, timeout_s: float = 0.5) -> None:
         self._path = path
         self._speed_hz = speed_hz
-        self._bit_ns = 1e9 / speed_hz
         self._timeout_s = timeout_s
         self._reply = memoryview(bytearray(1 << 16))
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -53,20 +46,15 @@ class UnixI2c:
         check_address(address, self._path)
         if not self._open:
             raise Closed("the bus is closed", device=self._path)
-        asked_ns = time.monotonic_ns()
-        parts = [_HEAD.pack(address, len(ops), asked_ns)]
-        data_bytes = 0
+        parts = [_HEAD.pack(address, len(ops), time.monotonic_ns())]
         for op in ops:
             if isinstance(op, I2cWrite):
-                data_bytes += (n := len(op.data))
-                parts.append(_SEGMENT.pack(0, n))
+                parts.append(_SEGMENT.pack(0, len(op.data)))
                 parts.append(op.data)
             else:
-                data_bytes += op.n
                 parts.append(_SEGMENT.pack(1, op.n))
         try:
             self._socket.sendall(b"".join(parts))
-            self._wait_awake(asked_ns + int((10 * len(ops) + 9 * data_bytes) * self._bit_ns))
             n = self._receive_at_least(_REPLY.size, 0)
             status, length = _REPLY.unpack_from(self._reply)
             n = self._receive_at_least(_REPLY.size + length, n)
@@ -81,17 +69,6 @@ class UnixI2c:
         if status:
             raise _error(status, address, self._path)
         return self._reply[_REPLY.size : n].tobytes()
-
-    def _wait_awake(self, due_ns: int) -> None:
-        """Sleep until shortly before ``due_ns``, then look: back when there is an answer, or when it is late."""
-        sleep_ns = due_ns - AWAKE_NS - time.monotonic_ns()
-        if sleep_ns > 0 and select.select((self._socket,), (), (), sleep_ns * 1e-9)[0]:
-            return  # refused
-        late_ns = due_ns + AWAKE_NS
-        while time.monotonic_ns() < late_ns:
-            with contextlib.suppress(BlockingIOError):
-                self._socket.recv_into(self._reply[:1], 1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
-                return
 
     def _receive_at_least(self, wanted: int, have: int) -> int:
         while have < wanted:
