@@ -28,12 +28,15 @@ def stages() -> Stages:
 
 
 def scans(n: int) -> NDArray[np.float64]:
-    """(n, Layout.size): a trembling, slowly turning instrument, as counts; commanded from tick 1000 on."""
+    """(n, Layout.size): a trembling, slowly turning instrument, as counts; commanded from tick 1000 on.
+
+    A tremor of 0.12 mm at its peak: the strokes stay where nothing has to yield, which the peers leave out.
+    """
     rows = np.zeros((n, LAYOUT.size))
     t = np.arange(n) / 1000.0
     rng = np.random.default_rng(1)
     level = np.array([12400, 11600, 17300, 11200, 12000, 17100, 16270, 4747])
-    wave = 60.0 * np.sin(2 * np.pi * 10.0 * t)[:, None] * np.array([1, -1, 0.5, 1, 2, -2, 0, 0])
+    wave = 40.0 * np.sin(2 * np.pi * 10.0 * t)[:, None] * np.array([1, -1, 0.5, 1, 2, -2, 0, 0])
     rows[:, COUNTS : COUNTS + 8] = np.round(level + wave + 3.0 * rng.standard_normal((n, 8)))
     rows[:, TICK] = np.arange(n)
     rows[:, TIME] = t

@@ -6,7 +6,9 @@ import json
 
 import pytest
 
-from benchmarks import guard
+from benchmarks import guard, step
+from benchmarks.numpy_step import NumpyStep
+from benchmarks.yardstick import Yardstick, compiler
 
 
 def test_compiled_work_costs_what_it_did() -> None:
@@ -27,3 +29,18 @@ def test_the_guard_sees_a_slow_step(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard.json, "loads", lambda _: {"step": stored["step"]})
     monkeypatch.setattr(guard, "ATTEMPTS", 1)
     assert "step" in guard.slower()
+
+
+def test_the_peers_of_the_step_compute_the_same() -> None:
+    """Or the benchmark would compare different work; it stops there, and so does this."""
+    n = 60
+    ours, plain = step.Again(n), step.Again(n)
+    ours.back().run(ours.work)
+    step.feed(plain.stages, plain.work, NumpyStep(plain.back()).step)
+    step.same(plain.work, ours.work, "numpy")
+    if compiler() is not None:
+        peer = step.Again(n)
+        assert Yardstick(peer.back()).run(peer.work) == n
+        step.same(peer.work, ours.work, "C", 1e-7)
+        with pytest.raises(AssertionError, match="column"):
+            step.same(peer.work * 1.001, ours.work, "C", 1e-7)
