@@ -13,7 +13,7 @@ from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.output import check_writable, write_json, write_text_atomic
 
-calibrate = typer.Typer(no_args_is_help=True, help="Identify sensors and stacks from calibration recordings.")
+calibrate = typer.Typer(help="Identify sensors and stacks from calibration recordings.")
 
 calibrate.command("accelerometer")(calibrate_axes.accelerometer)
 calibrate.command("magnetometer")(calibrate_axes.magnetometer)

@@ -234,7 +234,7 @@ def ramp(
             raise typer.Exit(Exit.FAILED)
 
 
-can = typer.Typer(no_args_is_help=True, help="CAN buses of a bench.")
+can = typer.Typer(help="CAN buses of a bench.")
 
 
 @can.command("dump")
@@ -294,7 +294,7 @@ def capture(
         write_json({"format": 1, "out": str(out), "transfers": counts}, json_file)
 
 
-golden = typer.Typer(no_args_is_help=True, help="Golden transcripts.")
+golden = typer.Typer(help="Golden transcripts.")
 
 
 @golden.command("diff")
@@ -328,7 +328,7 @@ def golden_diff(
             raise typer.Exit(Exit.FAILED)
 
 
-log = typer.Typer(no_args_is_help=True, help="The log of a running bench.")
+log = typer.Typer(help="The log of a running bench.")
 
 
 @log.command("follow")

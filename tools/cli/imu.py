@@ -15,7 +15,7 @@ from tools.errors import InputError
 from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
 
-imu = typer.Typer(no_args_is_help=True, help="Inertial sensors: offsets, stability, drift, noise, temperature.")
+imu = typer.Typer(help="Inertial sensors: offsets, stability, drift, noise, temperature.")
 
 
 @imu.command("evaluate")

@@ -99,13 +99,23 @@ def load(name: str) -> Any:
     found = getattr(import_module(f"tools.cli.{module}"), attribute)
     around = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):
-        around.add_typer(found, name=name)
+        around.add_typer(found, name=name, cls=Helpful)
     else:
         around.command(name)(found)
     return typer.main.get_group(around).commands[name]
 
 
-class OnDemand(TyperGroup):
+class Helpful(TyperGroup):
+    """A bare call is a question, not a mistake: the help on standard output, exit status 0."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if not args:
+            typer.echo(ctx.get_help())
+            ctx.exit()
+        return super().parse_args(ctx, args)
+
+
+class OnDemand(Helpful):
     """Its commands are lines of help until one is called."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
@@ -126,14 +136,21 @@ def options(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
 ) -> None:
-    """Firmware and bench of a handheld instrument that cancels tremor. Start with: micron run"""
+    """Firmware and bench of a handheld instrument that cancels tremor.
+
+    First steps, without any device:
+
+    micron doctor: what this machine offers, what is missing
+    micron run: the instrument for ten seconds, with a picture at its end
+    micron bench: its page in a browser
+    micron COMMAND --help: each command, with an example
+    """
 
 
 app = typer.Typer(
     name="micron",
     cls=OnDemand,
     callback=options,
-    no_args_is_help=True,
     add_completion=False,
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,

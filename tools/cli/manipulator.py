@@ -12,7 +12,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.output import check_writable, write_json
 
-app = typer.Typer(no_args_is_help=True, help="The three-legged manipulator at the tip.")
+app = typer.Typer(help="The three-legged manipulator at the tip.")
 
 
 @app.callback()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # what a command needs is imported inside it: `micron --help` shall not wait for the engine
 
-app = typer.Typer(no_args_is_help=True, help="Where simulation and recording differ, and which physics is missing.")
+app = typer.Typer(help="Where simulation and recording differ, and which physics is missing.")
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")

@@ -12,7 +12,7 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 
-app = typer.Typer(no_args_is_help=True, help="Error budgets of the sensing stage on emulated sensors.")
+app = typer.Typer(help="Error budgets of the sensing stage on emulated sensors.")
 
 
 @app.command("budget")

@@ -1,20 +1,27 @@
 """It is a bench, the instrument works on it in virtual time, and a slip in it is named before anything is opened."""
 
+import shutil
 from pathlib import Path
 
 import pytest
 
+import benches
 from drivers.specs import check_devices
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError
 
-HERE = Path(__file__).parent
+
+@pytest.fixture
+def bench(tmp_path):
+    """The bench file with the calibration of the emulated instrument beside it."""
+    shutil.copytree(Path(benches.__file__).with_name("calibration"), tmp_path / "calibration")
+    return Path(shutil.copy(Path(__file__).with_name("bench.toml"), tmp_path))
 
 
-def test_the_instrument_runs_on_it():
-    outcome, truth = run_in_process(RunRequest(HERE / "bench.toml", 2.0, virtual=True))
+def test_the_instrument_runs_on_it(bench):
+    outcome, truth = run_in_process(RunRequest(bench, 2.0, virtual=True))
     assert set(outcome["devices"]) == {"daq", "piezo"}
     assert outcome["samples"]["lost"] == 0
     assert outcome["safe_state"]["normal"]
@@ -30,7 +37,7 @@ def test_the_instrument_runs_on_it():
         ("address = 0x0C", "adress = 0x0C", r"adress\] unknown key; check the spelling"),
     ],
 )
-def test_a_slip_is_named(tmp_path, right, wrong, message):
-    (tmp_path / "bench.toml").write_text((HERE / "bench.toml").read_text().replace(right, wrong))
+def test_a_slip_is_named(bench, right, wrong, message):
+    bench.write_text(bench.read_text().replace(right, wrong))
     with pytest.raises(BenchError, match=message):
-        check_devices(load_bench(tmp_path / "bench.toml").description, "bench.toml")
+        check_devices(load_bench(bench).description, "bench.toml")

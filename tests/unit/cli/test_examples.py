@@ -10,6 +10,7 @@ from collections.abc import Iterator
 
 import click
 import pytest
+from typer.testing import CliRunner
 
 from tools.cli.main import COMMANDS, app
 from tools.cli.reference import micron
@@ -49,13 +50,27 @@ def test_the_example_parses(name: str):
         assert not refusal(command, name, words[len(path) + 1 :]), line
 
 
-def test_a_bare_call_helps():
-    from typer.testing import CliRunner
+GROUPS = [name for name, command in micron.commands.items() if hasattr(command, "commands")]
 
-    result = CliRunner().invoke(app, [])
-    assert "micron" in result.output
-    assert "run" in result.output
-    assert result.exit_code in (0, 2)
+
+@pytest.mark.parametrize("words", [[], *([name] for name in GROUPS)], ids=str)
+def test_a_bare_call_helps(words: list[str]):
+    """On standard output with exit status 0: who asks nothing has made no mistake. What the help names is there."""
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0
+    assert f"Usage: {' '.join(['micron', *words])} " in result.stdout
+    assert not result.stderr
+    if not words:
+        steps = re.findall(r"micron (\w+): ", result.stdout)
+        assert steps == ["doctor", "run", "bench"]
+        assert set(steps) <= set(COMMANDS)
+
+
+@pytest.mark.parametrize("words", [["nosuch"], ["can", "nosuch"]], ids=str)
+def test_a_command_that_is_not_there_is_bad_input(words: list[str]):
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 2
+    assert "No such command 'nosuch'" in result.stderr
 
 
 @pytest.mark.parametrize("name", COMMANDS)
