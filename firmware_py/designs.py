@@ -11,6 +11,7 @@ import importlib
 import json
 import os
 from contextlib import suppress
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,7 @@ Array = NDArray[Any]
 def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
     """What ``scipy.signal.FUNCTION`` returns, as a tuple of arrays; arguments are numbers, words and arrays."""
     plain = [_plain(argument) for argument in arguments], {name: _plain(value) for name, value in options.items()}
-    asked = json.dumps([function, version("scipy"), *plain], sort_keys=True)
+    asked = json.dumps([function, _scipy_version(), *plain], sort_keys=True)
     file = user_cache() / "designs" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.json"
     known = _read(file, asked)
     if known is not None:
@@ -35,6 +36,12 @@ def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
     arrays = tuple(np.asarray(part) for part in (found if isinstance(found, tuple) else (found,)))
     _write(file, asked, arrays)
     return arrays
+
+
+@cache
+def _scipy_version() -> str:
+    """Looked up once: the file that it comes from takes longer to parse than a design to read."""
+    return version("scipy")
 
 
 def _plain(value: Any) -> Any:
