@@ -187,6 +187,7 @@ def make_outcome(
         "noticed": dict(counts.noticed),
         "commands": {
             "sent": counts.commands,
+            "superseded": counts.superseded,
             "clipped": counts.clipped,
             # ticks by limit, as the actuation stage sees them
             "limited": loop.stages.actuation.limited,

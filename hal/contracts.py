@@ -134,6 +134,11 @@ class AnalogOutput(Protocol):
     name: str
     limits: tuple[OutputLimit, ...]
 
+    @property
+    def commands_sent(self) -> int:
+        """``write`` calls whose values left for the device; a slow one may pass some over for newer ones."""
+        ...
+
     def arm(self) -> None:
         """Allow ``write``. Raises ``SafetyTrip`` when the self-test fails."""
         ...

@@ -121,6 +121,10 @@ class CanAmplifier:
         self._safe_steps = 0
         self.guard.armed = True
 
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
     def write(self, values_V: Float64Array) -> int:
         """See ``AnalogOutput.write``. Also raises when the node has left the armed state or fallen silent."""
         self.poll()

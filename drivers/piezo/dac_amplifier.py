@@ -120,6 +120,10 @@ class DacAmplifier:
             wait_s(self._clock, RAMP_TICK_S)
         self.guard.armed = True
 
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
     def write(self, values_V: Float64Array) -> int:
         """``ProtocolError`` with ``read_back``: the DAC holds something else than it was told just now."""
         mask = self.guard.admit(values_V)

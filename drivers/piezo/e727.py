@@ -100,6 +100,10 @@ class E727:
         self.guard.require(good, f"neutral is {neutral} V, the controller answers {told}")
         self.guard.armed = True
 
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
     def write(self, values_V: Float64Array) -> int:
         """See ``AnalogOutput.write``: between two commands only the newest values count, the others are
         ``superseded``. Raises what the controller reports, some commands later."""

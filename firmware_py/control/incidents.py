@@ -25,10 +25,10 @@ class Recorder(Protocol):
 class LoopCounts:
     """What the loop counted besides the scheduler's figures.
 
-    ``lost``: scans known to be missing; ``unread``: scans that were due after the last
-    one read, when the loop stopped.
-    ``clipped``: commands that ran into a limit (yielding is none). ``noticed``: bench time at which something that
-    does not end a run was first seen.
+    ``lost``: scans known to be missing; ``unread``: scans that were due after the last one read, when the loop stopped.
+    ``commands``: those that left for the amplifier; ``superseded``: ticks whose values a slow one passed over for
+    newer ones. ``clipped``: ticks whose command ran into a limit (yielding is none). ``latency``: of those that left.
+    ``noticed``: bench time at which something that does not end a run was first seen.
     """
 
     expected: int = 0
@@ -36,6 +36,7 @@ class LoopCounts:
     lost: int = 0
     unread: int = 0
     commands: int = 0
+    superseded: int = 0
     clipped: int = 0
     magnetometer_errors: int = 0
     noticed: dict[str, int] = field(default_factory=dict[str, int])

@@ -319,18 +319,23 @@ class InstrumentLoop:
 
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:
+            amplifier = self._devices.amplifier
+            sent = amplifier.commands_sent
             try:
-                clipped = self._devices.amplifier.write(self.stages.command_V)
+                clipped = amplifier.write(self.stages.command_V)
             except HalError as error:
                 self.incidents.error = error
-                self.incidents.trip_for(self._devices.amplifier.name, error)
+                self.incidents.trip_for(amplifier.name, error)
+                return
+            self.counts.clipped += bool(clipped != 0 or int(self._frame[CLIP]) & ~CLIP_YIELD)
+            if amplifier.commands_sent == sent:
+                self.counts.superseded += 1
                 return
             latency_ns = self._clock.now_ns() - info.due_ns
             if latency_ns > LATE_PART * self._period_ns:
                 self.incidents.notice("commands were late")
             self.counts.latency.add(latency_ns, info.k)
             self.counts.commands += 1
-            self.counts.clipped += bool(clipped != 0 or int(self._frame[CLIP]) & ~CLIP_YIELD)
         elif self.supervisor.step():
             self._note_safe()
 

@@ -37,6 +37,10 @@ class GuardedAmplifier:
         self._heart.beat(self._clock.now_ns())
         self._heart.say(Phase.RUNNING)
 
+    @property
+    def commands_sent(self) -> int:
+        return self._inner.commands_sent
+
     def write(self, values_V: Float64Array) -> int:
         """Raises ``SafetyTrip`` when the guardian has the outputs, or will have them because the lease is over."""
         return self._inner.write(values_V)

@@ -80,6 +80,10 @@ class NidaqmxOutput:
         )
         self.guard.armed = True
 
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
     def write(self, values_V: Float64Array) -> int:
         mask = self.guard.admit(values_V)
         self._send()

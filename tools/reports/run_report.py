@@ -94,6 +94,11 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
         f"{result['ticks']['skipped']} ticks skipped, {result['ticks']['caught_up']} caught up without a command of "
         f"their own, {result['commands']['clipped']} commands clipped",
     ]
+    if passed_over := result["commands"].get("superseded"):
+        sent = result["commands"]["sent"]
+        lines.append(
+            f"the amplifier is slower than the ticks: {sent} commands sent, {passed_over} passed over for newer"
+        )
     kinematics = result.get("kinematics", {})
     if kinematics.get("method") == "numeric":
         lines.append(f"numeric kinematics: {kinematics['fallbacks']} ticks fell back to the analytic solution")
