@@ -8,22 +8,27 @@ from dataclasses import replace
 from hal import plugins
 from sim_devices.physics.axes import CROSS_AXIS_NONLINEARITY, MISALIGNMENT, SCALE_FACTOR_VARIATION, SOFT_IRON
 from sim_devices.physics.backlash import BACKLASH
+from sim_devices.physics.clock_skew import CLOCK_SKEW
 from sim_devices.physics.creep import CREEP
+from sim_devices.physics.curve import STATIC_NONLINEARITY
+from sim_devices.physics.dead_zone import DEAD_ZONE
+from sim_devices.physics.delay import CHANNEL_DELAY, DEAD_TIME
 from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT
+from sim_devices.physics.dropped_samples import DROPPED_SAMPLES
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
 from sim_devices.physics.friction import COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
-from sim_devices.physics.memoryless import DEAD_ZONE, QUANTIZATION, SLEW_LIMIT, STATIC_NONLINEARITY
+from sim_devices.physics.quantization import QUANTIZATION
 from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
 from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_ERROR
 from sim_devices.physics.saturation import SATURATION
+from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.spring import COGGING_FORCE, CUBIC_STIFFNESS
-from sim_devices.physics.timebase import CHANNEL_DELAY, CLOCK_SKEW, DEAD_TIME, DROPPED_SAMPLES
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
 _ALL = (

@@ -140,3 +140,9 @@ def rank_starts(
     found = [(affine_misfit(output_of(q)[k], measured[k]), i) for i, q in enumerate(candidates)]
     steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found if np.isfinite(f)]
     return [candidates[i] for _, i in sorted(steps)] or candidates[:1]
+
+
+def value_range(x: Array) -> tuple[float, float]:
+    """(least, largest) of x; a unit wide about a signal that stands still."""
+    lo, hi = float(x.min()), float(x.max())
+    return (lo, hi) if hi > lo else (lo - 0.5, hi + 0.5)

@@ -8,9 +8,8 @@ weights are in output units and linear: input or output placement is the same th
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,58 +18,13 @@ from sim_devices.physics.effect import (
     STAGES,
     Array,
     Context,
-    Effect,
     Human,
-    Parameter,
-    Parts,
     Settings,
-    Stage,
 )
+from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
-
-
-@dataclass(frozen=True)
-class Placed:
-    """One effect at one place of the chain.
-
-    ``site``: where in the flow; ``target``: the input or output signal there; ``outputs``: whose residual it may
-    change (several for shared effects); ``note`` lists places that the recording cannot tell from this one.
-    """
-
-    effect: Effect
-    site: Literal["input", "output", "feedback"]
-    target: str
-    stage: Stage
-    outputs: tuple[str, ...]
-    settings: Settings = field(default_factory=dict[str, tuple[float, ...]])
-    note: str = ""
-
-    @property
-    def parts(self) -> Parts:
-        """Its parameters."""
-        return self.effect.parts(self.settings)
-
-    @property
-    def label(self) -> str:
-        """Name for parameter lists and logs, e.g. ``creep[displacement]``."""
-        return f"{self.effect.name}[{self.target}]"
-
-
-@dataclass(frozen=True)
-class Free:
-    """One entry of the parameter vector."""
-
-    name: str
-    unit: str
-    lo: float
-    hi: float
-    log: bool
-    scale: float
-    linear: bool
-    placed: int
-    """-1 for base parameters, else the index of the placed effect."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +49,7 @@ class Model:
         self.placed = tuple(placed)
         free: list[Free] = []
         self._slices: list[tuple[slice, slice]] = []
-        base = [_free(p, twin.units, "", "", "", -1) for p in twin.parameters]
+        base = [free_entry(p, "", "", "", -1) for p in twin.parameters]
         free.extend(base)
         for k, pl in enumerate(self.placed):
             parts = pl.parts
@@ -108,7 +62,7 @@ class Model:
             if pl.site == "input":
                 u_in = u_tgt
             for p in (*parts.nonlinear, *parts.weights):
-                free.append(_free(p, twin.units, u_in, u_out, pl.label + ".", k))
+                free.append(free_entry(p, u_in, u_out, pl.label + ".", k))
             self._slices.append((slice(a, b), slice(b, c)))
         self.order = sorted(range(len(self.placed)), key=lambda k: STAGES.index(self.placed[k].stage))
         self._free = tuple(free)
@@ -157,7 +111,7 @@ class Model:
         theta[: self.n_base] = self.twin.start(recording)
         for k, pl in enumerate(self.placed):
             s, _ = self._slices[k]
-            theta[s] = [_middle(p) for p in pl.parts.nonlinear]
+            theta[s] = [middle(p) for p in pl.parts.nonlinear]
         return theta
 
     def carry(self, other: Model, theta: Array, recording: Recording) -> Array:
@@ -391,7 +345,7 @@ class Model:
             0,
             {},
         )
-        theta = np.array([_middle(f) for f in self._free])
+        theta = np.array([middle(f) for f in self._free])
         folded: set[int] = set()
         with np.errstate(all="ignore"):
             flow = self._flow(run, theta, False, folded)
@@ -417,17 +371,3 @@ def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
 
 def _frozen(settings: Settings) -> tuple[object, ...]:
     return tuple(sorted(settings.items()))
-
-
-def _middle(p: Parameter | Free) -> float:
-    lo, hi = p.lo, p.hi
-    if p.log and lo > 0 and np.isfinite(hi):
-        return float(np.sqrt(lo * hi))
-    if np.isfinite(lo) and np.isfinite(hi):
-        return 0.5 * (lo + hi)
-    return float(min(max(p.scale, lo), hi))
-
-
-def _free(p: Parameter, units: Mapping[str, str], u_in: str, u_out: str, prefix: str, k: int) -> Free:
-    unit = p.unit.replace("{in}", u_in).replace("{out}", u_out)
-    return Free(prefix + p.name, unit, p.lo, p.hi, p.log, p.scale, False, k)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from sim_devices.physics.effect import Effect, Stage
+from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
-from tools.mismatch.simulate import Placed
 from tools.mismatch.twins.base import Twin
 
 SAME = "input or output"

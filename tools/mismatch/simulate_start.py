@@ -10,7 +10,8 @@ import numpy as np
 from sim_devices.physics.effect import Array, Context, Settings
 from sim_devices.physics.forces import base_moves
 from sim_devices.physics.statistics import least_squares, runs, thin
-from tools.mismatch.simulate import Model, Placed, make_context
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model, make_context
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import remember
 

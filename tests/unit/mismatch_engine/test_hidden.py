@@ -10,7 +10,6 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import bouc_wen, recording, wave
-from tools.mismatch.engine.assemble import beyond_form
 from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.revise import pair_search
@@ -19,6 +18,7 @@ from tools.mismatch.engine.screen import Candidate, places
 from tools.mismatch.engine.select import acceptable, search
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import lead
+from tools.mismatch.engine.verdict import beyond_form
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.twins.make import make
 

@@ -11,9 +11,9 @@ from scipy.stats import t as student
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
-from tools.mismatch.engine.assemble import human_values
 from tools.mismatch.engine.colour import Whitener, fit_whitener
 from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import covariance, few_blocks
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.split import own_split

@@ -6,7 +6,7 @@ import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.hysteresis import one_loop, turning_points
-from tools.mismatch.engine.fit import STAND_OFF, stand_ins
+from tools.mismatch.engine.residual import STAND_OFF, stand_ins
 from tools.mismatch.engine.unexplained import about
 
 

@@ -10,8 +10,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
-from tools.mismatch.engine.assemble import _units
-from tools.mismatch.simulate import Placed
+from tools.mismatch.engine.found import _units
+from tools.mismatch.placed import Placed
 from tools.mismatch.twins.make import make
 
 T = np.arange(100) * 0.01

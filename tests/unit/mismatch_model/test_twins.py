@@ -13,8 +13,9 @@ from scipy.signal import StateSpace, dlsim, lsim
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
+from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins import make

@@ -11,21 +11,16 @@ from scipy.linalg import expm
 from scipy.signal import lsim
 
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.curve import curve_basis
+from sim_devices.physics.dropped_samples import best_shifts, find_drops, shift_by, shift_costs
 from sim_devices.physics.effect import Context
 from sim_devices.physics.exponential import exponential
 from sim_devices.physics.lag import low_pass
-from sim_devices.physics.memoryless import curve_basis, find_step, mean_of_steps, slew
+from sim_devices.physics.quantization import find_step, mean_of_steps
+from sim_devices.physics.resampling import delay_by_correlation, resample, resample_straight
 from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.saturation import limit
-from sim_devices.physics.timebase import (
-    best_shifts,
-    delay_by_correlation,
-    find_drops,
-    resample,
-    resample_straight,
-    shift_by,
-    shift_costs,
-)
+from sim_devices.physics.slew import slew
 
 Array = NDArray[np.float64]
 ONE = np.zeros(1, np.int64)

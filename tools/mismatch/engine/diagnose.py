@@ -13,13 +13,14 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import assemble
 from tools.mismatch.engine.checks import messages
-from tools.mismatch.engine.fit import Fit, fit, fit_base, residuals
+from tools.mismatch.engine.fit import Fit, fit, fit_base
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
 from tools.mismatch.engine.report import Report
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.select import search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
 from tools.mismatch.engine.unexplained import about, lead, leftover, stranger

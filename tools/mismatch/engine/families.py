@@ -7,13 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 
-from tools.mismatch.engine.fit import Fit, residuals
+from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.revise import added, beyond_limits, size
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
 
 EXACT = frozenset(
     (

@@ -1,7 +1,6 @@
 """Output-error fits inside the simulator: what is linear solved exactly, what is not searched within bounds.
 
-Variable projection (Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973) with a damped Gauss-Newton search over
-the nonlinear parameters, noise-weighted over outputs, outliers bounded by Huber's weights. Base parameters are
+A damped Gauss-Newton search over the nonlinear parameters of projected, noise-weighted residuals. Base parameters are
 always free. On a long recording the search begins on its first part, when that shows all that the inputs do.
 """
 
@@ -13,12 +12,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.engine.problem import Problem, spread
-from tools.mismatch.simulate import Free, Model
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.projected import Projected
+from tools.mismatch.engine.residual import residuals
+from tools.mismatch.placed import Free
+from tools.mismatch.simulate import Model
 
 Array = NDArray[np.float64]
 
-HUBER = 4.0
 LEAST_ROWS = 2000  # that a coarse search looks at
 MOST_ROWS = 300_000  # that any search looks at
 
@@ -44,90 +45,6 @@ class Fit:
     @property
     def labels(self) -> tuple[str, ...]:
         return tuple(p.label for p in self.model.placed)
-
-
-def huber_weights(z: Array) -> Array:
-    """Huber's weights of residuals in units of their robust scale."""
-    return np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-12))
-
-
-def robust_scale(r: Array, floor: float) -> float:
-    """Scale of a residual that outliers do not own, never below ``floor``."""
-    return max(1.4826 * float(np.median(np.abs(r - np.median(r)))), floor, 1e-300)
-
-
-class _Projected:
-    """Residuals as a function of the nonlinear parameters alone."""
-
-    def __init__(self, problem: Problem, model: Model, outputs: Sequence[str], most_rows: int) -> None:
-        self.problem = problem
-        self.model = model
-        self.view = problem.view
-        self.outputs = tuple(outputs)
-        rows = spread(problem.fit_rows, most_rows, problem.seed)
-        self.rows = rows
-        self.samples = problem.index[rows]
-        design_free = model.parameters_of(outputs)
-        self.free = [i for i in model.nonlinear if i in design_free]
-        self.linear = np.array([j for j in model.linear if j in design_free], int)
-        self.position = {j: i for i, j in enumerate(self.linear.tolist())}
-        kept = [i for i, j in enumerate(model.linear) if j in design_free]
-        self.penalty = model.penalty[:, kept]
-        self.lo = np.array([model.parameters[j].lo for j in self.linear])
-        self.hi = np.array([model.parameters[j].hi for j in self.linear])
-        self.measured = {o: problem.measured[o][rows] for o in self.outputs}
-        self.usual = {o: 1.0 - model.excused(self.view, o)[rows] for o in self.outputs}
-        self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
-        self.evaluations = 0
-
-    @property
-    def usual_count(self) -> float:
-        """How many squares the cost sums."""
-        return float(sum(u.sum() for u in self.usual.values()))
-
-    def reweight(self, residual: dict[str, Array]) -> None:
-        for o in self.outputs:
-            r = residual[o][self.rows]
-            s = robust_scale(r, self.problem.sigma(o))
-            robust = np.sqrt(huber_weights((r - np.median(r)) / s))
-            robust[self.problem.lively[self.rows]] = 1.0
-            self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
-
-    def evaluate(self, theta: Array) -> tuple[Array, Array]:
-        """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
-        self.evaluations += 1
-        theta = theta.copy()
-        design = self.model.design(self.view, theta, self.outputs, self.samples)
-        if self.linear.size == 0:
-            parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
-            return np.concatenate(parts), theta
-        k = self.linear.size
-        gram = np.zeros((k, k))
-        cross = np.zeros(k)
-        kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
-        for o in self.outputs:
-            w = self.weight[o]
-            at = np.array([self.position[j] for j in design.linear[o]], int)
-            a = design.columns[o]
-            a *= w[:, None]
-            b = (self.measured[o] - design.constant[o]) * w
-            gram[np.ix_(at, at)] += a.T @ a
-            cross[at] += a.T @ b
-            kept.append((a, b, at))
-        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
-        scaled = gram / np.outer(size, size)
-        if np.any(self.penalty):
-            # rows are in units of weight; weak against what the data see
-            rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
-            scaled = scaled + (rows.T @ rows) / np.outer(size, size)
-        scaled[np.diag_indices(k)] += 1e-11
-        try:
-            solution = np.linalg.solve(scaled, cross / size) / size
-        except np.linalg.LinAlgError:
-            solution = np.linalg.lstsq(scaled, cross / size, rcond=1e-10)[0] / size
-        solution = np.clip(solution, self.lo, self.hi)
-        theta[self.linear] = solution
-        return np.concatenate([b - a @ solution[at] for a, b, at in kept]), theta
 
 
 def _inside(p: Free, v: float) -> float:
@@ -161,7 +78,7 @@ def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     return shifted
 
 
-def _slopes(projected: _Projected, theta: Array, residual: Array) -> Array:
+def _slopes(projected: Projected, theta: Array, residual: Array) -> Array:
     """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences."""
     model = projected.model
     out = np.zeros((residual.size, len(projected.free)))
@@ -174,7 +91,7 @@ def _slopes(projected: _Projected, theta: Array, residual: Array) -> Array:
     return out
 
 
-def _search(projected: _Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
+def _search(projected: Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
     """Damped Gauss-Newton with bounds; returns theta and the cost.
 
     Between steps the sensitivities are updated from what the step itself showed (Broyden, Mathematics of Computation
@@ -232,42 +149,6 @@ def _search(projected: _Projected, theta: Array, iterations: int, tolerance: flo
     return theta, cost
 
 
-def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[str] | None = None) -> dict[str, Array]:
-    """Measured minus simulated on the problem's view (of ``outputs``, all if None); not finite becomes very large.
-
-    In samples that an effect takes as its own events earlier usual samples stand in, so that every mean square is over
-    usual samples; not the nearest, which is quiet by the choice of where the event ends.
-    """
-    found = model.residual(problem.view, theta, outputs)
-    out: dict[str, Array] = {}
-    for o in outputs or problem.twin.outputs:
-        r = np.nan_to_num(found[o], nan=1e12, posinf=1e12, neginf=-1e12)
-        excused = model.excused(problem.view, o)
-        if excused.any() and not excused.all():
-            source = stand_ins(excused)
-            r = r[source]
-        out[o] = r
-    return out
-
-
-STAND_OFF = 8  # samples between an event and what stands in for it
-
-
-def stand_ins(excused: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """Row that stands for each row (n,): itself, or for the k-th of an event the k-th usual one before it, from
-    ``STAND_OFF`` back; at the start of the record the first ones after it. At least one row must be usual.
-    """
-    usual = np.flatnonzero(~excused)
-    source = np.arange(excused.size)
-    rows = np.flatnonzero(excused)
-    place = np.searchsorted(usual, rows)  # usual rows before the event
-    first = np.diff(rows, prepend=-2) > 1
-    number = np.arange(rows.size) - np.maximum.accumulate(np.where(first, np.arange(rows.size), 0))
-    back = place - STAND_OFF - 1 - number
-    source[rows] = usual[np.where(back >= 0, back, (place + STAND_OFF + number) % usual.size)]
-    return source
-
-
 def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
     stuck: list[str] = []
     for i, p in enumerate(model.parameters):
@@ -308,13 +189,13 @@ def fit(
     best = list(starts[:1])
     if model.nonlinear and (len(starts) > 1 or np.isfinite(hopeless)):
         few = min(rows, max(LEAST_ROWS, rows // 3), ground.fit_rows.size)
-        tried, evaluations = _coarsely(_Projected(ground, model, outputs, few), starts, tries)
+        tried, evaluations = _coarsely(Projected(ground, model, outputs, few), starts, tries)
         best = [t[1] for t in tried[:2]]
         if len(tried) > 1 and tried[1][0] > 1.05 * tried[0][0]:
             best = best[:1]
         if opening is not None and np.isfinite(hopeless):
             # what it leaves of the opening says nothing about the whole
-            projected = _Projected(problem, model, outputs, few)
+            projected = Projected(problem, model, outputs, few)
             residual, _ = projected.evaluate(best[0])
             left = float(residual @ residual) / max(1.0, projected.usual_count)
         else:
@@ -335,7 +216,7 @@ def fit(
         theta, cost, count = _finely(problem, model, outputs, theta, rows, 10, rounds, tolerance)
         evaluations += count
     elif give_up and opening is not None:
-        _, theta = _Projected(problem, model, outputs, rows).evaluate(theta)
+        _, theta = Projected(problem, model, outputs, rows).evaluate(theta)
     residual = residuals(problem, model, theta, outputs)
     if keep is not None:
         residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
@@ -356,7 +237,7 @@ lines, lost samples) or follows a context may not have happened yet in the first
 """
 
 
-def _coarsely(projected: _Projected, starts: Sequence[Array], tries: int) -> tuple[list[tuple[float, Array]], int]:
+def _coarsely(projected: Projected, starts: Sequence[Array], tries: int) -> tuple[list[tuple[float, Array]], int]:
     """(cost per usual sample, theta), best first, of the best ``tries`` starts after a few steps; evaluations."""
     ranked: list[tuple[float, int, Array]] = []
     for i, theta in enumerate(starts[: 3 * tries]):
@@ -384,7 +265,7 @@ def _finely(
     tolerance: float,
 ) -> tuple[Array, float, int]:
     """(theta, cost, evaluations) after a search on ``rows`` and another with outliers weighed down."""
-    projected = _Projected(problem, model, outputs, rows)
+    projected = Projected(problem, model, outputs, rows)
     cost = np.inf
     for round_ in range(rounds):
         theta, cost = _search(projected, theta, iterations if round_ == 0 else 4, tolerance)

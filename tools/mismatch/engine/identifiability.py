@@ -13,7 +13,8 @@ from tools.mismatch.engine.colour import Whitener, whiten
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.screen import places
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_start import starts as starts_of
 

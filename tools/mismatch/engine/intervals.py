@@ -7,8 +7,9 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from tools.mismatch.engine.colour import fit_whitener
-from tools.mismatch.engine.fit import HUBER, Fit, moved_a_little, robust_scale
+from tools.mismatch.engine.fit import Fit, moved_a_little
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.projected import HUBER, robust_scale
 
 Array = NDArray[np.float64]
 

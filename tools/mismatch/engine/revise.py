@@ -12,7 +12,8 @@ from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
 from tools.mismatch.engine.trial import Trial
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_start import prepare, starts
 
 Array = np.ndarray

@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.mismatch.engine.colour import Whitener, fit_whitener, whiten
-from tools.mismatch.engine.fit import Fit, robust_scale
+from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.projected import robust_scale
 
 Array = NDArray[np.float64]
 Span = tuple[int, int]

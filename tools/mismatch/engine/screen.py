@@ -12,7 +12,8 @@ from scipy.stats import f as f_distribution
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem, spread
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare, probe_signals, starts
 

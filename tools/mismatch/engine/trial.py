@@ -14,7 +14,8 @@ from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
 from tools.mismatch.engine.screen import Candidate, Ground, bend, one_step
-from tools.mismatch.simulate import Model, Placed
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
 
 Array = np.ndarray
 Progress = Callable[[str, int, int], None]

@@ -1,0 +1,72 @@
+"""Dead zone: no response for small inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import least_squares, thin, value_range
+
+
+def _range_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {"range": value_range(x)}
+
+
+def _dead_parts(settings: Settings) -> Parts:
+    lo, hi = settings.get("range", (-1.0, 1.0))
+    span = hi - lo
+    return Parts(
+        (
+            Parameter("half_width", "{in}", 1e-4 * span, 0.45 * span, log=True, scale=0.02 * span),
+            Parameter("centre", "{in}", lo, hi, scale=0.02 * span),
+        ),
+        (Parameter("missing_slope", "{out}/{in}"),),
+    )
+
+
+def _dead_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return -np.clip(x - q[1], -q[0], q[0])[:, None]
+
+
+def _dead_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    lo, hi = settings["range"]
+    span = hi - lo
+    k = thin(ctx.keep, 4000)
+    r = residual[k]
+    straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    tried: list[tuple[float, float, float]] = []
+    centres = [*np.linspace(lo + 0.1 * span, hi - 0.1 * span, 9), *([0.0] if lo < 0 < hi else [])]
+    for h in span * np.geomspace(0.01, 0.3, 8):
+        for c in centres:
+            column = ctx.to_output(-np.clip(x - c, -h, h))[k]
+            tried.append((least_squares(np.column_stack([straight, column]), r)[1], float(h), float(c)))
+    tried.sort()
+    return tuple((h, c) for _, h, c in tried[:3])
+
+
+def _dead_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    share = p[2] / scale if scale else 0.0
+    return (
+        Human("half_width", float(p[0]), "{in}"),
+        Human("centre", float(p[1]), "{in}"),
+        Human("slope_lost_inside", float(share), "1"),
+    )
+
+
+DEAD_ZONE = Effect(
+    name="dead_zone",
+    summary="no response for small inputs",
+    kind="add",
+    stages=("actuator", "amplifier", "sensor"),
+    parts=_dead_parts,
+    equation=r"y = x - w\,\mathrm{clip}(x - c, -h, h)",
+    source="H. K. Khalil, Nonlinear Systems, 3rd ed., section 1.2.7",
+    excitation="inputs that pass through the zone and go well beyond it",
+    confusable_with=("static_nonlinearity", "backlash", "coulomb_friction"),
+    prepare=_range_settings,
+    guess=_dead_guess,
+    basis=_dead_basis,
+    report=_dead_report,
+)

@@ -1,0 +1,124 @@
+"""Slew limit: the rate of change is limited, the same both ways or not."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from hal.compiled import kernel
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.statistics import rank_starts, thin
+
+
+@kernel
+def slew(x, down, up, share, starts):
+    """Move towards x by ``share`` of the distance per sample, at most ``up`` and ``down``; on x at each start."""
+    y = np.empty_like(x)
+    s = 0
+    v = 0.0
+    for i in range(x.size):
+        if s < starts.size and i == starts[s]:
+            s += 1
+            v = x[i]
+        else:
+            v += min(max(share * (x[i] - v), -down), up)
+        y[i] = v
+    return y
+
+
+def _slew_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+    rate = np.abs(np.diff(x)) / ctx.dt
+    top = float(rate.max()) or 1.0
+    usual = float(np.quantile(rate[rate > 0], 0.9)) if np.any(rate > 0) else 1.0
+    return {"rates": (usual, top), "time": (ctx.dt,)}
+
+
+def _slew_parts(settings: Settings) -> Parts:
+    usual, top = settings.get("rates", (1.0, 10.0))
+    dt = settings.get("time", (1e-3,))[0]
+    lo = 0.02 * usual
+    return Parts(
+        (
+            Parameter("rate_up", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
+            Parameter("rate_down", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
+            Parameter("time_constant_s", "s", 0.05 * dt, 50 * dt, log=True, scale=dt),
+        )
+    )
+
+
+def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return slew(x, q[1] * ctx.dt, q[0] * ctx.dt, -np.expm1(-ctx.dt / q[2]), np.array(ctx.starts))
+
+
+def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    usual, top = settings["rates"]
+    measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
+    grid: list[tuple[float, ...]] = [
+        (float(r), float(r), f * ctx.dt) for r in np.geomspace(0.03 * usual, top, 20) for f in (0.1, 3.0, 12.0)
+    ]
+    return rank_starts(
+        grid,
+        lambda q: ctx.to_output(_slew_apply(x, ctx, np.array(q), settings)),
+        measured,
+        thin(ctx.keep, 8000),
+    )[:3]
+
+
+def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("rate_up", float(p[0]), "{in}/s"),
+        Human("rate_down", float(p[1]), "{in}/s"),
+        Human("time_constant_s", float(p[2]), "s"),
+    )
+
+
+_UNEVEN_SLEW = Effect(
+    name="slew_limit",
+    summary="rate of change limited",
+    kind="nonlinear",
+    stages=("amplifier", "actuator"),
+    parts=_slew_parts,
+    equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r_-,\, r_+\right)",
+    source="W. Jung, Op Amp Applications Handbook, section 1-4",
+    excitation="changes quicker and slower than the limit",
+    confusable_with=("first_order_lag", "saturation"),
+    prepare=_slew_prepare,
+    guess=_slew_guess,
+    apply=_slew_apply,
+    report=_slew_report,
+)
+
+
+def _even_parts(settings: Settings) -> Parts:
+    up, _, lag = _slew_parts(settings).nonlinear
+    return Parts((replace(up, name="rate"), lag))
+
+
+def _both_ways(q: Array) -> Array:
+    return np.array([q[0], q[0], q[1]])
+
+
+def _even_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return _slew_apply(x, ctx, _both_ways(q), settings)
+
+
+def _even_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return [(up, lag) for up, _, lag in _slew_guess(x, residual, ctx, settings)]
+
+
+def _even_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return _slew_report(_both_ways(p), settings, scale)
+
+
+# one rate both ways comes first: edges of one direction then speak for the other
+SLEW_LIMIT = replace(
+    _UNEVEN_SLEW,
+    parts=_even_parts,
+    equation=r"\dot y = \mathrm{clip}\left((x - y)/\tau,\, -r,\, r\right)",
+    guess=_even_guess,
+    apply=_even_apply,
+    report=_even_report,
+    variants=(_UNEVEN_SLEW,),
+)

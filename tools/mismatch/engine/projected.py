@@ -1,0 +1,101 @@
+"""Weighted residuals as a function of the nonlinear parameters alone: the linear ones are solved exactly (variable
+projection: Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973), outliers bounded by Huber's weights.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.problem import Problem, spread
+from tools.mismatch.simulate import Model
+
+Array = NDArray[np.float64]
+
+HUBER = 4.0
+
+
+def huber_weights(z: Array) -> Array:
+    """Huber's weights of residuals in units of their robust scale."""
+    return np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-12))
+
+
+def robust_scale(r: Array, floor: float) -> float:
+    """Scale of a residual that outliers do not own, never below ``floor``."""
+    return max(1.4826 * float(np.median(np.abs(r - np.median(r)))), floor, 1e-300)
+
+
+class Projected:
+    """Residuals as a function of the nonlinear parameters alone."""
+
+    def __init__(self, problem: Problem, model: Model, outputs: Sequence[str], most_rows: int) -> None:
+        self.problem = problem
+        self.model = model
+        self.view = problem.view
+        self.outputs = tuple(outputs)
+        rows = spread(problem.fit_rows, most_rows, problem.seed)
+        self.rows = rows
+        self.samples = problem.index[rows]
+        design_free = model.parameters_of(outputs)
+        self.free = [i for i in model.nonlinear if i in design_free]
+        self.linear = np.array([j for j in model.linear if j in design_free], int)
+        self.position = {j: i for i, j in enumerate(self.linear.tolist())}
+        kept = [i for i, j in enumerate(model.linear) if j in design_free]
+        self.penalty = model.penalty[:, kept]
+        self.lo = np.array([model.parameters[j].lo for j in self.linear])
+        self.hi = np.array([model.parameters[j].hi for j in self.linear])
+        self.measured = {o: problem.measured[o][rows] for o in self.outputs}
+        self.usual = {o: 1.0 - model.excused(self.view, o)[rows] for o in self.outputs}
+        self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
+        self.evaluations = 0
+
+    @property
+    def usual_count(self) -> float:
+        """How many squares the cost sums."""
+        return float(sum(u.sum() for u in self.usual.values()))
+
+    def reweight(self, residual: dict[str, Array]) -> None:
+        for o in self.outputs:
+            r = residual[o][self.rows]
+            s = robust_scale(r, self.problem.sigma(o))
+            robust = np.sqrt(huber_weights((r - np.median(r)) / s))
+            robust[self.problem.lively[self.rows]] = 1.0
+            self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
+
+    def evaluate(self, theta: Array) -> tuple[Array, Array]:
+        """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
+        self.evaluations += 1
+        theta = theta.copy()
+        design = self.model.design(self.view, theta, self.outputs, self.samples)
+        if self.linear.size == 0:
+            parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
+            return np.concatenate(parts), theta
+        k = self.linear.size
+        gram = np.zeros((k, k))
+        cross = np.zeros(k)
+        kept: list[tuple[Array, Array, NDArray[np.int64]]] = []
+        for o in self.outputs:
+            w = self.weight[o]
+            at = np.array([self.position[j] for j in design.linear[o]], int)
+            a = design.columns[o]
+            a *= w[:, None]
+            b = (self.measured[o] - design.constant[o]) * w
+            gram[np.ix_(at, at)] += a.T @ a
+            cross[at] += a.T @ b
+            kept.append((a, b, at))
+        size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        scaled = gram / np.outer(size, size)
+        if np.any(self.penalty):
+            # rows are in units of weight; weak against what the data see
+            rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
+            scaled = scaled + (rows.T @ rows) / np.outer(size, size)
+        scaled[np.diag_indices(k)] += 1e-11
+        try:
+            solution = np.linalg.solve(scaled, cross / size) / size
+        except np.linalg.LinAlgError:
+            solution = np.linalg.lstsq(scaled, cross / size, rcond=1e-10)[0] / size
+        solution = np.clip(solution, self.lo, self.hi)
+        theta[self.linear] = solution
+        return np.concatenate([b - a @ solution[at] for a, b, at in kept]), theta

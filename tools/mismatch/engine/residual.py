@@ -1,0 +1,49 @@
+"""Residuals on a problem's view, and what stands in for samples that an effect takes as its own events."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.simulate import Model
+
+Array = NDArray[np.float64]
+
+
+def residuals(problem: Problem, model: Model, theta: Array, outputs: Sequence[str] | None = None) -> dict[str, Array]:
+    """Measured minus simulated on the problem's view (of ``outputs``, all if None); not finite becomes very large.
+
+    In samples that an effect takes as its own events earlier usual samples stand in, so that every mean square is over
+    usual samples; not the nearest, which is quiet by the choice of where the event ends.
+    """
+    found = model.residual(problem.view, theta, outputs)
+    out: dict[str, Array] = {}
+    for o in outputs or problem.twin.outputs:
+        r = np.nan_to_num(found[o], nan=1e12, posinf=1e12, neginf=-1e12)
+        excused = model.excused(problem.view, o)
+        if excused.any() and not excused.all():
+            source = stand_ins(excused)
+            r = r[source]
+        out[o] = r
+    return out
+
+
+STAND_OFF = 8  # samples between an event and what stands in for it
+
+
+def stand_ins(excused: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Row that stands for each row (n,): itself, or for the k-th of an event the k-th usual one before it, from
+    ``STAND_OFF`` back; at the start of the record the first ones after it. At least one row must be usual.
+    """
+    usual = np.flatnonzero(~excused)
+    source = np.arange(excused.size)
+    rows = np.flatnonzero(excused)
+    place = np.searchsorted(usual, rows)  # usual rows before the event
+    first = np.diff(rows, prepend=-2) > 1
+    number = np.arange(rows.size) - np.maximum.accumulate(np.where(first, np.arange(rows.size), 0))
+    back = place - STAND_OFF - 1 - number
+    source[rows] = usual[np.where(back >= 0, back, (place + STAND_OFF + number) % usual.size)]
+    return source
