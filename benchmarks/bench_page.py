@@ -90,14 +90,17 @@ def record(address: str) -> None:
     urllib.request.urlopen(request, timeout=60).read()
 
 
-def measure() -> dict[str, float]:
-    """Share of a core, frames a second, p99 of the tick without and with the viewer (us); with viewer, telemetry and a
-    recording: lateness (us) and the part of the ticks that began a period late or were skipped (%)."""
+def measure(bench: Path) -> dict[str, float]:
+    """On ``bench``: share of a core, frames a second, p99 of the tick without and with the viewer (us); with viewer,
+    telemetry and a recording: lateness (us), the part of the ticks that began a period late or were skipped (%)."""
     subscription = json.dumps({"type": "subscribe", "id": 1, "channels": CHANNELS, "rows": 5000, "pixels": 1200})
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
-        command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
+        command = [sys.executable, "-m", "tools.cli.main", "bench", "--bench", str(bench), "--port", "0"]
         server = subprocess.Popen(
-            [*command, "--recordings", folder], stderr=subprocess.PIPE, text=True, env={**os.environ, "COLUMNS": "400"}
+            [*command, "--stale-ms", "1000", "--recordings", folder],
+            stderr=subprocess.PIPE,
+            text=True,
+            env={**os.environ, "COLUMNS": "400"},
         )
         try:
             assert server.stderr is not None
