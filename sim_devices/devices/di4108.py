@@ -220,8 +220,7 @@ class Di4108:
         return np.select([m == 1, m == 2, m == 3], [s.mean(0), s.max(0), s.min(0)], s[-1])
 
     def _codes_of(self, volts: Volts) -> np.ndarray:
-        work = self._work
-        np.multiply(volts, self._scale, out=work)
+        work = np.multiply(volts, self._scale, out=self._work)
         np.rint(work, out=work)
         np.maximum(work, -32768.0, out=work)
         np.minimum(work, 32767.0, out=work)
@@ -250,8 +249,7 @@ class Di4108:
             self._out += data
             return
         self._partial += data
-        full = len(self._partial) // self._packet_bytes * self._packet_bytes
-        if full:
+        if full := len(self._partial) // self._packet_bytes * self._packet_bytes:
             self._out += self._partial[:full]
             del self._partial[:full]
 
@@ -377,11 +375,9 @@ class Di4108:
         self._set_dout(0)  # page 57: all ports are re-initialised
 
     def _set_dout(self, mask: int) -> None:
-        switches = mask & self._endo
-        if switches != self.switches:
-            self.switches = switches
-            if self._on_switches is not None:
-                self._on_switches(switches, self._now_ns)
+        before, self.switches = self.switches, mask & self._endo
+        if self.switches != before and self._on_switches is not None:
+            self._on_switches(self.switches, self._now_ns)
 
     def _din(self) -> int:
         return (self.digital_levels & ~self._endo & 0x7F) | self.switches

@@ -9,16 +9,11 @@ from pathlib import Path
 import pytest
 
 
-@pytest.fixture(autouse=True)
-def installed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """What ``pip install -e .`` does with the example's ``pyproject.toml``: modules and entry points are found."""
-    folder = request.path.parent
-    if not (folder / "pyproject.toml").exists():  # nothing to install
-        yield folder
-        return
+def install(folder: Path, into: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What ``pip install -e .`` does with the ``pyproject.toml`` of ``folder``: modules and entry points are found."""
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     name, version = project["name"].replace("-", "_"), project["version"]
-    info = tmp_path / "installed" / f"{name}-{version}.dist-info"
+    info = into / "installed" / f"{name}-{version}.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {version}\n")
     groups = project["entry-points"].items()
@@ -26,6 +21,16 @@ def installed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytes
     (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
     monkeypatch.syspath_prepend(str(info.parent))
     monkeypatch.syspath_prepend(str(folder))
+
+
+@pytest.fixture(autouse=True)
+def installed(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """The package that a test stands in, installed."""
+    folder = request.path.parent
+    if not (folder / "pyproject.toml").exists():  # nothing to install
+        yield folder
+        return
+    install(folder, tmp_path, monkeypatch)
     yield folder
     for module in folder.glob("*.py"):
         sys.modules.pop(module.stem, None)

@@ -30,6 +30,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         (
             "tests/virtual_time/test_scheduler.py",
             "tests/virtual_time/test_scheduler_counts.py",
+            "tests/virtual_time/test_waiting_tasks.py",
             "tests/virtual_time/test_tickers.py",
             "tests/virtual_time/test_background.py",
         ),

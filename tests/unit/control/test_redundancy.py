@@ -1,0 +1,132 @@
+"""What becomes of an axis that contradicts the others: left out, or the end of the run. ``Parity`` is the real one."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from firmware_py.control.incidents import Incidents, LoopCounts
+from firmware_py.control.parity import ALONE_TICKS, LEARN_TICKS, PATIENCE_TICKS
+from firmware_py.control.redundancy import Redundancy
+from firmware_py.control.safety import State, Supervisor
+from firmware_py.frame import LAYOUT, PARITIES, PARITY, STATUS, FrameStatus
+from hal.clock import VirtualClock
+
+# eight directions in the plane of two parities, 22.5 degrees apart
+TURN = np.pi * np.arange(8) / 8
+NULL = np.array([np.cos(TURN), np.sin(TURN)])
+SIZE = max(column.start + column.size for column in LAYOUT)
+
+
+class Bench:
+    """A redundancy of ``axes`` axes in the state ``state``; ``told`` is what the stage's parity would be."""
+
+    def __init__(self, axes: int = 8, state: State = State.RUNNING) -> None:
+        self.left_out: list[int] = []
+        self.ignored: list[int] = []
+        self.supervisor = Supervisor(cast(Any, SimpleNamespace()))
+        self.supervisor.state = state
+        self.counts = LoopCounts()
+        self.check = SimpleNamespace(ignore=self.ignored.append, stepped_together=False)
+        params = {"parities": np.array([axes - 6]), "null": np.array([NULL[:, :axes]])}
+        self.sensing = SimpleNamespace(
+            params=params, config=SimpleNamespace(channels=tuple(range(axes))), leave_out=self._leave_out
+        )
+        self.frame = np.zeros(SIZE)
+        self.redundancy = Redundancy(
+            cast(Any, SimpleNamespace(sensing=self.sensing, frame=self.frame)),
+            cast(Any, self.check),
+            self.supervisor,
+            Incidents(self.supervisor, self.counts, VirtualClock(), None),
+            tuple(f"acc{i}" for i in range(axes)),
+        )
+
+    def _leave_out(self, axis: int, usual: Any) -> float:
+        self.left_out.append(axis)
+        self.sensing.params["parities"][0] -= 1
+        self.sensing.params["null"][0, 1] = 0.0
+        return 1.25
+
+    def agree(self, told: Any, ticks: int = 1) -> str:
+        """The last word of ``ticks`` ticks whose parity is ``told``; the first word that ends the run."""
+        for _ in range(ticks):
+            self.frame[PARITY : PARITY + len(PARITIES)] = told
+            said = self.redundancy.agree(self.frame)
+            if said:
+                return said
+        return ""
+
+    def learnt(self) -> Bench:
+        assert not self.agree((0.0, 0.0), LEARN_TICKS)
+        return self
+
+
+def test_the_axis_that_contradicts_is_left_out_and_the_run_goes_on() -> None:
+    bench = Bench().learnt()
+    assert not bench.agree(30.0 * NULL[:, 3])
+    assert bench.left_out == bench.ignored == [3]
+    (said,) = bench.counts.noticed
+    assert said.startswith("acc3 contradicts the other axes: left out")
+    assert "times 1.25" in said
+    assert bench.frame[PARITY + 1] == 0.0  # one parity is left, and the other is no longer told
+    assert not bench.agree((0.0, 0.0), LEARN_TICKS)
+
+
+def test_the_second_axis_ends_the_run_for_nobody_can_tell_which_it_is() -> None:
+    bench = Bench().learnt()
+    bench.agree(30.0 * NULL[:, 3])
+    assert not bench.agree((30.0, 0.0), ALONE_TICKS)
+    assert "cannot be told which one is wrong" in bench.agree((30.0, 0.0))
+    assert bench.left_out == [3]
+
+
+def test_what_no_single_axis_explains_is_noticed_and_then_ends_the_run() -> None:
+    bench = Bench().learnt()
+    between = np.array([np.cos(np.pi / 16), np.sin(np.pi / 16)])  # as near to axis 0 as to axis 1
+    assert not bench.agree(100.0 * between, PATIENCE_TICKS)
+    assert list(bench.counts.noticed) == ["the accelerometer axes contradict each other"]
+    assert "cannot be told" in bench.agree(100.0 * between)
+    assert not bench.left_out
+
+
+def test_before_the_outputs_may_move_an_axis_is_refused_not_left_out() -> None:
+    bench = Bench(state=State.SELF_TEST).learnt()
+    assert not bench.agree(30.0 * NULL[:, 3])
+    assert not bench.left_out
+    between = 100.0 * (NULL[:, 0] + NULL[:, 1])
+    assert bench.agree(between, 2 * PATIENCE_TICKS) == "the accelerometer axes (acc) contradict each other"
+    assert bench.redundancy.impossible(3, "acc3 is at its rail") == "acc3 is at its rail"
+
+
+def test_axes_that_step_together_are_their_supply() -> None:
+    bench = Bench().learnt()
+    bench.check.stepped_together = True
+    assert "stepped together" in bench.agree(30.0 * NULL[:, 3])
+    assert not bench.left_out
+
+
+@pytest.mark.parametrize("status", [FrameStatus.INVALID, FrameStatus.STALE, FrameStatus.ALIGNING])
+def test_a_tick_that_is_not_believed_says_nothing_of_the_axes(status: FrameStatus) -> None:
+    bench = Bench().learnt()
+    bench.frame[STATUS] = status
+    assert not bench.agree(30.0 * NULL[:, 3], 2 * PATIENCE_TICKS)
+    assert not bench.left_out
+
+
+def test_an_impossible_reading_of_an_axis_is_left_out_and_of_another_input_trips() -> None:
+    bench = Bench().learnt()
+    assert bench.redundancy.there
+    assert bench.redundancy.impossible(8, "the supply is gone") == "the supply is gone"
+    assert bench.redundancy.impossible(5, "acc5 is at its rail") == ""
+    assert bench.left_out == [5]
+    assert next(iter(bench.counts.noticed)).startswith("acc5 is at its rail: left out")
+
+
+def test_six_axes_have_none_to_spare() -> None:
+    bench = Bench(axes=6)
+    assert not bench.redundancy.there
+    assert bench.redundancy.impossible(3, "acc3 is at its rail") == "acc3 is at its rail"
+    assert not bench.agree((50.0, 50.0), 2 * PATIENCE_TICKS)
