@@ -7,6 +7,7 @@ import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from pathlib import Path
 
 import click
 import pytest
@@ -77,6 +78,12 @@ def test_a_command_that_is_not_there_is_bad_input(words: list[str]):
 def test_the_list_says_what_the_help_says(name: str):
     own = micron.commands[name].help or ""
     assert COMMANDS[name][1] == " ".join(own.split("\n\n")[0].split())
+
+
+def test_the_readme_names_every_command():
+    readme = (Path(__file__).parents[3] / "README.md").read_text(encoding="utf-8")
+    table = readme[readme.index("## The commands") :]
+    assert not [name for name in COMMANDS if not re.search(rf"`(micron )?{name}\b", table)]
 
 
 def test_commands_that_need_no_kernels_start_without_them():

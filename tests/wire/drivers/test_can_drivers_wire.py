@@ -190,6 +190,37 @@ def test_unconfirmed_safe_state_is_an_error():
             clock.burn_ns(MS)
 
 
+def test_close_waits_for_the_safe_state_of_an_armed_node():
+    amplifier, can, node, _ = armed()
+    amplifier.close()
+    assert node.state == DISARMED
+    assert (0x122, "00ff") in can.sent
+    can.sent.clear()
+    amplifier.close()  # it is there: not a frame more
+    assert not can.sent
+
+
+def test_close_says_when_neutral_was_not_seen():
+    amplifier, _, node, _ = armed()
+    node.obedient = False
+    with pytest.raises(HalTimeout, match="the outputs were NOT seen to reach neutral"):
+        amplifier.close()
+
+
+def test_arm_needs_the_measured_voltages_at_neutral():
+    amplifier, _, node, _ = stand()
+    node.status = lambda: node.can.arrive(0x121, f"0000ffff0080{node.state}{node.accepted:02x}")
+    with pytest.raises(SafetyTrip, match="the node measures"):
+        amplifier.arm()
+    assert not amplifier.guard.armed
+
+
+def test_readback_of_an_armed_node_holds_the_setpoint_meanwhile():
+    amplifier, can, _, _ = armed()
+    assert amplifier.readback_V() == pytest.approx([50.0] * 3, abs=1e-3)
+    assert {can_id for can_id, _ in can.sent} >= {0x120}
+
+
 def test_readback_is_measured_by_the_node():
     amplifier, can, _, clock = stand()
     clock.burn_ns(MS)

@@ -7,7 +7,7 @@ import pytest
 
 from drivers.piezo.e727 import E727
 from hal.clock import VirtualClock
-from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
+from hal.errors import BenchError, Disconnected, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
 from hal.output_guard import RAMP_STEPS
 from tests.wire.drivers.scripted_ports import ScriptedSerial
 
@@ -182,6 +182,31 @@ def test_safe_ramp_ends_exactly_at_neutral():
         clock.burn_ns(MS)
     assert done == [False] * (RAMP_STEPS - 1) + [True]
     port.done()
+
+
+def test_close_brings_the_outputs_to_neutral_first():
+    steps = [sva(60 + (50 - 60) * k / RAMP_STEPS, 50, 50) for k in (1, 6, 11, 16)]
+    device, port, clock = armed(sva(60, 50, 50), *steps, rate_hz=200.0, slew_V_per_s=1e9)
+    device.write(np.array([60.0, 50.0, 50.0]))
+    clock.burn_ns(5 * MS)
+    device.close()
+    port.done()
+    assert port.closed
+    device.close()  # nothing is left to be done, nothing is sent
+
+
+def test_close_says_when_neutral_was_not_reached_and_closes_all_the_same():
+    device, port, clock = armed(sva(60, 50, 50), rate_hz=200.0, slew_V_per_s=1e9)
+    device.write(np.array([60.0, 50.0, 50.0]))
+    clock.burn_ns(5 * MS)
+
+    def cut(data: bytes, timeout_s: float) -> None:
+        raise Disconnected("the cable is out", device="tty")
+
+    port.write = cut
+    with pytest.raises(Disconnected, match="the cable is out; the outputs were NOT brought to neutral"):
+        device.close()
+    assert port.closed
 
 
 def test_servo_mode_commands_micrometres():
