@@ -114,6 +114,7 @@ class ScriptedCan:
         self.queue.append(CanFrame(can_id, bytes.fromhex(data), t_ns=self.clock.now_ns()))
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
+        assert timeout_s == 0.0, "a driver of the loop does not wait for the bus"
         self.sent.append((frame.can_id, frame.data.hex()))
         for react in self.on_send:
             react(frame)

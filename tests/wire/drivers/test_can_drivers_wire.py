@@ -14,7 +14,7 @@ from drivers.dbc import load_database
 from drivers.piezo.can_amplifier import CanAmplifier
 from hal.clock import VirtualClock
 from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip
-from hal.types import CanFrame
+from hal.types import CanFrame, ChannelInfo
 from tests.wire.drivers.scripted_ports import ScriptedCan
 
 MS = 1_000_000
@@ -233,6 +233,7 @@ def test_heartbeat_at_50_hz_keeps_phase_and_sends_no_volley():
     clock = VirtualClock()
     can = ScriptedCan(clock)
     heartbeat = HostHeartbeat(can, clock, load_database())
+    assert (heartbeat.state, heartbeat.sent) == (0, 0)
     heartbeat.state = 2
     for _ in range(100):
         heartbeat.beat()
@@ -241,7 +242,7 @@ def test_heartbeat_at_50_hz_keeps_phase_and_sends_no_volley():
     clock.burn_ns(500 * MS)
     for _ in range(3):
         heartbeat.beat()
-    assert len(can.sent) == 6
+    assert len(can.sent) == heartbeat.sent == 6
 
 
 def test_telemetry_frames():
@@ -275,6 +276,30 @@ def test_stop_button():
     assert telemetry.poll() is False
     clock.burn_ns(1600 * MS)
     assert telemetry.button_silent()
+
+
+def test_only_the_buttons_own_frame_says_something_of_the_button():
+    clock = VirtualClock()
+    can = ScriptedCan(clock)
+    telemetry = CanTelemetry(can, clock)
+    clock.burn_ns(MS)
+    for can_id, data in ((0x081, "0101"), (0x080, "01"), (0x080, "010203")):  # another's, too short, too long
+        can.arrive(can_id, data)
+        assert telemetry.poll() is False
+        assert telemetry.button_silent()
+
+
+def test_presses_are_counted_once_each():
+    clock = VirtualClock()
+    can = ScriptedCan(clock)
+    telemetry = CanTelemetry(can, clock, name="panel")
+    counts = []
+    for pressed in (0, 1, 1, 1, 0, 1, 0, 0, 1):
+        can.arrive(0x080, f"0{pressed}00")
+        telemetry.poll()
+        counts.append(telemetry.presses)
+    assert counts == [0, 1, 1, 1, 1, 2, 2, 2, 3]
+    assert telemetry.channels() == [ChannelInfo("panel.stop", "1", 0.0, 1.0, 1.0)]
 
 
 def test_the_button_is_silent_only_beyond_its_limit():
