@@ -41,7 +41,10 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("tests/unit/guardian",),
     ),
     "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
-    "daq": (("drivers/daq/di4108.py",), ("tests/wire/drivers/test_di4108_wire.py",)),
+    "daq": (
+        ("drivers/daq/di4108.py",),
+        ("tests/wire/drivers/test_di4108_wire.py", "tests/wire/drivers/test_di4108_edges.py"),
+    ),
     "e727": (
         ("drivers/piezo/gcs.py",),
         ("tests/wire/drivers/test_gcs_link.py", "tests/wire/drivers/test_e727_wire.py"),

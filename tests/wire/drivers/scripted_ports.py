@@ -35,6 +35,7 @@ class ScriptedSerial(SilentSerial):
         self.script = deque(script)
 
     def write(self, data: bytes, timeout_s: float) -> None:
+        assert 0.0 <= timeout_s < 60.0, "every wait has a limit"
         self._times()
         assert self.script, f"unexpected write {data!r}: the script is over"
         kind, *rest = self.script.popleft()
