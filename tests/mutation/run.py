@@ -50,7 +50,10 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         ("tests/wire/drivers/test_gcs_link.py", "tests/wire/drivers/test_e727_wire.py"),
     ),
     "can": (("drivers/can_frames.py", "drivers/can_telemetry.py"), ("tests/wire/drivers/test_can_drivers_wire.py",)),
-    "motion card": (("drivers/motion_card_protocol.py",), ("tests/wire/drivers/test_motion_card_wire.py",)),
+    "motion card": (
+        ("drivers/motion_card_protocol.py",),
+        ("tests/wire/drivers/test_motion_card_wire.py", "tests/wire/drivers/test_motion_card_edges.py"),
+    ),
 }
 
 
