@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -16,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from websockets.sync.client import connect
+
+from tools.bench.started import started
 
 SECONDS = 10.0
 PERIOD_NS = 1_000_000
@@ -94,41 +95,31 @@ def measure(bench: Path) -> dict[str, float]:
     """On ``bench``: share of a core, frames a second, p99 of the tick without and with the viewer (us); with viewer,
     telemetry and a recording: lateness (us), the part of the ticks that began a period late or were skipped (%)."""
     subscription = json.dumps({"type": "subscribe", "id": 1, "channels": CHANNELS, "rows": 5000, "pixels": 1200})
-    with tempfile.TemporaryDirectory(prefix="micron-") as folder:
-        command = [sys.executable, "-m", "tools.cli.main", "bench", "--bench", str(bench), "--port", "0"]
-        server = subprocess.Popen(
-            [*command, "--stale-ms", "1000", "--recordings", folder],
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "COLUMNS": "400"},
-        )
-        try:
-            assert server.stderr is not None
-            address = next(word for word in server.stderr.readline().split() if word.startswith("http"))
-            url = address.partition("/#")[0].replace("http", "ws") + "/live"
-            while state(url)["status"].get("state") != "running":
-                time.sleep(0.5)
-            time.sleep(2.0)
-            record(address)
-            time.sleep(1.0)
-            start = counts(url)
-            time.sleep(SECONDS)
-            alone = counts(url)
-            skipped = state(url)["status"]["skipped"]
-            used_s = cpu_s(server.pid)
-            viewer = subprocess.run(
-                [sys.executable, "-c", VIEWER, url, str(SECONDS), subscription],
-                capture_output=True, text=True, check=True,
-            )  # fmt: skip
-            used_s = cpu_s(server.pid) - used_s
-            watched = counts(url)
-            ended = state(url)
-            if ended["phase"] == "safe":
-                raise RuntimeError(f"the firmware went to its safe state, nothing to measure: {ended['reason']}")
-            skipped = ended["status"]["skipped"] - skipped
-        finally:
-            server.send_signal(signal.SIGTERM)
-            server.communicate(timeout=60)
+    with (
+        tempfile.TemporaryDirectory(prefix="micron-") as folder,
+        started("--bench", str(bench), "--recordings", folder) as (server, address),
+    ):
+        url = address.partition("/#")[0].replace("http", "ws") + "/live"
+        while state(url)["status"].get("state") != "running":
+            time.sleep(0.5)
+        time.sleep(2.0)
+        record(address)
+        time.sleep(1.0)
+        start = counts(url)
+        time.sleep(SECONDS)
+        alone = counts(url)
+        skipped = state(url)["status"]["skipped"]
+        used_s = cpu_s(server.pid)
+        viewer = subprocess.run(
+            [sys.executable, "-c", VIEWER, url, str(SECONDS), subscription],
+            capture_output=True, text=True, check=True,
+        )  # fmt: skip
+        used_s = cpu_s(server.pid) - used_s
+        watched = counts(url)
+        ended = state(url)
+        if ended["phase"] == "safe":
+            raise RuntimeError(f"the firmware went to its safe state, nothing to measure: {ended['reason']}")
+        skipped = ended["status"]["skipped"] - skipped
     late = between(alone, watched, "lateness")
     ticks = sum(n for _, n in late) + skipped
     return {

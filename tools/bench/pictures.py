@@ -5,17 +5,16 @@ Needs the package ``playwright`` and Debian's Chromium; starts its own server on
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
-import threading
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
+
+from tools.bench.started import started
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 SETTLE_MS = {"scope": 9000, "tremor": 8000}
@@ -33,12 +32,11 @@ def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
 
 def report(folder: Path) -> Path:
     """The report on the recording of docs/tutorial-mismatch.md: an emulated stack against one that only multiplies."""
-    lab = ["sim_devices.plant.lab", "piezo", "--profile", "loops", "--seconds", "20", "--out", str(folder / "stack")]
-    page = folder / "report.html"
-    diagnose = ["tools.cli.main", "mismatch", "diagnose", str(folder / "stack"), "--html", str(page)]
+    lab = ["sim_devices.plant.lab", "piezo", "--profile", "loops", "--seconds", "20", "--out", "lab-stack"]
+    diagnose = ["tools.cli.main", "mismatch", "diagnose", "lab-stack", "--html", "report.html"]
     for command in (lab, diagnose):
-        subprocess.run([sys.executable, "-m", *command], check=True, stdout=subprocess.DEVNULL)
-    return page
+        subprocess.run([sys.executable, "-m", *command], check=True, stdout=subprocess.DEVNULL, cwd=folder)
+    return folder / "report.html"
 
 
 def main(arguments: list[str]) -> int:
@@ -54,39 +52,23 @@ def main(arguments: list[str]) -> int:
         return 1
     folder = Path(arguments[0] if arguments else "docs/pictures")
     folder.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(prefix="micron-") as recordings:
-        command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000"]
-        server = subprocess.Popen(
-            [*command, "--recordings", recordings],
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "COLUMNS": "400"},
+    with tempfile.TemporaryDirectory(prefix="micron-") as recordings, sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
         )
-        try:
-            assert server.stderr is not None
-            address = next(word for word in server.stderr.readline().split() if word.startswith("http"))
-            threading.Thread(target=server.stderr.read, daemon=True).start()
-            with sync_playwright() as playwright:
-                browser = playwright.chromium.launch(
-                    executable_path=chromium, args=["--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
-                )
-                page = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True).new_page()
-                page.goto(address)
-                page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
-                take(page, address.partition("/#")[0], folder, VIEWS)
-                page.keyboard.press("t")
-                page.wait_for_timeout(1000)
-                page.screenshot(path=folder / "dark.png", timeout=90_000)
-                server.send_signal(signal.SIGTERM)  # nothing else runs beside the diagnosis
-                server.wait(60)
-                page.goto(report(Path(recordings)).as_uri())
-                page.wait_for_timeout(1000)
-                page.screenshot(path=folder / "report.png", timeout=90_000)
-                browser.close()
-        finally:
-            if server.poll() is None:
-                server.send_signal(signal.SIGTERM)
-                server.wait(60)
+        page = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True).new_page()
+        with started("--recordings", recordings) as (_, address):
+            page.goto(address)
+            page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
+            take(page, address.partition("/#")[0], folder, VIEWS)
+            page.keyboard.press("t")
+            page.wait_for_timeout(1000)
+            page.screenshot(path=folder / "dark.png", timeout=90_000)
+        # nothing else runs beside the diagnosis
+        page.goto(report(Path(recordings)).as_uri())
+        page.wait_for_timeout(1000)
+        page.screenshot(path=folder / "report.png", timeout=90_000)
+        browser.close()
     people.print(f"pictures: {folder}")
     return 0
 

@@ -1,0 +1,31 @@
+"""A bench page of one's own, for screenshots and measurements: started on a free port, ended with the block."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """Process of ``micron bench`` with ``options``, and the address that it printed, token included."""
+    server = subprocess.Popen(
+        [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000", *options],
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "COLUMNS": "400"},  # the address in one line
+    )
+    try:
+        assert server.stderr is not None
+        address = next(word for word in server.stderr.readline().split() if word.startswith("http"))
+        threading.Thread(target=server.stderr.read, daemon=True).start()
+        yield server, address
+    finally:
+        if server.poll() is None:
+            server.send_signal(signal.SIGTERM)
+            server.wait(60)
