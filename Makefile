@@ -67,6 +67,9 @@ wheel: setup
 	$(BIN)/uv build --quiet --wheel --out-dir out/wheel
 	$(BIN)/uv venv --quiet --python $(BIN)/python out/wheel/venv
 	VIRTUAL_ENV=out/wheel/venv $(BIN)/uv pip install --quiet -c constraints.txt out/wheel/*.whl
+	$(BIN)/python -m zipfile -l out/wheel/*.whl > out/wheel/files.txt
+	for file in hal/py.typed drivers/dbc/micron.dbc benches/calibration/piezo.toml tools/bench/static/index.html; do \
+	  grep -q "^$$file " out/wheel/files.txt || { echo "the wheel lacks $$file"; exit 1; }; done
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
 # the unit tests once more with what they reach: by branch, without kernels (compiled code cannot be traced, their

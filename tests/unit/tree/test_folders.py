@@ -25,3 +25,9 @@ def test_it_says_what_lives_there_and_what_must_not(folder: Path):
     assert "What lives here: " in said or "Here: " in said
     assert "What must not: " in said or "Not here: " in said
     assert len(said.splitlines()) <= 9
+
+
+@pytest.mark.parametrize("room", ["hal", "drivers", "sim_devices", "firmware_py", "tools"])
+def test_its_types_are_for_others_too(room: str):
+    """PEP 561: without the marker a type checker treats an installed package as untyped."""
+    assert (ROOT / room / "py.typed").is_file()
