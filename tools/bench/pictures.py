@@ -64,7 +64,7 @@ def main(arguments: list[str]) -> int:
             page.keyboard.press("t")
             page.wait_for_timeout(1000)
             page.screenshot(path=folder / "dark.png", timeout=90_000)
-        # nothing else runs beside the diagnosis
+            page.goto("about:blank")  # nothing else runs beside the diagnosis
         page.goto(report(Path(recordings)).as_uri())
         page.wait_for_timeout(1000)
         page.screenshot(path=folder / "report.png", timeout=90_000)
