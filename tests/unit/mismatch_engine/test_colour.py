@@ -16,7 +16,7 @@ def test_recursion_equals_a_plain_convolution() -> None:
     taps[1:17] -= 0.2 / 16
     for columns in (x, x[:, 0]):
         np.testing.assert_allclose(model.apply(columns), lfilter(taps, 1.0, columns, axis=0)[16:], atol=1e-12)
-    args = (x[:60], model.lags, model.scales, model.weights, 16)
+    args = (np.ascontiguousarray(x[:60].T), model.lags, model.scales, model.weights, 16)
     np.testing.assert_allclose(whiten_stretch(*args), whiten_stretch.py_func(*args), atol=1e-13)
 
 

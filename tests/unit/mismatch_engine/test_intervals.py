@@ -84,7 +84,7 @@ def test_the_instant_of_a_step_has_an_interval() -> None:
     fitted = replace(
         base, model=model, theta=theta, residual={"displacement": 0.05 * rng.standard_normal(problem.index.size)}
     )
-    low, high = human_values(problem, fitted)[placed.label]["time1_s"].ci95
+    low, high = human_values(problem, fitted, covariance(problem, fitted))[placed.label]["time1_s"].ci95
     # two samples and eleven times (0.05 / 0.1)^2, 10 ms each, either way
     assert 0.5 * (high - low) == pytest.approx(0.0475 + 0.0025, abs=0.02)
 

@@ -40,9 +40,8 @@ from tools.mismatch.simulate import Model
 Array = NDArray[np.float64]
 
 
-def base_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> list[BaseShift]:
+def base_shifts(raw: Fit, base: Fit, fitted: Fit, cov: Array) -> list[BaseShift]:
     """How far the missing effects had pulled the base parameters."""
-    cov = covariance(problem, fitted)
     shifts: list[BaseShift] = []
     for i in range(base.model.n_base):
         p = base.model.parameters[i]
@@ -69,7 +68,8 @@ def assemble(
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
     verdict, p = decide(problem, raw, base, selection, left, rule)
-    physics = physics_found(problem, selection)
+    cov = covariance(problem, fitted)
+    physics = physics_found(problem, selection, cov)
     runners, groups = alternatives(problem, selection, rule)
     looked = fitted if verdict == "unexplained" else base
     if verdict == "missing_physics":
@@ -144,7 +144,7 @@ def assemble(
             {o: problem.floors[o].method for o in twin.outputs},
             problem.split.fit,
             problem.split.held_out,
-            tuple(base_shifts(problem, raw, base, fitted)),
+            tuple(base_shifts(raw, base, fitted, cov)),
         ),
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),

@@ -17,27 +17,36 @@ from hal.compiled import kernel
 Array = NDArray[np.float64]
 
 
+AT_ONCE = 2048  # samples that stay in the processor's first cache while every coefficient passes over them
+
+
 @kernel
 def whiten_stretch(x, lags, scales, weights, warm):
-    """Innovations (n - warm, k) of one stretch x (n, k): each sample less ``lags[i]`` times the one i + 1 before it and
-    ``weights[j]`` times the mean of the ``scales[j]`` before it.
+    """Innovations (k, n - warm) of one stretch x (k, n), a signal per row: each sample less ``lags[i]`` times the one
+    i + 1 before it and ``weights[j]`` times the mean of the ``scales[j]`` before it.
     """
-    n, k = x.shape
-    out = np.empty((n - warm, k))
-    sums = np.zeros((scales.size, k))
-    for j in range(scales.size):
-        for i in range(warm - scales[j], warm):
-            for c in range(k):
-                sums[j, c] += x[i, c]
-    for i in range(warm, n):
-        for c in range(k):
-            v = x[i, c]
+    k, n = x.shape
+    out = np.empty((k, n - warm))
+    sums = np.zeros(n + 1)
+    for c in range(k):
+        for i in range(n):
+            sums[i + 1] = sums[i] + x[c, i]
+        for first in range(warm, n, AT_ONCE):
+            last = min(first + AT_ONCE, n)
+            here = out[c, first - warm : last - warm]
+            here[:] = x[c, first:last]
+            # one coefficient over many samples, not all over one: these loops run in vector registers
             for a in range(lags.size):
-                v -= lags[a] * x[i - 1 - a, c]
+                gain = lags[a]
+                before = x[c, first - 1 - a : last - 1 - a]
+                for i in range(here.size):
+                    here[i] -= gain * before[i]
             for j in range(scales.size):
-                v -= weights[j] / scales[j] * sums[j, c]
-                sums[j, c] += x[i, c] - x[i - scales[j], c]
-            out[i - warm, c] = v
+                gain = weights[j] / scales[j]
+                until = sums[first:last]
+                since = sums[first - scales[j] : last - scales[j]]
+                for i in range(here.size):
+                    here[i] -= gain * (until[i] - since[i])
     return out
 
 
@@ -77,9 +86,9 @@ class Whitener:
             return x[:0]
         if warm == 0:
             return x
-        columns = np.ascontiguousarray(x if x.ndim == 2 else x[:, None], np.float64)
-        out = whiten_stretch(columns, self.lags, self.scales, self.weights, warm)
-        return out if x.ndim == 2 else out[:, 0]
+        signals = np.ascontiguousarray(x.T if x.ndim == 2 else x[None, :], np.float64)
+        out = whiten_stretch(signals, self.lags, self.scales, self.weights, warm)
+        return out.T if x.ndim == 2 else out[0]
 
 
 def _scales(n: int, lags: int) -> list[int]:

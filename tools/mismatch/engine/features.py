@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.signal import lfilter
+
+from hal.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,11 @@ class Feature:
     memory: bool = False
 
 
+def side_by_side(signals: Sequence[Array]) -> Array:
+    """(n, k) from k signals (n,), each of them contiguous: filters and sums of products pass along a signal."""
+    return np.stack(signals).T
+
+
 def curve(x: Array, knots: int = 7) -> Array:
     """Columns (n, k) that span piecewise linear curves of ``x`` (n,): the value and hinges at its quantiles."""
     spread = float(np.std(x))
@@ -33,10 +40,10 @@ def curve(x: Array, knots: int = 7) -> Array:
     z = (x - x.mean()) / spread
     levels = np.unique(np.round(z[:: max(1, z.size // 5000)], 9))
     if levels.size <= 8:
-        return np.column_stack([(np.abs(z - v) < 1e-6) for v in levels[1:]]).astype(float)
+        return side_by_side([(np.abs(z - v) < 1e-6).astype(float) for v in levels[1:]])
     spots = np.unique(np.quantile(z, np.linspace(0.08, 0.92, knots)))
     columns = [z, *(np.maximum(z - s, 0.0) for s in spots[:-1])]
-    return np.column_stack(columns)
+    return side_by_side(columns)
 
 
 def rate_of(x: Array, dt: float, width: int = 1) -> Array:
@@ -53,12 +60,14 @@ def recent_mean(x: Array, seconds: float, dt: float) -> Array:
     return lfilter([1 - a], [1, -a], x, zi=np.array([a * x[0]]))[0]
 
 
-def last_reversal(x: Array, band: float) -> Array:
+@kernel
+def last_reversal(x, band):
     """Value (n,) of ``x`` at its last reversal of more than ``band``: what a loop remembers."""
     out = np.empty_like(x)
     extreme = held = x[0]
     direction = 0
-    for i, v in enumerate(x.tolist()):
+    for i in range(x.size):
+        v = x[i]
         if direction == 0:
             if abs(v - extreme) > band:
                 direction, extreme = (1 if v > extreme else -1), v
@@ -123,7 +132,7 @@ def features_of(
             out.append(Feature(name, "running extremum", curve(last_reversal(z, 0.05), 4), memory=True))
         history = [z - recent_mean(z, s, dt) for s in _times(dt, duration)]
         history += [recent_mean(np.abs(z), s, dt) for s in _times(dt, duration)]
-        out.append(Feature(name, "recent history", np.column_stack(history), memory=True))
+        out.append(Feature(name, "recent history", side_by_side(history), memory=True))
         slow = max(20 * dt, duration / 60)
         out.append(Feature(name, "amplitude", curve(envelope(z, slow, dt), 4), memory=True))
         out.append(Feature(name, "frequency", curve(local_frequency(z, slow, dt), 4), memory=True))
@@ -141,7 +150,7 @@ def features_of(
                     out.append(Feature(gain_by, "cross product with rate", curve(za, 5) * slope[:, None]))
     if n:
         phase = np.linspace(0, 1, n)
-        waves = np.column_stack([np.cos(np.pi * k * phase) for k in range(1, 7)])
+        waves = side_by_side([np.cos(np.pi * k * phase) for k in range(1, 7)])
         out.append(Feature("time", "time itself", waves))
         if drive in names and pairs:
             out.append(Feature("time", "cross product", waves * standard(signals[drive])[:, None]))

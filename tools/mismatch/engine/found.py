@@ -11,7 +11,6 @@ from scipy.stats import norm
 from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.identifiability import experiment
-from tools.mismatch.engine.intervals import covariance
 from tools.mismatch.engine.parsimony import Rule, as_good
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Alternative, Equivalent, ParameterValue, PhysicsFound
@@ -24,10 +23,11 @@ from tools.mismatch.placed import Placed
 Array = NDArray[np.float64]
 
 
-def human_values(problem: Problem, fitted: Fit) -> dict[str, dict[str, ParameterValue]]:
-    """Human parameters with 95 % intervals by the delta method, per effect label and "base"."""
+def human_values(problem: Problem, fitted: Fit, cov: Array) -> dict[str, dict[str, ParameterValue]]:
+    """Human parameters with 95 % intervals by the delta method from the parameters' covariance, per effect label and
+    "base".
+    """
     model, theta = fitted.model, fitted.theta
-    cov = covariance(problem, fitted)
     values = model.human(theta)
     flat = np.array([h.value for group in values.values() for h in group])
     gradient = np.zeros((flat.size, theta.size))
@@ -69,12 +69,12 @@ def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: 
     return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", units.get(output, "1"))
 
 
-def physics_found(problem: Problem, selection: Selection) -> list[PhysicsFound]:
-    """Accepted effects in the order of their acceptance, parameters from the joint fit."""
+def physics_found(problem: Problem, selection: Selection, cov: Array) -> list[PhysicsFound]:
+    """Accepted effects in the order of their acceptance, parameters from the joint fit and its covariance."""
     fitted = selection.fitted
     if not fitted.model.placed:
         return []
-    values = human_values(problem, fitted)
+    values = human_values(problem, fitted, cov)
     rows = problem.held_rows
     out: list[PhysicsFound] = []
     for k, placed in enumerate(fitted.model.placed):
