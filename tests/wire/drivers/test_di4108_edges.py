@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import pytest
 
-from drivers.daq.di4108 import Di4108
+from drivers.daq.di4108 import Di4108, scan_rate
 from hal.clock import VirtualClock
 from hal.errors import BenchError, HalError, HalTimeout, Overrun, ProtocolError, WrongDevice
 from hal.types import ChannelInfo, ScanBlock, ScanConfig, TimeSource
@@ -26,17 +27,42 @@ def test_the_inputs_are_told_with_range_and_resolution():
 
 
 def test_fast_scans_come_in_larger_packets():
-    """8 inputs at 5 kHz are 80 bytes in a millisecond: packets of 64, ``ps 2``; a read of 64 bytes is whole."""
-    script = [
-        (kind, data.replace(b"ps 0", b"ps 2").replace(b"srate 60000", b"srate 12000")) for kind, data in CONFIGURE
-    ]
+    """8 inputs at 7.5 kHz are 120 bytes in a millisecond: packets of 64, ``ps 2``; half of one is not believed."""
+    script = [(kind, data.replace(b"ps 0", b"ps 2").replace(b"srate 60000", b"srate 8000")) for kind, data in CONFIGURE]
     stream = b"".join(alike(k) for k in range(16))
-    pieces = [e for i in range(0, 256, 64) for e in (("at", 10 * MS + i * 12_500), ("r", stream[i : i + 64]))]
+    pieces = [e for i in range(0, 256, 32) for e in (("at", 10 * MS + i * 8_333), ("r", stream[i : i + 32]))]
     daq, port, _ = device(*script, ("w", b"start 0\r"), *pieces)
-    assert daq.configure(ScanConfig(5000.0, tuple(range(8)), (5.0,) * 8)).rate_hz == 5000.0
+    assert daq.configure(ScanConfig(7500.0, tuple(range(8)), (5.0,) * 8)).rate_hz == 7500.0
     daq.start()
     assert [daq.read_scans(OUT, 0.01).n for _ in range(4)] == [4] * 4
     port.done()
+
+
+@pytest.mark.parametrize("rate_hz", [7.3, 99.7, 333.3, 1234.5, 44_100.0, 60e6 / (65535 * 512), 60e6 / 375])
+def test_the_divisors_are_the_nearest_that_there_are(rate_hz: float):
+    srate, dec, real_hz = scan_rate(rate_hz)
+    every = [
+        (abs(60e6 / (s * d) - rate_hz), d)
+        for d in range(1, 513)
+        for s in (math.floor(60e6 / rate_hz / d), math.ceil(60e6 / rate_hz / d))
+        if 375 <= s <= 65535
+    ]
+    assert real_hz == 60e6 / (srate * dec)
+    assert abs(real_hz - rate_hz) == pytest.approx(min(every)[0], abs=1e-9)
+    # of equals the smallest, which filters least
+    assert dec == min(d for miss, d in every if miss < min(every)[0] + 1e-9)
+
+
+@pytest.mark.parametrize("rate_hz", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_rate_is_a_positive_number(rate_hz: float):
+    with pytest.raises(BenchError, match="not a positive number"):
+        scan_rate(rate_hz)
+
+
+@pytest.mark.parametrize("rate_hz", [1.78, 160_300.0])
+def test_the_refusal_of_a_rate_says_what_there_is(rate_hz: float):
+    with pytest.raises(BenchError, match=r"is outside 1\.79 \.\. 160000 Hz of the DI-4108"):
+        scan_rate(rate_hz)
 
 
 def test_a_block_of_nothing_has_the_number_of_the_next_scan():
@@ -70,6 +96,40 @@ def test_a_start_after_an_overflow_begins_anew():
     block = daq.read_scans(OUT, 0.03)
     assert (block.n, block.seq0, OUT[0, 0]) == (1, 0, 7)
     port.done()
+
+
+def test_scans_before_an_overflow_are_handed_out_one_by_one():
+    daq, _, _ = scanning(("at", 10 * MS), ("r", scan(1) + scan(2) + scan(3) + b"stop 01"))
+    one = np.zeros((1, 8), dtype=np.int16)
+    seen = []
+    for _ in range(3):
+        assert daq.read_scans(one, 0.01).n == 1
+        seen.append(int(one[0, 0]))
+    assert seen == [1, 2, 3]
+    with pytest.raises(Overrun):
+        daq.read_scans(one, 0.01)
+
+
+def test_an_answer_may_come_byte_by_byte_with_strays_in_it():
+    answers = [
+        (b"info 1\r", b"\ninfo 1 4108\r"),
+        (b"info 2\r", b"info 2 65\x00\r"),
+        (b"info 6\r", b"info 6 5C76A3E8\r"),
+    ]
+    script = [e for asked, told in answers for e in (("w", asked), *(("r", bytes((byte,))) for byte in told))]
+    daq, port, _ = device(*STOP, *script)
+    assert daq.probe() == "DI-4108 firmware 1.01 serial 5C76A3E8"
+    port.done()
+
+
+def test_an_answer_without_end_is_a_bounded_wait():
+    more = [e for k in range(1, 20) for e in (("at", k * 100 * MS), ("r", b"x"))]
+    daq, _, clock = device(*STOP, ("w", b"info 1\r"), *more)
+    with pytest.raises(HalTimeout, match=r"no answer to 'info 1' within 0\.5 s, got b'xxxx") as caught:
+        daq.probe()
+    assert caught.value.partial == 5
+    assert caught.value.device == "daq"
+    assert clock.now_ns() <= 600 * MS
 
 
 def test_a_device_that_has_stopped_itself_is_not_told_to_stop():
