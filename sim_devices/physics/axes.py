@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.rigid import centripetal_row, rates, tangential_row
 
 _VECTORS = ("specific_force_", "field_")
 
@@ -38,9 +39,23 @@ def _turnable(signals: Mapping[str, Array], output: str) -> str:
     return _available(signals, output) if own_axis(output) in "xyz" else "the output is no axis of a vector"
 
 
+def vector_at(ctx: Context) -> dict[str, Array]:
+    """Axis letter -> the vector (n,) where the sensor sits: a body that turns accelerates elsewhere as well.
+
+    f + alpha x r + omega x (omega x r), H. Goldstein, Classical Mechanics, 3rd ed., eq. 4.91; r as believed.
+    """
+    here = {a: ctx.signals[s] for a, s in vector_of(ctx.signals).items()}
+    r = np.array(ctx.facts.get("position_m", ()))
+    if r.size != 3 or not r.any():
+        return here
+    w = rates(ctx)
+    rows = {a: tangential_row(w, i, ctx.dt) + centripetal_row(w, i) for i, a in enumerate("xyz") if a in here}
+    return {a: v + rows[a] @ r for a, v in here.items()}
+
+
 def _columns_of(ctx: Context, axes: Sequence[str]) -> list[Array]:
-    vector = vector_of(ctx.signals)
-    return [ctx.signals[vector[a]] for a in axes]
+    vector = vector_at(ctx)
+    return [vector[a] for a in axes]
 
 
 def _axes(settings: Settings) -> list[str]:
@@ -58,15 +73,15 @@ _PAIRS = (("x", "y"), ("x", "z"), ("y", "z"))
 
 def _rotation_columns(ctx: Context) -> Array:
     """Columns of a small rotation of the whole vector: output i gets -(phi x f)_i."""
-    vector = vector_of(ctx.signals)
+    vector = vector_at(ctx)
     i = "xyz".index(own_axis(ctx.output))
     out = np.zeros((ctx.t.size, 3))
     j, k = (i + 1) % 3, (i + 2) % 3
     # (phi x f)_i = phi_j f_k - phi_k f_j
     if "xyz"[k] in vector:
-        out[:, j] = -ctx.signals[vector["xyz"[k]]]
+        out[:, j] = -vector["xyz"[k]]
     if "xyz"[j] in vector:
-        out[:, k] = ctx.signals[vector["xyz"[j]]]
+        out[:, k] = vector["xyz"[j]]
     return out
 
 

@@ -46,7 +46,8 @@ def find_steps(residual: Array, keep: np.ndarray) -> tuple[list[int], float, flo
     """
     e = np.where(keep, residual, 0.0)
     n = e.size
-    sigma = max(long_run_rms(residual[keep]), 1e-300)
+    # a residual that mostly stands still has no long-run variance: then its whole rms, however little, is the scale
+    sigma = long_run_rms(residual[keep]) or float(np.std(residual[keep])) or 1.0
     size = max(1, n // 4000)
     m = n // size
     total = e[: m * size].reshape(m, size).sum(axis=1)

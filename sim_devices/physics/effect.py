@@ -208,3 +208,7 @@ class Effect:
     """Its course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     """Human parameters (``report``) outside of which it is other physics in disguise; checked before it is named."""
+    forbidden: Mapping[str, tuple[tuple[float, float], ...]] = field(
+        default_factory=dict[str, tuple[tuple[float, float], ...]]
+    )
+    """The same the other way round: ranges of human parameters that are by definition another effect's."""

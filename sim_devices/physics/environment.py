@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 import numpy as np
 
@@ -29,9 +30,9 @@ def _temp_available(signals: Mapping[str, Array], output: str) -> str:
     return _varies("temperature", signals)
 
 
-def _temp_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
+def _prepare(signal: str, x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
-    v = ctx.signals["temperature"][k]
+    v = ctx.signals[signal][k]
     moving = float(np.ptp(x[k])) > 0
     return {
         "reference": (float(v.mean()),),
@@ -42,20 +43,20 @@ def _temp_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     }
 
 
-def _temp_parts(settings: Settings) -> Parts:
+def _parts(unit: str, lag: str, settings: Settings) -> Parts:
     dt, span = settings.get("time", (1e-3, 1.0))
-    weights = [Parameter("bias_per_K", "{out}/K"), Parameter("bias_per_K2", "{out}/K^2")]
+    weights = [Parameter(f"bias_per_{unit}", f"{{out}}/{unit}"), Parameter(f"bias_per_{unit}2", f"{{out}}/{unit}^2")]
     if settings.get("gain", (1.0,))[0]:
-        weights.append(Parameter("scale_per_K", "{out}/({in} K)"))
+        weights.append(Parameter(f"scale_per_{unit}", f"{{out}}/({{in}} {unit})"))
     return Parts(
-        (Parameter("thermal_lag_s", "s", 0.01 * dt, 0.3 * span, log=True, scale=dt),),
+        (Parameter(lag, "s", 0.01 * dt, 0.3 * span, log=True, scale=dt),),
         tuple(weights),
         np.diag([0.02, 0.1, 0.02][: len(weights)]),
     )
 
 
-def _temp_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    d = ctx.signals["temperature"] - settings.get("reference", (0.0,))[0]
+def _basis(signal: str, x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    d = ctx.signals[signal] - settings.get("reference", (0.0,))[0]
     if q[0] > 0.1 * ctx.dt:
         d = low_pass(np.ascontiguousarray(d), ctx.dt, q[0], np.array(ctx.starts))
     cols = [d, d * d]
@@ -64,7 +65,7 @@ def _temp_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return np.stack(cols, axis=1)
 
 
-def _temp_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+def _guess(signal: str, x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
     k = thin(ctx.keep, 8000)
     straight = np.stack([np.ones(k.size), x[k]], axis=1)
@@ -72,7 +73,7 @@ def _temp_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
         straight = straight[:, :1]
     tried: list[tuple[float, float]] = []
     for tau in (0.02 * dt, *np.geomspace(2 * dt, 0.2 * span, 12)):
-        cols = _temp_basis(x, ctx, np.array([tau]), settings)[k]
+        cols = _basis(signal, x, ctx, np.array([tau]), settings)[k]
         tried.append((least_squares(np.column_stack([straight, cols]), residual[k])[1], float(tau)))
     # without a lag unless a lag is clearly better
     plain = tried[0]
@@ -97,14 +98,14 @@ TEMPERATURE_SENSITIVITY = Effect(
     summary="follows a recorded temperature",
     kind="add",
     stages=("sensor", "environment"),
-    parts=_temp_parts,
+    parts=partial(_parts, "K", "thermal_lag_s"),
     equation=r"y = x + a\,\Delta T + b\,\Delta T^2 + c\,(x - x_0)\,\Delta T,\; \Delta T \text{ behind a thermal lag}",
     source="IEEE Std 1293-2018, temperature model; J. Fraden, Handbook of Modern Sensors, 5th ed., section 3.2",
     excitation="a temperature that changes by more than sensor noise can hide, best up and down again",
     confusable_with=("thermal_drift", "random_walk", "supply_sensitivity"),
-    prepare=_temp_prepare,
-    guess=_temp_guess,
-    basis=_temp_basis,
+    prepare=partial(_prepare, "temperature"),
+    guess=partial(_guess, "temperature"),
+    basis=partial(_basis, "temperature"),
     report=_temp_report,
     sites=("output",),
     needs=("temperature",),
@@ -118,36 +119,15 @@ def _supply_available(signals: Mapping[str, Array], output: str) -> str:
     return _varies("supply", signals)
 
 
-def _supply_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    k = ctx.keep
-    moving = float(np.ptp(x[k])) > 0
-    return {
-        "reference": (float(ctx.signals["supply"][k].mean()),),
-        "centre": (float(x[k].mean()),),
-        "gain": (1.0 if moving else 0.0,),
-    }
-
-
-def _supply_parts(settings: Settings) -> Parts:
-    weights = [Parameter("bias_per_V", "{out}/V")]
-    if settings.get("gain", (1.0,))[0]:
-        weights.append(Parameter("scale_per_V", "{out}/({in} V)"))
-    return Parts((), tuple(weights), 0.02 * np.eye(len(weights)))
-
-
-def _supply_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    d = ctx.signals["supply"] - settings.get("reference", (0.0,))[0]
-    cols = [d]
-    if settings.get("gain", (1.0,))[0]:
-        cols.append(_gain_column(x, d, settings.get("centre", (0.0,))[0]))
-    return np.stack(cols, axis=1)
-
-
 def _supply_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     reference = settings["reference"][0]
-    out = [Human("bias_per_V", float(p[0]), "{out}/V")]
-    if p.size > 1:
-        relative = float(p[1] / scale * reference) if scale else 0.0
+    out = [
+        Human("bias_per_V", float(p[1]), "{out}/V"),
+        Human("bias_per_V2", float(p[2]), "{out}/V^2"),
+        Human("supply_lag_s", float(p[0]), "s"),
+    ]
+    if p.size > 3:
+        relative = float(p[3] / scale * reference) if scale else 0.0
         out.append(Human("ratiometric_share", relative, "1"))
     return out
 
@@ -157,13 +137,14 @@ SUPPLY_SENSITIVITY = Effect(
     summary="follows a recorded supply voltage (ratiometric)",
     kind="add",
     stages=("sensor", "acquisition"),
-    parts=_supply_parts,
-    equation=r"y = x + a\,\Delta V_s + b\,(x - x_0)\,\Delta V_s",
+    parts=partial(_parts, "V", "supply_lag_s"),
+    equation=r"y = x + a\,\Delta V_s + b\,\Delta V_s^2 + c\,(x - x_0)\,\Delta V_s,\; \Delta V_s \text{ behind an RC}",
     source="ADXL103/ADXL203 data sheet, section Using the ADXL103/ADXL203 with operating voltages other than 5 V",
     excitation="a supply that changes, and an input that changes with it and without",
     confusable_with=("temperature_sensitivity", "random_walk"),
-    prepare=_supply_prepare,
-    basis=_supply_basis,
+    prepare=partial(_prepare, "supply"),
+    guess=partial(_guess, "supply"),
+    basis=partial(_basis, "supply"),
     report=_supply_report,
     sites=("output",),
     needs=("supply",),

@@ -269,4 +269,6 @@ VIBRATION = Effect(
     report=_line_report,
     driven=False,
     sites=("output",),
+    # a mains line that wanders has skirts beside the band where its own search looks
+    forbidden={"frequency_Hz": tuple((0.99 * m, 1.01 * m) for m in MAINS_HZ)},
 )

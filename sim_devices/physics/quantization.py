@@ -1,4 +1,4 @@
-"""Quantisation: readings on a grid coarser than declared."""
+"""Quantisation: a grid that is seen in the readings themselves, bare or under noise that came after it."""
 
 from __future__ import annotations
 
@@ -36,10 +36,56 @@ def find_step(y: Array) -> float:
     return 0.0
 
 
+LUMPED = 0.3  # least length of the mean phasor beyond that of the model's own output
+STEPS = (0.5, 3.8)  # of the residual's rms: q / sqrt(12) is all of it at most, and too little of it below
+
+
+def find_lumps(y: Array, x: Array, rms: float) -> tuple[float, float, float]:
+    """(step, origin, p) of a grid under noise that came after the rounding: y (n,) gathers at multiples of a step while
+    the model's output x (n,) does not; step 0 if there is none. ``rms`` of the residual.
+
+    The characteristic function of y at 1 / step is exp(-2 (pi s / step)^2) for noise of rms s, and next to nothing
+    for a smooth distribution (Widrow, Kollar 2008, eq. 4.11). A passage from one cell to the next counts as one sample.
+    """
+    lo, span = float(y.min()), float(np.ptp(y))
+    if rms <= 0.0 or not 4.0 * STEPS[1] * rms < span < 1e5 * rms:
+        return 0.0, 0.0, 1.0
+    width = 0.1 * rms
+    size = 1 << int(np.ceil(np.log2(4 * span / width)))
+    edges = lo + width * np.arange(int(span / width) + 2)
+    f = np.arange(size // 2) / (size * width)
+    wanted = (f > 1 / (STEPS[1] * rms)) & (f < 1 / (STEPS[0] * rms))
+    lengths = [np.abs(np.fft.rfft(np.histogram(v, edges)[0], size)[: size // 2]) / y.size for v in (y, x)]
+    beyond = np.where(wanted, lengths[0] - lengths[1], 0.0)
+    best = int(np.argmax(beyond))
+    if beyond[best] < LUMPED:
+        return 0.0, 0.0, 1.0
+    fine = f[best] + np.linspace(-1.0, 1.0, 101) / (size * width)
+    phasors = np.array([np.mean(np.exp(2j * np.pi * v * (y - lo))) for v in fine])
+    top = int(np.argmax(np.abs(phasors)))
+    step = float(1 / fine[top])
+    origin = lo + step * float(np.angle(phasors[top])) / (2 * np.pi)
+    cells = np.round((x - origin) / step)
+    passages = int(np.count_nonzero(np.diff(cells))) + 1
+    length = max(float(np.abs(phasors[top])) - float(np.abs(np.mean(np.exp(2j * np.pi * fine[top] * (x - lo))))), 0.0)
+    p = min(1.0, float(np.count_nonzero(wanted)) * float(np.exp(-passages * length**2)))
+    return step, origin, max(p, 1e-300)
+
+
+def _lumps(x: Array, residual: Array, ctx: Context) -> tuple[float, float, float]:
+    if ctx.measured is None:
+        return 0.0, 0.0, 1.0
+    k = ctx.keep
+    y, r = ctx.measured[k], residual[k]
+    return find_lumps(y, y - r, float(np.sqrt(np.mean(r**2))))
+
+
 def _grid_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     y = ctx.measured if ctx.measured is not None else x
     step = find_step(y)
-    origin = float(np.unique(y)[0]) if step > 0 else 0.0
+    if step > 0:
+        return {"step": (step,), "origin": (float(np.unique(y)[0]),)}
+    step, origin, _ = _lumps(x, residual, ctx)
     return {"step": (step,), "origin": (origin,)}
 
 
@@ -83,8 +129,12 @@ def _grid_test(x: Array, residual: Array, ctx: Context) -> Signature:
         return Signature(1.0, 0.0)
     step = find_step(ctx.measured)
     power = float(np.mean(residual[ctx.keep] ** 2))
-    if step == 0.0 or power == 0.0:
+    if power == 0.0:
         return Signature(1.0, 0.0, "no grid")
+    if step == 0.0:
+        step, _, p = _lumps(x, residual, ctx)
+        share = min(1.0, step * step / 12 / power)
+        return Signature(p, share, f"readings gather at multiples of {step:g}" if step else "no grid")
     share = min(1.0, step * step / 12 / power)
     # every distinct value but the two that fix the grid lies on it by chance of twice the tolerance
     values = min(max(round(float(np.ptp(ctx.measured)) / step) - 1, 0), 100)

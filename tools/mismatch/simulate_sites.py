@@ -11,6 +11,7 @@ from tools.mismatch.twins.base import Twin
 
 SAME = "input or output"
 _WHOLE_RECORD = ("dead_time", "clock_skew", "dropped_samples")  # one clock for all outputs
+_ALIKE = ("first_order_lag",)  # equal channels of one instrument, or one filter in front of them
 _DRIVES = ("amplifier", "actuator")  # stages before the base physics
 
 
@@ -72,9 +73,12 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     if effect.name in _WHOLE_RECORD:
         return [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs, note=SAME)]
     inputs, outputs = "input" in effect.sites, "output" in effect.sites
+    together: list[Placed] = []
+    if effect.name in _ALIKE and len(twin.outputs) > 1:
+        together = [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs)]
     if twin.static:
-        return _static(twin, effect, stage, usable, inputs, outputs, bool(present))
-    found: list[Placed] = []
+        return together + _static(twin, effect, stage, usable, inputs, outputs, bool(present))
+    found: list[Placed] = together
     if outputs:
         found += [Placed(effect, "output", o, stage, (o,)) for o in usable]
     if inputs and effect.driven:
@@ -104,10 +108,15 @@ def _static(
 
 
 def _groups(twin: Twin, effect: Effect, usable: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Outputs that share one set of weights: those of one location for a position error, else all."""
-    if effect.name != "sensor_position_error":
+    """Outputs that share one set of weights: those of one location for a position error, of one or all of them for a
+    package that is turned, else all.
+    """
+    if effect.name not in ("sensor_position_error", "misalignment"):
         return [usable]
     by: dict[float, list[str]] = {}
     for o in usable:
         by.setdefault(twin.facts(o).get("location", (0.0,))[0], []).append(o)
-    return [tuple(g) for g in by.values()]
+    packages = [tuple(g) for g in by.values()]
+    if effect.name == "misalignment":
+        return [usable] + [g for g in packages if 1 < len(g) < len(usable)]
+    return packages

@@ -16,7 +16,7 @@ from sim_devices.physics.dropped_samples import best_shifts, find_drops, shift_b
 from sim_devices.physics.effect import Context
 from sim_devices.physics.exponential import exponential
 from sim_devices.physics.lag import low_pass
-from sim_devices.physics.quantization import find_step, mean_of_steps
+from sim_devices.physics.quantization import find_lumps, find_step, mean_of_steps
 from sim_devices.physics.resampling import delay_by_correlation, resample, resample_straight
 from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.saturation import limit
@@ -125,6 +125,23 @@ def test_grid_is_found_and_noise_has_none() -> None:
     assert find_step(x) == 0.0
     coarse = np.round(200 * x / np.ptp(x))
     assert find_step(0.07 * np.round(coarse / 0.07)) == pytest.approx(1.0, rel=1e-4)  # a finer grid over it
+
+
+def test_a_grid_is_found_under_noise_that_came_after_the_rounding() -> None:
+    rng = np.random.default_rng(1)
+    x = 5.0 * np.sin(np.arange(4000) * 0.013) + np.sin(np.arange(4000) * 0.11)
+    late = 0.025 * rng.standard_normal(4000)
+    y = 0.1 + 0.25 * np.round((x - 0.1) / 0.25) + late
+    step, origin, p = find_lumps(y, x, float(np.std(y - x)))
+    assert step == pytest.approx(0.25, rel=1e-3)
+    assert (origin - 0.1) / 0.25 == pytest.approx(np.round((origin - 0.1) / 0.25), abs=0.02)
+    assert p < 1e-12
+    plain = x + 0.08 * rng.standard_normal(4000)
+    assert find_lumps(plain, x, 0.08)[2] == 1.0
+    # a few levels that are held lie on many a grid
+    held = np.repeat(rng.uniform(-5, 5, 14), 300)
+    off = held + np.repeat(rng.uniform(-0.2, 0.2, 14), 300)
+    assert find_lumps(off, held, float(np.std(off - held)))[2] > 1e-7
 
 
 def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:

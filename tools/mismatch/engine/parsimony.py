@@ -12,6 +12,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.revise import size
 from tools.mismatch.engine.score import block_energy, misfits, paired_t
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
 FAR = 100.0  # noise variances above which the best is a poor model: then blocks say nothing about which is simpler
@@ -77,8 +78,12 @@ FREEDOM = {
     "hysteresis": 8,
     "rate_dependent_hysteresis": 20,
     "random_walk": 12,
+    "mains_interference": 6,
+    "vibration": 6,
 }
-"""What a family counts as at most: its weights are smoothed, and how many columns its data asked for is no physics."""
+"""What a family counts as at most: its weights are smoothed, and how many columns its data asked for (bends of a curve,
+harmonics and wander of a line) is no physics.
+"""
 
 
 def less_plain(name: str, among: Collection[str]) -> bool:
@@ -113,12 +118,16 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     return b <= a + form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
 
 
+def freedom(placed: Placed) -> float:
+    """How many numbers an effect brings, those of a family counted as no more than ``FREEDOM``."""
+    return min(size(placed), FREEDOM.get(placed.effect.name, np.inf))
+
+
 def complexity(trial: Trial) -> float:
     """How much freedom an effect has, per output that it serves but at least one; events read off the data count as
     parameters.
     """
-    most = FREEDOM.get(trial.name, np.inf)
-    return max(min(size(trial.placed), most) / max(len(trial.placed.outputs), 1), 1.0)
+    return max(freedom(trial.placed) / max(len(trial.placed.outputs), 1), 1.0)
 
 
 def fewest(

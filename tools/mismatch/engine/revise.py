@@ -96,7 +96,7 @@ def swap_pass(
                 candidate = replaced(problem, fitted, k, rival.placed)
             if better(problem, fitted, candidate, margin=margin, least=least):
                 # the newcomer is last in its model; keep the order of acceptance
-                fitted = _reordered(problem, candidate, k)
+                fitted = reordered(problem, candidate, k)
                 changed.append(k)
                 break
     return fitted, changed
@@ -152,18 +152,19 @@ def simplify_pass(
             if candidate.ok and left <= limit:
                 passed.append((size(rival), left, i, candidate))
         if passed:
-            fitted = _reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
+            fitted = reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
             changed.append(k)
     return fitted, changed
 
 
 def beyond_limits(fitted: Fit, placed: Placed) -> bool:
     """Whether a report figure of a fitted effect is beyond what its physics can be."""
-    limits = placed.effect.limits
-    if not limits:
+    limits, forbidden = placed.effect.limits, placed.effect.forbidden
+    if not limits and not forbidden:
         return False
     found = fitted.model.human(fitted.theta)[placed.label]
-    return any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
+    outside = any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
+    return outside or any(a <= h.value <= b for h in found for a, b in forbidden.get(h.name, ()))
 
 
 def size(placed: Placed) -> int:
@@ -173,7 +174,8 @@ def size(placed: Placed) -> int:
     return len(parts.nonlinear) + len(parts.weights) + events
 
 
-def _reordered(problem: Problem, fitted: Fit, k: int) -> Fit:
+def reordered(problem: Problem, fitted: Fit, k: int) -> Fit:
+    """The fit with the last effect of its model moved to position ``k``, fitted again."""
     order = list(fitted.model.placed)
     order.insert(k, order.pop())
     model = Model(problem.twin, order)

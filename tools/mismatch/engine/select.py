@@ -9,6 +9,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.families import (
+    FILTERS,
     FLEXIBLE,
     LOOSE,
     beside_flexible,
@@ -59,6 +60,8 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
     if trial.placed.effect.claims is not None:
         p, share = trial.candidate.p_value, trial.candidate.share
         settings = trial.placed.settings
+        if of_the_grid(trial):
+            return False
         taken = sum(settings.get("stops", ())) - sum(settings.get("starts", ()))
         if taken > MOST_EXCUSED * trial.fitted.residual[trial.placed.outputs[0]].size:
             return False
@@ -75,7 +78,31 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
     clean = after < 1.25 and (c.gain > 0.4 or c.excess_gain > 0.75) and c.z > 2 * rule.z
     # nor does one number take most of it, far beyond doubt, unless that is the physics
     sharp = after < 2.0 and c.excess_gain > 0.5 and c.z > 3 * rule.z and size(trial.placed) <= 2
-    return c.improvement > taken or ((clean or sharp) and trial.name not in LOOSE)
+    # nor do a few numbers take nearly all of it, wherever they leave it: a form left over has the shape of nothing else
+    most = c.excess_gain > 0.75 and c.z > 4 * rule.z and size(trial.placed) <= 4
+    return c.improvement > taken or ((clean or sharp or most) and trial.name not in LOOSE and not of_the_filter(trial))
+
+
+def of_the_grid(trial: Trial) -> bool:
+    """Whether bursts are no higher than the steps of a named quantiser: readings beside an edge fall on either side."""
+    fitted, placed = trial.fitted, trial.placed
+    assert fitted is not None
+    assert placed.effect.claims is not None
+    for p in fitted.model.placed[:-1]:
+        if p.effect.name == "quantization" and set(p.outputs) & set(placed.outputs):
+            r = fitted.residual[placed.outputs[0]]
+            inside = np.abs(r[placed.effect.claims(placed.settings, r.size)])
+            return bool(np.quantile(inside, 0.99) < 1.5 * p.settings["step"][0]) if inside.size else True
+    return False
+
+
+def of_the_filter(trial: Trial) -> bool:
+    """Whether an effect is linear dynamics beside linear dynamics of the same output: a second pole, or a lead, of what
+    is there, until it takes more than the form of that may leave.
+    """
+    assert trial.fitted is not None
+    before = {p.effect.name for p in trial.fitted.model.placed[:-1] if set(p.outputs) & set(trial.placed.outputs)}
+    return trial.name in FILTERS and bool(before & FILTERS)
 
 
 def search(
@@ -177,7 +204,7 @@ def search(
         known = {
             k: t for k, t in known.items() if decoupled and t.fitted is not None and not touched & set(t.placed.outputs)
         }
-    if steps and steps[0].name in FLEXIBLE:
+    if steps and steps[0].name in (*FLEXIBLE, "random_walk"):
         parted = part_flexible(problem, base, steps[0], first)
         if parted is not None:
             fitted, two = parted
@@ -247,6 +274,9 @@ def second_thoughts(
         o: max((t.candidate.share for t in seen if o in t.placed.outputs), default=0.0) for o in problem.twin.outputs
     }
     pool = [t.placed for t in seen if t.candidate.share > 0.1 * min(top[o] for o in t.placed.outputs)]
+    # what was good beside the earlier effects may have looked like nothing before them
+    pool += [t.placed for later in rivals[1:] for t in later if t.placed.effect.claims is None and not t.refused]
+    pool = list({key_of(p): p for p in pool}.values())
     current, simpler = simplify_pass(problem, base, current, pool, tie=rule.tie, shape=rule.shape)
     for k in sorted({*changed, *simpler}):
         placed = current.model.placed[k]

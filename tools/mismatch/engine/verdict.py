@@ -54,9 +54,10 @@ def decide(
         walks = any(s.name == "random_walk" and worst.output in s.placed.outputs for s in selection.steps)
         if walks and not any(d.signal != "time" and d.strength > WANDERS and d.p_value < 1e-4 for d in worst.follows):
             return "missing_physics", p
-        if any(s.name == "quantization" and worst.output in s.placed.outputs for s in selection.steps):
+        grids = [s.placed for s in selection.steps if s.name == "quantization" and worst.output in s.placed.outputs]
+        if grids:
             # readings beside an edge of the grid fall on either side, and nobody knows on which
-            step = problem.floors[worst.output].step
+            step = max(problem.floors[worst.output].step, *(g.settings["step"][0] for g in grids))
             if worst.ratio * problem.sigma(worst.output) ** 2 < step**2 / 12:
                 return "missing_physics", p
         if worst.real and left_over > 0.3 and worst.ratio > 1.3:
