@@ -24,7 +24,7 @@ def headline(result: Mapping[str, Any]) -> str:
     if result["armed_ns"] is None:
         return "Nothing was armed, so there is nothing to compare."
     if tremor["reduction_percent"] is None:
-        return "No truth to compare with: see the estimates in the recording."
+        return "No tremor figure: it needs an emulated bench (the truth is its) and a run of more than a few seconds."
     return (
         f"Tip tremor {tremor['uncompensated_rms_um']:.1f} um rms without, "
         f"{tremor['compensated_rms_um']:.1f} um rms with compensation: "

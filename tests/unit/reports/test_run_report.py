@@ -27,6 +27,10 @@ def test_a_run_that_arms_nothing_says_so(sensed: dict[str, Any]):
     assert not any(line.startswith("noticed") for line in summary_lines(sensed))
 
 
+def test_a_run_too_short_for_a_figure_says_what_it_needs(sensed: dict[str, Any]):
+    assert "a run of more than a few seconds" in headline({**sensed, "armed_ns": 1})
+
+
 def test_what_was_noticed_and_caught_up_is_told(sensed: dict[str, Any]):
     told = {**sensed, "noticed": {"scans came late": 7, "parallel axes disagree": 9}}
     told["ticks"] = {**sensed["ticks"], "caught_up": 41}

@@ -19,6 +19,7 @@ class Line(SilentSerial):
         self.room, self.sent, self.arrived = room, b"", b""
 
     def write(self, data: bytes, timeout_s: float) -> None:
+        assert timeout_s == 0.0, "the loop never waits"
         taken = data[: self.room]
         self.sent += taken
         self.room -= len(taken)
@@ -68,6 +69,16 @@ def test_a_reply_that_never_ends_is_cut_off():
     with pytest.raises(HalTimeout) as caught:
         link.query("HLP?")
     assert LONGEST_REPLY < caught.value.partial <= LONGEST_REPLY + 256
+
+
+def test_a_reply_that_comes_slowly_and_never_ends_is_a_bounded_wait():
+    clock = VirtualClock()
+    pieces = [e for k in range(1, 20) for e in (("at", k * 200 * MS), ("r", b"1=1 \n"))]
+    link = GcsLink(ScriptedSerial(clock, [("w", b"SVO?\n"), *pieces]), clock, "piezo", timeout_s=1.0)
+    with pytest.raises(HalTimeout, match=r"no answer to 'SVO\?' within 1\.0 s") as caught:
+        link.query("SVO?")
+    assert caught.value.partial == 5 * 5
+    assert clock.now_ns() <= 1200 * MS
 
 
 def test_a_command_is_asked_for_its_error_at_once():
