@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from drivers.specs import bus_loads, check_devices
-from hal.bench import load_bench, open_bench
-from hal.errors import BenchError
+from hal.bench import OpenBench, load_bench, open_bench
+from hal.clock import VirtualClock
+from hal.errors import BenchError, BusError, OpenFailed
 
 DEFAULT = Path(__file__).parents[3] / "benches" / "micron.toml"
 
@@ -51,6 +52,8 @@ def test_default_bench_is_valid():
         ("speed_hz = 400_000", "speed_hz = 100_000", ["[bus.i2c0]", "% of its time", "1000 Hz x 156 bit"]),
         ('provider = "sim_devices.register:provider"\n', "", ["[emulation.provider] is missing"]),
         ("[clock]", "[clock", ["not valid TOML", "line"]),
+        ('daq = "daq"', 'daq = "dak"', ["daq] no device named 'dak'", "devices are"]),
+        ('bus = "i2c0"\naddress = 0x0C', "address = 0x0C", ["[device.piezo.address]", "an address needs a bus"]),
     ],
 )
 def test_refusals_name_file_and_key(tmp_path: Path, old: str, new: str, words: list[str]):
@@ -87,5 +90,60 @@ def test_unknown_provider_is_named(tmp_path: Path):
     with (
         pytest.raises(BenchError, match=r"emulation.provider.*nowhere"),
         open_bench(load_bench(path), virtual=True, runtime_dir=tmp_path),
+    ):
+        pass
+
+
+class Closes:
+    """Something of a bench that is closed once; ``error`` is what that raises."""
+
+    def __init__(self, order: list[str], name: str, error: Exception | None = None) -> None:
+        self.order, self.name, self.error = order, name, error
+
+    def close(self) -> None:
+        self.order.append(self.name)
+        if self.error is not None:
+            raise self.error
+
+
+def test_closing_a_bench_closes_all_of_it_last_first_and_tells_the_first_error(tmp_path: Path):
+    order: list[str] = []
+    parts = [Closes(order, "world"), Closes(order, "a", BusError("a stuck")), Closes(order, "b", BusError("b stuck"))]
+    bench = OpenBench(load_bench(DEFAULT), VirtualClock(), {}, None, tmp_path, [part.close for part in parts])
+    with pytest.raises(BusError, match="b stuck"):
+        bench.close()
+    assert order == ["b", "a", "world"]
+    bench.close()
+    assert order == ["b", "a", "world"]
+
+
+def test_all_ports_that_cannot_be_opened_are_told_at_once(tmp_path: Path):
+    text = DEFAULT.read_text()
+    for emulated, real in (("sim://daq0", "serial:///dev/no-daq"), ("sim://i2c0", "linux-i2c://97")):
+        text = text.replace(emulated, real)
+    path = tmp_path / "bench.toml"
+    path.write_text(text.replace("sim://can0", "socketcan://nocan9"))
+    with (
+        pytest.raises(OpenFailed) as caught,
+        open_bench(load_bench(path), virtual=False, runtime_dir=tmp_path),
+    ):
+        pass
+    for word in ("/dev/no-daq", "97", "nocan9"):
+        assert word in str(caught.value)
+
+
+def test_a_recorded_hand_moves_no_real_instrument(tmp_path: Path):
+    text = DEFAULT.read_text()
+    for emulated, real in (
+        ("sim://daq0", "serial:///dev/no"),
+        ("sim://i2c0", "linux-i2c://97"),
+        ("sim://can0", "socketcan://no"),
+    ):
+        text = text.replace(emulated, real)
+    path = tmp_path / "bench.toml"
+    path.write_text(text)
+    with (
+        pytest.raises(BenchError, match="--hand moves an emulated instrument, but this bench is all real"),
+        open_bench(load_bench(path), virtual=False, runtime_dir=tmp_path, hand_file=Path("hand.csv")),
     ):
         pass
