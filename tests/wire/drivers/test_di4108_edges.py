@@ -132,6 +132,21 @@ def test_an_answer_without_end_is_a_bounded_wait():
     assert clock.now_ns() <= 600 * MS
 
 
+def test_scans_that_nobody_fetched_are_gone_with_a_new_start():
+    many = b"".join(scan(k) for k in range(1, 6))
+    daq, port, _ = scanning(
+        ("at", 10 * MS), ("r", many), ("w", b"stop\r"), ("r", b"stop\r\n\x00"), ("w", b"start 0\r"),
+        ("at", 30 * MS), ("r", scan(9)),
+    )  # fmt: skip
+    two = np.zeros((2, 8), dtype=np.int16)
+    assert daq.read_scans(two, 0.01).n == 2
+    daq.stop()
+    daq.start()
+    block = daq.read_scans(two, 0.03)
+    assert (block.n, block.seq0, two[0, 0]) == (1, 0, 9)
+    port.done()
+
+
 def test_a_device_that_has_stopped_itself_is_not_told_to_stop():
     daq, port, _ = scanning(("at", 10 * MS), ("r", scan(1) + b"stop 01"))
     daq.read_scans(OUT, 0.01)
