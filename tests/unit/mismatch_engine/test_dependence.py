@@ -5,7 +5,7 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import binom
 
-from tools.mismatch.engine.dependence import dependences, needs_memory, projected_energy
+from tools.mismatch.engine.dependence import cross_fitted_share, dependences, needs_memory, projected_energy
 from tools.mismatch.engine.features import Feature, curve, features_of, last_reversal
 
 N = 3000
@@ -89,3 +89,24 @@ def test_projection_by_gram_equals_qr_even_with_dependent_columns() -> None:
     energy, rank = projected_energy(e, x)
     assert rank == 5
     assert energy == pytest.approx(float(np.sum((q.T @ e) ** 2)), rel=1e-9)
+
+
+@pytest.mark.parametrize("level", [0.0, 1e6])
+def test_share_by_sums_of_products_is_that_of_two_plain_fits(level: float) -> None:
+    rng = np.random.default_rng(4)
+    columns = rng.standard_normal((960, 3)) * np.array([1.0, 50.0, 1e-3])
+    e = columns[:, 0] + 0.01 * columns[:, 1] + rng.standard_normal(960)
+    blocks = [(a, a + 90) for a in range(0, 960, 120)]
+    halves = [np.concatenate([np.arange(a, b) for a, b in blocks[h::2]]) for h in (0, 1)]
+    design = np.column_stack([np.ones(960), columns])
+    lost = total = 0.0
+    for fitted, held in (halves, halves[::-1]):
+        weight = np.linalg.lstsq(design[fitted], e[fitted], rcond=None)[0]
+        lost += float(np.sum((e[held] - design[held] @ weight) ** 2))
+        total += float(np.sum((e[held] - e[fitted].mean()) ** 2))
+    assert cross_fitted_share(e + level, columns, blocks) == pytest.approx(1 - lost / total, abs=1e-5)
+
+
+def test_last_reversal_compiled_equals_python() -> None:
+    x = wander(np.random.default_rng(5))[:500]
+    np.testing.assert_array_equal(last_reversal(x, 0.3), last_reversal.py_func(x, 0.3))

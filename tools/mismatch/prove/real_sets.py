@@ -78,8 +78,7 @@ SETS = (
             ("cubic_stiffness", "static_nonlinearity"),
             (),
             "Beyond the cubic spring the tool accepts nothing, though what is left is several times the floor and a "
-            "part of it follows the rate: others take it with models that name no physics. Rows of the tool before "
-            "5d65d56a show a floor of 0.8 mV: cuts of its own at the peaks of a residual that swells.",
+            "part of it follows the rate: others take it with models that name no physics.",
         )
         for label, span, best, cubic in (
             ("multisine", (105712, 127400), 0.26, 1.05),
@@ -104,8 +103,8 @@ SETS = (
         ("hysteresis", "rate_dependent_hysteresis"),
         ("static_nonlinearity", "creep", "dead_time"),
         "The level shifted by 0.7 um between the two files; without its mean the residual is 0.69 um. The fit run is a "
-        "sine of one amplitude, so neither a delay nor a lag can be told from a part of the loop: up to 5d65d56a the "
-        "tool named the loop, 3bb2d824 names the lag, and is wrong.",
+        "sine of one amplitude, so neither a delay nor a lag can be told from a part of the loop: the tool of 3bb2d824 "
+        "named the lag, those before and after it the loop.",
     ),
     RealSet(
         "coupled_electric_drives low",
