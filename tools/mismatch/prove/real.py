@@ -173,7 +173,8 @@ def document(rows: Sequence[RealRow]) -> str:
         "which effects to name is decided on that part, too, so a figure is a little kinder than one of a third part "
         "would be. The data are not part of the repository.",
         "",
-        f"{date}; each row says which state of the tool made it. The seconds are CPU time of one process.",
+        f"{date}; each row says which state of the tool made it. The seconds are CPU time of one process, "
+        "up to twice what they would be on a machine of its own.",
         "",
         *([f"Not run for this page: {', '.join(absent)}.", ""] if absent else []),
         "| set | unit | naive | re-calibrated | with physics | noise (tool's) | left over noise | published "
