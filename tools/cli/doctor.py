@@ -127,7 +127,19 @@ def bench_findings(bench: BenchFile) -> list[Finding]:
         where = spec.bus or spec.daq or spec.adc or "-"
         address = f" at 0x{spec.address:02x}" if spec.address is not None else ""
         findings.append(Finding(f"device {name}", "ok", f"{spec.driver} on {where}{address}"))
+    named = description.firmware.get("calibration", ())
+    if isinstance(named, list):  # the firmware's own check says what is wrong with anything else
+        findings += [_file_finding(bench, "calibration", str(name)) for name in named]
     return findings
+
+
+def _file_finding(bench: BenchFile, what: str, name: str) -> Finding:
+    """A file that the firmware reads before it opens anything; its name is relative to the bench file."""
+    path = bench.path.parent / name
+    if path.is_file():
+        return Finding(f"{what} {path.stem}", "ok", name)
+    remedy = f"copy it beside the bench file, or name the one of your instrument under [firmware] {what}"
+    return Finding(f"{what} {path.stem}", "missing", f"{path} is not there", remedy)
 
 
 def _bus_finding(name: str, uri: str) -> Finding:

@@ -1,0 +1,39 @@
+"""``micron doctor`` finds what would stop the firmware, and the guide's first hour passes it."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from tools.cli.main import app
+
+ROOT = Path(__file__).parents[3]
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    shutil.copytree(ROOT / "benches", tmp_path / "benches")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_a_bench_file_made_as_the_guide_says_is_whole(place: Path):
+    guide = (ROOT / "docs" / "lab-machine.md").read_text(encoding="utf-8")
+    (made,) = re.findall(r"^mkdir lab && .*$", guide, re.MULTILINE)
+    subprocess.run(made, shell=True, check=True, cwd=place)
+    for words in (["doctor"], ["run", "--virtual", "--seconds", "0.5", "--picture", "lab/run.png"]):
+        done = CliRunner().invoke(app, [*words, "--bench", "lab/micron.toml"])
+        assert done.exit_code == 0, done.output
+
+
+def test_calibration_that_is_not_there_is_missing_before_a_run_says_so(place: Path):
+    shutil.copy("benches/micron.toml", "alone.toml")
+    done = CliRunner().invoke(app, ["doctor", "--bench", "alone.toml", "--json", "-"])
+    assert done.exit_code == 4
+    assert done.stdout.count('"missing"') == 4  # three files, and how many
+    assert "copy it beside the bench file" in done.stdout
