@@ -57,9 +57,10 @@ def axis_recording(seconds: float):
     v, step_s = 0.0, 1.0 / RATE_HZ / sub
     velocity = np.zeros(n)
     for k in range(1, n):
-        for _ in range(sub):
+        for m in range(sub):
+            push = force[k - 1] + (force[k] - force[k - 1]) * (m + 0.5) / sub
             against = (0.8 + 0.4 * math.exp(-abs(v) / 0.02)) * math.tanh(v / 2e-3)
-            v += step_s * (force[k - 1] - against - 3.0 * v) / 0.9
+            v += step_s * (push - against - 3.0 * v) / 0.9
         velocity[k] = v
     measured = velocity + 0.004 * rng.standard_normal(n)
     return Recording(
