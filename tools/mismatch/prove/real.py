@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from firmware_py.recording.revision import git_revision
+from tools.errors import InputError
 from tools.mismatch.prove.disk import toml_text
 from tools.mismatch.prove.real_sets import SETS, RealSet
 from tools.mismatch.prove.runner import Diagnose, as_plain, diagnose_all
@@ -95,11 +96,15 @@ def run(
     say: Callable[[str], None] | None = None,
     rows_file: Path | None = None,
 ) -> list[RealRow]:
-    """Diagnose every set on its official split. FileNotFoundError when the data are not beside the project.
+    """Diagnose every set on its official split. FileNotFoundError when the data are not beside the project,
+    InputError when no set has a name of ``only``.
 
     ``rows_file`` (JSON) keeps each set as soon as it is done; what it already holds counts and is returned, so that
     the sets may be run one by one. Remove it when the tool changes; the page names the state that made each.
     """
+    unknown = [o for o in only if not any(o in s.name for s in SETS)]
+    if unknown:
+        raise InputError(f"no set's name has '{unknown[0]}' in it; there are {', '.join(s.name for s in SETS)}")
     tell = say or (lambda text: print(text, file=sys.stderr, flush=True))
     if not data.is_dir():
         raise FileNotFoundError(f"{data}: the measured recordings are not here; they are not part of the repository")
@@ -253,7 +258,10 @@ def main() -> None:
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every set, and continued from")
     p.add_argument("--json", type=Path, default=None)
     a = p.parse_args()
-    result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows)
+    try:
+        result = reproduce(a.data, only=a.only, jobs=a.jobs, doc=a.doc, rows_file=a.rows)
+    except (FileNotFoundError, InputError) as error:
+        p.error(str(error))
     text = json.dumps(result, indent=1)
     if a.json:
         a.json.write_text(text)
