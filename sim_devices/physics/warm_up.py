@@ -93,6 +93,7 @@ def _late_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("drift_over_record", float(p[2]), "{out}"),
         Human("middle_s", float(p[0]), "s"),
         Human("time_constant_s", float(p[1]), "s"),
+        Human("share_of_record", float(p[1] / settings["time"][1]), "1"),
     )
 
 
@@ -143,6 +144,8 @@ _LATE = Effect(
     report=_late_report,
     driven=False,
     sites=("output",),
+    # what rises within a fifth of the record (4.4 widths from a tenth to nine) is a step
+    limits={"share_of_record": (0.05, np.inf)},
 )
 
 _TWO = Effect(

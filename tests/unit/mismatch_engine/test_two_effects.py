@@ -145,3 +145,13 @@ def test_a_turned_package_on_a_turning_body_is_misalignment() -> None:
     assert [p.name for p in report.physics] == ["centripetal_acceleration", "misalignment"]
     turn = report.physics[1].parameters
     assert [turn[f"rotation_{a}"].value for a in AXES] == pytest.approx([-4, 6, -5], rel=0.1)
+
+
+def test_a_step_beside_a_curve_is_no_late_warm_up_and_no_walk() -> None:
+    f = forces(7)
+    change = np.zeros((N, 3))
+    change[:, 1] = 0.05 * f[:, 1] ** 2
+    change[N // 3 :, 1] += 0.04
+    names = ("step_shift", "thermal_drift", "random_walk", "static_nonlinearity")
+    report = diagnose(accelerometer(change, f), effects=[EFFECTS[n] for n in names], jobs=1)
+    assert {p.name for p in report.physics} == {"step_shift", "static_nonlinearity"}

@@ -50,6 +50,11 @@ SPECIFIC = 6  # numbers at most of an effect that says something definite
 FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
 
 
+def possible(fitted: Fit) -> bool:
+    """Whether a model came out and every effect of it has figures that its physics can have."""
+    return fitted.ok and not any(beyond_limits(fitted, p) for p in fitted.model.placed)
+
+
 def part_flexible(
     problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial]
 ) -> tuple[Fit, tuple[Trial, Trial]] | None:
@@ -87,7 +92,7 @@ def part_flexible(
             both = added(problem, one.fitted, other.placed)
             value = misfits(problem, both)
             left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
-            if both.ok and left <= limit and (best is None or left < best[0]):
+            if possible(both) and left <= limit and (best is None or left < best[0]):
                 best = (left, both, _two(problem, one, other, both))
     if flexible.name == "rate_dependent_hysteresis":
         for one, other, both, left in beside_a_filter(problem, flexible, first):
@@ -115,7 +120,7 @@ def beside_a_filter(
             with np.errstate(all="ignore"):
                 both = added(problem, one.fitted, replace(t.placed, settings={}))
             value = misfits(problem, both)
-            if both.ok:
+            if possible(both):
                 yield one, t.candidate, both, sum(max(value[o] - 1.0, 0.0) for o in outputs)
 
 

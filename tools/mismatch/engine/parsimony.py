@@ -69,6 +69,7 @@ ORDER = (
     ("mains_interference", "vibration"),
     ("dead_time", "clock_skew"),
     ("dead_time", "channel_delay"),
+    ("step_shift", "thermal_drift"),
 )
 """Where two effects serve equally well with equal freedom, the first is the plainer statement."""
 

@@ -94,7 +94,8 @@ def swap_pass(
             tried.add(name)
             with np.errstate(all="ignore"):
                 candidate = replaced(problem, fitted, k, rival.placed)
-            if better(problem, fitted, candidate, margin=margin, least=least):
+            possible = candidate.ok and not beyond_limits(candidate, candidate.model.placed[-1])
+            if possible and better(problem, fitted, candidate, margin=margin, least=least):
                 # the newcomer is last in its model; keep the order of acceptance
                 fitted = reordered(problem, candidate, k)
                 changed.append(k)
@@ -127,11 +128,15 @@ def simplify_pass(
         taken = sum(max(without[o] - now[o], 0.0) for o in placed.outputs)
         limit = tie * room + 0.02 + shape * taken
         elsewhere = {p.effect.name for p in held}
-        order = sorted(enumerate(pool), key=lambda r: (r[1].effect.name not in elsewhere, size(r[1]), r[0]))
+        akin = placed.effect.confusable_with
+        # what it is likely to stand for is tried first
+        order = sorted(
+            enumerate(pool),
+            key=lambda r: (r[1].effect.name not in elsewhere, r[1].effect.name not in akin, size(r[1]), r[0]),
+        )
         if beyond_limits(fitted, placed):
             # a second effect has joined since, and what is left for this one is other physics: the likeliest first
             limit = max(limit, 2.0 * room + OTHER * taken)
-            akin = placed.effect.confusable_with
             order.sort(key=lambda r: akin.index(r[1].effect.name) if r[1].effect.name in akin else len(akin))
         passed: list[tuple[int, float, int, Fit]] = []
         tried = 0
@@ -149,7 +154,7 @@ def simplify_pass(
                 candidate = added(problem, rest, rival)
             after = misfits(problem, candidate)
             left = sum(max(after[o] - 1.0, 0.0) for o in placed.outputs)
-            if candidate.ok and left <= limit:
+            if candidate.ok and left <= limit and not beyond_limits(candidate, candidate.model.placed[-1]):
                 passed.append((size(rival), left, i, candidate))
         if passed:
             fitted = reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
