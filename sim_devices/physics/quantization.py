@@ -37,7 +37,7 @@ def find_step(y: Array) -> float:
 
 
 LUMPED = 0.3  # least length of the mean phasor beyond that of the model's own output
-STEPS = (0.5, 3.8)  # of the residual's rms: q / sqrt(12) is all of it at most, and too little of it below
+STEPS = (0.5, 4.2)  # of the residual's rms: q / sqrt(12) is all of it at most, and too little of it below
 
 
 def find_lumps(y: Array, x: Array, rms: float) -> tuple[float, float, float]:
@@ -57,9 +57,11 @@ def find_lumps(y: Array, x: Array, rms: float) -> tuple[float, float, float]:
     wanted = (f > 1 / (STEPS[1] * rms)) & (f < 1 / (STEPS[0] * rms))
     lengths = [np.abs(np.fft.rfft(np.histogram(v, edges)[0], size)[: size // 2]) / y.size for v in (y, x)]
     beyond = np.where(wanted, lengths[0] - lengths[1], 0.0)
-    best = int(np.argmax(beyond))
-    if beyond[best] < LUMPED:
+    if beyond.max() < LUMPED:
         return 0.0, 0.0, 1.0
+    # the half, the third of a step gather as well where noise is small: the coarsest that gathers nearly as much
+    first = int(np.argmax(beyond > 0.8 * beyond.max()))
+    best = first + int(np.argmax(beyond[first : first + 2 * size // int(span / width)]))
     fine = f[best] + np.linspace(-1.0, 1.0, 101) / (size * width)
     phasors = np.array([np.mean(np.exp(2j * np.pi * v * (y - lo))) for v in fine])
     top = int(np.argmax(np.abs(phasors)))

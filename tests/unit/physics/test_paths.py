@@ -127,10 +127,11 @@ def test_grid_is_found_and_noise_has_none() -> None:
     assert find_step(0.07 * np.round(coarse / 0.07)) == pytest.approx(1.0, rel=1e-4)  # a finer grid over it
 
 
-def test_a_grid_is_found_under_noise_that_came_after_the_rounding() -> None:
+@pytest.mark.parametrize("noise", [0.025, 0.006])
+def test_a_grid_is_found_under_noise_that_came_after_the_rounding(noise: float) -> None:
     rng = np.random.default_rng(1)
     x = 5.0 * np.sin(np.arange(4000) * 0.013) + np.sin(np.arange(4000) * 0.11)
-    late = 0.025 * rng.standard_normal(4000)
+    late = noise * rng.standard_normal(4000)
     y = 0.1 + 0.25 * np.round((x - 0.1) / 0.25) + late
     step, origin, p = find_lumps(y, x, float(np.std(y - x)))
     assert step == pytest.approx(0.25, rel=1e-3)
