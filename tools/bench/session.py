@@ -176,7 +176,7 @@ class Session:
         """What must be said at once, in words; the worst first."""
         run, found = self.run, list[tuple[str, str]]()
         if run.phase == "starting":
-            found.append(("info", "Starting. The first start on a machine compiles for about a minute."))
+            found.append(("info", "Starting. The first start on a machine compiles, one to three minutes."))
         elif run.phase == "failed":
             found.append(("error", f"The firmware failed: {run.reason}"))
         elif run.phase == "ended":

@@ -203,7 +203,7 @@ def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
 def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     """Draw the status lines of the firmware until it ends."""
     assert process.stdout is not None
-    starting = "starting the emulated world and the firmware; the first run on a machine compiles for about a minute"
+    starting = "starting the emulated world and the firmware; the first run on a machine compiles, one to three minutes"
     with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
             live.update(_status_table(json.loads(line), seconds))
