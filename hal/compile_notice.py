@@ -54,6 +54,6 @@ class CompileNotice(event.Listener):
             return
         self._next_s = spent_s + REPEAT_S
         sys.stderr.write(
-            f"compiling kernels, once per version on this machine, one to three minutes: {self._done} done, {spent_s:.0f} s\n"
+            f"compiling kernels, once per version here, one to three minutes: {self._done} done, {spent_s:.0f} s\n"
         )
         sys.stderr.flush()
