@@ -13,7 +13,7 @@ from sim_devices.physics.statistics import least_squares, runs, thin
 
 N_PLAYS = 10
 FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays")
-"""Bases from few to many columns; the data choose (``choose_form``). Each meets what the others meet badly:
+"""Bases from few to many columns; the data choose (``choose``). Each meets what the others meet badly:
 
 stops        Prandtl-Ishlinskii, Maxwell-slip, Iwan
 dahl         smooth elements dz = dx - |dx| z / r: Dahl, Bouc-Wen with exponent one (gamma = 0)
@@ -170,11 +170,20 @@ def turning_points(x: Array, least: float) -> list[float]:
 
 
 def columns(
-    x: Array, form: str, lo: float, hi: float, rest: float, starts: tuple[int, ...], wide_too: bool = False
+    x: Array,
+    form: str,
+    lo: float,
+    hi: float,
+    rest: float,
+    starts: tuple[int, ...],
+    wide_too: bool = False,
+    before: float | None = None,
 ) -> Array:
-    """Columns of one form (n, k), every one without memory of what lies before a start. ``wide_too``: with elements of
-    more than half the range.
+    """Columns of one form (n, k), every one without memory of what lies before a start, but for one way from ``rest``
+    to ``before`` and back. ``wide_too``: with elements of more than half the range.
     """
+    if before is not None:
+        return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too)[2:]
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
     # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
@@ -217,32 +226,67 @@ def width_of(form: str, wide_too: bool = False) -> int:
     }[form]
 
 
-def choose_form(x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS) -> str:
-    """The form that predicts left-out blocks best; a larger one must be better by 7 % of the sum of squares."""
+NEED = 0.93
+"""What a form with more columns, or a history, must bring the sum of squares down to."""
+BEFORE = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
+"""Ways before a record that are tried, in its range."""
+
+
+def left_out(
+    x: Array, residual: Array, ctx: Context, form: str, lo: float, hi: float, before: float | None = None
+) -> float:
+    """Sum of squares on left-out blocks of what a form predicts."""
     index = thin(ctx.keep, 6000)
     fold = (np.arange(index.size) * 8 // max(index.size, 1)) % 2
     straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
-    best: tuple[float, str] | None = None
-    for form in forms:
-        e = columns(x, form, lo, hi, float(x[0]), ctx.starts, slips_once(lo, hi, float(x[0]))).T
-        a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
-        left = 0.0
-        for out in (0, 1):
-            w = least_squares(a[fold != out], residual[index][fold != out], 1e-6)[0]
-            left += float(np.sum((residual[index][fold == out] - a[fold == out] @ w) ** 2))
-        if best is None or left < 0.93 * best[0]:
-            best = (left, form)
-    assert best is not None
-    return best[1]
+    first = float(x[0])
+    wide = slips_once(lo, hi, first if before is None else before)
+    e = columns(x, form, lo, hi, first, ctx.starts, wide, before).T
+    a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
+    left = 0.0
+    for out in (0, 1):
+        w = least_squares(a[fold != out], residual[index][fold != out], 1e-6)[0]
+        left += float(np.sum((residual[index][fold == out] - a[fold == out] @ w) ** 2))
+    return left
+
+
+def choose(
+    x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS
+) -> tuple[str, float | None]:
+    """The form that predicts left-out blocks best, a larger one only where it is clearly better; and how far x went
+    before the record, if memory of that is in it: a record of several starts begins each without.
+    """
+
+    def best_of(forms: Sequence[str], before: float | None) -> tuple[float, str]:
+        best = (left_out(x, residual, ctx, forms[0], lo, hi, before), forms[0])
+        for form in forms[1:]:
+            left = left_out(x, residual, ctx, form, lo, hi, before)
+            if left < NEED * best[0]:
+                best = (left, form)
+        return best
+
+    left, form = best_of(forms, None)
+    if len(ctx.starts) > 1:
+        return form, None
+    ways = [float(x[0]) + share * (hi - lo) for share in BEFORE]
+    found, before = min((best_of(forms[:2], way)[0], way) for way in ways)
+    return (best_of(forms, before)[1], before) if found < NEED * left else (form, None)
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     lo, hi = float(x.min()), float(x.max())
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
-    form = choose_form(x, residual, ctx, lo, hi, MASING if one_loop(x, ctx.keep) else FORMS)
-    wide = float(slips_once(lo, hi, float(x[0])))
-    return {"range": (lo, hi), "rest": (float(x[0]),), "form": (float(FORMS.index(form)),), "wide": (wide,)}
+    form, before = choose(x, residual, ctx, lo, hi, MASING if one_loop(x, ctx.keep) else FORMS)
+    first = float(x[0])
+    wide = float(slips_once(lo, hi, first if before is None else before))
+    settings = {"range": (lo, hi), "rest": (first,), "form": (float(FORMS.index(form)),), "wide": (wide,)}
+    return settings if before is None else settings | {"before": (before,)}
+
+
+def way_before(settings: Settings) -> float | None:
+    """Where x had been before the record, when its memory shows that."""
+    return settings["before"][0] if "before" in settings else None
 
 
 def _wide(settings: Settings) -> bool:
@@ -261,7 +305,8 @@ def _parts(settings: Settings) -> Parts:
 
 def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
-    return columns(x, _form(settings), lo, hi, settings.get("rest", (0.0,))[0], ctx.starts, _wide(settings))
+    rest, before = settings.get("rest", (0.0,))[0], way_before(settings)
+    return columns(x, _form(settings), lo, hi, rest, ctx.starts, _wide(settings), before)
 
 
 def loop_width(y_of: Array, turns: int) -> float:

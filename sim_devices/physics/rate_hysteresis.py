@@ -7,7 +7,17 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.hysteresis import CYCLE, dahl, loop_width, stops, test_cycle, thresholds
+from sim_devices.physics.hysteresis import (
+    CYCLE,
+    MASING,
+    choose,
+    dahl,
+    loop_width,
+    stops,
+    test_cycle,
+    thresholds,
+    way_before,
+)  # fmt: skip
 from sim_devices.physics.lag import low_pass
 from sim_devices.physics.statistics import smooth
 
@@ -28,9 +38,16 @@ def _columns(x: Array, dt: float, tau: float, settings: Settings, starts: tuple[
     at = np.array(starts, np.int64)
     rest = settings.get("rest", (0.0,))[0]
     wide = half * np.geomspace(0.1, 3.0, N_DAHL)
+    before = way_before(settings)
+    # as in hysteresis.columns: the way before the record, and what it left in the elements
+    way, begins = (x, at) if before is None else (np.concatenate([[rest, before], x]), np.zeros(1, np.int64))
     e = np.concatenate(
-        [stops(x, np.array(thresholds(half, N_PLAYS)), rest, at), dahl(x, wide, np.zeros(N_DAHL), rest, at)], axis=1
-    )
+        [
+            stops(way, np.array(thresholds(half, N_PLAYS)), rest, begins),
+            dahl(way, wide, np.zeros(N_DAHL), rest, begins),
+        ],
+        axis=1,
+    )[way.size - x.size :]
     fast = e.T[::2]
     late = np.stack([low_pass(c, dt, tau, at) - c for c in np.ascontiguousarray(fast)])
     lag = low_pass(x, dt, tau, at) - x
@@ -40,12 +57,15 @@ def _columns(x: Array, dt: float, tau: float, settings: Settings, starts: tuple[
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
     slope = np.abs(smooth(np.gradient(x, ctx.dt), 3))
-    return {
+    lo, hi = float(x.min()), float(x.max())
+    before = choose(x, residual, ctx, lo, hi, MASING)[1] if hi > lo else None
+    settings = {
         "usual_slope": (float(np.sqrt(np.mean(slope[k] ** 2))) or 1.0,),
         "rest": (float(x[0]),),
-        "range": (float(x.min()), float(x.max())),
+        "range": (lo, hi),
         "time": (ctx.dt, ctx.dt * ctx.t.size),
     }
+    return settings if before is None else settings | {"before": (before,)}
 
 
 def _parts(settings: Settings) -> Parts:

@@ -9,8 +9,8 @@ import pytest
 from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_engine.cases import recording
-from tools.mismatch.engine.diagnose import prepared
+from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.fit import OPENING, fit
 from tools.mismatch.engine.problem import LEAST_OPENING, Problem
 from tools.mismatch.engine.screen import bend, one_step, places
@@ -71,3 +71,22 @@ def test_what_may_happen_later_is_never_searched_on_the_opening() -> None:
     assert not OPENING & late
     assert set(EFFECTS) >= OPENING
     assert not any(EFFECTS[name].needs or EFFECTS[name].test for name in OPENING)
+
+
+def test_a_memory_that_began_before_the_record_is_no_drift() -> None:
+    """Plays that a larger motion before the first sample has left off their middle (Krejci's operators, by hand)."""
+    rng = np.random.default_rng(5)
+    u = np.concatenate([np.linspace(0.0, 1.4, 100), np.linspace(1.4, 0.0, 100), wave(rng, 2000)])
+    y = np.zeros(u.size)
+    for radius, weight in ((0.1, 0.03), (0.25, 0.04), (0.45, 0.05), (0.7, 0.06)):
+        p = 0.0
+        for i, x in enumerate(u):
+            p = min(max(p, x - radius), x + radius)
+            y[i] += weight * p
+    y = (5.0 * (u + y) + 0.02 * rng.standard_normal(u.size))[200:]
+    given = {"gain_um_per_V": 5.0, "offset_um": 0.0}
+    made = recording("piezo_stack", {"command": u[200:]}, {"displacement": y}, given, noise={"displacement": 0.02})
+    names = ("hysteresis", "rate_dependent_hysteresis", "creep", "thermal_drift", "backlash", "ac_coupling")
+    report = diagnose(made, effects=[EFFECTS[n] for n in names], jobs=1)
+    assert [p.name for p in report.physics] == ["hysteresis"]
+    assert report.verdict == "missing_physics"

@@ -25,6 +25,12 @@ def test_own_split_is_blocked_guarded_and_fine_enough(seed: int) -> None:
     assert split == own_split(signals, held_out=0.3, seed=seed, guard=10)
 
 
+def test_own_split_leaves_the_beginning_out() -> None:
+    split = own_split(np.random.default_rng(1).standard_normal((3000, 1)), begin=90)
+    assert not (split.fit_mask() | split.held_out_mask())[:90].any()
+    assert split.fit[0][0] == 90
+
+
 def test_given_split_is_honoured() -> None:
     split = given_split(1000, (0, 600), (600, 1000), initialization=20)
     assert split.fit == ((0, 600),)

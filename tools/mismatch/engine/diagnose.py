@@ -33,6 +33,9 @@ from tools.mismatch.twins.make import make
 
 Progress = Callable[[str, int, int], None]
 
+UNKNOWN_START = 0.03
+"""Share of a record at its start that is simulated and not judged: what was before it is still in the memory of stacks,
+filters and masses, and no simulation knows it."""
 LEAST_PART = 30  # samples of a part that can be fitted or scored
 
 
@@ -43,7 +46,8 @@ def make_split(recording: Recording, held_out: float, seed: int, restart: bool) 
         return given_split(recording.n, *given, initialization=recording.split.initialization or 0)
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
     guard = max(4, recording.n // 2000)
-    return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6)
+    begin = 0 if restart else int(UNKNOWN_START * recording.n)
+    return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6, begin=begin)
 
 
 def ranges_of(recording: Recording) -> tuple[tuple[int, int], tuple[int, int]] | None:

@@ -16,6 +16,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
 FAR = 100.0  # noise variances above which the best is a poor model: then blocks say nothing about which is simpler
+PLAIN = 2.5  # so much more the form of an effect of one or two numbers may cost beside a family
 MOST_TIE = 0.3  # noise variances, besides what the form of a model may cost
 
 
@@ -102,7 +103,9 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False
     a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
-    form = 0.02 + rule.shape * max(before - best.misfits[output], 0.0)
+    # a family bends to what the form of a plain effect leaves
+    plain = freedom(best.placed) >= 8 and size(rival.placed) <= 2
+    form = 0.02 + (PLAIN if plain else 1.0) * rule.shape * max(before - best.misfits[output], 0.0)
     shapeless = best.placed.effect.stochastic
     # far above the noise a share of the excess is no trifle
     slack = form if shapeless else form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)

@@ -77,12 +77,15 @@ def _coverage(signals: Array, held: NDArray[np.bool_], used: NDArray[np.bool_]) 
     return worst
 
 
-def own_split(signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: int = 0, segments: int = 6) -> Split:
+def own_split(
+    signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: int = 0, segments: int = 6, begin: int = 0
+) -> Split:
     """Split of a recording that brings none.
 
     ``signals`` (n, k): inputs and context, whose values and rates both parts shall cover. The record is cut into
     ``segments`` stretches; each gives a contiguous held-out part with ``guard`` samples on either side that
-    nobody uses. Of 24 seeded layouts the one whose parts resemble each other most is taken.
+    nobody uses; nor does anybody use what is before sample ``begin``. Of 24 seeded layouts the one whose parts
+    resemble each other most is taken.
     """
     n = signals.shape[0]
     segments = max(1, min(segments, n // 60))
@@ -98,7 +101,7 @@ def own_split(signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: in
             length = int(held_out * (edges[i + 1] - edges[i]))
             room = edges[i + 1] - edges[i] - length
             # never the first stretch of the record: the fit needs to see how everything starts
-            least = int(0.25 * room) if i == 0 else 0
+            least = max(int(0.25 * room), begin + guard) if i == 0 else 0
             start = int(edges[i] + rng.integers(least, max(room, least + 1)))
             held.append((start, start + length))
         mask = _mask(n, tuple(held))[thin]
@@ -106,12 +109,12 @@ def own_split(signals: Array, *, held_out: float = 0.3, seed: int = 0, guard: in
         if best is None or score < best[0]:
             best = (score, held)
     assert best is not None
-    return _with_guard(n, tuple(best[1]), guard)
+    return _with_guard(n, tuple(best[1]), guard, begin)
 
 
-def _with_guard(n: int, held: tuple[Span, ...], guard: int) -> Split:
+def _with_guard(n: int, held: tuple[Span, ...], guard: int, begin: int) -> Split:
     fit: list[Span] = []
-    position = 0
+    position = begin
     for a, b in held:
         if a - guard > position:
             fit.append((position, a - guard))
