@@ -12,7 +12,8 @@ from sim_devices.physics.effect import Context
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.noise import NoiseFloor
-from tools.mismatch.engine.screen import bend, places
+from tools.mismatch.engine.parsimony import Rule, as_good
+from tools.mismatch.engine.screen import Candidate, bend, places
 from tools.mismatch.engine.select import in_disguise
 from tools.mismatch.engine.trial import Trial, extended, screen_one
 from tools.mismatch.simulate_sites import sites
@@ -73,3 +74,16 @@ def test_late_warm_up_is_met_by_the_logistic_form() -> None:
     assert late.basis is not None
     column = late.basis(t, ctx, np.array([18.0, 2.5]), settings)[:, 0]
     np.testing.assert_allclose(0.8 * column, residual, atol=1e-12)
+
+
+@pytest.mark.parametrize(("lag", "memory", "before", "plain"), [(5.0, 1.1, 494.0, True), (209.0, 170.0, 1700.0, False)])
+def test_one_number_is_named_beside_a_family_unless_it_leaves_far_more_than_the_noise(
+    lag: float, memory: float, before: float, plain: bool
+) -> None:
+    problem, _, base = prepared(stack(n=600), 0.3, 0, False)
+    one, many = (
+        Trial(place, Candidate(place, 1.0, 0.0, False, ()), base, None, {"displacement": left}, np.ones((4, 1)), 0)
+        for name, left in (("first_order_lag", lag), ("rate_dependent_hysteresis", memory))
+        for place in places(problem, (EFFECTS[name],), ())[:1]
+    )
+    assert as_good(one, many, Rule(), "displacement", before) is plain

@@ -17,6 +17,7 @@ from tools.mismatch.simulate import Model
 
 FAR = 100.0  # noise variances above which the best is a poor model: then blocks say nothing about which is simpler
 PLAIN = 2.5  # so much more the form of an effect of one or two numbers may cost beside a family
+NEAR = 10.0  # noise variances
 MOST_TIE = 0.3  # noise variances, besides what the form of a model may cost
 
 
@@ -103,8 +104,8 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False
     a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
-    # a family bends to what the form of a plain effect leaves
-    plain = freedom(best.placed) >= 8 and size(rival.placed) <= 2
+    # a family bends to what the form of a plain effect leaves, while that is not far above the noise
+    plain = freedom(best.placed) >= 8 and size(rival.placed) <= 2 and b < NEAR
     form = 0.02 + (PLAIN if plain else 1.0) * rule.shape * max(before - best.misfits[output], 0.0)
     shapeless = best.placed.effect.stochastic
     # far above the noise a share of the excess is no trifle
