@@ -104,8 +104,8 @@ SETS = (
         ("hysteresis", "rate_dependent_hysteresis"),
         ("static_nonlinearity", "creep", "dead_time"),
         "The level shifted by 0.7 um between the two files; without its mean the residual is 0.69 um. The fit run is a "
-        "sine of one amplitude, so neither a delay nor a lag can be told from a part of the loop: the tools of 3bb2d824 "
-        "and 89530632 named the lag, those before, between and after them the loop.",
+        "sine of one amplitude, so neither a delay nor a lag can be told from a part of the loop: the tools of "
+        "3bb2d824 and 89530632 named the lag, those before, between and after them the loop.",
     ),
     RealSet(
         "coupled_electric_drives low",
