@@ -13,7 +13,7 @@ from sim_devices.physics.creep import CREEP
 from sim_devices.physics.curve import STATIC_NONLINEARITY
 from sim_devices.physics.dead_zone import DEAD_ZONE
 from sim_devices.physics.delay import CHANNEL_DELAY, DEAD_TIME
-from sim_devices.physics.drift import RANDOM_WALK, STEP_SHIFT
+from sim_devices.physics.drift import RANDOM_WALK
 from sim_devices.physics.dropped_samples import DROPPED_SAMPLES
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
@@ -29,6 +29,7 @@ from sim_devices.physics.saturation import SATURATION
 from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.spring import COGGING_FORCE, CUBIC_STIFFNESS
+from sim_devices.physics.step_shift import STEP_SHIFT
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
 _ALL = (

@@ -122,11 +122,14 @@ class Signature:
 
 @dataclass(frozen=True)
 class Human:
-    """A parameter for the report: ``value`` in ``unit``, derived from the fitted ones."""
+    """A parameter for the report: ``value`` in ``unit``, derived from the fitted ones; ``spread`` its standard
+    deviation whatever the noise, where it is the mean of something that wanders.
+    """
 
     name: str
     value: float
     unit: str
+    spread: float = 0.0
 
 
 @dataclass(frozen=True)

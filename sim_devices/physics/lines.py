@@ -184,17 +184,30 @@ def _line_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     w = p[1:].reshape(2 * h, knots)
     amplitudes = np.sqrt(np.mean(w[0::2] ** 2 + w[1::2] ** 2, axis=1))
     at = np.array(settings["knots_s"])
-    turns = 0.0
+    turns = spread = 0.0
     if knots > 1:
         # sin w1 + cos w2 with slow w: the phase that the amplitudes carry is frequency, too
         z = w[1] - 1j * w[0]
         weight = np.minimum(np.abs(z[1:]), np.abs(z[:-1]))
         step = np.angle(z[1:] * np.conj(z[:-1])) / (2 * np.pi * np.diff(at))
         turns = float(np.sum(weight * step) / max(float(np.sum(weight)), 1e-300))
+        spread = mean_spread(step - turns, weight)
     return (
-        Human("frequency_Hz", float(p[0]) + turns, "Hz"),
+        Human("frequency_Hz", float(p[0]) + turns, "Hz", spread),
         *(Human(f"amplitude_{int(i)}", float(a), "{out}") for i, a in zip(orders, amplitudes, strict=True)),
     )
+
+
+def mean_spread(deviation: Array, weight: Array) -> float:
+    """Standard deviation of a weighted mean (of values that deviate so from it, (m,)), neighbours alike as much as they
+    are found to be: of m values about m (1 - r) / (1 + r) count, r the correlation of neighbours (Bartlett, J. Royal
+    Statistical Society 98, 1935).
+    """
+    power = float(np.sum(weight * deviation**2) / max(float(np.sum(weight)), 1e-300))
+    if deviation.size < 3 or power == 0.0:
+        return float(np.sqrt(power))
+    r = float(np.clip(np.mean(deviation[1:] * deviation[:-1]) / np.mean(deviation**2), 0.0, 0.9))
+    return float(np.sqrt(power * (1 + r) / (1 - r) / deviation.size))
 
 
 def _line_signature(z: float, f: float, trials: float, residual: Array, ctx: Context) -> Signature:

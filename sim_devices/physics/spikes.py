@@ -93,8 +93,11 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _test(x: Array, residual: Array, ctx: Context) -> Signature:
-    """Bursts beyond what heavy tails of the rest allow: Student-t with 4 degrees of freedom as the null."""
-    keep = ctx.keep
+    """Bursts beyond what heavy tails of the rest allow: Student-t with 4 degrees of freedom as the null.
+
+    The whole record is looked at: no parameter is fitted, and a few bursts may all lie in what is held out.
+    """
+    residual, keep = _where(ctx, residual)
     bursts = not_driven(find_bursts(residual, keep), ctx)
     if not bursts:
         return Signature(1.0, 0.0, "no burst")

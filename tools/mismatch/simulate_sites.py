@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sim_devices.physics.effect import Effect, Stage
 from tools.mismatch.placed import Placed
@@ -12,7 +13,7 @@ from tools.mismatch.twins.base import Twin
 SAME = "input or output"
 _WHOLE_RECORD = ("dead_time", "clock_skew", "dropped_samples")  # one clock for all outputs
 _ALIKE = ("first_order_lag",)  # equal channels of one instrument, or one filter in front of them
-_DRIVES = ("amplifier", "actuator")  # stages before the base physics
+_DRIVES: tuple[Stage, ...] = ("amplifier", "actuator")  # stages before the base physics
 
 
 def sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed] = ()) -> list[Placed]:
@@ -71,7 +72,13 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     if effect.shared:
         return [Placed(effect, "output", "+".join(g), stage, g) for g in _groups(twin, effect, usable)]
     if effect.name in _WHOLE_RECORD:
-        return [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs, note=SAME)]
+        late = [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs, note=SAME)]
+        if effect.name == "dead_time" and not twin.static and len(twin.inputs) > 1:
+            # one command may be late while the other inputs are not
+            late = [replace(late[0], note="")]
+            drives: list[Stage] = [d for d in _DRIVES if d in twin.chain]
+            late += [Placed(effect, "input", s, (*drives, stage)[0], twin.outputs) for s in twin.inputs]
+        return late
     inputs, outputs = "input" in effect.sites, "output" in effect.sites
     together: list[Placed] = []
     if effect.name in _ALIKE and len(twin.outputs) > 1:

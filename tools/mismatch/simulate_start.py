@@ -125,6 +125,18 @@ def _bounded(residual: Array, measured: Array) -> Array:
     return np.where(np.abs(residual) <= most, residual, 0.0)
 
 
+def moved(model: Model, view: View, theta: Array, output: str) -> Array:
+    """What the plant itself did, as recorded (n,): measured less what the model adds behind it (a level that jumps)."""
+    measured = view.recording.outputs[output]
+    behind = [p for p in model.placed if p.site == "output" and p.effect.kind == "add" and output in p.outputs]
+    if not behind:
+        return measured
+    plant = Model(model.twin, [p for p in model.placed if p not in behind])
+    plain = plant.carry(model, theta, view.recording)
+    added = model.whole(view, theta)[output] - plant.whole(view, plain)[output]
+    return measured - _bounded(added, measured)
+
+
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
     """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
     the view as mask, the declared noise, and the way to the output."""
@@ -152,7 +164,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
         ctx = replace(ctx, through=through)
-        return (run.signals[pl.target] if pl.site == "input" else measured), ctx
+        return (run.signals[pl.target] if pl.site == "input" else moved(model, view, theta, output)), ctx
     drive = twin.drive(output)
     if twin.static and drive and pl.effect.kind == "add":
         return run.signals[drive], replace(ctx, through=twin.through(run, drive, base, output))

@@ -11,11 +11,12 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import bouc_wen, recording, wave
 from tools.mismatch.engine.diagnose import diagnose, prepared
+from tools.mismatch.engine.forward import acceptable
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.revise import pair_search
 from tools.mismatch.engine.score import Comparison
 from tools.mismatch.engine.screen import Candidate, places
-from tools.mismatch.engine.select import acceptable, search
+from tools.mismatch.engine.select import search
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import lead
 from tools.mismatch.engine.verdict import beyond_form

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from tests.unit.mismatch_report.systems import recording
-from tools.mismatch.engine import trial
+from tools.mismatch.engine import workers
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.recording_load import load
 
@@ -20,7 +20,8 @@ def test_one_and_two_processes_say_the_same(tmp_path: Path, monkeypatch: pytest.
         return 0.125 * (u - np.clip(u - 50, -4, 4)) - 1.0
 
     rec = load(recording(tmp_path, change=dead_zone))
-    monkeypatch.setattr(trial, "PARALLEL_WORK", 0)
+    monkeypatch.setattr(workers, "LEAST_WORK", 0)
+    monkeypatch.setattr(workers, "LEAST_SAMPLES", 0)
     reports = [diagnose(rec, jobs=jobs).to_json() for jobs in (1, 2)]
     for report in reports:
         report["seconds"] = 0.0

@@ -11,10 +11,10 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Context
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.families import in_disguise
 from tools.mismatch.engine.noise import NoiseFloor
 from tools.mismatch.engine.parsimony import Rule, as_good
 from tools.mismatch.engine.screen import Candidate, bend, places
-from tools.mismatch.engine.select import in_disguise
 from tools.mismatch.engine.trial import Trial, extended, screen_one
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.twins.make import make

@@ -11,11 +11,11 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
 from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.forward import acceptable
 from tools.mismatch.engine.parsimony import Rule, freedom
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison
 from tools.mismatch.engine.screen import Candidate, places
-from tools.mismatch.engine.select import acceptable
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording

@@ -7,11 +7,11 @@ import pytest
 
 from sim_devices.physics import hysteresis
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.drift import paying_steps
 from sim_devices.physics.dropped_samples import find_drops
 from sim_devices.physics.effect import Context
 from sim_devices.physics.hysteresis import loop_width, stops
 from sim_devices.physics.slew import slew
+from sim_devices.physics.step_shift import paying_steps
 
 DT = 0.002
 

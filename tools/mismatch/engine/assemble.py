@@ -34,6 +34,7 @@ from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.select import Selection
 from tools.mismatch.engine.unexplained import Leftover, about
 from tools.mismatch.engine.verdict import OF_THE_CLOCK, compare_ratio, decide
+from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
 
@@ -61,6 +62,7 @@ def assemble(
     rule: Rule,
     said: Sequence[str] = (),
     official: Problem | None = None,
+    jobs: int = 1,
 ) -> Report:
     """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
     free run, when the decisions were made on shorter stretches.
@@ -86,11 +88,11 @@ def assemble(
     depends: list[DependsOn] = []
     memory_p = 1.0
     seen: set[tuple[str, str]] = set()
-    for o in guilty:
-        if verdict == "unexplained":
-            found, mp = list(left[o].follows), left[o].memory_p
-        else:
-            found, mp = follow(problem, looked, o)
+    if verdict == "unexplained":
+        followed = [(list(left[o].follows), left[o].memory_p) for o in guilty]
+    else:
+        followed = mapped(problem, follow, [(problem, looked, o) for o in guilty], jobs)
+    for found, mp in followed:
         memory_p = min(memory_p, mp)
         for d in found[:6]:
             if (verdict == "unexplained" or (d.p_value < 1e-3 and d.strength > 0.01)) and (

@@ -23,7 +23,8 @@ from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.select import search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
-from tools.mismatch.engine.unexplained import about, lead, leftover, stranger
+from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
+from tools.mismatch.engine.workers import mapped
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
@@ -164,10 +165,13 @@ def _diagnose(
         if strange is not None:
             # the effects only imitated it: nothing is named
             selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
-    left = {o: leftover(problem, selection.fitted, o) for o in twin.outputs}
-    leads = (
-        [strange] if strange is not None else [lead(problem, selection.fitted, o) for o in twin.outputs if left[o].real]
-    )
+    fitted = selection.fitted
+    outputs = twin.outputs
+    remains: list[Leftover] = mapped(problem, leftover, [(problem, fitted, o) for o in outputs], jobs)
+    left = dict(zip(outputs, remains, strict=True))
+    leads: list[Stranger | None] = [strange]
+    if strange is None:
+        leads = mapped(problem, lead, [(problem, fitted, o) for o in outputs if left[o].real], jobs)
     for found in leads:
         if found is not None:
             left[found.output] = left[found.output].led_by(found)
@@ -178,7 +182,7 @@ def _diagnose(
         official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
         base = over_the_whole(problem, official, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, official, selection.fitted))
-    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs)
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:

@@ -15,6 +15,7 @@ from tools.mismatch.engine.revise import added, beyond_limits, reordered, size, 
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import CLEAR_P, Trial
+from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
@@ -56,7 +57,7 @@ def possible(fitted: Fit) -> bool:
 
 
 def part_flexible(
-    problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial]
+    problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial], jobs: int = 1
 ) -> tuple[Fit, tuple[Trial, Trial]] | None:
     """Two specific effects in place of one flexible family that took both of them; None when no two do as well."""
     outputs = flexible.placed.outputs
@@ -84,12 +85,15 @@ def part_flexible(
         unique = list({key_of(p): p for p in beside}.values())
         with np.errstate(all="ignore"):
             bends = bend(problem, one.fitted)
-            looked = [one_step(problem, one.fitted, p, bends) for p in unique]
+        looked: list[Candidate] = mapped(
+            problem, one_step, [(problem, one.fitted, p, bends) for p in unique], jobs, long=False
+        )
         # an effect with a test of its own is a candidate where that test is clear
         looked = [c for c in looked if c.share > 0.3 and (not c.tested or c.p_value < CLEAR_P)]
         looked.sort(key=lambda c: (-c.share, c.placed.label))
-        for other in [c for c in looked if freedom(c.placed) <= SPECIFIC][:2]:
-            both = added(problem, one.fitted, other.placed)
+        others = [c for c in looked if freedom(c.placed) <= SPECIFIC][:2]
+        pairs: list[Fit] = mapped(problem, added, [(problem, one.fitted, c.placed) for c in others], jobs)
+        for other, both in zip(others, pairs, strict=True):
             value = misfits(problem, both)
             left = sum(max(value[o] - 1.0, 0.0) for o in outputs)
             if possible(both) and left <= limit and (best is None or left < best[0]):

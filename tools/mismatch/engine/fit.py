@@ -160,6 +160,7 @@ def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
     return tuple(stuck)
 
 
+@np.errstate(all="ignore")  # trials may run away
 def fit(
     problem: Problem,
     model: Model,

@@ -49,7 +49,7 @@ def human_values(problem: Problem, fitted: Fit, cov: Array) -> dict[str, dict[st
     for label, group in values.items():
         out[label] = {}
         for h in group:
-            half = max(1.96 * float(spread[i]), read_off.get(label, {}).get(h.name, 0.0))
+            half = max(1.96 * float(np.hypot(spread[i], h.spread)), read_off.get(label, {}).get(h.name, 0.0))
             out[label][h.name] = ParameterValue(h.value, h.unit, (h.value - half, h.value + half))
             i += 1
     return out

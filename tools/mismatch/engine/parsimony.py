@@ -80,12 +80,13 @@ FREEDOM = {
     "creep": 5,
     "hysteresis": 8,
     "rate_dependent_hysteresis": 20,
+    "step_shift": 10,
     "random_walk": 12,
     "mains_interference": 6,
     "vibration": 6,
 }
 """What a family counts as at most: its weights are smoothed, and how many columns its data asked for (bends of a curve,
-harmonics and wander of a line) is no physics.
+harmonics and wander of a line) is no physics. Levels are the plainer statement than a walk, however many they are.
 """
 
 

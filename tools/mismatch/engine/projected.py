@@ -85,6 +85,9 @@ class Projected:
             gram[np.ix_(at, at)] += a.T @ a
             cross[at] += a.T @ b
             kept.append((a, b, at))
+        if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross))):
+            # a plant that ran away: no cost, and LAPACK must not see it
+            return np.full(sum(b.size for _, b, _ in kept), np.inf), theta
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled = gram / np.outer(size, size)
         if np.any(self.penalty):

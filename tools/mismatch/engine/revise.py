@@ -18,6 +18,7 @@ from tools.mismatch.simulate_start import prepare, starts
 
 Array = np.ndarray
 
+INDISPENSABLE = 0.5  # share of the mean square that would come back: then few independent blocks are no reason
 OTHER = 0.02  # share of what an effect takes that the right name may cost where the fitted figures rule this one out
 
 
@@ -97,9 +98,11 @@ def swap_pass(
             possible = candidate.ok and not beyond_limits(candidate, candidate.model.placed[-1])
             if possible and better(problem, fitted, candidate, margin=margin, least=least):
                 # the newcomer is last in its model; keep the order of acceptance
-                fitted = reordered(problem, candidate, k)
-                changed.append(k)
-                break
+                turned = reordered(problem, candidate, k)
+                if turned.ok and better(problem, fitted, turned, margin=margin, least=least):
+                    fitted = turned
+                    changed.append(k)
+                    break
     return fitted, changed
 
 
@@ -145,7 +148,9 @@ def simplify_pass(
             simpler = size(rival) < 0.6 * mine or (name in elsewhere and size(rival) <= mine)
             fits_here = set(rival.outputs) == set(placed.outputs) and simpler
             twice = any(p.effect.name == name and p.target == rival.target for p in held)
-            if not fits_here or name == placed.effect.name or twice:
+            # the same physics on another output speaks for a name
+            shared = placed.effect.name in elsewhere and name not in elsewhere
+            if not fits_here or name == placed.effect.name or twice or shared:
                 continue
             tried += 1
             if tried > most:
@@ -157,8 +162,12 @@ def simplify_pass(
             if candidate.ok and left <= limit and not beyond_limits(candidate, candidate.model.placed[-1]):
                 passed.append((size(rival), left, i, candidate))
         if passed:
-            fitted = reordered(problem, min(passed, key=lambda c: c[:3])[3], k)
-            changed.append(k)
+            _, left, _, candidate = min(passed, key=lambda c: c[:3])
+            turned = reordered(problem, candidate, k)
+            # in another order two effects act on one another
+            if turned.ok and total(problem, turned) <= total(problem, candidate) + 0.05 + 0.1 * left:
+                fitted = turned
+                changed.append(k)
     return fitted, changed
 
 
@@ -201,7 +210,7 @@ def prune(problem: Problem, fitted: Fit, *, z: float, gain: float) -> tuple[Fit,
                 continue
             small = reduced(problem, fitted, k)
             c = compare(problem, small, fitted)
-            if not (c.z > z and c.gain > gain):
+            if not (c.z > z and c.gain > gain) and not (c.gain > INDISPENSABLE and c.improvement > 1.0):
                 worth.append((c.improvement, k, small))
         if not worth:
             break

@@ -1,4 +1,4 @@
-"""Which effects are named: forward selection on held-out scores, pairs, pruning, swaps, and parsimony."""
+"""Which effects are named: forward selection on held-out scores, other beginnings, pruning, swaps, and parsimony."""
 
 from __future__ import annotations
 
@@ -8,28 +8,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.families import (
-    FILTERS,
-    FLEXIBLE,
-    LOOSE,
-    beside_flexible,
-    in_disguise,
-    key_of,
-    own_form,
-    part_flexible,
-)
-from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.families import FLEXIBLE, key_of, own_form, part_flexible
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.forward import Way, Work, forward
 from tools.mismatch.engine.locate import follow
-from tools.mismatch.engine.parsimony import Rule, choose, fewest, refine
+from tools.mismatch.engine.other_way import other_pair
+from tools.mismatch.engine.parsimony import Rule, fewest
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import added, pair_search, prune, simplify_pass, size, swap_pass, total
+from tools.mismatch.engine.revise import added, prune, simplify_pass, size, swap_pass, total
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
-from tools.mismatch.engine.trial import Progress, Trial, try_all
-from tools.mismatch.engine.unexplained import Stranger, about, stranger
+from tools.mismatch.engine.trial import Progress, Trial
+from tools.mismatch.engine.unexplained import Stranger
 
-MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated
-WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
+WORTH_ANOTHER = 0.5  # noise variances that one way must leave before another is tried, and
+BEYOND = 1.5  # times what the form of its effects may leave;
+CROWDED = 0.25  # where more than two effects share an output, their number is suspect by itself
 
 
 @dataclass(frozen=True)
@@ -49,62 +43,6 @@ class Selection:
     """A context signal whose free curve does better than the next effect would have done: the search ended there."""
 
 
-def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
-    """May this effect be named at all: better on held-out data by more than chance and by more than a trifle.
-
-    ``taken``: mean square over noise variance that the form of earlier effects may leave on the same outputs.
-    """
-    c = trial.comparison
-    if trial.fitted is None or c is None or not trial.fitted.ok:
-        return False
-    if trial.placed.effect.claims is not None:
-        p, share = trial.candidate.p_value, trial.candidate.share
-        settings = trial.placed.settings
-        if of_the_grid(trial):
-            return False
-        taken = sum(settings.get("stops", ())) - sum(settings.get("starts", ()))
-        if taken > MOST_EXCUSED * trial.fitted.residual[trial.placed.outputs[0]].size:
-            return False
-        loud = max(c.before.values(), default=0.0) > 1.3
-        # no tail, however heavy, puts most of a record's energy into a few neighbours
-        most = p < 1e-4 and share > 0.8
-        return (p < rule.p_tested and share > 0.2) or most or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
-    if trial.refused:
-        return False
-    if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess or in_disguise(trial):
-        return False
-    # what the form of an earlier effect leaves over, no other effect explains down to the noise
-    after = max(c.after.values(), default=np.inf)
-    clean = after < 1.25 and (c.gain > 0.4 or c.excess_gain > 0.75) and c.z > 2 * rule.z
-    # nor does one number take most of it, far beyond doubt, unless that is the physics
-    sharp = after < 2.0 and c.excess_gain > 0.5 and c.z > 3 * rule.z and size(trial.placed) <= 2
-    # nor do a few numbers take nearly all of it, wherever they leave it: a form left over has the shape of nothing else
-    most = c.excess_gain > 0.75 and c.z > 4 * rule.z and size(trial.placed) <= 4
-    return c.improvement > taken or ((clean or sharp or most) and trial.name not in LOOSE and not of_the_filter(trial))
-
-
-def of_the_grid(trial: Trial) -> bool:
-    """Whether bursts are no higher than the steps of a named quantiser: readings beside an edge fall on either side."""
-    fitted, placed = trial.fitted, trial.placed
-    assert fitted is not None
-    assert placed.effect.claims is not None
-    for p in fitted.model.placed[:-1]:
-        if p.effect.name == "quantization" and set(p.outputs) & set(placed.outputs):
-            r = fitted.residual[placed.outputs[0]]
-            inside = np.abs(r[placed.effect.claims(placed.settings, r.size)])
-            return bool(np.quantile(inside, 0.99) < 1.5 * p.settings["step"][0]) if inside.size else True
-    return False
-
-
-def of_the_filter(trial: Trial) -> bool:
-    """Whether an effect is linear dynamics beside linear dynamics of the same output: a second pole, or a lead, of what
-    is there, until it takes more than the form of that may leave.
-    """
-    assert trial.fitted is not None
-    before = {p.effect.name for p in trial.fitted.model.placed[:-1] if set(p.outputs) & set(trial.placed.outputs)}
-    return trial.name in FILTERS and bool(before & FILTERS)
-
-
 def search(
     problem: Problem,
     base: Fit,
@@ -115,97 +53,43 @@ def search(
     jobs: int = 1,
     progress: Progress | None = None,
 ) -> Selection:
-    """Forward selection."""
+    """Forward selection, from other beginnings too where the first way leaves much; then second thoughts."""
     rule = rule or Rule()
     effects = tuple(effects)
-    current = base
-    start = misfits(problem, base)
-    steps: list[Trial] = []
-    rivals: list[tuple[Trial, ...]] = []
-    first: tuple[Trial, ...] = ()
-    known: dict[tuple[str, ...], Trial] = {}
-    passed: list[tuple[Trial, ...]] = []
-    strange: Stranger | None = None
-    decoupled = bool(getattr(problem.twin, "static", False))
-    while len(steps) < rule.most * len(problem.twin.outputs):
-        now = misfits(problem, current)
-        form = {
-            o: rule.form * own_form(p.effect.name for p in current.model.placed if o in p.outputs)
-            * max(start[o] - now[o], 0.0)
-            for o in now
-        }  # fmt: skip
-        pool = [
-            p
-            for p in places(problem, effects, current.model.placed)
-            if p.effect.claims is not None
-            or p.effect.name == "quantization"  # the noise floor holds its steps
-            or any(
-                now[o] - 1 > max(0.5 * rule.gain, form[o] if p.effect.name in LOOSE else min(form[o], 0.2))
-                for o in p.outputs
-            )
-        ]
-        todo = [p for p in pool if key_of(p) not in known]
-        for t in try_all(
-            problem, current, todo, stride=stride, jobs=jobs, progress=progress, what=f"step {len(steps) + 1}"
-        ):
-            known[key_of(t.placed)] = t
-        trials = [known[key_of(p)] for p in pool]
-        if not steps:
-            first = tuple(trials)
-        good = [t for t in trials if acceptable(t, rule, sum(form[o] for o in t.placed.outputs))]
-        passed += [(*steps, t) for t in good]
-        if not good and not steps and max(now.values()) > WORTH_A_PAIR:
-            pair = pair_search(problem, current, trials, z=rule.z + 1, gain=rule.gain)
-            if pair is None:
-                break
-            for member in pair[1]:
-                steps.append(replace(member, fitted=pair[0], misfits=misfits(problem, pair[0])))
-                rivals.append(())
-            current = pair[0]
-            known = {}
-            continue
-        if not good:
-            freed = beside_flexible(problem, current, steps, trials, 2 * rule.z) if steps else None
-            if freed is None:
-                break
-            current, steps = freed[0], list(freed[1])
-            rivals.append(())
-            known = {}
-            continue
-        # bursts taken out of the comparison make no model: only where no model does better
-        models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
-        best = choose(models or good, rule, now, frozenset(t.name for t in steps))
-        refined = refine(problem, current, best)
-        assert refined.fitted is not None
-        found = (stranger(problem, current, refined.fitted, o, (best.name,)) for o in best.placed.outputs)
-        strange = next((f for f in found if f is not None), None)
-        if strange is not None:
-            signal = strange.signal
-            own = [t for t in good if signal in about(t.placed.effect) and strange.output in t.placed.outputs]
-            if not any(signal in about(t.placed.effect) for t in trials):
-                break
-            strange = None
-            if own:
-                # a context signal that the vocabulary knows: its own effect first
-                best = choose(own, rule, now, frozenset(t.name for t in steps))
-                refined = refine(problem, current, best)
-                assert refined.fitted is not None
-        steps.append(refined)
-        shared = [t for t in good if t is not best and set(t.placed.outputs) & set(best.placed.outputs)]
-        rivals.append(tuple(sorted(shared, key=lambda t: (_left(t, best), t.label))))
-        current = refined.fitted
-        quieter = problem.quieter(current.residual)
-        if quieter is not problem:
-            problem, start = quieter, misfits(quieter, base)
-            current = fit(problem, current.model, [current.theta], iterations=6)
-            steps[-1] = replace(refined, fitted=current, misfits=misfits(problem, current))
-        touched = set(best.placed.outputs)
-        # what looked hopeless beside a louder output is looked at again now that this one is quieter
-        known = {
-            k: t for k, t in known.items() if decoupled and t.fitted is not None and not touched & set(t.placed.outputs)
-        }
+    work = Work(effects, rule, stride, jobs, progress)
+    way = forward(problem, base, base, (), work)
+    found = settled(base, way, work)
+    if way.strange is None:
+        start = misfits(found.problem, base)
+        left = {o: v - 1.0 for o, v in misfits(found.problem, found.fitted).items()}
+        worst = max(left, key=lambda o: left[o])
+        taken = max(start[worst] - 1.0, 0.0)
+        form = own_form(t.name for t in found.steps if worst in t.placed.outputs)
+        crowded = sum(worst in t.placed.outputs for t in found.steps) > 2
+        if left[worst] > max(WORTH_ANOTHER, (CROWDED if crowded else BEYOND) * form * taken):
+            pair = other_pair(found.problem, base, way.first, found.steps, worst, work)
+            if pair is not None and outdone(found, pair[0], len(pair[1])):
+                again = settled(base, forward(found.problem, base, pair[0], pair[1], work, way.first), work)
+                if again.strange is None and outdone(found, again.fitted, len(again.steps)):
+                    found = again
+    return found
+
+
+def outdone(found: Selection, other: Fit, effects: int) -> bool:
+    """Whether another account explains so much more that it is the better one: at least half of what the first left,
+    and more for every effect that it takes in addition.
+    """
+    excess = lambda f: sum(max(v - 1.0, 0.0) for v in misfits(found.problem, f).values())  # noqa: E731
+    more = max(effects - max(len(found.steps), 1), 0)
+    return excess(other) <= 0.5 ** (1 + more) * excess(found.fitted)
+
+
+def settled(base: Fit, way: Way, work: Work) -> Selection:
+    """A way with its second thoughts."""
+    problem, current, strange, first, rule = way.problem, way.current, way.strange, way.first, work.rule
+    steps, rivals = list(way.steps), list(way.rivals)
     if steps and steps[0].name in (*FLEXIBLE, "random_walk"):
-        parted = part_flexible(problem, base, steps[0], first)
+        parted = part_flexible(problem, base, steps[0], first, work.jobs)
         if parted is not None:
             fitted, two = parted
             if len(steps) == 1 or total(problem, fitted) <= total(problem, current) + 0.05:
@@ -213,11 +97,11 @@ def search(
     if len(steps) > 1:
         current, steps, rivals = second_thoughts(problem, base, current, steps, rivals, first, rule)
     if len(steps) > 1:
-        fewer = fewest(problem, base, current, steps, passed)
+        fewer = fewest(problem, base, current, steps, way.passed)
         if fewer is not None:
             current, steps = fewer[0], list(fewer[1])
             rivals = [*rivals[: len(steps) - 1], ()]
-    walk = unshaped(problem, current, effects, rule) if strange is None else None
+    walk = unshaped(problem, current, work.effects, rule) if strange is None else None
     if walk is not None:
         current = walk[0]
         steps.append(walk[1])
@@ -285,8 +169,3 @@ def second_thoughts(
     for k in sorted(dropped, reverse=True):
         del steps[k], rivals[k]
     return current, steps, rivals
-
-
-def _left(rival: Trial, best: Trial) -> float:
-    """What a rival leaves on the outputs that both serve."""
-    return sum(rival.misfits[o] for o in best.placed.outputs if o in rival.placed.outputs)

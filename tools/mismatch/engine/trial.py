@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
 from tools.mismatch.engine.screen import Candidate, Ground, bend, one_step
+from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
@@ -26,7 +25,6 @@ MOST_FITS = 7
 NEAR_TOP = 0.3
 CLEAR_P = 1e-7
 LEAST_P = 1e-3
-PARALLEL_WORK = 4_000_000  # samples times candidates above which processes pay
 TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is accepted is fitted on every row
 
 
@@ -73,8 +71,7 @@ def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Arr
 
 def screen_one(problem: Problem, current: Fit, place: Placed, ground: Ground) -> Candidate:
     """One step of one candidate."""
-    with np.errstate(all="ignore"), threadpool_limits(1):
-        return one_step(problem, current, place, ground)
+    return one_step(problem, current, place, ground)
 
 
 def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, tops: dict[str, float]) -> Trial:
@@ -82,21 +79,20 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
 
     ``tops``: the best one-step share per output; who stays far below it is not refined.
     """
-    with np.errstate(all="ignore"), threadpool_limits(1):
-        model, _ = extended(problem, current, candidate.placed)
-        rows = problem.fit_rows
-        touched = candidate.placed.outputs
-        now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
-        gone = max(0.5 * tops[o] * now[o] for o in touched)
-        limit = (sum(now.values()) - gone) / len(now)
-        thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
-        fitted = fit(
-            problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-4, hopeless=limit,
-            keep=current, touched=touched,
-        )  # fmt: skip
-        comparison = compare(problem, current, fitted)
-        value = misfits(problem, fitted)
-        energy = block_energy(problem, fitted, problem.held_blocks)
+    model, _ = extended(problem, current, candidate.placed)
+    rows = problem.fit_rows
+    touched = candidate.placed.outputs
+    now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
+    gone = max(0.5 * tops[o] * now[o] for o in touched)
+    limit = (sum(now.values()) - gone) / len(now)
+    thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
+    fitted = fit(
+        problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-4, hopeless=limit,
+        keep=current, touched=touched,
+    )  # fmt: skip
+    comparison = compare(problem, current, fitted)
+    value = misfits(problem, fitted)
+    energy = block_energy(problem, fitted, problem.held_blocks)
     added = len(model.parameters) - len(current.model.parameters)
     return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added, problem.twin.outputs)
 
@@ -107,21 +103,34 @@ def freedom(candidate: Candidate) -> int:
     return len(parts.nonlinear) + len(parts.weights)
 
 
-def hopeful(candidates: Sequence[Candidate]) -> list[bool]:
-    """Which candidates deserve a fit: per output the best by their one-step share, specific effects and flexible
-    families ranked apart (one step flatters the latter), and whatever has a clear test of its own.
+def vouched(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Forms of one effect at one place share the clearest of their own tests, corrected for how many there are."""
+    tests: dict[tuple[str, ...], list[float]] = {}
+    place = lambda c: (c.placed.effect.name, c.placed.site, c.placed.target)  # noqa: E731
+    for c in candidates:
+        if c.tested:
+            tests.setdefault(place(c), []).append(c.p_value)
+    best = {k: min(1.0, len(p) * min(p)) for k, p in tests.items()}
+    return [replace(c, p_value=best[place(c)]) if c.tested else c for c in candidates]
+
+
+def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int = MOST_FITS) -> list[bool]:
+    """Which candidates deserve a fit: per output the best by their one-step share, specific effects, flexible
+    families (one step flatters these) and events or noise with a test of their own ranked apart (of each ``least``,
+    and up to ``most`` that are near the best), and whatever is clear by that test.
     """
     keep = [False] * len(candidates)
     outputs = sorted({o for c in candidates for o in c.placed.outputs})
+    kinds = ["tested" if c.tested else "flexible" if freedom(c) > 4 else "specific" for c in candidates]
     for o in outputs:
-        for flexible in (False, True):
-            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and (freedom(c) > 4) == flexible]
+        for kind in ("specific", "flexible", "tested"):
+            here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and kinds[i] == kind]
             here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
             top = candidates[here[0]].share if here else 0.0
             for rank, i in enumerate(here):
                 share = candidates[i].share
-                near = share > NEAR_TOP * top and rank < MOST_FITS
-                if share > LEAST_SHARE and (rank < LEAST_FITS or near):
+                near = share > NEAR_TOP * top and rank < most
+                if share > LEAST_SHARE and (rank < least or near):
                     keep[i] = True
     for i, c in enumerate(candidates):
         if c.tested and c.p_value < CLEAR_P:
@@ -138,28 +147,22 @@ def try_all(
     jobs: int,
     progress: Progress | None = None,
     what: str = "candidates",
+    least: int = LEAST_FITS,
+    most: int = MOST_FITS,
 ) -> list[Trial]:
-    """Every candidate screened, the hopeful ones fitted. The answer does not depend on ``jobs``."""
-    heavy = problem.recording.n * len(problem.twin.outputs) * len(candidates) > PARALLEL_WORK
-    parallel = Parallel(n_jobs=jobs, return_as="generator") if jobs > 1 and heavy else None
+    """Every candidate screened, the ``hopeful`` ones fitted. The answer does not depend on ``jobs``."""
 
     def run(function: Callable[..., Any], items: Sequence[Any], extra: tuple[Any, ...], label: str) -> list[Any]:
-        work = ((problem, current, item, *extra) for item in items)
-        if parallel is not None and len(items) > 2:
-            stream = parallel(delayed(function)(*w) for w in work)
-        else:
-            stream = (function(*w) for w in work)
-        found: list[Any] = []
-        for result in stream:
-            found.append(result)
-            if progress:
-                progress(label, len(found), len(items))
-        return found
+        work = [(problem, current, item, *extra) for item in items]
+        told = progress  # the type checker keeps it in the closure
+        tell = (lambda done: told(label, done, len(items))) if told else None
+        return mapped(problem, function, work, jobs, long=False, tell=tell)
 
     with np.errstate(all="ignore"):
         ground = bend(problem, current)
     screened: list[Candidate] = run(screen_one, candidates, (ground,), f"{what}: screen")
-    keep = hopeful(screened)
+    screened = vouched(screened)
+    keep = hopeful(screened, least, most)
     chosen = [c for c, k in zip(screened, keep, strict=True) if k]
     tops = dict.fromkeys(problem.twin.outputs, 0.0)
     for c in chosen:

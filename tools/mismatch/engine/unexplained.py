@@ -147,8 +147,8 @@ def stranger(
     """Does a free curve of a context signal explain what the effects between ``before`` and ``after`` do not?
 
     Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
-    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much,
-    or whatever it leaves when it takes nearly all.
+    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much
+    if it takes a third, or whatever it leaves when it takes nearly all.
     """
     used = {s for p in after.model.placed if output in p.outputs for s in about(p.effect)}
     names = [s for s in problem.recording.context if s not in used]
@@ -168,7 +168,12 @@ def stranger(
     limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
     if said <= SHAPELESS:
         return _plainest(
-            problem, before, output, names, p_limit, lambda share: share > 0.85 or (1 - share) * start - 1 < limit
+            problem,
+            before,
+            output,
+            names,
+            p_limit,
+            lambda share: share > 0.85 or (share > 0.3 and (1 - share) * start - 1 < limit),
         )
     return _plainest(problem, before, output, names, p_limit, lambda share: (1 - share) * start - 1 < limit)
 

@@ -1,0 +1,47 @@
+"""Independent pieces of work in parallel processes, where they are long enough to pay; the answer is the same."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+
+from tools.mismatch.engine.problem import Problem
+
+LEAST_SAMPLES = 40_000  # samples times outputs above which processes pay for a handful of pieces
+LEAST_WORK = 1_500_000  # samples times outputs times pieces above which they pay for any number
+
+
+def quietly(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
+    """One piece: the linear algebra with one thread, and no warnings of trials that run away."""
+    with np.errstate(all="ignore"), threadpool_limits(1):
+        return function(*arguments)
+
+
+def mapped(
+    problem: Problem,
+    function: Callable[..., Any],
+    work: Sequence[tuple[Any, ...]],
+    jobs: int,
+    *,
+    long: bool = True,
+    tell: Callable[[int], None] | None = None,
+) -> list[Any]:
+    """``function`` of every tuple of arguments in ``work``, in order. ``long``: a piece is a fit, not a look;
+    ``tell`` is called with how many are done.
+    """
+    size = problem.recording.n * len(problem.twin.outputs)
+    pays = len(work) > 1 and (size * len(work) > LEAST_WORK or (long and size > LEAST_SAMPLES))
+    if jobs > 1 and pays:
+        stream = Parallel(n_jobs=jobs, return_as="generator")(delayed(quietly)(function, w) for w in work)
+    else:
+        stream = (quietly(function, w) for w in work)
+    found: list[Any] = []
+    for result in stream:
+        found.append(result)
+        if tell:
+            tell(len(found))
+    return found
