@@ -117,7 +117,7 @@ def test_the_game_is_won_with_a_scripted_mouse(page: Any, server: Server, artefa
             page.wait_for_timeout(100)
             if state()["reached"] > reached:
                 break
-    page.wait_for_timeout(300)
+    page.wait_for_function("micron.game().report")
     page.screenshot(path=artefacts / "game.png")
     final = state()
     assert final["result"]["reached"] == 5
