@@ -71,14 +71,8 @@ def _coulomb_report(p: Array, settings: Settings, scale: float) -> Sequence[Huma
     )
 
 
-def _travel_of(x: Array, ctx: Context) -> Array:
-    """Displacement that friction sees: the smoothed position, or the integral of what is recorded as velocity."""
-    v = ctx.signals.get("velocity")
-    return np.cumsum(v) * ctx.dt if v is not None and v is x else smooth(x, 5)
-
-
 def _bristle_settings(x: Array, residual: Array, ctx: Context) -> Settings:
-    travel = float(np.ptp(_travel_of(x, ctx)[ctx.keep])) or 1.0
+    travel = float(np.ptp(smooth(x, 5)[ctx.keep])) or 1.0
     return {**_no_settings(x, residual, ctx), "travel": (travel,)}
 
 
@@ -91,7 +85,7 @@ def _bristle_distance(settings: Settings) -> Parameter:
 def _bent(x: Array, ctx: Context, distance: float) -> Array:
     """Bristles -1..1 along the recorded travel, (n,)."""
     at = np.array(ctx.starts, np.int64)
-    u = _travel_of(x, ctx)
+    u = smooth(x, 5)
     return dahl(u, np.array([distance]), np.zeros(1), float(u[0]), at)[:, 0] / distance
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import COGGING, base_moves
+from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves
 from sim_devices.physics.statistics import least_squares, thin
 
 
@@ -16,28 +16,38 @@ def _travel(x: Array, residual: Array, ctx: Context) -> Settings:
     return {"size": (float(np.max(np.abs(x[k]))) or 1.0,), "travel": (float(np.ptp(x[k])) or 1.0,)}
 
 
+def _spring_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    return {**_travel(x, residual, ctx), **({UNCENTRED: (1.0,)} if UNCENTRED in ctx.facts else {})}
+
+
 def _spring_parts(settings: Settings) -> Parts:
-    return Parts(
-        (),
-        (Parameter("cubic", "1/({out}^2 s^2)"), Parameter("quadratic", "1/({out} s^2)")),
-        np.diag([0.0, 0.02]),
-    )
+    terms = [Parameter("cubic", "1/({out}^2 s^2)"), Parameter("quadratic", "1/({out} s^2)")]
+    if UNCENTRED in settings:
+        # of a spring that is not at rest where the record begins, with no other spring to take its slope there
+        terms.append(Parameter("linear", "1/s^2"))
+    return Parts((), tuple(terms), np.diag([0.0, 0.02, 0.0][: len(terms)]))
 
 
 def _spring_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return -np.stack([x * x * x, x * x], axis=1)
+    terms = [x * x * x, x * x, *((x,) if UNCENTRED in settings else ())]
+    return -np.stack(terms, axis=1)
 
 
 def _spring_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    return {"spring": np.asarray(w, np.float64)}
+    row = np.zeros(SPRING)
+    row[: w.size] = w
+    return {"spring": row}
 
 
 def _spring_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     g = scale or 1.0
-    return (
+    out = [
         Human("cubic_stiffness", float(p[0]) / g, "{in}/{out}^3"),
         Human("quadratic_stiffness", float(p[1]) / g, "{in}/{out}^2"),
-    )
+    ]
+    if UNCENTRED in settings:
+        out.append(Human("stiffness_at_start", float(p[2]) / g, "{in}/{out}"))
+    return out
 
 
 CUBIC_STIFFNESS = Effect(
@@ -50,7 +60,7 @@ CUBIC_STIFFNESS = Effect(
     source="I. Kovacic, M. J. Brennan, The Duffing Equation, Wiley 2011, eq. 1.1",
     excitation="small and large amplitudes",
     confusable_with=("static_nonlinearity", "saturation"),
-    prepare=_travel,
+    prepare=_spring_settings,
     basis=_spring_basis,
     fill=_spring_fill,
     report=_spring_report,

@@ -57,6 +57,8 @@ class Model:
             b = a + len(parts.nonlinear)
             c = b + len(parts.weights)
             u_out = twin.units.get(pl.outputs[0], "")
+            if pl.site == "feedback" and twin.counted:
+                u_out = u_out.removesuffix("/s")  # forces depend on position
             u_in = twin.units.get(twin.drive(pl.outputs[0]) or pl.target, "")
             u_tgt = twin.units.get(pl.target, "")
             if pl.site == "input":

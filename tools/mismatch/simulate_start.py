@@ -13,7 +13,7 @@ from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
 from tools.mismatch.simulate_view import View, view_run
-from tools.mismatch.twins.base import remember
+from tools.mismatch.twins.base import remember, travelled
 
 
 def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
@@ -125,6 +125,12 @@ def _bounded(residual: Array, measured: Array) -> Array:
     return np.where(np.abs(residual) <= most, residual, 0.0)
 
 
+def course(model: Model, view: View, theta: Array, output: str) -> Array:
+    """The position (n,) that forces depend on, as recorded."""
+    x = moved(model, view, theta, output)
+    return travelled(x, view.recording.dt, model.twin.counted) if model.twin.counted else x
+
+
 def moved(model: Model, view: View, theta: Array, output: str) -> Array:
     """What the plant itself did, as recorded (n,): measured less what the model adds behind it (a level that jumps)."""
     measured = view.recording.outputs[output]
@@ -164,7 +170,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
         ctx = replace(ctx, through=through)
-        return (run.signals[pl.target] if pl.site == "input" else moved(model, view, theta, output)), ctx
+        return (run.signals[pl.target] if pl.site == "input" else course(model, view, theta, output)), ctx
     drive = twin.drive(output)
     if twin.static and drive and pl.effect.kind == "add":
         return run.signals[drive], replace(ctx, through=twin.through(run, drive, base, output))

@@ -66,7 +66,10 @@ def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: 
     # output is driven by its input
     driven = placed.site == "feedback" or (problem.twin.static and placed.effect.kind == "add")
     source = drive if driven or target not in units else target
-    return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", units.get(output, "1"))
+    moves = units.get(output, "1")
+    if placed.site == "feedback" and problem.twin.counted:
+        moves = moves.removesuffix("/s")  # forces depend on position
+    return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", moves)
 
 
 def physics_found(problem: Problem, selection: Selection, cov: Array) -> list[PhysicsFound]:

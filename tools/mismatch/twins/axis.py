@@ -87,6 +87,7 @@ def axis_twin(recording: Recording) -> DynamicTwin:
         text_of=text_of,
         restart=bool(np.min(-rates.real) * span < 20.0),
         feedback_on="position" if "position" in outputs else "velocity",
+        counted="" if "position" in outputs else "rest" if sprung else "start",
         fastest_per_s=float(np.max(np.abs(rates))) if sprung else float(damping / mass),
     )
 

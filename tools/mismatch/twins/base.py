@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
 from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
 from tools.mismatch.recording import Recording
+
+Counted = Literal["", "start", "rest"]
+"""What a position is counted from where only its rate was recorded: the begin of the record, or a spring at rest."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +122,11 @@ class Twin(Protocol):
         """The output that feedback effects act on ("" when the twin has no equation of motion)."""
         ...
 
+    @property
+    def counted(self) -> Counted:
+        """What the position of feedback effects counts from where ``feedback_on`` is a velocity."""
+        ...
+
     def start(self, recording: Recording) -> Array:
         """Base parameters as the engineer gave them; what is missing is estimated from the data."""
         ...
@@ -161,6 +169,12 @@ class Twin(Protocol):
     def to_text(self, theta: Array) -> dict[str, object]:
         """``[twin.parameters]`` for a corrected twin."""
         ...
+
+
+def travelled(velocity: Array, dt: float, counted: Counted) -> Array:
+    """Position (n,) that a recorded velocity has led to, on average zero where a spring holds it."""
+    x = np.concatenate([[0.0], np.cumsum(0.5 * dt * (velocity[1:] + velocity[:-1]))])
+    return x - x.mean() if counted == "rest" else x
 
 
 def fold(signal: Signal, theta: Array, gain: float = 1.0) -> Signal:

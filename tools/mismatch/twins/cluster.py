@@ -10,7 +10,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.twins.base import Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.head import ScaledOutputs
 
 _NEXT = ((1, 2), (2, 0), (0, 1))
@@ -26,6 +26,7 @@ class ClusterTwin(ScaledOutputs):
     apart: bool = True
     restart: bool = False
     feedback_on: str = ""
+    counted: Counted = ""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""

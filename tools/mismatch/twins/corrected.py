@@ -17,7 +17,7 @@ from sim_devices.physics.effect import Array, Human, Parameter
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
-from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, Twin, fold
 from tools.mismatch.twins.head import Head
 
 MOST_FREE = 3  # weights of an effect that are re-fitted one by one
@@ -39,6 +39,7 @@ class CorrectedTwin(Head):
     penalty: Array
     """Smoothness rows of weights that are free, (rows, len(parameters))."""
     apart: bool = False
+    counted: Counted = ""
 
     @property
     def core(self) -> Twin:
@@ -177,4 +178,5 @@ def corrected_twin(recording: Recording) -> CorrectedTwin:
         twin.restart,
         twin.feedback_on,
         penalty,
+        counted=twin.counted,
     )

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
-from tools.mismatch.twins.base import Force, Run, Signal, remember
+from sim_devices.physics.forces import UNCENTRED
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, remember, travelled
 from tools.mismatch.twins.feedback import Rows, pack, run_feedback
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import Discrete, Hold, StartState, discretise, run_states, start_state
@@ -61,6 +62,7 @@ class DynamicTwin(Head):
     fastest_per_s: float
     static: bool = False
     apart: bool = False
+    counted: Counted = ""
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -72,7 +74,7 @@ class DynamicTwin(Head):
 
     def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
         """See Twin."""
-        return {}
+        return {UNCENTRED: (1.0,)} if self.counted == "start" else {}
 
     def sensitivity(self, output: str, theta: Array) -> float:
         """See Twin: the gain that weights of input and feedback effects carry."""
@@ -265,6 +267,8 @@ class DynamicTwin(Head):
         token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
         token = (*token, *((f.effect.name, _key(f)) for f in forces))
         cp = rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
+        if self.counted:
+            cp = np.eye(plant.a.shape[0])[0]
         sub = 1
         if forces and self.hold != "discrete":
             push = float(cp @ plant.a @ plant.b) or 1.0
@@ -276,7 +280,7 @@ class DynamicTwin(Head):
             cv = cp @ (plant.a - np.eye(plant.a.shape[0])) / run.dt
         else:
             cv = cp @ plant.a if abs(cp @ plant.b) < 1e-12 * (np.abs(cp) @ np.abs(plant.b) + 1e-300) else cp
-        if "velocity" in self.outputs and self.feedback_on == "position":
+        if self.counted or ("velocity" in self.outputs and self.feedback_on == "position"):
             cv = rows["velocity"]
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
@@ -299,6 +303,9 @@ class DynamicTwin(Head):
         full = np.linalg.matrix_power(d.ad, sub)
         ss = start_state(full, rows, run.measured, run.starts, run.t.size, window, run.memo, whole=False)
         x0 = np.zeros((starts.size, plant.a.shape[0]))
+        if forces and self.counted:
+            # the rows of the outputs do not show where it stands; how it came there was recorded
+            x0[:, 0] = travelled(run.measured[self.feedback_on], run.dt, self.counted)[starts]
         # what sets the state is simulated alone, one window after the other
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])

@@ -14,7 +14,7 @@ import numpy as np
 
 from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
 from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.twins.base import Force, Run, Signal, fold, remember
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 
 
 class UserTwin(Protocol):
@@ -49,6 +49,7 @@ class OpaqueTwin:
     apart: bool = False
     restart: bool = False
     feedback_on: str = ""
+    counted: Counted = ""
     source: str = field(default="", compare=False)
 
     def start(self, recording: Recording) -> Array:

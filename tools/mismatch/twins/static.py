@@ -9,7 +9,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
 from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.twins.base import Force, Run, Signal, fold
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
 
 
@@ -28,6 +28,7 @@ class StaticTwin(ScaledOutputs):
     apart: bool = True
     restart: bool = False
     feedback_on: str = ""
+    counted: Counted = ""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
