@@ -210,7 +210,8 @@ def _table() -> dict[str, dict[str, Entry]]:
         "accelerometer_cluster": cluster,
         "mechanical_axis": axis,
         "state_space": ss,
-        FMU: ss,
+        # its power has one sign: a dead zone is never crossed, and moves the offset
+        FMU: {k: e for k, e in ss.items() if k != "dead_zone"},
         USER: ss,
         INSTRUMENT: bench,
     }
