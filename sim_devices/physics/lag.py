@@ -1,13 +1,15 @@
-"""First-order low-pass and high-pass in the signal path."""
+"""Low-pass of first order, and high-pass of first and second, in the signal path."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.resonance import discrete_mode, mode
 from sim_devices.physics.statistics import rank_starts, thin
 
 
@@ -112,7 +114,54 @@ def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Se
     )[:3]
 
 
-AC_COUPLING = Effect(
+def _twice_parts(settings: Settings) -> Parts:
+    time_constant, settled = _ac_parts(settings).nonlinear
+    # names of their own: twin files tell forms by their parameters
+    return Parts(
+        (
+            replace(time_constant, name="period_by_2pi_s"),
+            Parameter("damping_ratio", "1", 0.3, 3.0, log=True, scale=0.1),
+            settled,
+        )
+    )
+
+
+def _twice_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    tau, damping, settled = q
+    at = np.array(ctx.starts)
+    k = np.arange(x.size)
+    since = k - at[np.searchsorted(at, k, side="right") - 1]
+    ad, g0, g1 = discrete_mode(1 / (2 * np.pi * tau), damping, ctx.dt)
+    z = mode(x, ad, np.ascontiguousarray(g0), g1, at)
+    # what a start away from rest leaves: two poles, which must not meet
+    root = np.sqrt(complex((damping + 1e-7) ** 2 - 1.0))
+    r, s = -damping - root, -damping + root
+    age = since * ctx.dt / tau
+    fall, rise = np.exp(r * age), np.exp(s * age)
+    free = np.real((s * fall - r * rise) / (s - r))
+    speed = np.real(r * s * (fall - rise) / (s - r))
+    begun = (1 - settled) * x[k - since]
+    return x - (z[0] - begun * free) - 2 * damping * (z[1] - begun * speed)
+
+
+def _twice_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    dt, span = settings["time"]
+    grid: list[tuple[float, ...]] = [
+        (float(t), d, s) for t in np.geomspace(5 * dt, 20 * span, 20) for d in (0.6, 1.1) for s in (1.0, 0.0)
+    ]
+    return rank_starts(
+        grid,
+        lambda q: ctx.to_output(_twice_apply(x, ctx, np.array(q), settings)),
+        _target(residual, ctx, x),
+        thin(ctx.keep, 8000),
+    )[:3]
+
+
+def _twice_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (Human("corner_hz", float(1 / (2 * np.pi * p[0])), "Hz"), Human("damping_ratio", float(p[1]), "1"))
+
+
+_ONCE = Effect(
     name="ac_coupling",
     summary="high-pass: the mean is lost",
     kind="linear",
@@ -127,3 +176,12 @@ AC_COUPLING = Effect(
     apply=_ac_apply,
     report=_report,
 )
+_TWICE = replace(
+    _ONCE,
+    parts=_twice_parts,
+    equation=r"\tau^2 \ddot y + 2 D \tau \dot y + y = \tau^2 \ddot x",
+    guess=_twice_guess,
+    apply=_twice_apply,
+    report=_twice_report,
+)
+AC_COUPLING = replace(_ONCE, variants=(_TWICE,))
