@@ -45,7 +45,7 @@ def _skew_parts(settings: Settings) -> Parts:
 
 
 def _skew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample(x, 0.0, 1.0 + 1e-6 * q[0])
+    return resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.0)
 
 
 def _skew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
@@ -100,7 +100,7 @@ def _straight_skew_parts(settings: Settings) -> Parts:
 
 
 def _straight_skew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample_straight(x, 0.0, 1.0 + 1e-6 * q[0])
+    return resample_straight(x, 0.0, 1.0 + 1e-6 * q[0], 0.0)
 
 
 _STRAIGHT_SKEW = replace(
@@ -109,4 +109,41 @@ _STRAIGHT_SKEW = replace(
     equation=r"y(t) = x\left((1 + \epsilon)\,t\right),\; x \text{ straight between samples}",
     apply=_straight_skew_apply,
 )
-CLOCK_SKEW = replace(_SMOOTH_SKEW, variants=(_STRAIGHT_SKEW,))
+
+
+def _drifting_parts(settings: Settings) -> Parts:
+    skew = _skew_parts(settings).nonlinear[0]
+    return Parts((replace(skew, name="skew_at_begin_ppm"), replace(skew, name="skew_change_ppm")))
+
+
+def _drifting_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return resample(x, 0.0, 1.0 + 1e-6 * q[0], 0.5e-6 * q[1] / ctx.t.size)
+
+
+def _drifting_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    n = ctx.t.size
+    found = [(q[0], 0.0) for q in _skew_guess(x, residual, ctx, settings)]
+    c, d, sd = local_delays(ctx.to_output(x - x.mean()), residual, ctx.keep, 24)
+    if c.size > 4:
+        w = 1 / np.maximum(sd, 1e-9)
+        columns = np.stack([c, 0.5 * c * c / n], axis=1)
+        slopes = np.linalg.lstsq(columns * w[:, None], d * w, rcond=None)[0]
+        found.append((-1e6 * float(slopes[0]), -1e6 * float(slopes[1])))
+    return tuple((float(np.clip(a, -5e4, 5e4)), float(np.clip(b, -5e4, 5e4))) for a, b in found)
+
+
+def _drifting_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    mean = float(p[0] + 0.5 * p[1])
+    return (Human("skew_ppm", mean, "ppm"), Human("skew_change_ppm", float(p[1]), "ppm"))
+
+
+_DRIFTING = replace(
+    _SMOOTH_SKEW,
+    parts=_drifting_parts,
+    equation=r"y(t) = x\left(t + \epsilon t + \alpha t^2 / 2T\right)",
+    source="D. W. Allan, IEEE Trans. UFFC 34 (1987) 647 (time error y t + D t^2/2); Keys 1981 for the resampling",
+    guess=_drifting_guess,
+    apply=_drifting_apply,
+    report=_drifting_report,
+)
+CLOCK_SKEW = replace(_SMOOTH_SKEW, variants=(_STRAIGHT_SKEW, _DRIFTING))

@@ -21,7 +21,7 @@ def _delay_parts(settings: Settings) -> Parts:
 
 
 def _delay_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample(x, -q[0] / ctx.dt, 1.0)
+    return resample(x, -q[0] / ctx.dt, 1.0, 0.0)
 
 
 def _straight_delay_parts(settings: Settings) -> Parts:
@@ -30,7 +30,7 @@ def _straight_delay_parts(settings: Settings) -> Parts:
 
 
 def _straight_delay_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return resample_straight(x, -q[0] / ctx.dt, 1.0)
+    return resample_straight(x, -q[0] / ctx.dt, 1.0, 0.0)
 
 
 def _delay_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:

@@ -134,8 +134,9 @@ def _twice_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     ad, g0, g1 = discrete_mode(1 / (2 * np.pi * tau), damping, ctx.dt)
     z = mode(x, ad, np.ascontiguousarray(g0), g1, at)
     # what a start away from rest leaves: two poles, which must not meet
-    root = np.sqrt(complex((damping + 1e-7) ** 2 - 1.0))
-    r, s = -damping - root, -damping + root
+    apart = damping if abs(damping - 1.0) > 1e-8 else 1.0 + 1e-8
+    root = np.sqrt(complex(apart * apart - 1.0))
+    r, s = -apart - root, -apart + root
     age = since * ctx.dt / tau
     fall, rise = np.exp(r * age), np.exp(s * age)
     free = np.real((s * fall - r * rise) / (s - r))

@@ -9,15 +9,15 @@ from sim_devices.physics.effect import Array
 
 
 @kernel
-def resample(x, first, step):
-    """x at positions ``first + step * k`` (in samples), k = 0..n-1, by cubic convolution; edges are held.
+def resample(x, first, step, bend):
+    """x at positions ``first + step * k + bend * k^2`` (in samples), k = 0..n-1, by cubic convolution; edges are held.
 
     R. Keys, IEEE Trans. ASSP 29 (1981) 1153, eq. 15 (a = -1/2).
     """
     n = x.size
     y = np.empty(n)
     for k in range(n):
-        p = first + step * k
+        p = first + (step + bend * k) * k
         if p <= 0.0:
             y[k] = x[0]
             continue
@@ -35,12 +35,12 @@ def resample(x, first, step):
 
 
 @kernel
-def resample_straight(x, first, step):
+def resample_straight(x, first, step, bend):
     """The same on straight lines between samples, as a held or played-back signal runs; edges are held."""
     n = x.size
     y = np.empty(n)
     for k in range(n):
-        p = first + step * k
+        p = first + (step + bend * k) * k
         if p <= 0.0:
             y[k] = x[0]
         elif p >= n - 1:

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.families import FLEXIBLE, key_of, own_form, part_flexible
+from tools.mismatch.engine.families import FLEXIBLE, key_of, own_form, part_flexible, possible
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.forward import Way, Work, forward
 from tools.mismatch.engine.locate import follow
 from tools.mismatch.engine.other_way import other_pair
 from tools.mismatch.engine.parsimony import Rule, fewest
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import added, prune, simplify_pass, size, swap_pass, total
+from tools.mismatch.engine.revise import added, prune, reduced, simplify_pass, size, swap_pass, total
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import Progress, Trial
@@ -79,9 +79,13 @@ def outdone(found: Selection, other: Fit, effects: int) -> bool:
     """Whether another account explains so much more that it is the better one: at least half of what the first left,
     and more for every effect that it takes in addition.
     """
-    excess = lambda f: sum(max(v - 1.0, 0.0) for v in misfits(found.problem, f).values())  # noqa: E731
     more = max(effects - max(len(found.steps), 1), 0)
-    return excess(other) <= 0.5 ** (1 + more) * excess(found.fitted)
+    return excess(found.problem, other) <= 0.5 ** (1 + more) * excess(found.problem, found.fitted)
+
+
+def excess(problem: Problem, fitted: Fit) -> float:
+    """Mean square over noise variance above one, of all outputs."""
+    return sum(max(v - 1.0, 0.0) for v in misfits(problem, fitted).values())
 
 
 def settled(base: Fit, way: Way, work: Work) -> Selection:
@@ -106,7 +110,36 @@ def settled(base: Fit, way: Way, work: Work) -> Selection:
         current = walk[0]
         steps.append(walk[1])
         rivals.append(())
+    current, dropped = of_the_walk(problem, current)
+    for k in dropped:
+        del steps[k], rivals[k]
     return Selection(problem, base, current, tuple(steps), tuple(rivals), first, strange)
+
+
+OF_A_WALK = ("step_shift", "thermal_drift")
+
+
+def of_the_walk(problem: Problem, current: Fit) -> tuple[Fit, list[int]]:
+    """Integrated noise without the levels and drifts that are read off it: they go unless they take half of what it
+    leaves, or (a smooth drift, which a walk follows) leave less than twice as much alone. The model and the positions
+    that were dropped, last first.
+    """
+    dropped: list[int] = []
+    for k in reversed(range(len(current.model.placed))):
+        placed = current.model.placed
+        walked = {o for p in placed if p.effect.name == "random_walk" for o in p.outputs}
+        if placed[k].effect.name in OF_A_WALK and set(placed[k].outputs) <= walked:
+            alone = reduced(problem, current, k)
+            left = excess(problem, alone)
+            if not possible(alone) or left > 2.0 * excess(problem, current) + 0.1:
+                continue
+            if placed[k].effect.name == "thermal_drift":
+                walk = next(j for j, p in enumerate(placed) if p.effect.name == "random_walk")
+                if excess(problem, reduced(problem, current, walk)) <= 2.0 * left:
+                    continue
+            current = alone
+            dropped.append(k)
+    return current, dropped
 
 
 def unshaped(problem: Problem, current: Fit, effects: Iterable[Effect], rule: Rule) -> tuple[Fit, Trial] | None:
