@@ -230,7 +230,7 @@ def candidates(good: Sequence[Trial]) -> list[Trial]:
     """Which of the acceptable trials stand for choice: bursts taken out of the comparison make no model, so they only
     where no model does better; levels read off the data model bursts only by following them.
     """
-    models = [t for t in good if t.placed.effect.claims is None and t.comparison and t.comparison.excess_gain > 0.5]
+    models = [t for t in good if t.placed.effect.claims is None]
     bursts = [t for t in good if t.placed.effect.claims is not None]
     excess = lambda t: max(t.misfits[o] - 1.0 for o in t.placed.outputs)  # noqa: E731
 
@@ -238,7 +238,7 @@ def candidates(good: Sequence[Trial]) -> list[Trial]:
         same = [b for b in bursts if set(b.placed.outputs) <= set(t.placed.outputs)]
         return t.name in SHAPELESS and any(excess(b) < 2.0 * excess(t) for b in same)
 
-    if not models:
+    if not any(t.comparison and t.comparison.excess_gain > 0.5 for t in models):
         return list(good)
     return [t for t in models if not follows_bursts(t)] or bursts
 
