@@ -56,6 +56,12 @@ def possible(fitted: Fit) -> bool:
     return fitted.ok and not any(beyond_limits(fitted, p) for p in fitted.model.placed)
 
 
+def definite(candidate: Candidate) -> bool:
+    """Whether an effect says something by few numbers, or by events of which its own test is sure."""
+    sure = candidate.placed.effect.name in EXACT and candidate.tested and candidate.p_value < CLEAR_P
+    return sure or freedom(candidate.placed) <= SPECIFIC
+
+
 def part_flexible(
     problem: Problem, base: Fit, flexible: Trial, first: Sequence[Trial], jobs: int = 1
 ) -> tuple[Fit, tuple[Trial, Trial]] | None:
@@ -67,8 +73,8 @@ def part_flexible(
         t
         for t in first
         if t.fitted is not None and t.fitted.ok and t.placed.effect.claims is None
-        and t.name not in LOOSE and freedom(t.placed) <= SPECIFIC and set(t.placed.outputs) & set(outputs)
-        and not t.refused
+        and t.name not in LOOSE and set(t.placed.outputs) & set(outputs) and not t.refused
+        and definite(t.candidate)
     ]  # fmt: skip
     specific.sort(key=lambda t: (sum(t.misfits[o] for o in outputs if o in t.misfits), t.label))
     best: tuple[float, Fit, tuple[Trial, Trial]] | None = None
@@ -91,7 +97,7 @@ def part_flexible(
         # an effect with a test of its own is a candidate where that test is clear
         looked = [c for c in looked if c.share > 0.3 and (not c.tested or c.p_value < CLEAR_P)]
         looked.sort(key=lambda c: (-c.share, c.placed.label))
-        others = [c for c in looked if freedom(c.placed) <= SPECIFIC][:2]
+        others = [c for c in looked if definite(c)][:2]
         pairs: list[Fit] = mapped(problem, added, [(problem, one.fitted, c.placed) for c in others], jobs)
         for other, both in zip(others, pairs, strict=True):
             value = misfits(problem, both)

@@ -56,13 +56,18 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
     names = {t.name for t in near}
     # as good here within a trifle: then what it does for the other outputs counts
     close = best.misfits[output] + 0.05 + 0.001 * max(now[output] - best.misfits[output], 0.0)
-    return min(
+    chosen = min(
         near,
         key=lambda t: (
-            t.name not in named, complexity(t), less_plain(t.name, names), t.misfits[output] > close, -t.improvement,
-            t.label,
+            t.name not in named or t.placed.effect.stochastic, complexity(t), less_plain(t.name, names),
+            t.misfits[output] > close, -t.improvement, t.label,
         ),
     )  # fmt: skip
+    # of its forms the one that leaves least, unless by a trifle: what a form leaves is mended with names
+    trifle = 0.02 + rule.shape * max(now[output] - chosen.misfits[output], 0.0)
+    forms = [t for t in here if t.label == chosen.label and t.placed.site == chosen.placed.site]
+    least = min(forms, key=lambda t: t.misfits[output])
+    return least if least.misfits[output] < chosen.misfits[output] - trifle else chosen
 
 
 ORDER = (

@@ -148,8 +148,8 @@ def simplify_pass(
             simpler = size(rival) < 0.6 * mine or (name in elsewhere and size(rival) <= mine)
             fits_here = set(rival.outputs) == set(placed.outputs) and simpler
             twice = any(p.effect.name == name and p.target == rival.target for p in held)
-            # the same physics on another output speaks for a name
-            shared = placed.effect.name in elsewhere and name not in elsewhere
+            # the same physics on another output speaks for a name, but noise that runs up everywhere for nothing
+            shared = placed.effect.name in elsewhere and name not in elsewhere and not placed.effect.stochastic
             if not fits_here or name == placed.effect.name or twice or shared:
                 continue
             tried += 1

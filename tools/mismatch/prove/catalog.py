@@ -41,7 +41,7 @@ class Entry:
     fast_only: bool = False
 
 
-INSTRUMENT_DRIVE = ("hysteresis", "backlash", "dead_zone", "saturation", "slew_limit", "dead_time")
+INSTRUMENT_DRIVE = ("hysteresis", "backlash", "saturation", "slew_limit", "dead_time")
 INSTRUMENT_ANYTIME = (
     "mains_interference", "vibration", "spikes", "step_shift", "quantization", "clock_skew", "dropped_samples",
 )  # fmt: skip
@@ -210,7 +210,7 @@ def _table() -> dict[str, dict[str, Entry]]:
         "accelerometer_cluster": cluster,
         "mechanical_axis": axis,
         "state_space": ss,
-        # its power has one sign: a dead zone is never crossed, and moves the offset
+        # power and commands of the bench have one sign: a dead zone is never crossed there, and moves the offset
         FMU: {k: e for k, e in ss.items() if k != "dead_zone"},
         USER: ss,
         INSTRUMENT: bench,
