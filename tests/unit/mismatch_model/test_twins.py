@@ -17,6 +17,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins import make
 from tools.mismatch.twins.feedback import run_feedback
@@ -179,6 +180,34 @@ def test_duffing_against_an_ode_solver() -> None:
     assert np.max(np.abs(got - want)) < 2e-3 * np.ptp(want)
 
 
+@pytest.mark.parametrize("pieces", [1, 3])
+def test_a_spring_of_an_axis_of_which_only_the_velocity_was_recorded(pieces: int) -> None:
+    """Its force follows the position, counted from the velocity, however often the simulation starts afresh."""
+    dt, n, k3 = 2e-3, 6000, 4e4
+    f, t = force(n, dt), np.arange(n) * dt
+
+    def rhs(s: float, y: Array) -> list[float]:
+        return [y[1], np.interp(s, t, f) - 3 * y[1] - k3 * y[0] ** 3]
+
+    want = solve_ivp(rhs, (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=dt).y[1]
+    rec = recording(
+        "mechanical_axis", dt, {"force": f}, {"velocity": want}, AXIS, {"mass": 1.0, "damping": 3.0, "stiffness": 0.0}
+    )
+    twin = make(rec)
+    (place,) = sites(twin, rec, EFFECTS["cubic_stiffness"])
+    size = n // pieces
+    view = View(rec, tuple((k * size, (k + 1) * size - 100) for k in range(pieces)), 10)
+    base = Model(twin)
+    (spring,) = Model(twin, [prepare(base, view, base.start(rec), place)]).placed
+    model = Model(twin, [spring])
+    theta = model.carry(base, base.start(rec), rec)
+    names = [p.name for p in model.parameters]
+    for name, value in (("cubic", k3), ("quadratic", 0.0), ("linear", 0.0)):
+        theta[names.index(f"cubic_stiffness[velocity].{name}")] = value
+    got = model.simulate(view, theta)["velocity"]
+    assert np.max(np.abs(got - view.measured("velocity"))) < 5e-3 * np.ptp(want)
+
+
 def test_cluster_against_rigid_body() -> None:
     dt, n = 1e-3, 2000
     t = np.arange(n) * dt
@@ -246,7 +275,7 @@ def test_linear_kernels_equal_python() -> None:
     c = np.array([1.0, 0.5])
     args = (d.ad, d.g0, d.g1, c, u, starts)
     np.testing.assert_allclose(run_output(*args), run_output.py_func(*args), atol=1e-14)
-    rows = (np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]), np.array([3.0, 0.5]), np.array([0.1, 0.2, 0.1, 0.0, 0.05]))
+    rows = (np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]), np.array([3.0, 0.5, 2.0]), np.array([0.1, 0.2, 0.1, 0.0, 0.05]))
     more = (np.array([0.01]), np.array([2.0]))
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for dry, stiff in ((True, 0.0), (False, 60.0)):
