@@ -302,7 +302,7 @@ def _stribeck_report(p: Array, settings: Settings, scale: float) -> Sequence[Hum
     return (
         Human("coulomb_forward", float(p[1] + p[2]) / g, "{in}"),
         Human("coulomb_backward", float(p[1] - p[2]) / g, "{in}"),
-        Human("breakaway_extra", float(p[4]) / g, "{in}"),
+        Human("static_friction", float(p[1] + p[4]) / g, "{in}"),
         Human("stribeck_speed", float(p[0]), "{out}/s"),
         Human("viscous_difference", 2 * float(p[3]) / g, "{in} s/{out}"),
     )
@@ -337,7 +337,7 @@ def _stribeck_bristle_report(p: Array, settings: Settings, scale: float) -> Sequ
     return (
         Human("coulomb_forward", float(p[2]) / g, "{in}"),
         Human("coulomb_backward", float(p[2]) / g, "{in}"),
-        Human("breakaway_extra", float(p[3]) / g, "{in}"),
+        Human("static_friction", float(p[2] + p[3]) / g, "{in}"),
         Human("stribeck_speed", float(p[0]), "{out}/s"),
         Human("presliding_distance", float(p[1]), "{out}"),
     )

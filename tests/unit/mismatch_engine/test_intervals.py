@@ -12,7 +12,7 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
-from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import covariance, few_blocks
 from tools.mismatch.engine.screen import places
@@ -110,3 +110,16 @@ def test_one_loud_stretch_that_runs_on_is_an_event_and_noise_is_none() -> None:
     bump[a : a + 60] += 1.0 * np.hanning(60)
     problem, _, base = prepared(stack(bump), 0.3, 0, False)
     assert lone_event(problem, base, "displacement")
+
+
+def test_a_delay_before_a_coarse_grid_has_an_interval_that_is_no_point() -> None:
+    rate_hz, delay_s, step = 100.0, 0.013, 0.1
+    u = 50 + 30 * wave(np.random.default_rng(5), 3000)
+    t = np.arange(u.size) / rate_hz
+    y = np.round(0.125 * np.interp(t - delay_s, t, u) / step) * step
+    parameters: dict[str, object] = {"gain_um_per_V": 0.125, "offset_um": 0.0}
+    rec = recording("piezo_stack", {"command": u}, {"displacement": y}, parameters, rate_hz=rate_hz)
+    found = {p.name: p.parameters for p in diagnose(rec, jobs=1).physics}
+    delay = found["dead_time"]["delay_s"]
+    assert delay.value == pytest.approx(delay_s, abs=5e-5)
+    assert 1e-6 < delay.ci95[1] - delay.ci95[0] < 1 / rate_hz

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
@@ -10,30 +13,45 @@ from tools.mismatch.engine.colour import fit_whitener
 from tools.mismatch.engine.fit import Fit, moved_a_little
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import HUBER, robust_scale
+from tools.mismatch.simulate import Model
 
 Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
 
 
 def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
-    """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters)."""
+    """Sensitivity of the noise-weighted outputs on fit rows to every parameter (rows, parameters).
+
+    The steps of a quantiser have no slope that says anything: what lies before it is moved without it.
+    """
     model, theta = fitted.model, fitted.theta
     rows = problem.fit_rows[:: max(1, stride)]
-    design = model.design(problem.view, theta, samples=problem.index[rows])
     outputs = problem.twin.outputs
-    sensitivity = {o: np.zeros((rows.size, theta.size)) for o in outputs}
-    for o in outputs:
+    found = np.zeros((rows.size * len(outputs), theta.size))
+    smooth = Model(problem.twin, [p for p in model.placed if p.effect.name != "quantization"])
+    if len(smooth.placed) < len(model.placed):
+        at = smooth.carry(model, theta, problem.recording)
+        names = [p.name for p in model.parameters]
+        before = [names.index(p.name) for p in smooth.parameters]
+        found[:, before] = jacobian(problem, replace(fitted, model=smooth, theta=at), stride)
+        return _moved(problem, model, theta, rows, found, [i for i in range(theta.size) if i not in before])
+    design = model.design(problem.view, theta, samples=problem.index[rows])
+    for k, o in enumerate(outputs):
         for i, j in enumerate(design.linear[o]):
-            sensitivity[o][:, j] = design.columns[o][:, i]
-    here = model.simulate(problem.view, theta) if model.nonlinear else {}
-    for i in model.nonlinear:
+            found[k * rows.size : (k + 1) * rows.size, j] = design.columns[o][:, i] / problem.sigma(o)
+    return _moved(problem, model, theta, rows, found, model.nonlinear)
+
+
+def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Array, which: Sequence[int]) -> Array:
+    """``found`` with the columns of these parameters from differences of two simulations."""
+    stack = lambda y: np.concatenate([y[o][rows] / problem.sigma(o) for o in problem.twin.outputs])  # noqa: E731
+    here = stack(model.simulate(problem.view, theta)) if which else found[:, 0]
+    for i in which:
         shifted = moved_a_little(model, theta, i)
-        moved = shifted[i] - theta[i]
-        if moved == 0.0:
-            continue
-        there = model.simulate(problem.view, shifted)
-        for o in outputs:
-            sensitivity[o][:, i] = (there[o][rows] - here[o][rows]) / moved
-    return np.concatenate([sensitivity[o] / problem.sigma(o) for o in outputs])
+        by = shifted[i] - theta[i]
+        if by != 0.0:
+            found[:, i] = (stack(model.simulate(problem.view, shifted)) - here) / by
+    return found
 
 
 def covariance(problem: Problem, fitted: Fit) -> Array:
@@ -46,7 +64,7 @@ def covariance(problem: Problem, fitted: Fit) -> Array:
     j = jacobian(problem, fitted, stride)
     rows = problem.fit_rows[::stride]
     r = np.concatenate([fitted.residual[o][rows] / problem.sigma(o) for o in problem.twin.outputs])
-    limit = HUBER * robust_scale(r, 0.0)
+    limit = HUBER * robust_scale(r, 1.0)
     r = np.clip(r, -limit, limit)
     size = np.sqrt(np.maximum(np.sum(j * j, axis=0), 1e-300))
     js = j / size

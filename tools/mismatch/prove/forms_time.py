@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from scipy.interpolate import CubicSpline
 from scipy.signal import lfilter
@@ -41,6 +43,12 @@ def thermal_drift(rng: Rng, scene: Scene) -> Bound:
     return added("thermal_drift", form, scene, pick_outputs(rng, scene, False), wave, stages=ANYWHERE, truth=truth)
 
 
+def _mean_hz(turns: Callable[[Array], Array], scene: Scene) -> float:
+    """Mean frequency over the record of a line of this phase: what a recording can tell of one that wanders."""
+    phase = turns(scene.t[: scene.keep])
+    return float(phase[-1] - phase[0]) / (2 * np.pi * (scene.keep - 1) * scene.dt)
+
+
 def mains_interference(rng: Rng, scene: Scene) -> Bound:
     form = str(rng.choice(["steady", "wandering", "harmonics"]))
     base = float(rng.choice([50.0, 60.0]))
@@ -49,12 +57,15 @@ def mains_interference(rng: Rng, scene: Scene) -> Bound:
     detune = 0.0 if form == "steady" else rng.uniform(-0.03, 0.03)
     swing, rate, breathe = rng.uniform(0.2, 1.2), rng.uniform(0.02, 0.08), rng.uniform(0.05, 0.25)
 
+    def turns(t: Array) -> Array:
+        ph = 2 * np.pi * (base + detune) * t
+        return ph if form == "steady" else ph + swing * np.sin(2 * np.pi * rate * t + phases[0])
+
     def wave(flow: Flow, key: str) -> Array:
         t = flow.t
-        ph = 2 * np.pi * (base + detune) * t
+        ph = turns(t)
         env = np.ones(t.size)
         if form != "steady":
-            ph = ph + swing * np.sin(2 * np.pi * rate * t + phases[0])
             env = 1.0 + breathe * np.sin(2 * np.pi * 1.3 * rate * t + phases[1])
         w = np.zeros(t.size)
         for k, a in enumerate(amps):
@@ -69,7 +80,7 @@ def mains_interference(rng: Rng, scene: Scene) -> Bound:
         pick_outputs(rng, scene, False),
         wave,
         stages=ANYWHERE,
-        truth=lambda s: {"frequency": (base + detune, "Hz")},
+        truth=lambda s: {"frequency": (_mean_hz(turns, scene), "Hz")},
     )
 
 
@@ -83,11 +94,13 @@ def vibration(rng: Rng, scene: Scene) -> Bound:
     phase, m, mf = rng.uniform(0, 6.28), rng.uniform(0.3, 0.9), rng.uniform(0.05, 0.3)
     tau = (scene.t[-1] - scene.t[0]) * rng.uniform(0.3, 0.8)
 
+    def turns(t: Array) -> Array:
+        ph = 2 * np.pi * f * t + phase
+        return ph + 1.5 * np.sin(2 * np.pi * 0.3 * mf * t) if form == "slow_wander" else ph
+
     def wave(flow: Flow, key: str) -> Array:
         t = flow.t - flow.t[0]
-        ph = 2 * np.pi * f * t + phase
-        if form == "slow_wander":
-            ph = ph + 1.5 * np.sin(2 * np.pi * 0.3 * mf * t)
+        ph = turns(t)
         env = np.ones(t.size)
         if form == "modulated":
             env = 1.0 + m * np.sin(2 * np.pi * mf * t + 1.0)
@@ -102,7 +115,7 @@ def vibration(rng: Rng, scene: Scene) -> Bound:
         pick_outputs(rng, scene, False),
         wave,
         stages=ANYWHERE,
-        truth=lambda s: {"frequency": (f, "Hz")},
+        truth=lambda s: {"frequency": (_mean_hz(lambda t: turns(t - t[0]), scene), "Hz")},
     )
 
 
