@@ -11,10 +11,14 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import rank_starts, thin
 
+SUBSTEPS = 8  # where a limited course meets its input again lies between samples, and all that follows hangs on it
+
 
 @kernel
-def slew(x, down, up, share, starts):
-    """Move towards x by ``share`` of the distance per sample, at most ``up`` and ``down``; on x at each start."""
+def slew(x, down, up, share, starts, parts):
+    """Move towards x, straight between samples, in ``parts`` steps per sample: by ``share`` of the distance, at most
+    ``up`` and ``down`` a step; on x at each start.
+    """
     y = np.empty_like(x)
     s = 0
     v = 0.0
@@ -23,7 +27,8 @@ def slew(x, down, up, share, starts):
             s += 1
             v = x[i]
         else:
-            v += min(max(share * (x[i] - v), -down), up)
+            for k in range(1, parts + 1):
+                v += min(max(share * (x[i - 1] + (x[i] - x[i - 1]) * k / parts - v), -down), up)
         y[i] = v
     return y
 
@@ -43,13 +48,14 @@ def _slew_parts(settings: Settings) -> Parts:
         (
             Parameter("rate_up", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
             Parameter("rate_down", "{in}/s", lo, 1.2 * top, log=True, scale=0.1 * usual),
-            Parameter("time_constant_s", "s", 0.05 * dt, 50 * dt, log=True, scale=dt),
+            Parameter("time_constant_s", "s", 0.01 * dt, 50 * dt, log=True, scale=dt),
         )
     )
 
 
 def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    return slew(x, q[1] * ctx.dt, q[0] * ctx.dt, -np.expm1(-ctx.dt / q[2]), np.array(ctx.starts))
+    h = ctx.dt / SUBSTEPS
+    return slew(x, q[1] * h, q[0] * h, -np.expm1(-h / q[2]), np.array(ctx.starts), SUBSTEPS)
 
 
 def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:

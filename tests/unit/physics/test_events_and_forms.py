@@ -10,7 +10,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.dropped_samples import find_drops
 from sim_devices.physics.effect import Context
 from sim_devices.physics.hysteresis import loop_width, stops
-from sim_devices.physics.slew import slew
+from sim_devices.physics.slew import SUBSTEPS, slew
 from sim_devices.physics.step_shift import paying_steps
 
 DT = 0.002
@@ -74,7 +74,9 @@ def test_one_slew_rate_holds_both_ways() -> None:
     x = np.repeat([0.0, 1.0, 0.0], 200)
     assert effect.apply is not None
     y = effect.apply(x, context(x.size), np.array([5.0, 1e-6]), {})
-    np.testing.assert_allclose(y, slew(x, 5.0 * DT, 5.0 * DT, 1.0, np.array([0])), atol=1e-9)
+    np.testing.assert_allclose(
+        y, slew(x, 5.0 * DT / SUBSTEPS, 5.0 * DT / SUBSTEPS, 1.0, np.array([0]), SUBSTEPS), atol=1e-9
+    )
     assert np.max(np.abs(np.diff(y))) == pytest.approx(5.0 * DT)
 
 

@@ -128,9 +128,19 @@ def test_hard_and_soft_limits() -> None:
 
 def test_slew_of_a_step() -> None:
     x = np.concatenate([np.zeros(1), np.ones(50)])
-    y = slew(x, 0.05, 0.1, 1.0, ONE)
+    y = slew(x, 0.05, 0.1, 1.0, ONE, 1)
     np.testing.assert_allclose(y, np.minimum(0.1 * np.arange(51), 1.0), atol=1e-12)
-    np.testing.assert_allclose(slew(-x, 0.05, 0.1, 1.0, ONE), -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
+    np.testing.assert_allclose(slew(-x, 0.05, 0.1, 1.0, ONE, 1), -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
+
+
+def test_a_sine_far_beyond_the_slew_limit_becomes_a_triangle() -> None:
+    t = np.arange(40_000) * DT
+    frequency, rate = 71.3, 40.0  # 14 samples a period: most turns lie between samples
+    effect = EFFECTS["slew_limit"]
+    assert effect.apply is not None
+    y = effect.apply(np.sin(2 * np.pi * frequency * t), Context(t, DT, {}, "y"), np.array([rate, 1e-7]), {})
+    peak = rate / (4 * frequency)
+    assert np.sqrt(3.0) * np.std(y[4000:]) == pytest.approx(peak, rel=2e-3)
 
 
 def test_quantiser_mean_against_monte_carlo() -> None:
@@ -184,7 +194,7 @@ def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:
         (low_pass, (DT, 0.01, np.array([0, 70]))),
         (mode, (*(np.ascontiguousarray(m) for m in discrete_mode(30.0, 0.2, DT)), np.array([0, 70]))),
         (limit, (-0.5, 0.7, 0.05)),
-        (slew, (0.02, 0.03, 0.5, np.array([0, 70]))),
+        (slew, (0.02, 0.03, 0.5, np.array([0, 70]), 3)),
         (resample, (-3.3, 1.001, 1e-5)),
         (shift_by, (np.array([20, 90]), np.array([3, -1]))),
     ],
