@@ -12,7 +12,7 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context
 
 FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness
-SPRING = 3  # cubic, quadratic, linear
+SPRING = 4  # cubic, quadratic, linear, quintic
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
 COGGING = 5  # period, sin1, cos1, sin2, cos2
 
@@ -50,7 +50,8 @@ def bristle_after(z, v, step_s, row):
 @kernel
 def smooth_force(p, v, spring, cogging, friction):
     """Forces that are continuous in position p and velocity v: spring curvature, cogging, unequal viscosity."""
-    f = -spring[0] * p * p * p - spring[1] * p * p - spring[2] * p - friction[4] * abs(v)
+    q = p * p
+    f = -(spring[0] + spring[3] * q) * q * p - spring[1] * q - spring[2] * p - friction[4] * abs(v)
     if cogging[0] > 0.0:
         a = 2.0 * np.pi * p / cogging[0]
         f += cogging[1] * np.sin(a) + cogging[2] * np.cos(a)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves
 from sim_devices.physics.statistics import least_squares, thin
+
+MOST_PERIOD = 0.8  # of the travel: what was not seen to come again is a spring
 
 
 def _travel(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -50,7 +53,7 @@ def _spring_report(p: Array, settings: Settings, scale: float) -> Sequence[Human
     return out
 
 
-CUBIC_STIFFNESS = Effect(
+_CUBIC = Effect(
     name="cubic_stiffness",
     summary="spring that hardens or softens",
     kind="feedback",
@@ -67,9 +70,41 @@ CUBIC_STIFFNESS = Effect(
 )
 
 
+def _quintic_parts(settings: Settings) -> Parts:
+    parts = _spring_parts(settings)
+    terms = (*parts.weights, Parameter("quintic", "1/({out}^4 s^2)"))
+    return Parts((), terms, np.diag([0.0, 0.02, *[0.0] * (len(terms) - 2)]))
+
+
+def _quintic_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.column_stack([_spring_basis(x, ctx, q, settings), -(x**5)])
+
+
+def _quintic_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = _spring_fill(q, w[:-1], settings)["spring"]
+    row[3] = w[-1]
+    return {"spring": row}
+
+
+def _quintic_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    quintic = Human("quintic_stiffness", float(p[-1]) / (scale or 1.0), "{in}/{out}^5")
+    return (*_spring_report(p[:-1], settings, scale), quintic)
+
+
+_QUINTIC = replace(
+    _CUBIC,
+    parts=_quintic_parts,
+    equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 x^3 + k_5 x^5 = F",
+    basis=_quintic_basis,
+    fill=_quintic_fill,
+    report=_quintic_report,
+)
+CUBIC_STIFFNESS = replace(_CUBIC, variants=(_QUINTIC,))
+
+
 def _cog_parts(settings: Settings) -> Parts:
     travel = settings.get("travel", (1.0,))[0]
-    lo, hi = settings.get("near", (2e-3 * travel, 2 * travel))
+    lo, hi = settings.get("near", (2e-3 * travel, MOST_PERIOD * travel))
     unit = "{out}/s^2"
     return Parts(
         (Parameter("period", "{out}", lo, hi, log=True, scale=1e-3 * lo),),
@@ -96,7 +131,7 @@ def _cog_scan(x: Array, residual: Array, ctx: Context, travel: float) -> list[tu
             out.append((least_squares(np.column_stack([line, cols]), residual[k])[1], float(period)))
         return sorted(out)
 
-    coarse = tried(np.concatenate([np.arange(0.5, 60, 0.3), np.geomspace(60, 300, 80)]))
+    coarse = tried(np.concatenate([np.arange(1 / MOST_PERIOD, 60, 0.3), np.geomspace(60, 300, 80)]))
     near = travel / coarse[0][1]
     fine = tried(near + np.linspace(-0.3, 0.3, 13) * max(1.0, near / 15))
     return sorted([*fine[:2], *coarse[:2]])

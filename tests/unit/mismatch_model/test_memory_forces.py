@@ -8,7 +8,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.twins.feedback import run_feedback
 
-NONE3, NONE5, NONE6 = np.zeros(3), np.zeros(5), np.zeros(6)
+NO_SPRING, NONE5, NONE6 = np.zeros(4), np.zeros(5), np.zeros(6)
 
 
 def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, stiffness: float) -> np.ndarray:
@@ -18,7 +18,7 @@ def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, 
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
     x = run_feedback(
         ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.array([x0]),
-        np.zeros(1, np.int64), np.array([u.size]), NONE6, NONE3, NONE5, np.array([radius]), np.array([stiffness]),
+        np.zeros(1, np.int64), np.array([u.size]), NONE6, NO_SPRING, NONE5, np.array([radius]), np.array([stiffness]),
         False,
     )  # fmt: skip
     return x[:, 0]
@@ -45,7 +45,7 @@ def lugre(u: np.ndarray, dt: float, row: np.ndarray) -> np.ndarray:
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
     return run_feedback(
         ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.zeros((1, 2)),
-        np.zeros(1, np.int64), np.array([u.size]), row, NONE3, NONE5, np.zeros(0), np.zeros(0), False,
+        np.zeros(1, np.int64), np.array([u.size]), row, NO_SPRING, NONE5, np.zeros(0), np.zeros(0), False,
     )  # fmt: skip
 
 

@@ -194,7 +194,7 @@ def test_a_spring_of_an_axis_of_which_only_the_velocity_was_recorded(pieces: int
         "mechanical_axis", dt, {"force": f}, {"velocity": want}, AXIS, {"mass": 1.0, "damping": 3.0, "stiffness": 0.0}
     )
     twin = make(rec)
-    (place,) = sites(twin, rec, EFFECTS["cubic_stiffness"])
+    place = sites(twin, rec, EFFECTS["cubic_stiffness"])[0]
     size = n // pieces
     view = View(rec, tuple((k * size, (k + 1) * size - 100) for k in range(pieces)), 10)
     base = Model(twin)
@@ -275,7 +275,11 @@ def test_linear_kernels_equal_python() -> None:
     c = np.array([1.0, 0.5])
     args = (d.ad, d.g0, d.g1, c, u, starts)
     np.testing.assert_allclose(run_output(*args), run_output.py_func(*args), atol=1e-14)
-    rows = (np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]), np.array([3.0, 0.5, 2.0]), np.array([0.1, 0.2, 0.1, 0.0, 0.05]))
+    rows = (
+        np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]),
+        np.array([3.0, 0.5, 2.0, 1.0]),
+        np.array([0.1, 0.2, 0.1, 0.0, 0.05]),
+    )
     more = (np.array([0.01]), np.array([2.0]))
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for dry, stiff in ((True, 0.0), (False, 60.0)):

@@ -45,7 +45,7 @@ def jacobian(problem: Problem, fitted: Fit, stride: int = 1) -> Array:
 def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Array, which: Sequence[int]) -> Array:
     """``found`` with the columns of these parameters from differences of two simulations."""
     stack = lambda y: np.concatenate([y[o][rows] / problem.sigma(o) for o in problem.twin.outputs])  # noqa: E731
-    here = stack(model.simulate(problem.view, theta)) if which else found[:, 0]
+    here = stack(model.simulate(problem.view, theta)) if which else np.zeros(0)
     for i in which:
         shifted = moved_a_little(model, theta, i)
         by = shifted[i] - theta[i]

@@ -64,7 +64,7 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
         ),
     )  # fmt: skip
     # of its forms the one that leaves least, unless by a trifle: what a form leaves is mended with names
-    trifle = 0.02 + rule.shape * max(now[output] - chosen.misfits[output], 0.0)
+    trifle = 0.02 + 0.25 * rule.shape * max(now[output] - chosen.misfits[output], 0.0)
     forms = [t for t in here if t.label == chosen.label and t.placed.site == chosen.placed.site]
     least = min(forms, key=lambda t: t.misfits[output])
     return least if least.misfits[output] < chosen.misfits[output] - trifle else chosen
@@ -104,12 +104,14 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     """Is the rival within error of the best on one output: worse by a trifle, or by no more than the form of a model
     may cost, or not significantly over blocks. ``before``: mean square over noise variance without either.
 
-    A tenth of the blocks may be left out: what a start transient costs says nothing about the physics. A best effect
-    without shape allows for no form of its own.
+    The first tenth of the blocks may be left out: what a start transient costs says nothing about the physics. A best
+    effect without shape allows for no form of its own. A best that leaves less than the noise shows that the noise was
+    estimated too high.
     """
     if rival.fitted is None or not rival.fitted.ok or output not in rival.misfits:
         return False
-    a, b = max(best.misfits[output] - 1.0, 0.0), max(rival.misfits[output] - 1.0, 0.0)
+    floor = min(best.misfits[output], 1.0)
+    a, b = best.misfits[output] - floor, max(rival.misfits[output] - floor, 0.0)
     # a family bends to what the form of a plain effect leaves, while that is not far above the noise
     plain = freedom(best.placed) >= 8 and size(rival.placed) <= 2 and b < NEAR
     form = 0.02 + (PLAIN if plain else 1.0) * rule.shape * max(before - best.misfits[output], 0.0)
@@ -124,8 +126,8 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     mine, his = best.energy[:, column], rival.energy[:, column]
     if paired_t(his[:, None], mine[:, None]) < 2.0 and b <= 2.0 * a + 0.1:
         return True
-    usual = np.argsort(his - mine)[: his.size - his.size // 10]
-    a, b = max(float(mine[usual].mean()) - 1.0, 0.0), max(float(his[usual].mean()) - 1.0, 0.0)
+    usual = slice(his.size // 10, None)
+    a, b = max(float(mine[usual].mean()) - floor, 0.0), max(float(his[usual].mean()) - floor, 0.0)
     return b <= a + form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
 
 
