@@ -36,14 +36,17 @@ def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int
     # close gaps of a few samples, so that one burst is one event
     join = max(3, n // 20_000)
     breaks = np.flatnonzero(np.diff(index) > join) + 1
+    longest = max(60, n // 100)
     out: list[tuple[int, int, float]] = []
     for group in np.split(index, breaks):
         a, b = int(group[0]), int(group[-1]) + 1
         around = np.concatenate([residual[max(0, a - 60) : max(1, a - 5)], residual[b + 5 : b + 60]])
         local = float(np.median(around)) if around.size else 0.0
-        while a > 0 and abs(residual[a - 1] - local) > 2.5 * usual:
+        # no further than a burst is short: the level there may be another one
+        first, last = max(0, a - longest), min(n, b + longest)
+        while a > first and abs(residual[a - 1] - local) > 2.5 * usual:
             a -= 1
-        while b < n and abs(residual[b] - local) > 2.5 * usual:
+        while b < last and abs(residual[b] - local) > 2.5 * usual:
             b += 1
         a, b = max(0, a - 1), min(n, b + 1)
         if out and a <= out[-1][1]:
