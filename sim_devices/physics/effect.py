@@ -204,7 +204,8 @@ class Effect:
     claims: Callable[[Settings, int], NDArray[np.bool_]] | None = None
     """(settings, n) -> samples that it takes as its own events: not to be fitted, nor held against the model."""
     variants: tuple[Effect, ...] = ()
-    """The same physics at another place of the equations (hysteresis as a force); same name."""
+    """The same physics in other shapes, or at another place of the equations (hysteresis as a force); same name, other
+    equation."""
     fill: Callable[[Array, Array, Settings], Mapping[str, Array]] | None = None
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
@@ -215,3 +216,8 @@ class Effect:
         default_factory=dict[str, tuple[tuple[float, float], ...]]
     )
     """The same the other way round: ranges of human parameters that are by definition another effect's."""
+
+    @property
+    def form(self) -> tuple[str, str, str]:
+        """What tells one shape of an effect from another."""
+        return self.name, self.kind, self.equation

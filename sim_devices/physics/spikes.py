@@ -123,10 +123,12 @@ def _test(x: Array, residual: Array, ctx: Context) -> Signature:
     p = min(1.0, keep.sum() * 2 * float(student.sf(typical[0] * 0.74, 4)))
     width = np.mean([b - a for a, b, _ in bursts])
     if width > 2.5:
-        # neighbours far out together do not happen to independent noise; what is less may be the filter's ringing
-        beside = typical[: int(np.sum(typical > max(4.0, 0.2 * typical[0])))][:4]
-        together = keep.sum() * float(np.prod(2 * student.sf(beside * 0.74, 4)))
-        p = min(p * p if p < 1 else 1e-3, 2 * together)
+        # neighbours far out together do not happen to independent noise
+        p = p * p if p < 1 else 1e-3
+        if len(bursts) > 2:
+            # nor several times (once is a start or a lost sample); what is less may be the filter's ringing
+            beside = typical[: int(np.sum(typical > max(4.0, 0.2 * typical[0])))][:4]
+            p = min(p, 2 * keep.sum() * float(np.prod(2 * student.sf(beside * 0.74, 4))))
     return Signature(float(p), share, f"{len(bursts)} bursts, {width:.1f} samples wide")
 
 

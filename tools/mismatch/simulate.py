@@ -209,9 +209,7 @@ class Model:
     @cached_property
     def key(self) -> tuple[object, ...]:
         """What tells this model from another of the same twin."""
-        return tuple(
-            (p.effect.name, p.effect.kind, p.site, p.target, p.outputs, _frozen(p.settings)) for p in self.placed
-        )
+        return tuple((*p.effect.form, p.site, p.target, p.outputs, _frozen(p.settings)) for p in self.placed)
 
     @cached_property
     def penalty(self) -> Array:
@@ -299,7 +297,7 @@ class Model:
         a, b = self._slices[k]
         q = theta[a]
         ctx = make_context(self.twin, run, pl.target if pl.site == "input" else output, output)
-        key = (effect.name, pl.target, output, q.tobytes(), _frozen(pl.settings))
+        key = (effect.form, pl.target, output, q.tobytes(), _frozen(pl.settings))
 
         gain = self.twin.input_gain(pl.target, theta) if pl.site == "input" else 1.0
 

@@ -225,3 +225,18 @@ def test_what_a_view_remembers_never_outlives_a_change_of_base_parameters(base_k
             np.testing.assert_array_equal(kept, model.simulate(View.whole(rec), t)[output])
             design = model.design(view, t)
             np.testing.assert_array_equal(design.constant[output], model.design(View.whole(rec), t).constant[output])
+
+
+def test_two_shapes_of_one_effect_with_the_same_numbers_are_not_taken_for_one_another() -> None:
+    rec = piezo()
+    twin, view = make(rec), View.whole(rec)
+    shapes = [e for e in (EFFECTS["slew_limit"], *EFFECTS["slew_limit"].variants) if len(e.parts({}).nonlinear) == 2]
+    assert len(shapes) == 2
+    found: list[Array] = []
+    for effect in shapes:
+        model = Model(twin, [Placed(effect, "input", "command", "amplifier", ("displacement",))])
+        theta = model.start(rec)
+        theta[model.slices(0)[0]] = [300.0, 0.02]
+        found.append(model.simulate(view, theta)["displacement"])
+        np.testing.assert_array_equal(found[-1], model.simulate(View.whole(rec), theta)["displacement"])
+    assert np.max(np.abs(found[0] - found[1])) > 1e-3

@@ -18,6 +18,10 @@ def test_the_vocabulary_is_complete() -> None:
     assert tuple(EFFECTS) == NAMES
 
 
+def test_every_shape_of_an_effect_has_an_equation_of_its_own() -> None:
+    assert len({e.form for _, e in ALL}) == len(ALL)
+
+
 @pytest.mark.parametrize("effect", [e for _, e in ALL], ids=[n for n, _ in ALL])
 def test_an_effect_is_described(effect: Effect) -> None:
     assert effect.summary

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 from scipy.signal import lsim
 
@@ -128,9 +129,10 @@ def test_hard_and_soft_limits() -> None:
 
 def test_slew_of_a_step() -> None:
     x = np.concatenate([np.zeros(1), np.ones(50)])
-    y = slew(x, 0.05, 0.1, 1.0, ONE, 1)
+    y = slew(x, 0.05, 0.1, 1.0, ONE, 1, False)
     np.testing.assert_allclose(y, np.minimum(0.1 * np.arange(51), 1.0), atol=1e-12)
-    np.testing.assert_allclose(slew(-x, 0.05, 0.1, 1.0, ONE, 1), -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
+    back = slew(-x, 0.05, 0.1, 1.0, ONE, 1, False)
+    np.testing.assert_allclose(back, -np.minimum(0.05 * np.arange(51), 1.0), atol=1e-12)
 
 
 def test_a_sine_far_beyond_the_slew_limit_becomes_a_triangle() -> None:
@@ -141,6 +143,21 @@ def test_a_sine_far_beyond_the_slew_limit_becomes_a_triangle() -> None:
     y = effect.apply(np.sin(2 * np.pi * frequency * t), Context(t, DT, {}, "y"), np.array([rate, 1e-7]), {})
     peak = rate / (4 * frequency)
     assert np.sqrt(3.0) * np.std(y[4000:]) == pytest.approx(peak, rel=2e-3)
+
+
+def test_a_rounded_slew_limit_against_an_ode_solver() -> None:
+    t = np.arange(600) * DT
+    rate, lag = 40.0, 0.004
+    x = np.sin(2 * np.pi * 13.7 * t)
+
+    def slope(s: float, y: Array) -> Array:
+        return rate * np.tanh((np.interp(s, t, x) - y) / (rate * lag))
+
+    want = solve_ivp(slope, (0, t[-1]), [0.0], t_eval=t, rtol=1e-9, atol=1e-11, max_step=DT).y[0]
+    effect = EFFECTS["slew_limit"].variants[1]
+    assert effect.apply is not None
+    got = effect.apply(x, Context(t, DT, {}, "y"), np.array([rate, lag]), {})
+    np.testing.assert_allclose(got, want, atol=5e-3 * np.ptp(want))
 
 
 def test_quantiser_mean_against_monte_carlo() -> None:
@@ -194,7 +211,7 @@ def test_curves_have_no_offset_line_inside_and_tangents_outside() -> None:
         (low_pass, (DT, 0.01, np.array([0, 70]))),
         (mode, (*(np.ascontiguousarray(m) for m in discrete_mode(30.0, 0.2, DT)), np.array([0, 70]))),
         (limit, (-0.5, 0.7, 0.05)),
-        (slew, (0.02, 0.03, 0.5, np.array([0, 70]), 3)),
+        (slew, (0.02, 0.03, 0.5, np.array([0, 70]), 3, True)),
         (resample, (-3.3, 1.001, 1e-5)),
         (shift_by, (np.array([20, 90]), np.array([3, -1]))),
     ],

@@ -39,7 +39,7 @@ def own_form(names: Iterable[str]) -> float:
 
 def key_of(p: Placed) -> tuple[str, ...]:
     """What tells one candidate from another."""
-    return (p.effect.name, p.effect.kind, p.site, p.target, p.effect.equation)
+    return (*p.effect.form, p.site, p.target)
 
 
 def in_disguise(trial: Trial) -> bool:

@@ -265,7 +265,7 @@ class DynamicTwin(Head):
         u = _once(u)
         token: tuple[object, ...] = ("forced", theta[: len(self.parameters)].tobytes(), run.starts, run.window)
         token = (*token, drive.token, tuple(theta[j] for j in drive.columns))
-        token = (*token, *((f.effect.name, _key(f)) for f in forces))
+        token = (*token, *((f.effect.form, _key(f)) for f in forces))
         cp = rows.get(self.feedback_on, np.zeros(plant.a.shape[0]))
         if self.counted:
             cp = np.eye(plant.a.shape[0])[0]
