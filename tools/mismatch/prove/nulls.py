@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import statistics
 import sys
 import tempfile
@@ -191,8 +192,25 @@ def _by(result: NullResult, key: str, values: Sequence[str]) -> list[str]:
     return lines
 
 
-def document(result: NullResult, earlier: Sequence[NullResult] = ()) -> str:
-    """The text of docs/mismatch-false-alarms.md; ``earlier``: other states of the tool, beside and uncounted."""
+_TOOL_AND_SEED = re.compile(r"seed (\d+), tool (\w+)")
+_ALARMS = re.compile(r"^- false alarms: (.+)$", re.MULTILINE)
+_EARLIER = "Earlier states of the tool, each with its own seed:"
+
+
+def earlier_states(page: str, revision: str) -> list[str]:
+    """Table rows of what a page says of other states of the tool than this one: those it lists, then its own."""
+    _, _, table = page.partition(_EARLIER)
+    rows = [line for line in table.splitlines() if line.startswith("| ")][1:]
+    made_by, counted = _TOOL_AND_SEED.search(page), _ALARMS.search(page)
+    if made_by and counted:
+        rows.append(f"| {made_by[2]} | {made_by[1]} | {counted[1]} |")
+    return [row for row in rows if not row.startswith(f"| {revision[:12]} ")]
+
+
+def document(result: NullResult, before: str = "") -> str:
+    """The text of docs/mismatch-false-alarms.md; ``before``: the page that it takes the place of, whose figures stay
+    beside.
+    """
     k, n = result.count()
     failed = sum(r["failed"] for r in result.rows)
     named: dict[str, int] = {}
@@ -231,11 +249,9 @@ def document(result: NullResult, earlier: Sequence[NullResult] = ()) -> str:
         "What was blamed: " + (", ".join(f"{w} {c}" for w, c in sorted(named.items())) or "nothing") + ".",
         "",
     ]
+    earlier = earlier_states(before, result.revision)
     if earlier:
-        lines += ["Earlier states of the tool, each with its own seed:", ""]
-        lines += ["| tool | seed | false alarms (95 % interval) |", "|---|---|---|"]
-        lines += [f"| {e.revision[:12]} | {e.seed} | {_cell(*e.count())} |" for e in earlier]
-        lines.append("")
+        lines += [_EARLIER, "", "| tool | seed | false alarms (95 % interval) |", "|---|---|---|", *earlier, ""]
     return "\n".join(lines)
 
 
@@ -253,18 +269,16 @@ def main() -> None:
     p.add_argument("--doc", type=Path, default=DOC)
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every recording, and continued from")
     p.add_argument("--page-only", action="store_true", help="no further recording: the page of what --rows holds")
-    p.add_argument("--earlier", type=Path, nargs="*", default=[], help="rows of earlier states, to stand beside")
     a = p.parse_args()
     if a.page_only and a.rows is None:
         p.error("--page-only needs --rows")
     try:
-        earlier = [kept(file) for file in a.earlier]
         result = (
             kept(a.rows)
             if a.page_only
             else nulls(a.n, a.seed, a.jobs, doc=None, rows_file=a.rows, max_samples=a.max_samples)
         )
-        text = document(result, earlier)
+        text = document(result, a.doc.read_text() if a.doc.exists() else "")
         a.doc.write_text(text)
         print(text)
     except (ValueError, OSError) as error:  # rows of another run, a file that cannot be written
