@@ -82,6 +82,7 @@ def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("rate_up", float(p[0]), "{in}/s"),
         Human("rate_down", float(p[1]), "{in}/s"),
         Human("time_constant_s", float(p[2]), "s"),
+        Human("share_of_fastest_input", float(max(p[0], p[1])) / settings["rates"][1], "1"),
     )
 
 
@@ -95,6 +96,8 @@ _UNEVEN_SLEW = Effect(
     source="W. Jung, Op Amp Applications Handbook, section 1-4",
     excitation="changes quicker and slower than the limit",
     confusable_with=("first_order_lag", "saturation"),
+    # a limit that is not met leaves the lag alone
+    limits={"share_of_fastest_input": (0.0, 0.9)},
     prepare=_slew_prepare,
     guess=_slew_guess,
     apply=_slew_apply,

@@ -21,6 +21,7 @@ from tools.mismatch.placed import Placed
 
 MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated
 FITS = (LEAST_FITS, MOST_FITS)
+OF_A_WALK = 0.7  # of the excess that integrated noise leaves nobody else: between its knots it is still noise
 WORTH_A_PAIR = 1.5  # mean square over noise variance above which two effects are tried together
 
 
@@ -82,6 +83,9 @@ def acceptable(trial: Trial, rule: Rule, taken: float) -> bool:
         most = p < 1e-4 and share > 0.8
         return (p < rule.p_tested and share > 0.2) or most or (loud and share > 0.6 and c.z > 7.0 and c.gain > 0.08)
     if trial.refused:
+        return False
+    # noise that runs up is all of it, or has only followed something else
+    if trial.placed.effect.stochastic and c.excess_gain < OF_A_WALK:
         return False
     if c.z < rule.z or c.gain < rule.gain or c.excess_gain < rule.excess or in_disguise(trial):
         return False

@@ -10,7 +10,7 @@ import numpy as np
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.families import FLEXIBLE, key_of, own_form, part_flexible, possible
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.forward import Way, Work, forward
+from tools.mismatch.engine.forward import OF_A_WALK, Way, Work, forward
 from tools.mismatch.engine.locate import follow
 from tools.mismatch.engine.other_way import other_pair
 from tools.mismatch.engine.parsimony import Rule, fewest
@@ -116,7 +116,7 @@ def settled(base: Fit, way: Way, work: Work) -> Selection:
     return Selection(problem, base, current, tuple(steps), tuple(rivals), first, strange)
 
 
-OF_A_WALK = ("step_shift", "thermal_drift")
+READ_OFF_A_WALK = ("step_shift", "thermal_drift")
 
 
 def of_the_walk(problem: Problem, current: Fit) -> tuple[Fit, list[int]]:
@@ -128,7 +128,7 @@ def of_the_walk(problem: Problem, current: Fit) -> tuple[Fit, list[int]]:
     for k in reversed(range(len(current.model.placed))):
         placed = current.model.placed
         walked = {o for p in placed if p.effect.name == "random_walk" for o in p.outputs}
-        if placed[k].effect.name in OF_A_WALK and set(placed[k].outputs) <= walked:
+        if placed[k].effect.name in READ_OFF_A_WALK and set(placed[k].outputs) <= walked:
             alone = reduced(problem, current, k)
             left = excess(problem, alone)
             if not possible(alone) or left > 2.0 * excess(problem, current) + 0.1:
@@ -162,7 +162,7 @@ def unshaped(problem: Problem, current: Fit, effects: Iterable[Effect], rule: Ru
         with np.errstate(all="ignore"):
             walk = added(problem, current, place)
         value = misfits(problem, walk)
-        if walk.ok and value[o] < now[o]:
+        if walk.ok and now[o] - value[o] > OF_A_WALK * (now[o] - 1.0):
             better = compare(problem, current, walk)
             energy = block_energy(problem, walk, problem.held_blocks)
             added_one = walk.model.placed[-1]

@@ -117,7 +117,7 @@ def vouched(candidates: Sequence[Candidate]) -> list[Candidate]:
 def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int = MOST_FITS) -> list[bool]:
     """Which candidates deserve a fit: per output the best by their one-step share, specific effects, flexible
     families (one step flatters these) and events or noise with a test of their own ranked apart (of each ``least``,
-    and up to ``most`` that are near the best), and whatever is clear by that test.
+    and up to ``most`` that are near the best), and whatever is clear by that test. Forms of one effect take one rank.
     """
     keep = [False] * len(candidates)
     outputs = sorted({o for c in candidates for o in c.placed.outputs})
@@ -127,8 +127,9 @@ def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int 
             here = [i for i, c in enumerate(candidates) if o in c.placed.outputs and kinds[i] == kind]
             here.sort(key=lambda i: (-candidates[i].share, candidates[i].placed.label))
             top = candidates[here[0]].share if here else 0.0
-            for rank, i in enumerate(here):
-                share = candidates[i].share
+            names = list(dict.fromkeys(candidates[i].placed.effect.name for i in here))
+            for i in here:
+                share, rank = candidates[i].share, names.index(candidates[i].placed.effect.name)
                 near = share > NEAR_TOP * top and rank < most
                 if share > LEAST_SHARE and (rank < least or near):
                     keep[i] = True
