@@ -97,7 +97,7 @@ _UNEVEN_SLEW = Effect(
     excitation="changes quicker and slower than the limit",
     confusable_with=("first_order_lag", "saturation"),
     # a limit that is not met leaves the lag alone
-    limits={"share_of_fastest_input": (0.0, 0.9)},
+    limits={"share_of_fastest_input": (0.0, 1.0)},
     prepare=_slew_prepare,
     guess=_slew_guess,
     apply=_slew_apply,

@@ -77,6 +77,7 @@ ORDER = (
     ("dead_time", "clock_skew"),
     ("dead_time", "channel_delay"),
     ("step_shift", "thermal_drift"),
+    ("dropped_samples", "clock_skew"),
 )
 """Where two effects serve equally well with equal freedom, the first is the plainer statement."""
 
@@ -89,9 +90,11 @@ FREEDOM = {
     "random_walk": 12,
     "mains_interference": 6,
     "vibration": 6,
+    "dropped_samples": 2,
 }
 """What a family counts as at most: its weights are smoothed, and how many columns its data asked for (bends of a curve,
-harmonics and wander of a line) is no physics. Levels are the plainer statement than a walk, however many they are.
+harmonics and wander of a line, samples that were lost) is no physics. Levels are the plainer statement than a walk,
+however many they are.
 """
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.families import FLEXIBLE, key_of, own_form, part_flexible, possible
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.forward import OF_A_WALK, Way, Work, forward
+from tools.mismatch.engine.forward import Way, Work, forward
 from tools.mismatch.engine.locate import follow
 from tools.mismatch.engine.other_way import other_pair
 from tools.mismatch.engine.parsimony import Rule, fewest
@@ -24,6 +24,7 @@ from tools.mismatch.engine.unexplained import Stranger
 WORTH_ANOTHER = 0.5  # noise variances that one way must leave before another is tried, and
 BEYOND = 1.5  # times what the form of its effects may leave;
 CROWDED = 0.25  # where more than two effects share an output, their number is suspect by itself
+LEAST_OF_A_WALK = 0.4  # of what is left, where its own test speaks for it and nothing else does
 
 
 @dataclass(frozen=True)
@@ -162,7 +163,7 @@ def unshaped(problem: Problem, current: Fit, effects: Iterable[Effect], rule: Ru
         with np.errstate(all="ignore"):
             walk = added(problem, current, place)
         value = misfits(problem, walk)
-        if walk.ok and now[o] - value[o] > OF_A_WALK * (now[o] - 1.0):
+        if walk.ok and now[o] - value[o] > LEAST_OF_A_WALK * (now[o] - 1.0):
             better = compare(problem, current, walk)
             energy = block_energy(problem, walk, problem.held_blocks)
             added_one = walk.model.placed[-1]
