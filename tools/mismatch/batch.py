@@ -167,10 +167,12 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
         }
         for future in as_completed(list(futures)):
             job = futures[future]
-            if future.status == "finished":
+            # a result that died with its worker is worked out again elsewhere: both calls wait for that
+            failure = future.exception()
+            if failure is None:
                 yield future.result()
             else:
-                yield Row(job.name, str(job.path), error=f"lost on the cluster: {future.exception()}")
+                yield Row(job.name, str(job.path), error=f"lost on the cluster: {failure}")
 
 
 def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:

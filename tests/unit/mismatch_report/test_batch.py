@@ -118,6 +118,45 @@ def test_a_dask_cluster_of_two_survives_a_killed_worker(tmp_path: Path):
     assert {r.report["threads"] for r in rows} == {"1"}
 
 
+class LostOnce:
+    """A future that was done, whose result died with its worker, and is worked out again."""
+
+    status = "pending"
+
+    def __init__(self, row: Row) -> None:
+        self.row = row
+
+    def exception(self) -> None:
+        self.status = "finished"
+
+    def result(self) -> Row:
+        assert self.status == "finished"
+        return self.row
+
+
+class OneFuture:
+    """A Dask client that hands out such futures."""
+
+    def __init__(self, *args: object, **more: object) -> None:
+        pass
+
+    __enter__ = as_current = lambda self: self
+
+    def __exit__(self, *why: object) -> None:
+        pass
+
+    def submit(self, work: object, job: Job, **more: object) -> LostOnce:
+        return LostOnce(Row(job.name, str(job.path)))
+
+
+def test_a_result_that_dies_with_its_worker_is_waited_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    pytest.importorskip("distributed")
+    monkeypatch.setattr("distributed.Client", OneFuture)
+    monkeypatch.setattr("distributed.as_completed", list)
+    (row,) = batch.run_on_dask([Job("r0", tmp_path, None, 0.3, 0)], "tcp://127.0.0.1:1")
+    assert (row.name, row.error) == ("r0", "")
+
+
 def test_without_the_extra_the_message_says_what_to_install(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"micron-bench\[dask\]"):
