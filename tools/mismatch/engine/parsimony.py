@@ -77,7 +77,6 @@ ORDER = (
     ("dead_time", "clock_skew"),
     ("dead_time", "channel_delay"),
     ("step_shift", "thermal_drift"),
-    ("dropped_samples", "clock_skew"),
 )
 """Where two effects serve equally well with equal freedom, the first is the plainer statement."""
 
