@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-
 import pytest
 
 from benchmarks import guard, step
@@ -17,16 +15,16 @@ def test_compiled_work_costs_what_it_did() -> None:
 
 
 def test_the_guard_sees_a_slow_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Twice the work is beyond the margin."""
+    """Twice the work is beyond the margin of what it costs here: processors differ by less, but by some of it."""
     real = guard.jobs
+    here = min(guard.measure()["step"] for _ in range(2))
 
     def twice() -> dict:
         step = real()["step"]
         return {"step": lambda: (step(), step())}
 
-    stored = json.loads(guard.FILE.read_text())
     monkeypatch.setattr(guard, "jobs", twice)
-    monkeypatch.setattr(guard.json, "loads", lambda _: {"step": stored["step"]})
+    monkeypatch.setattr(guard.json, "loads", lambda _: {"step": here})
     monkeypatch.setattr(guard, "ATTEMPTS", 1)
     assert "step" in guard.slower()
 
