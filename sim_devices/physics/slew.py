@@ -11,6 +11,7 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import least_squares, thin
 
+RATES = (1.0, 10.0)  # usual and fastest of the input, where a file does not say
 SUBSTEPS = 8  # where a limited course meets its input again lies between samples, and all that follows hangs on it
 
 
@@ -46,7 +47,7 @@ def _slew_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 
 def _slew_parts(settings: Settings) -> Parts:
-    usual, top = settings.get("rates", (1.0, 10.0))
+    usual, top = settings.get("rates", RATES)
     dt = settings.get("time", (1e-3,))[0]
     lo = 0.02 * usual
     return Parts(
@@ -71,7 +72,7 @@ def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     for rate in np.geomspace(0.03 * usual, top, 24).tolist():
         for lag in (0.1 * ctx.dt, 0.6 * ctx.dt, 3.0 * ctx.dt, 12.0 * ctx.dt):
             q = (rate, rate, lag)
-            # what goes, not what is left: a plant that integrates has forgotten neither, but knows only of changes
+            # against the residual: how a plant that integrates came to where it is, no change of its input says
             change = ctx.to_output(_slew_apply(x, ctx, np.array(q), settings) - x)[k]
             tried.append((least_squares(np.column_stack([line, change]), residual[k])[1], q))
     return [q for _, q in sorted(tried)[:3]]
@@ -82,7 +83,7 @@ def _slew_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
         Human("rate_up", float(p[0]), "{in}/s"),
         Human("rate_down", float(p[1]), "{in}/s"),
         Human("time_constant_s", float(p[2]), "s"),
-        Human("share_of_fastest_input", float(max(p[0], p[1])) / settings["rates"][1], "1"),
+        Human("share_of_fastest_input", float(max(p[0], p[1])) / settings.get("rates", RATES)[1], "1"),
     )
 
 

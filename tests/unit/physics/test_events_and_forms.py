@@ -144,3 +144,10 @@ def test_a_walk_whose_slow_part_was_fitted_away_is_still_one() -> None:
     assert test(t, bent / bent.std() + 0.02 * rng.standard_normal(n), context(n)).p_value < 1e-3
     brief = np.convolve(rng.standard_normal(n), np.exp(-np.arange(60) / 12), "same")
     assert test(t, brief, context(n)).p_value == 1.0
+
+
+def test_a_slew_limit_of_a_file_without_settings_is_reported() -> None:
+    for effect in (EFFECTS["slew_limit"], *EFFECTS["slew_limit"].variants):
+        assert effect.report is not None
+        found = effect.report(np.array([3.0, 2.0, 0.1][: len(effect.parts({}).nonlinear)]), {}, 1.0)
+        assert next(h.value for h in found if h.name == "rate_up") == 3.0
