@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,11 @@ TICKS_CHANNEL, EVENTS_CHANNEL = 1, 2  # fixed, so that a file with a damaged fir
 LAYOUT_METADATA, END_METADATA, STATISTICS_METADATA = "layout", "end", "statistics"
 BLOCK_ROWS = 100
 CHUNK_BYTES = 16 * 1024
+MOST_COLUMNS = 10_000
+MOST_NAME_LENGTH = 1000
+MOST_NESTING = 100
+MOST_ROW = 1 << 53
+"""Row numbers and ticks are exact as float64 up to here; at 1 kHz that is 285,000 years."""
 
 TICK_COLUMN = "tick"  # device sequence number of the scan
 TIME_COLUMN = "t"  # s since the start of the run
@@ -50,14 +56,17 @@ class Block(NamedTuple):
 
 
 def check_columns(columns: Sequence[tuple[str, str]]) -> tuple[ColumnInfo, ...]:
-    """The columns of a layout; ``RecordingError`` when there are none or two have one name."""
+    """The columns of a layout; ``RecordingError`` when there are none, too many, or two have one name."""
     result = tuple(ColumnInfo(name, unit) for name, unit in columns)
-    if not result:
-        raise RecordingError("a recording needs at least one column")
-    names = [c.name for c in result]
-    for name in names:
-        if names.count(name) > 1:
-            raise RecordingError(f"two columns are called {name!r}: give each its own name")
+    if not 1 <= len(result) <= MOST_COLUMNS:
+        raise RecordingError(f"a recording needs 1 to {MOST_COLUMNS} columns, not {len(result)}")
+    seen: set[str] = set()
+    for column in result:
+        if len(column.name) > MOST_NAME_LENGTH or len(column.unit) > MOST_NAME_LENGTH:
+            raise RecordingError(f"the name or unit of a column is longer than {MOST_NAME_LENGTH} characters")
+        if column.name in seen:
+            raise RecordingError(f"two columns are called {column.name!r}: give each its own name")
+        seen.add(column.name)
     return result
 
 
@@ -67,8 +76,44 @@ def layout_text(columns: Sequence[ColumnInfo]) -> str:
 
 
 def layout_of_text(text: str) -> tuple[ColumnInfo, ...]:
-    """Inverse of ``layout_text``."""
-    return tuple(ColumnInfo(entry["name"], entry["unit"]) for entry in json.loads(text))
+    """Inverse of ``layout_text``. ``RecordingError`` when the text is no layout."""
+    return layout_of(load_json(text))
+
+
+def layout_of(entries: object) -> tuple[ColumnInfo, ...]:
+    """The layout in a list of ``{"name", "unit"}``, as stored. ``RecordingError`` when it is no layout."""
+    columns: list[tuple[str, str]] = []
+    for entry in entries if isinstance(entries, list) else [None]:
+        if (
+            not isinstance(entry, dict)
+            or not isinstance(entry.get("name"), str)
+            or not isinstance(entry.get("unit"), str)
+        ):
+            raise RecordingError("the layout is not a list of columns with a name and a unit")
+        columns.append((entry["name"], entry["unit"]))
+    return check_columns(columns)
+
+
+def load_json(text: str | bytes) -> Any:
+    """The value of a JSON text that somebody else wrote; it can be written again. ``RecordingError`` otherwise."""
+    try:
+        text = text if isinstance(text, str) else text.decode()
+        if text.count("[") + text.count("{") > MOST_NESTING and _nesting(text) > MOST_NESTING:
+            raise RecordingError(f"a JSON text is nested more than {MOST_NESTING} deep")
+        value = json.loads(text)
+        json.dumps(value, ensure_ascii=False).encode()  # half a surrogate pair can be read, but never written
+    except (ValueError, RecursionError) as error:
+        raise RecordingError(f"a text is not JSON: {error}") from error
+    return value
+
+
+def _nesting(text: str) -> int:
+    """An upper bound of how deep ``text`` is nested; brackets inside its strings count as well."""
+    deep = deepest = 0
+    for match in re.finditer(r"[\[{\]}]", text):
+        deep += 1 if match[0] in "[{" else -1
+        deepest = max(deepest, deep)
+    return deepest
 
 
 def layout_crc(columns: Sequence[ColumnInfo]) -> int:
@@ -121,8 +166,11 @@ def encode_block(row0: int, rows: Float64Array, crc: int) -> bytes:
     return _HEADER.pack(_MAGIC, n_columns, n_rows, crc, row0) + shuffled.tobytes()
 
 
-def decode_block(message: bytes, crc: int) -> Block:
-    """Inverse of ``encode_block``. ``RecordingError`` when the message is not a block of this layout."""
+def decode_block(message: bytes | memoryview, crc: int, layout_columns: int) -> Block:
+    """Inverse of ``encode_block``. ``RecordingError`` when the message is not a block of this layout.
+
+    ``layout_columns`` is the number of columns of the layout whose ``layout_crc`` is ``crc``.
+    """
     if len(message) < _HEADER.size:
         raise RecordingError(f"a block of {len(message)} bytes is shorter than its header")
     magic, n_columns, n_rows, found_crc, row0 = _HEADER.unpack_from(message)
@@ -135,6 +183,8 @@ def decode_block(message: bytes, crc: int) -> Block:
         raise RecordingError("a message of the ticks channel is not a block of ticks")
     if found_crc != crc:
         raise RecordingError("a block was written with another layout than the file's")
+    if n_columns != layout_columns or n_rows == 0 or row0 + n_rows > MOST_ROW:
+        raise RecordingError(f"a block claims {n_rows} rows from row {row0} on, of {n_columns} columns")
     shuffled = np.frombuffer(message, dtype=np.uint8, offset=_HEADER.size).reshape(8, -1)
     data = np.ascontiguousarray(shuffled.T).view("<f8").reshape(n_columns, n_rows)
     return Block(row0, data.astype(np.float64, copy=False))
@@ -173,7 +223,7 @@ def decode_metadata(name: str, record: Mapping[str, str]) -> Any:
         raise RecordingError(f"the metadata record has no {missing}") from missing
     if _metadata_crc(name, kind, text) != crc:
         raise RecordingError("the text of the metadata record does not match its CRC")
-    return json.loads(text) if kind == "json" else text
+    return load_json(text) if kind == "json" else text
 
 
 def _metadata_crc(name: str, kind: str, text: str) -> str:

@@ -65,7 +65,12 @@ class Health:
             lines.append(f"ticks {self.first_tick} to {self.last_tick}{at}")
         if self.ended and self.ended != "stopped":
             lines.append(f"the recording ended early: {self.ended}")
-        if self.expected_rows is None:
+        if self.expected_rows is None and self.finished and not self.ended:
+            lines.append(
+                "the file is complete, but without the recorder's last words: another program has copied it without "
+                "its metadata; whether ticks are missing at its end is not known"
+            )
+        elif self.expected_rows is None:
             lines.append(
                 "the recorder was killed or is still writing: it left no last words; "
                 "up to 0.2 s after the last tick may be missing"

@@ -3,21 +3,44 @@
 from __future__ import annotations
 
 import json
+import zlib
+from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from mcap.records import McapRecord, Message, Schema
+from mcap.records import Channel, Schema
+from numpy.typing import NDArray
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.format import Block, ColumnInfo, Float64Array
 from firmware_py.recording.health import Health, RowGap, TickGap
-from firmware_py.recording.scan import ChunkRecord, Damage, Finished, MetadataRecord, read_chunk, scan
+from firmware_py.recording.scan import (
+    ChunkMessage,
+    ChunkRecord,
+    Damage,
+    Finished,
+    Item,
+    MetadataRecord,
+    Scanner,
+    chunk_records,
+    message_at,
+    read_chunk,
+)
+from firmware_py.recording.unpack import FileTooExpansive
+
+IndexArray = NDArray[np.int64]
 
 _MAX_LISTED = 1000
+MOST_EVENT_BYTES = 1 << 20
+MOST_EVENTS_BYTES = 1 << 26
+_EVENT_COST_BYTES = 128
+"""An event is counted as so many bytes more than its text: two bytes of JSON cost an object as well."""
+_FREE_REREAD_BYTES = 1 << 28
+_REREAD_RATIO = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,47 +49,50 @@ class Event:
 
     number: int
     time_ns: int
-    content: dict[str, Any]
+    text: bytes
 
-
-@dataclass(frozen=True, slots=True)
-class _Place:
-    """Where a block is."""
-
-    offset: int
-    row0: int
-    n_rows: int
+    @property
+    def content(self) -> dict[str, Any]:
+        """The JSON object of the event; it was checked when the recording was opened."""
+        return json.loads(self.text)
 
 
 class Recording:
     """A recording on disk. Opening it reads it once and checks every CRC; data are read again when asked for.
 
-    Raises ``RecordingError`` when the file is not a recording of this project or its layout is lost.
+    Another program may have copied it: chunks of any size, messages in any order, channels with other numbers. A block
+    is addressed by its chunk and by the place of its message in it. Two equal copies of a block count as one; two
+    different blocks with the same rows are an error.
+
+    Raises ``RecordingError`` when the file is not a recording of this project, its layout is lost, or it contradicts
+    itself.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = Path(path)
         self.metadata: dict[str, Any] = {}
         self.events: list[Event] = []
-        self._places: list[_Place] = []
-        self._damage: list[Damage] = []
+        self._places = _Places()
+        self._damage = _DamageList()
         self._finished = False
         self._layout: tuple[ColumnInfo, ...] | None = None
+        self._crc = 0
+        self._channels = {fmt.TICKS_CHANNEL: fmt.TICKS_TOPIC, fmt.EVENTS_CHANNEL: fmt.EVENTS_TOPIC}
+        self._event_bytes = 0
+        self._chunk_bytes: dict[int, int] = {}
         self._ticks = _TickCheck()
-        for item in scan(self.path):
-            match item:
-                case MetadataRecord():
-                    self._take_metadata(item)
-                case ChunkRecord():
-                    self._take_chunk(item)
-                case Damage():
-                    self._damage.append(item)
-                case Finished():
-                    self._finished = True
+        try:
+            with self.path.open("rb") as file:
+                scanner = Scanner(file, self.path)
+                for item in scanner.items():
+                    self._take(item, scanner)
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be read ({error.strerror})") from error
+        self._size_bytes = scanner.size
         self.columns = self._known_layout()
-        self._places.sort(key=lambda place: place.row0)
-        self.events.sort(key=lambda event: event.number)
-        self.n_rows = sum(place.n_rows for place in self._places)
+        self._places.sort(self.path)
+        self.events = self._single_events()
+        self.n_rows = self._places.n_rows
         self.health = self._health()
 
     # -- data --------------------------------------------------------------------------------------------
@@ -79,10 +105,24 @@ class Recording:
         return self.columns[self._index(name)].unit
 
     def blocks(self) -> Iterator[Block]:
-        """All blocks in order of their rows; one block of memory at a time."""
-        with self.path.open("rb") as file:
-            for place in self._places:
-                yield self._block_of(read_chunk(file, place.offset))
+        """All blocks in order of their rows; one chunk of memory at a time.
+
+        ``RecordingError`` when the rows are scattered over so many chunks that reading them in order would unpack the
+        file many times, or when the file has changed since it was opened.
+        """
+        self._refuse_scattered()
+        try:
+            with self.path.open("rb") as file:
+                chunk, content = -1, b""
+                for offset, at in self._places.addresses():
+                    if offset != chunk:
+                        content = read_chunk(file, offset)
+                        chunk = offset
+                    yield fmt.decode_block(message_at(content, at).data, self._crc, len(self.columns))
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        except OSError as error:
+            raise RecordingError(f"{self.path}: cannot be read ({error.strerror})") from error
 
     def array(self, names: Sequence[str]) -> Float64Array:
         """``[n_rows, len(names)]``, the whole recording."""
@@ -106,8 +146,7 @@ class Recording:
 
     def row_numbers(self) -> np.ndarray:
         """Number of every row, int64 ``[n_rows]``; a jump is a gap."""
-        parts = [np.arange(place.row0, place.row0 + place.n_rows) for place in self._places]
-        return np.concatenate(parts) if parts else np.empty(0, dtype=np.int64)
+        return self._places.row_numbers()
 
     def _index(self, name: str) -> int:
         try:
@@ -115,17 +154,41 @@ class Recording:
         except ValueError:
             raise RecordingError(f"{self.path} has no column {name!r}; it has: {', '.join(self.names)}") from None
 
+    def _refuse_scattered(self) -> None:
+        """Every change from chunk to chunk unpacks one again; an ordinary file changes once per chunk."""
+        unpacked = sum(self._chunk_bytes[offset] for offset in self._places.visits())
+        if unpacked > _FREE_REREAD_BYTES + _REREAD_RATIO * sum(self._chunk_bytes.values()):
+            raise RecordingError(
+                f"{self.path}: its rows are scattered over its chunks; put them in order first ('mcap sort FILE')"
+            )
+
     # -- opening -----------------------------------------------------------------------------------------
+
+    def _take(self, item: Item, scanner: Scanner) -> None:
+        match item:
+            case MetadataRecord():
+                self._take_metadata(item)
+            case ChunkRecord():
+                try:
+                    self._take_chunk(item, scanner)
+                except FileTooExpansive as error:
+                    raise RecordingError(f"{self.path} is not read: {error}") from error
+            case Damage():
+                self._damage.add(item)
+            case Finished():
+                self._finished = True
 
     def _take_metadata(self, item: MetadataRecord) -> None:
         try:
             value = fmt.decode_metadata(item.name, item.metadata)
             if item.name == fmt.LAYOUT_METADATA:
                 self._take_layout(fmt.layout_of_text(value))
+            elif item.name in self.metadata and self.metadata[item.name] != value:
+                raise RecordingError("it is there twice, with different texts; the first one is used")
             else:
-                self.metadata[item.name] = value
-        except (RecordingError, ValueError, KeyError, TypeError) as error:
-            self._damage.append(Damage(0, 0, f"metadata {item.name!r}: {error}"))
+                self.metadata.setdefault(item.name, _check_end(value) if item.name == fmt.END_METADATA else value)
+        except RecordingError as error:
+            self._damage.add(Damage(item.offset, 0, f"metadata {item.name[:60]!r}: {error}"))
 
     def _take_layout(self, layout: tuple[ColumnInfo, ...]) -> None:
         if self._layout is None:
@@ -133,106 +196,256 @@ class Recording:
             names = [c.name for c in layout]
             self._ticks.use(names)
             self._crc = fmt.layout_crc(layout)
+        elif layout != self._layout:
+            raise RecordingError("the file holds two different layouts: it was made of several recordings")
 
     def _known_layout(self) -> tuple[ColumnInfo, ...]:
         if self._layout is None:
             raise RecordingError(f"{self.path} is not a recording of this instrument: it has no column layout")
         return self._layout
 
-    def _take_chunk(self, chunk: ChunkRecord) -> None:
-        for record in chunk.records:
-            if isinstance(record, Schema) and record.name == fmt.TICKS_SCHEMA:
-                stored = json.loads(record.data)["x-layout"]
-                self._take_layout(tuple(ColumnInfo(entry["name"], entry["unit"]) for entry in stored))
-            elif isinstance(record, Message) and record.channel_id == fmt.TICKS_CHANNEL:
-                self._known_layout()
-                block = self._block_of((record,))
-                self._places.append(_Place(chunk.offset, block.row0, block.data.shape[1]))
-                self._ticks.take(block)
-            elif isinstance(record, Message) and record.channel_id == fmt.EVENTS_CHANNEL:
-                self.events.append(Event(record.sequence, record.log_time, json.loads(record.data)))
+    def _take_chunk(self, chunk: ChunkRecord, scanner: Scanner) -> None:
+        records = chunk_records(chunk.content, scanner.budget)
+        self._chunk_bytes[chunk.offset] = len(chunk.content)
+        while True:
+            try:
+                record = next(records, None)
+            except FileTooExpansive:
+                raise
+            except RecordingError as error:
+                self._damage.add(Damage(chunk.offset, chunk.length, f"a chunk is not read to its end: {error}"))
+                return
+            match record:
+                case None:
+                    return
+                case Schema():
+                    if record.name == fmt.TICKS_SCHEMA:
+                        self._take_schema(record)
+                case Channel():
+                    self._channels[record.id] = record.topic
+                case ChunkMessage():
+                    topic = self._channels.get(record.channel_id)
+                    if topic == fmt.TICKS_TOPIC:
+                        self._take_block(chunk, record)
+                    elif topic == fmt.EVENTS_TOPIC:
+                        self._take_event(chunk, record)
 
-    def _block_of(self, records: Sequence[McapRecord]) -> Block:
-        """The block in a chunk; the writer puts at most one there."""
-        for record in records:
-            if isinstance(record, Message) and record.channel_id == fmt.TICKS_CHANNEL:
-                try:
-                    return fmt.decode_block(record.data, self._crc)
-                except RecordingError as error:
-                    raise RecordingError(f"{self.path}: {error}") from error
-        raise RecordingError(f"{self.path}: a chunk that had a block has none now; the file was changed")
+    def _take_schema(self, schema: Schema) -> None:
+        if self._layout is not None:
+            return  # a block of another layout is refused by its CRC
+        try:
+            content = fmt.load_json(schema.data)
+            self._take_layout(fmt.layout_of(content.get("x-layout") if isinstance(content, dict) else None))
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: the schema of the ticks is not one of ours: {error}") from error
+
+    def _take_block(self, chunk: ChunkRecord, message: ChunkMessage) -> None:
+        columns = self._known_layout()
+        try:
+            block = fmt.decode_block(message.data, self._crc, len(columns))
+        except RecordingError as error:
+            raise RecordingError(f"{self.path}: {error}") from error
+        self._places.add(chunk.offset, message.at, block.row0, block.data.shape[1], zlib.crc32(message.data))
+        self._ticks.take(block)
+
+    def _take_event(self, chunk: ChunkRecord, message: ChunkMessage) -> None:
+        text = bytes(message.data)
+        self._event_bytes += len(text) + _EVENT_COST_BYTES
+        try:
+            if len(text) > MOST_EVENT_BYTES or self._event_bytes > MOST_EVENTS_BYTES:
+                raise RecordingError(f"the events are longer than {MOST_EVENTS_BYTES >> 20} MiB, or one is than 1 MiB")
+            if not isinstance(fmt.load_json(text), dict):
+                raise RecordingError("it is not a JSON object")
+        except RecordingError as error:
+            self._damage.add(Damage(chunk.offset, 0, f"event {message.sequence} is not read: {error}"))
+            return
+        self.events.append(Event(message.sequence, message.log_time, text))
+
+    def _single_events(self) -> list[Event]:
+        """The events in order; of two with one number the first, and damage when they differ."""
+        single: dict[int, Event] = {}
+        for event in self.events:
+            known = single.setdefault(event.number, event)
+            if known is not event and known != event:
+                self._damage.add(Damage(0, 0, f"two different events have the number {event.number}"))
+        return [single[number] for number in sorted(single)]
 
     def _health(self) -> Health:
         end: dict[str, Any] = self.metadata.get(fmt.END_METADATA, {})
         expected: int | None = end.get("rows_pushed")
         for name in end.get("metadata", ()):
             if name != fmt.LAYOUT_METADATA and name not in self.metadata:
-                self._damage.append(Damage(0, 0, f"metadata {name!r} is missing"))
-        gaps: list[RowGap] = []
-        next_row = 0
-        for place in self._places:
-            if place.row0 != next_row:
-                gaps.append(RowGap(next_row, place.row0 - next_row))
-            next_row = place.row0 + place.n_rows
-        if expected is not None and expected > next_row:
-            gaps.append(RowGap(next_row, expected - next_row))
+                self._damage.add(Damage(0, 0, f"metadata {name[:60]!r} is missing"))
+        gaps, missing = self._places.gaps(expected)
+        ticks = self._ticks.result(self._places.order, self._places.row0, self._places.n)
         seen_events = self.events[-1].number + 1 if self.events else 0
         expected_events = max(end.get("events_pushed", 0), seen_events)
         return Health(
             path=self.path,
-            size_bytes=self.path.stat().st_size,
+            size_bytes=self._size_bytes,
             finished=self._finished,
             ended=end.get("ended", ""),
             rows=self.n_rows,
             expected_rows=expected,
-            missing_rows=sum(gap.missing for gap in gaps),
+            missing_rows=missing,
             dropped=end.get("rows_dropped", 0),
-            row_gaps=tuple(gaps[:_MAX_LISTED]),
-            first_tick=self._ticks.first,
-            last_tick=self._ticks.last,
-            last_time_s=self._ticks.last_time_s,
-            tick_gaps=tuple(self._ticks.gaps),
-            missing_ticks=self._ticks.missing,
+            row_gaps=gaps,
+            first_tick=ticks.first,
+            last_tick=ticks.last,
+            last_time_s=ticks.last_time_s,
+            tick_gaps=ticks.gaps,
+            missing_ticks=ticks.missing,
             events=len(self.events),
             missing_events=expected_events - len(self.events),
-            damage=tuple(self._damage),
+            damage=self._damage.listed(),
         )
 
 
+def _check_end(value: object) -> dict[str, Any]:
+    """The recorder's last words. ``RecordingError`` when they are not what a recorder says."""
+    if not isinstance(value, dict) or not isinstance(value.get("ended", ""), str):
+        raise RecordingError("the record is not the last words of a recorder")
+    for key in ("rows_pushed", "rows_dropped", "rows_written", "events_pushed", "events_dropped"):
+        count = value.get(key, 0)
+        may_be_unknown = key == "rows_pushed" and count is None
+        if not may_be_unknown and (type(count) is not int or not 0 <= count < fmt.MOST_ROW):
+            raise RecordingError(f"{key} is not a count")
+    names = value.get("metadata", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise RecordingError("the names of the metadata are not a list of names")
+    return value
+
+
+class _DamageList:
+    """Damage as it is found, neighbours of one reason joined, at most ``_MAX_LISTED`` entries."""
+
+    def __init__(self) -> None:
+        self._found: list[Damage] = []
+        self._more = self._more_bytes = 0
+
+    def add(self, item: Damage) -> None:
+        last = self._found[-1] if self._found else None
+        if last and last.length and last.reason == item.reason and last.offset + last.length == item.offset:
+            self._found[-1] = Damage(last.offset, last.length + item.length, item.reason, item.torn)
+        elif len(self._found) < _MAX_LISTED:
+            self._found.append(item)
+        else:
+            self._more += 1
+            self._more_bytes += item.length
+
+    def listed(self) -> tuple[Damage, ...]:
+        if not self._more:
+            return tuple(self._found)
+        return (*self._found, Damage(0, self._more_bytes, f"{self._more} more places are damaged"))
+
+
+class _Places:
+    """Where every block is: chunk, place in the chunk, first row, number of rows, CRC-32 of the message."""
+
+    def __init__(self) -> None:
+        self._raw = array("q")
+        self.n_rows = 0
+        self.order: IndexArray = np.empty(0, dtype=np.int64)
+        self.row0: IndexArray = self.order
+        self.n: IndexArray = self.order
+        self._chunk: IndexArray = self.order
+        self._at: IndexArray = self.order
+
+    def add(self, chunk: int, at: int, row0: int, n_rows: int, crc: int) -> None:
+        self._raw.extend((chunk, at, row0, n_rows, crc))
+
+    def sort(self, path: Path) -> None:
+        """Put the blocks in order of their rows; equal copies count once. ``RecordingError`` when two differ."""
+        places = np.frombuffer(self._raw, dtype=np.int64).reshape(-1, 5)
+        self.order = np.lexsort((places[:, 1], places[:, 0], places[:, 2]))
+        what = places[self.order, 2:]
+        self.order = self.order[np.concatenate(([True], (what[1:] != what[:-1]).any(axis=1)))[: len(self.order)]]
+        self._chunk, self._at, self.row0, self.n, _ = places[self.order].T
+        self.n_rows = int(self.n.sum())
+        overlaps = np.flatnonzero(self.row0[1:] < self.row0[:-1] + self.n[:-1])
+        if len(overlaps):
+            raise RecordingError(
+                f"{path} holds two different versions of row {self.row0[overlaps[0] + 1]}: it was made of several "
+                "recordings, whose rows cannot be told apart; use the originals"
+            )
+
+    def addresses(self) -> Iterator[tuple[int, int]]:
+        """Chunk and place in the chunk of every block, in order of the rows."""
+        return zip(self._chunk.tolist(), self._at.tolist(), strict=True)
+
+    def visits(self) -> list[int]:
+        """The chunks in the order in which the rows ask for them."""
+        changes = np.concatenate(([True], self._chunk[1:] != self._chunk[:-1]))[: len(self._chunk)]
+        return self._chunk[changes].tolist()
+
+    def row_numbers(self) -> IndexArray:
+        """Number of every row, ``[n_rows]``."""
+        starts = np.cumsum(self.n) - self.n
+        return np.arange(self.n_rows) + np.repeat(self.row0 - starts, self.n)
+
+    def gaps(self, expected: int | None) -> tuple[tuple[RowGap, ...], int]:
+        """The first gaps, and how many rows are missing in all."""
+        ends = np.concatenate(([0], self.row0 + self.n))
+        starts = np.concatenate((self.row0, [max(ends[-1], expected or 0)]))
+        missing = starts - ends
+        first = np.flatnonzero(missing)[:_MAX_LISTED]
+        return tuple(RowGap(int(ends[k]), int(missing[k])) for k in first), int(missing.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class _Ticks:
+    """What the tick numbers of a file say."""
+
+    first: int | None
+    last: int | None
+    last_time_s: float | None
+    gaps: tuple[TickGap, ...]
+    missing: int
+
+
 class _TickCheck:
-    """Follows the tick numbers through the blocks of a file."""
+    """Follows the tick numbers through the blocks of a file, which need not come in order."""
 
     def __init__(self) -> None:
         self._tick_row: int | None = None
         self._time_row: int | None = None
-        self._next_row = 0
-        self.first: int | None = None
-        self.last: int | None = None
-        self.last_time_s: float | None = None
-        self.gaps: list[TickGap] = []
-        self.missing = 0
+        self._edges = array("q")  # first and last tick of every block, scans missing inside it; -1 without ticks
+        self._last_t_s = array("d")
+        self._inside: list[TickGap] = []
 
     def use(self, names: Sequence[str]) -> None:
         self._tick_row = names.index(fmt.TICK_COLUMN) if fmt.TICK_COLUMN in names else None
         self._time_row = names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in names else None
 
     def take(self, block: Block) -> None:
-        """Count the scans that the instrument missed; across a gap of rows nothing can be said."""
-        if self._time_row is not None:
-            self.last_time_s = float(block.data[self._time_row, -1])
-        if self._tick_row is None:
-            return
-        ticks = block.data[self._tick_row]
-        if not np.all(np.isfinite(ticks)):
+        """Count the scans that the instrument missed inside one block."""
+        self._last_t_s.append(float(block.data[self._time_row, -1]) if self._time_row is not None else np.nan)
+        ticks = block.data[self._tick_row] if self._tick_row is not None else None
+        if ticks is None or not np.all((ticks >= 0) & (ticks < fmt.MOST_ROW)):  # NaN is neither
+            self._edges.extend((-1, -1, 0))
             return
         ticks = ticks.astype(np.int64)
-        if self.first is None:
-            self.first = int(ticks[0])
-        if self.last is not None and block.row0 == self._next_row:
-            ticks = np.concatenate(([self.last], ticks))
-        for at in np.flatnonzero(np.diff(ticks) > 1):
-            self.missing += int(ticks[at + 1] - ticks[at]) - 1
-            if len(self.gaps) < _MAX_LISTED:
-                self.gaps.append(TickGap(int(ticks[at]), int(ticks[at + 1])))
-        self.last = int(ticks[-1])
-        self._next_row = block.row0 + block.data.shape[1]
+        steps = np.diff(ticks)
+        jumps = np.flatnonzero(steps > 1)
+        self._edges.extend((int(ticks[0]), int(ticks[-1]), int((steps[jumps] - 1).sum())))
+        self._inside.extend(
+            TickGap(int(ticks[at]), int(ticks[at + 1])) for at in jumps[: _MAX_LISTED - len(self._inside)]
+        )
+
+    def result(self, order: IndexArray, row0: IndexArray, n: IndexArray) -> _Ticks:
+        """Over the blocks ``order``, which begin at ``row0`` and hold ``n`` rows; across missing rows nothing is
+        said."""
+        first, last, inside = np.frombuffer(self._edges, dtype=np.int64).reshape(-1, 3)[order].T
+        sound = first >= 0
+        joined = sound[1:] & sound[:-1] & (row0[1:] == row0[:-1] + n[:-1])
+        jumps = np.where(joined, first[1:] - last[:-1] - 1, 0)
+        at = np.flatnonzero(jumps > 0)
+        between = [TickGap(int(last[k]), int(first[k + 1])) for k in at[:_MAX_LISTED]]
+        ticks = np.flatnonzero(sound)
+        return _Ticks(
+            first=int(first[ticks[0]]) if len(ticks) else None,
+            last=int(last[ticks[-1]]) if len(ticks) else None,
+            last_time_s=float(self._last_t_s[order[-1]]) if len(order) and self._time_row is not None else None,
+            gaps=tuple(sorted([*self._inside, *between], key=lambda gap: gap.after)[:_MAX_LISTED]),
+            missing=int(inside.sum() + jumps[at].sum()),
+        )

@@ -65,8 +65,13 @@ def recover(path: Path, out: Path, *, overwrite: bool = False) -> RecoverReport:
             writer.write_block(block.row0, block.data.T)
         if fmt.STATISTICS_METADATA in recording.metadata:
             writer.write_metadata(fmt.STATISTICS_METADATA, recording.metadata[fmt.STATISTICS_METADATA])
+        missing = (
+            "whether ticks are missing at the end is not known"
+            if health.finished
+            else ("up to 0.2 s after the last tick may be missing")
+        )
         unknown = {
-            "ended": "recovered from a file without last words; up to 0.2 s after the last tick may be missing",
+            "ended": f"recovered from a file without last words; {missing}",
             "rows_pushed": None,
         }
         writer.finish(recording.metadata.get(fmt.END_METADATA, unknown))

@@ -104,7 +104,7 @@ def test_a_block_of_a_later_version_is_named():
     block = bytearray(fmt.encode_block(0, np.zeros((3, 1)), crc))
     struct.pack_into("<4s", block, 0, b"MTB2")
     with pytest.raises(RecordingError, match="blocks of format 2: a later version wrote them"):
-        fmt.decode_block(bytes(block), crc)
+        fmt.decode_block(bytes(block), crc, 1)
 
 
 def test_a_bench_of_a_later_version_is_refused_with_its_key(tmp_path: Path):
