@@ -146,9 +146,9 @@ def magnetometer() -> tuple[Fault, ...]:
         Fault("magnetometer: ADC refuses its address", InWorld("nack", "mag_adc"), "safe state", ("mag", "0x48"), 0.3),
         Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "safe state", ("mag",), 0.3),
         Fault("magnetometer: ADC always says ready", InWorld("always_ready", "mag_adc"), "harmless", why=waits),
-        Fault("magnetometer: one transfer in ten refused", OnBus("i2c0", {"nack": 0.1}, ADC), "noticed", ("mag",)),
+        Fault("magnetometer: one transfer in ten refused", OnBus("i2c1", {"nack": 0.1}, ADC), "noticed", ("mag",)),
         Fault(
-            "magnetometer: bits of its readings flipped", OnBus("i2c0", {"corruption": 0.1}, ADC), "noticed", ("mag",),
+            "magnetometer: bits of its readings flipped", OnBus("i2c1", {"corruption": 0.1}, ADC), "noticed", ("mag",),
             why="gated by the field's norm; " + coasts,
         ),
         Fault("magnetometer: no ADC at start", InWorld("nack", "mag_adc"), "refused", ("0x48",), at_start=True),

@@ -21,7 +21,8 @@ def lab(tmp_path: Path) -> Path:
     """The default bench with real buses, on ports that no machine has."""
     text = DEFAULT_BENCH.read_text()
     for bus, uri in (
-        ("daq0", "serial:///dev/none"), ("i2c0", "linux-i2c:///dev/none"), ("can0", "socketcan://none0"),
+        ("daq0", "serial:///dev/none"), ("i2c0", "linux-i2c:///dev/none"), ("i2c1", "linux-i2c:///dev/none1"),
+        ("can0", "socketcan://none0"),
     ):  # fmt: skip
         text = text.replace(f"sim://{bus}", uri)
     for name in ("sensors", "piezo", "manipulator"):
@@ -62,7 +63,7 @@ def test_for_ever_is_a_time():
 @pytest.mark.parametrize(
     ("texts", "says"),
     [
-        (("i2c0@0x7F:nack=0.1",), "no device 0x7F on bus 'i2c0'; addresses are 0x0C, 0x48, 0x49"),
+        (("i2c1@0x7F:nack=0.1",), "no device 0x7F on bus 'i2c1'; addresses are 0x48, 0x49"),
         (("daq0@0x0C:loss=0.1",), "no device 0x0C on bus 'daq0'; addresses are none, it is no I2C bus"),
         (("daq0:nack=0.1",), "nack does nothing on bus 'daq0', which is serial; it is for i2c"),
         (("i2c0:truncation=0.1",), "truncation does nothing on bus 'i2c0', which is i2c; it is for serial and can"),
@@ -81,7 +82,8 @@ def test_a_fault_that_would_do_nothing_is_refused(texts: tuple[str, ...], says: 
         ("can0:loss=0.1", 1),
         ("i2c0:nack=0.1", 4),
         ("i2c0@0x0C:nack=0.1", 4),
-        ("i2c0@0x48:nack=1", 1),
+        ("i2c1@0x48:nack=1", 1),
+        ("i2c1:nack=1", 1),
     ],
 )
 def test_what_may_move_outputs_has_the_effect_of_motion(text: str, effect: int):

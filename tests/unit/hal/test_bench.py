@@ -30,7 +30,7 @@ def test_default_bench_is_valid():
     bench = load_bench(DEFAULT)
     options = check_devices(bench.description, "micron.toml")
     assert options["daq"].rate_hz == 1000
-    assert set(bench.description.emulated_buses()) == {"daq0", "i2c0", "can0"}
+    assert set(bench.description.emulated_buses()) == {"daq0", "i2c0", "i2c1", "can0"}
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ def test_default_bench_is_valid():
         ("tick_hz = 1000", "tick_hertz = 1000", ["[clock.tick_hertz]", "unknown key"]),
         ('uri = "sim://daq0"', 'url = "sim://daq0"', ["bus.daq0", "unknown key", "this key is missing"]),
         ('bus = "daq0"', 'bus = "daq7"', ["[device.daq.bus]", "no bus named 'daq7'"]),
-        ("address = 0x0C", "address = 0x48", ["0x48", "already taken by 'mag_adc'"]),
+        ("address = 0x49", "address = 0x48", ["0x48", "already taken by 'mag_adc'"]),
         ("address = 0x0C", "address = 0x80", ["device.piezo.address"]),
         ("channels = { y = 2, z = 3 }", "channels = { y = 1, z = 3 }", ["[device.acc2]", "taken by 'acc1'"]),
         ("channels = { y = 2, z = 3 }", "channels = { y = 2, z = 9 }", ["device.acc2", "channels.z"]),
@@ -119,7 +119,7 @@ def test_closing_a_bench_closes_all_of_it_last_first_and_tells_the_first_error(t
 
 def test_all_ports_that_cannot_be_opened_are_told_at_once(tmp_path: Path):
     text = DEFAULT.read_text()
-    for emulated, real in (("sim://daq0", "serial:///dev/no-daq"), ("sim://i2c0", "linux-i2c://97")):
+    for emulated, real in (("sim://daq0", "serial:///dev/no-daq"), ("sim://i2c0", "linux-i2c://97"), ("sim://i2c1", "linux-i2c://98")):  # fmt: skip
         text = text.replace(emulated, real)
     path = tmp_path / "bench.toml"
     path.write_text(text.replace("sim://can0", "socketcan://nocan9"))
@@ -137,6 +137,7 @@ def test_a_recorded_hand_moves_no_real_instrument(tmp_path: Path):
     for emulated, real in (
         ("sim://daq0", "serial:///dev/no"),
         ("sim://i2c0", "linux-i2c://97"),
+        ("sim://i2c1", "linux-i2c://98"),
         ("sim://can0", "socketcan://no"),
     ):
         text = text.replace(emulated, real)

@@ -47,6 +47,7 @@ class Bench:
         self.world = world
         self.daq: Any = world.endpoint("daq0")
         self.i2c: Any = world.endpoint("i2c0")
+        self.slow_i2c: Any = world.endpoint("i2c1")
         self.can: Any = world.endpoint("can0")
         self.buffer = memoryview(bytearray(65536))
 
@@ -124,19 +125,21 @@ def test_magnetometer_is_wired_to_the_adc_as_the_bench_says() -> None:
     volts: list[float] = []
     for mux in (4, 5, 6):
         config = 0x8000 | mux << 12 | 0x0100 | 7 << 5 | 3  # +-6.144 V, single shot
-        bench.i2c.transfer(0x48, [I2cWrite(bytes((1, config >> 8, config & 0xFF)))])
+        bench.slow_i2c.transfer(0x48, [I2cWrite(bytes((1, config >> 8, config & 0xFF)))])
         bench.clock.burn_ns(2 * MS)
-        answer = bench.i2c.transfer(0x48, [I2cWrite(b"\0"), I2cRead(2)])
+        answer = bench.slow_i2c.transfer(0x48, [I2cWrite(b"\0"), I2cRead(2)])
         volts.append(int.from_bytes(answer, "big", signed=True) * 6.144 / 32768)
     assert volts == pytest.approx([2.5, 3.0, 2.0], abs=2e-4)
 
 
 def test_general_call_resets_the_adc_and_leaves_the_dac() -> None:
     bench = Bench()
-    bench.i2c.transfer(0x48, [I2cWrite(b"\x01\x84\x83")])
+    bench.slow_i2c.transfer(0x48, [I2cWrite(b"\x01\x84\x83")])
     bench.i2c.transfer(0x0C, [I2cWrite(b"\x31\x40\x00")])
-    bench.i2c.transfer(0x00, [I2cWrite(b"\x06")])
-    assert bench.i2c.transfer(0x48, [I2cWrite(b"\x01"), I2cRead(2)]) == b"\x85\x83"
+    bench.slow_i2c.transfer(0x00, [I2cWrite(b"\x06")])
+    with pytest.raises(I2cNack):  # the DAC knows no general call
+        bench.i2c.transfer(0x00, [I2cWrite(b"\x06")])
+    assert bench.slow_i2c.transfer(0x48, [I2cWrite(b"\x01"), I2cRead(2)]) == b"\x85\x83"
     assert bench.i2c.transfer(0x0C, [I2cWrite(b"\x01"), I2cRead(2)]) == b"\x40\x00"
 
 
