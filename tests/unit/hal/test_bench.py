@@ -119,7 +119,11 @@ def test_closing_a_bench_closes_all_of_it_last_first_and_tells_the_first_error(t
 
 def test_all_ports_that_cannot_be_opened_are_told_at_once(tmp_path: Path):
     text = DEFAULT.read_text()
-    for emulated, real in (("sim://daq0", "serial:///dev/no-daq"), ("sim://i2c0", "linux-i2c://97"), ("sim://i2c1", "linux-i2c://98")):  # fmt: skip
+    for emulated, real in (
+        ("sim://daq0", "serial:///dev/no-daq"),
+        ("sim://i2c0", "linux-i2c://97"),
+        ("sim://i2c1", "linux-i2c://98"),
+    ):
         text = text.replace(emulated, real)
     path = tmp_path / "bench.toml"
     path.write_text(text.replace("sim://can0", "socketcan://nocan9"))
