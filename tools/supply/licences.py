@@ -74,6 +74,7 @@ def page(rows: list[Part]) -> str:
         "",
         "Made by `python -m tools.supply.licences docs/licences.md` from what is installed for development. This",
         "project is Apache-2.0. uPlot (MIT) is in `tools/bench/static/vendor` with its licence beside it.",
+        "axe-playwright-python brings axe-core (MPL-2.0), which only the tests of the page run.",
         "",
         "## Copyleft parts",
         "",

@@ -70,6 +70,7 @@ export function canvas(draw, label) {
     context.clearRect(0, 0, w, hgt);
     draw(context, w, hgt);
   };
+  new ResizeObserver(() => element.redraw()).observe(element); // else it is stretched until the next time
   return element;
 }
 

@@ -53,6 +53,35 @@ function buildNav() {
     a.append(title, h("kbd", {}, String(i + 1)));
     byId("nav").append(a);
   });
+  const open = (on) => {
+    byId("nav").classList.toggle("open", on);
+    byId("menu").setAttribute("aria-expanded", String(on));
+  };
+  byId("menu").onclick = (event) => {
+    event.stopPropagation();
+    open(!byId("nav").classList.contains("open"));
+  };
+  document.addEventListener("click", () => open(false));
+  byId("nav").addEventListener("keydown", (event) => { if (event.key === "Tab") setTimeout(() => open(byId("nav").contains(document.activeElement))); });
+}
+
+/** Two fingers may enlarge the page so far that the button in the bar is outside: a second one stays in what is seen. */
+function keepSafeNear() {
+  const near = byId("safe-near");
+  const seen = window.visualViewport;
+  if (!seen) return;
+  const place = () => {
+    const box = byId("safe").getBoundingClientRect();
+    const [left, top, right, bottom] = [seen.offsetLeft, seen.offsetTop, seen.offsetLeft + seen.width, seen.offsetTop + seen.height];
+    near.hidden = seen.scale < 1.01 || (box.left >= left && box.right <= right && box.top >= top && box.bottom <= bottom);
+    if (near.hidden) return;
+    near.style.transform = `scale(${1 / seen.scale})`;
+    near.style.left = `${right - (near.offsetWidth + 8) / seen.scale}px`;
+    near.style.top = `${top + 8 / seen.scale}px`;
+  };
+  seen.addEventListener("resize", place);
+  seen.addEventListener("scroll", place);
+  place();
 }
 
 function showVitals(state) {
@@ -146,7 +175,8 @@ async function boot() {
   buildNav();
   bindKeys();
   byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
-  byId("safe").onclick = goSafe;
+  byId("safe").onclick = byId("safe-near").onclick = goSafe;
+  keepSafeNear();
   byId("log-toggle").onclick = () => {
     byId("log").hidden = !byId("log").hidden;
     byId("log-toggle").setAttribute("aria-expanded", String(!byId("log").hidden));

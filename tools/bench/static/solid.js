@@ -73,6 +73,7 @@ function project([x, y, z], scale, cx, cy) {
 export function orbit(element) {
   element.tabIndex = 0;
   element.style.cursor = "grab";
+  element.style.touchAction = "pan-y"; // a finger turns it sideways and still scrolls the page up and down
   const turn = (dx, dy) => {
     camera.yaw -= dx * 0.008;
     camera.pitch = Math.max(-0.2, Math.min(1.3, camera.pitch + dy * 0.008));

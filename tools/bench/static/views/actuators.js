@@ -19,12 +19,12 @@ export function mount(root, { link }) {
     const loop = canvas((g, w, hgt) => drawLoop(g, w, hgt, c), `Hysteresis loop of stack ${c + 1}`);
     const minus = holdButton("−", c, -1);
     const plus = holdButton("+", c, 1);
-    const element = h("section.panel", { style: "display:flex;flex-direction:column;min-height:0" },
+    const element = h("section.panel.fig", {},
       h("h2", {}, h("span", { style: `color:var(--c${c + 1})` }, "●"), `Stack ${c + 1}`),
       h("div.row", { style: "justify-content:space-between;align-items:baseline" }, volts, stroke),
       h("div.meter", { style: "margin:6px 0;position:relative" }, fill, h("span", { style: "position:absolute;left:50%;top:0;bottom:0;width:1px;background:var(--soft)" })),
-      h("div.row.faint", { style: "justify-content:space-between;font-size:10.5px;margin:-4px 0 6px" }, h("span", {}, "0 V"), h("span", {}, "neutral"), h("span", {}, "100 V")),
-      h("div", { style: "flex:1;min-height:70px" }, loop),
+      h("div.row.faint.ends", {}, h("span", {}, "0 V"), h("span", {}, "neutral"), h("span", {}, "100 V")),
+      h("div.chart", {}, loop),
       h("div.row", { style: "margin-top:8px" }, minus, plus));
     return { volts, stroke, fill, loop, element, buttons: [minus, plus] };
   });
@@ -44,7 +44,7 @@ export function mount(root, { link }) {
       button.setAttribute("aria-pressed", "false");
     };
     const button = h("button.jog", {
-      style: "flex:1;font-size:18px;padding:4px;touch-action:none", disabled: true, "aria-label": `Hold: stack ${channel + 1} ${sign > 0 ? "up" : "down"}`,
+      disabled: true, "aria-label": `Hold: stack ${channel + 1} ${sign > 0 ? "up" : "down"}`,
       onpointerdown: start, onpointerup: stop, onpointerleave: stop, onpointercancel: stop, onblur: stop,
       onkeydown: (event) => { if ((event.key === " " || event.key === "Enter") && !event.repeat) start(event); },
       onkeyup: (event) => { if (event.key === " " || event.key === "Enter") stop(); },
@@ -75,7 +75,6 @@ export function mount(root, { link }) {
     if (armTimer && !running) disarm();
     const armed = Boolean(armTimer);
     arm.setAttribute("aria-checked", String(armed));
-    arm.setAttribute("aria-pressed", String(armed));
     arm.textContent = armed ? "Armed: disarm" : "Arm manual drive";
     arm.disabled = !link.mayOrder || !running;
     cards.forEach((card) => card.buttons.forEach((b) => { b.disabled = !armed || state !== "armed"; }));
@@ -85,11 +84,11 @@ export function mount(root, { link }) {
 
   const strip = new Strip([1, 2, 3].map((n) => ({ label: `command ${n}`, unit: "V" })), { least: 10 });
   const limits = h("div.row.num", { style: "font-size:12px;gap:16px" });
-  root.append(h("div.cols", { style: "grid-template-rows:auto minmax(0,1fr) 150px" },
+  root.append(h("div.cols.actuators", {},
     h("section.panel.row", {}, arm, h("span.soft", {}, "speed"),
       segments([[2, "2"], [20, "20"], [100, "100 V/s"]], settings.rate, (v) => { settings.rate = Number(v); settings.save(); }, "Jog speed"), manual, h("span.grow"), limits),
-    h("div.cols", { style: "grid-template-columns:repeat(3,minmax(0,1fr))" }, cards.map((c) => c.element)),
-    h("div", { style: "display:flex" }, strip.element)));
+    h("div.cols.stacks", {}, cards.map((c) => c.element)),
+    h("div.strips", {}, strip.element)));
 
   function drawLoop(g, w, hgt, c) {
     const b = subscription.buckets;

@@ -32,8 +32,8 @@ export function mount(root, { link }) {
   const gap = h("span.num.soft");
   const use = h("button", { id: "use-filter", onclick: () => change(() => post("/api/filters/use", { method: choice.value })) }, "Use it in the firmware");
   const back = h("button", { hidden: true, onclick: () => change(() => post("/api/calibrate/discard")) }, "Back to the original bench");
-  const secondPanel = h("section.panel", { style: "display:flex;flex-direction:column", hidden: true },
-    h("h2", {}, "Beside it: ", gap), h("div", { style: "flex:1;min-height:0" }, second));
+  const secondPanel = h("section.panel.fig", { hidden: true },
+    h("h2", {}, "Beside it: ", gap), h("div.chart.square", {}, second));
   const numbers = h("table");
   const error = h("p.note");
   const strip = new Strip(["x", "y", "z"].map((a) => ({ label: `rate ${a}`, unit: "°/s" })), { least: 2 });
@@ -68,17 +68,14 @@ export function mount(root, { link }) {
     back.disabled = !link.mayOrder;
   });
 
-  root.append(h("div.cols", { style: "grid-template:minmax(0,1fr) 170px / minmax(0,1fr) 270px" },
-    h("div", { style: "display:flex;gap:12px;min-height:0" },
-      h("section.panel", { style: "flex:1;display:flex;flex-direction:column;min-width:0" }, title, h("div", { style: "flex:1;min-height:0" }, main)),
-      h("div", { style: "flex:1;display:contents" }, secondPanel)),
-    h("div.stack",  { style: "overflow:auto" },
+  root.append(h("div.cols.attitude", {},
+    h("div.stack.solids", {}, h("section.panel.fig", {}, title, h("div.chart.square", {}, main)), secondPanel),
+    h("div.stack.side", {},
       h("section.panel", {}, h("h2", {}, "Attitude ", h("small", {}, "body to world")), numbers,
         h("div.row", { style: "margin-top:10px" }, h("button", { onclick: () => { reference = q; } }, "Zero the drift here"))),
       h("section.panel", {}, h("h2", {}, "Compare with"), h("div.row", {}, choice, use, back), error,
         h("p.note", {}, "It runs in the server on the same raw samples. Drag a picture to turn it."))),
-    h("div", { style: "grid-column:1/3;display:flex" }, strip.element)));
-  secondPanel.style.flex = "1";
+    h("div.strips", {}, strip.element)));
 
   let frame = 0;
   let turn = 0;

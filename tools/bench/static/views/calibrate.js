@@ -26,12 +26,12 @@ export function mount(root, { link }) {
     return button;
   });
 
-  root.append(h("div.cols", { style: "grid-template:auto minmax(0,1fr) / minmax(0,1.15fr) minmax(0,1fr)" },
-    h("div.row", { style: "grid-column:1/3" }, applied, discard, problem),
+  root.append(h("div.cols.calibrate", {},
+    h("div.row.top", {}, applied, discard, problem),
     wizard.element,
     h("div.stack", {},
-      h("section.panel", { style: "flex:1;display:flex;flex-direction:column" }, h("h2", {}, "Warm-up ", warmth), strip.element),
-      h("section.panel", { style: "flex:1.2;overflow:auto" }, h("h2", {}, "Stage and interferometer ", h("small", {}, "of the emulated lab")),
+      h("section.panel.fig.warm", {}, h("h2", {}, "Warm-up ", warmth), strip.element),
+      h("section.panel.lab", {}, h("h2", {}, "Stage and interferometer ", h("small", {}, "of the emulated lab")),
         h("div.row", {}, labButtons, labStatus), labResult,
         h("p.note", {}, "On a real bench use your own instruments and micron calibrate; the results can be applied in the bench file.")))));
 
@@ -40,7 +40,7 @@ export function mount(root, { link }) {
     labButtons.forEach((b) => { b.disabled = job.state === "running" || !link.mayOrder || !link.state?.emulated; });
     if (job.state === "none") return;
     const kind = job.title.startsWith("piezo") ? "piezo" : "tumble";
-    const table = h("pre.num", { style: "font-size:11px;line-height:1.4;overflow:auto;margin:8px 0" }, job.lines.slice(-14).join("\n"));
+    const table = h("pre.num.lines", { tabIndex: 0, role: "log", "aria-label": "What the identification says" }, job.lines.slice(-14).join("\n"));
     labResult.replaceChildren(table, job.state === "done" ? h("button.primary", { disabled: !link.mayOrder, onclick: () => apply(kind) }, "Apply to this bench") : "");
   }
 

@@ -31,9 +31,9 @@ export function poseWizard(link, apply, fail) {
   const again = h("button", { onclick: () => { taken.clear(); result = null; outcome.replaceChildren(); } }, "Start over");
   const quiet = h("button", { title: "Starts the firmware again without arming the outputs: turning is not tremor", onclick: () => post("/api/firmware/start", { sense_only: !senseOnly() }).catch(fail) });
   const senseOnly = () => link.state?.status.state === "sensing only";
-  const element = h("section.panel", { style: "display:flex;flex-direction:column;min-height:0" },
+  const element = h("section.panel.fig.poses", {},
     h("h2", {}, "Poses by hand ", h("small", {}, "hold each until it is taken; the arrow shows the way")),
-    h("div", { style: "flex:1;min-height:120px" }, picture),
+    h("div.chart", {}, picture),
     h("div.row", { style: "margin-top:6px" }, hint), h("div.meter", { style: "margin:6px 0" }, meter),
     h("div.row", {}, identify, again, quiet, count), outcome);
 

@@ -10,8 +10,8 @@ export function mount(root, { link }) {
   let what = LOOKS[0][0];
   let strip = null;
 
-  const name = h("input", { type: "text", placeholder: "Name (the time if empty)", maxLength: 80, style: "width:230px", "aria-label": "Name of the recording" });
-  const notes = h("input", { type: "text", placeholder: "Notes", maxLength: 2000, style: "flex:1", "aria-label": "Notes" });
+  const name = h("input", { type: "text", placeholder: "Name (the time if empty)", maxLength: 80, "aria-label": "Name of the recording" });
+  const notes = h("input.notes", { type: "text", placeholder: "Notes", maxLength: 2000, "aria-label": "Notes" });
   const start = h("button.primary", { id: "rec-start", onclick: () => act(() => post("/api/recording/start", { name: name.value.trim(), notes: notes.value })) }, "Start recording");
   const stop = h("button", { id: "rec-stop", onclick: () => act(() => post("/api/recording/stop")) }, "Stop recording");
   const note = h("button", { onclick: () => act(async () => { await post("/api/recording/note", { text: notes.value }); notes.value = ""; }) }, "Add note");
@@ -19,12 +19,12 @@ export function mount(root, { link }) {
   const problem = h("p.bad", { role: "alert", style: "margin:6px 0 0" });
   const body = h("tbody");
   const folder = h("small");
-  const look = h("section.panel", { style: "display:flex;flex-direction:column;min-height:0" }, h("p.empty", {}, "Choose a recording to look at it."));
+  const look = h("section.panel.fig", {}, h("p.empty", {}, "Choose a recording to look at it."));
 
-  root.append(h("div.cols", { style: "grid-template-rows:auto minmax(0,1fr) minmax(0,1fr)" },
+  root.append(h("div.cols.collect", {},
     h("section.panel", {}, h("div.row", {}, start, stop, name, notes, note, status), problem),
-    h("section.panel", { style: "overflow:auto" }, h("h2", {}, "Recordings ", folder),
-      h("table", {}, h("thead", {}, h("tr", {}, ["name", "notes"].map((t) => h("th", {}, t)), ["length", "lost", "size", "when"].map((t) => h("th.num", {}, t)), h("th"))), body)),
+    h("section.panel.list", {}, h("h2", {}, "Recordings ", folder),
+      h("table.cards", {}, h("thead", {}, h("tr", {}, ["name", "notes"].map((t) => h("th", {}, t)), ["length", "lost", "size", "when"].map((t) => h("th.num", {}, t)), h("th", {}, "actions"))), body)),
     look));
 
   async function act(work) {
@@ -38,12 +38,12 @@ export function mount(root, { link }) {
     try { list = await get("/api/recordings"); } catch (error) { problem.textContent = error.message; return; }
     folder.textContent = list.folder;
     body.replaceChildren(...list.recordings.map((r) => h("tr", { style: r.name === chosen ? "background:var(--raised)" : "" },
-      h("td", {}, h("button.quiet", { onclick: () => show(r.name), style: "padding:2px 4px;font-weight:600", disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
-      h("td.soft", { title: r.notes.join("\n"), style: "max-width:260px;overflow:hidden;text-overflow:ellipsis;white-space:nowrap" }, r.notes.join(" · ")),
-      h("td.num", {}, r.ticks === null ? "–" : duration(r.ticks / 1000)),
-      h("td.num", { className: r.dropped ? "num bad" : "num" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", {}, bytes(r.bytes)),
-      h("td.num.soft", {}, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
-      h("td", { style: "white-space:nowrap;text-align:right" }, r.recording ? null : actions(r)))));
+      h("td.whole", {}, h("button.quiet.name", { onclick: () => show(r.name), disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
+      h("td.soft.notes.whole", { title: r.notes.join("\n") }, r.notes.join(" · ")),
+      h("td.num", { "data-label": "length" }, r.ticks === null ? "–" : duration(r.ticks / 1000)),
+      h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
+      h("td.num.soft", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
+      h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r))))));
     if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));
   }
 

@@ -12,15 +12,15 @@ export function mount(root, { link }) {
   let counts = {};
   const rows = new Map();
   const big = canvas((g, w, hgt) => histogram(g, w, hgt, counts["sample to command"], null, true), "Histogram of sample to command");
-  const headline = h("div.row", { style: "gap:28px" });
+  const headline = h("div.row.headline");
   const body = h("tbody");
   const head = ["task", "rate", "distribution, log 1 µs to 20 ms", "p50", "p99", "p99.9", "worst", "budget", "over", "late", "skipped", "at tick"];
-  root.append(h("div.cols", { style: "grid-template-rows:210px minmax(0,1fr)" },
-    h("section.panel", { style: "display:grid;grid-template-columns:240px minmax(0,1fr);gap:18px" },
-      h("div", {}, h("h2", { style: "font-size:12px;color:var(--soft);margin:0 0 8px" }, "From sample to command"), headline),
-      h("div", { style: "min-height:0" }, big)),
-    h("section.panel", { style: "overflow:auto" }, h("h2", {}, "Tasks ", h("small", {}, "µs since the start; line: budget. “over” counts runs beyond the budget, “late” runs that ended after the deadline")),
-      h("table", {}, h("thead", {}, h("tr", {}, head.map((t, i) => h(i === 0 || i === 2 ? "th" : "th.num", {}, t)))), body))));
+  root.append(h("div.cols.latency", {},
+    h("section.panel.total", {},
+      h("div", {}, h("h2", {}, "From sample to command"), headline),
+      h("div.chart", {}, big)),
+    h("section.panel.tasks", {}, h("h2", {}, "Tasks ", h("small", {}, "µs since the start; line: budget. “over” counts runs beyond the budget, “late” runs that ended after the deadline")),
+      h("table.cards", {}, h("thead", {}, h("tr", {}, head.map((t, i) => h(i === 0 || i === 2 ? "th" : "th.num", {}, t)))), body))));
 
   function histogram(g, w, hgt, data, budget, axis) {
     const floor = axis ? hgt - 18 : hgt - 1;
@@ -29,7 +29,7 @@ export function mount(root, { link }) {
     g.font = `10px ${css("--mono")}`;
     for (const mark of [1, 10, 100, 1000, 10000]) {
       g.beginPath(); g.moveTo(x(mark, w), 0); g.lineTo(x(mark, w), floor); g.stroke();
-      if (axis) g.fillText(mark >= 1000 ? `${mark / 1000} ms` : `${mark} µs`, x(mark, w) + 2, hgt - 5);
+      if (axis && x(mark, w) < w - 40) g.fillText(mark >= 1000 ? `${mark / 1000} ms` : `${mark} µs`, x(mark, w) + 2, hgt - 5);
     }
     if (!data?.n.length) return;
     const most = Math.log10(Math.max(...data.n) + 1);
@@ -49,11 +49,11 @@ export function mount(root, { link }) {
 
   function row(name) {
     if (rows.has(name)) return rows.get(name);
-    const cells = Array.from({ length: 9 }, () => h("td.num"));
+    const cells = head.slice(3).map((label) => h("td.num", { "data-label": label }));
     const picture = canvas((g, w, hgt) => histogram(g, w, hgt, counts[name], rows.get(name).budget), `Histogram of ${name}`);
-    const rate = h("td.num.soft");
+    const rate = h("td.num.soft", { "data-label": "rate" });
     const line = h("tr", {}, h("td", {}, NAMES[name] || name.replaceAll("_", " ")), rate,
-      h("td", { style: "width:30%" }, h("div", { style: "height:26px" }, picture)), cells);
+      h("td.picture.whole", {}, h("div.small", {}, picture)), cells);
     body.append(line);
     const made = { cells, picture, rate, budget: null };
     rows.set(name, made);
@@ -64,9 +64,9 @@ export function mount(root, { link }) {
     const { timing, status } = state;
     const total = timing["sample to command"];
     if (total?.[0]) {
-      const item = (name, value) => h("div", {}, h("div.faint", {}, name), h("div.big", { style: "font-size:22px" }, (value / 1000).toFixed(2), h("span.unit", {}, "ms")));
+      const item = (name, value) => h("div", {}, h("div.faint", {}, name), h("div.big", {}, (value / 1000).toFixed(2), h("span.unit", {}, "ms")));
       headline.replaceChildren(item("p50", total[1]), item("p99", total[2]), item("worst", total[4]),
-        h("div", {}, h("div.faint", {}, "skipped ticks"), h("div.big", { style: "font-size:22px" }, String(status.skipped ?? 0))));
+        h("div", {}, h("div.faint", {}, "skipped ticks"), h("div.big", {}, String(status.skipped ?? 0))));
     }
     for (const [name, [n, p50, p99, p999, worst, tick]] of Object.entries(timing)) {
       if (name === "sample to command") continue;

@@ -9,7 +9,7 @@ export function mount(root, { link }) {
   let timer = 0;
   let compareTimer = 0;
   let inUse = false;
-  const select = h("select", { "aria-label": "Recording", style: "min-width:320px" });
+  const select = h("select", { "aria-label": "Recording" });
   const run = h("button.primary", { onclick: start }, "Diagnose");
   const cancel = h("button", { onclick: () => post("/api/jobs/mismatch/cancel").then(poll).catch(fail) }, "Cancel");
   const problem = h("span.bad", { role: "alert" });
@@ -18,11 +18,11 @@ export function mount(root, { link }) {
   const back = h("button", { hidden: true, onclick: goBack }, "Back to the original bench");
   const applied = h("div.row", { hidden: true, style: "margin-top:8px" });
   const status = h("span.soft.num");
-  const lines = h("pre.num", { style: "margin:8px 0 0;font-size:11.5px;line-height:1.5;max-height:130px;overflow:auto;white-space:pre-wrap" });
-  const report = h("div", { style: "min-height:0;height:100%" }, h("div.empty", {},
+  const lines = h("pre.num.lines", { tabIndex: 0, role: "log", "aria-label": "What the engine says" });
+  const report = h("div.report", {}, h("div.empty", {},
     h("p", {}, "Pick a recording. The engine compares it with its twin, names the physics that is missing and fits it on data that it then checks on the part it has not seen."),
     h("p", {}, "A run takes from half a minute to several, in a process of its own; the firmware does not notice.")));
-  root.append(h("div.cols", { style: "grid-template-rows:auto minmax(0,1fr)" },
+  root.append(h("div.cols.mismatch", {},
     h("section.panel", {}, h("div.row", {}, select, run, cancel, status, h("span.grow"), files, apply, back), problem, applied, lines), report));
 
   const fail = (error) => { problem.textContent = error.message; };
@@ -61,10 +61,11 @@ export function mount(root, { link }) {
     if (!inUse) return;
     applied.hidden = false;
     const um = (v) => (v === null || v === undefined ? "–" : `${v.toFixed(2)} µm`);
-    const row = (name, r) => h("tr", {}, h("td", {}, name), ...(r ? [um(r.band[0]), um(r.band[1]), `${r.band[2].toFixed(1)} %`, um(r.all[1])] : ["…", "…", "…", "…"]).map((v) => h("td.num", {}, v)));
+    const titles = ["tremor 8–12 Hz", "left of it", "less", "error, all bands"];
+    const row = (name, r) => h("tr", {}, h("td.whole", {}, name), ...(r ? [um(r.band[0]), um(r.band[1]), `${r.band[2].toFixed(1)} %`, um(r.all[1])] : ["…", "…", "…", "…"]).map((v, i) => h("td.num", { "data-label": titles[i] }, v)));
     const waiting = job.state === "running" ? `step ${job.step + 1} of ${job.steps}, ${duration(job.seconds)}` : job.state === "done" ? "" : `${job.state}: ${job.lines.at(-1) || ""}`;
-    applied.replaceChildren(h("table", { id: "difference", style: "width:auto;min-width:560px" },
-      h("tr", {}, h("th", {}, "same hand, 10 s of virtual time, truth at the tip"), ["tremor 8–12 Hz", "left of it", "less", "error, all bands"].map((t) => h("th.num", {}, t))),
+    applied.replaceChildren(h("table.cards", { id: "difference" }, h("thead", {},
+      h("tr", {}, h("th", {}, "same hand, 10 s of virtual time, truth at the tip"), titles.map((t) => h("th.num", {}, t)))),
       row("bench as it was", before), row("with the corrected twin", after)),
     h("span.soft", {}, waiting || "The page runs the bench with the corrected twin now."));
     if (job.state === "running") compareTimer = setTimeout(compare, 700);

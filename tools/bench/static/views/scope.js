@@ -22,8 +22,8 @@ export function mount(root, { link, catalogue }) {
   const trigger = new Trigger(settings.trigger);
 
   const plots = h("div.plots");
-  const readout = h("div.row.num", { style: "min-height:22px;font-size:12px" });
-  const rate = h("span.faint.num", { style: "margin-left:auto;font-size:11.5px" });
+  const readout = h("div.row.num.readout");
+  const rate = h("span.faint.num.rate");
   const pauseButton = h("button", { onclick: () => (paused ? resume() : pause()), title: "Pause or go on (Space)" }, "Pause");
   const windows = segments(WINDOWS, settings.rows, (rows) => setWindow(rows), "Window");
   const picker = channelPicker(catalogue, settings, () => { settings.save(); rebuild(); });
@@ -31,9 +31,8 @@ export function mount(root, { link, catalogue }) {
   const toolbar = h("div.toolbar", {}, pauseButton, windows,
     h("button", { onclick: fit, title: "Fit the vertical axes to what is shown (F)" }, "Fit"),
     h("button", { onclick: () => { settings.side = !settings.side; settings.save(); side.hidden = !settings.side; } }, "Channels"), rate);
-  const side = h("aside.stack.side", { style: "width:230px;overflow:auto;flex:none", hidden: !settings.side }, picker, triggerBox);
-  root.append(h("div", { style: "display:flex;flex-direction:column;gap:8px;height:100%" }, toolbar,
-    h("div", { style: "display:flex;gap:12px;flex:1;min-height:0" }, h("div.stack", { style: "flex:1;gap:4px" }, plots, readout), side)));
+  const side = h("div.stack.side", { hidden: !settings.side }, picker, triggerBox);
+  root.append(h("div.scope", {}, toolbar, h("div.body.stack", {}, h("div.stack.main", {}, plots, readout), side)));
 
   function groups() {
     const byUnit = new Map();

@@ -17,13 +17,14 @@ export function channelPicker(catalogue, settings, changed) {
   const groups = [...new Set(catalogue.map((c) => c.group))];
   const details = groups.map((group) => {
     const members = catalogue.filter((c) => c.group === group);
-    const all = h("input", { type: "checkbox", title: `All of ${group}`, onchange: () => choose(members.map((m) => m.name), all.checked) });
+    const all = h("input", { type: "checkbox", "aria-label": `All of ${group.replaceAll("_", " ")}`, onchange: () => choose(members.map((m) => m.name), all.checked) });
     const list = members.map((c) => {
       const box = h("input", { type: "checkbox", onchange: () => choose([c.name], box.checked) });
       boxes.set(c.name, box);
-      return h("label", { style: "display:flex;padding:1px 0 1px 18px" }, box, h("span.num", { style: "font-size:12px" }, c.name));
+      return h("label", {}, box, h("span.num", { style: "font-size:12px" }, c.name));
     });
-    const element = h("details", { title: members[0].what }, h("summary", { style: "cursor:pointer;padding:2px 0" }, all, ` ${group.replaceAll("_", " ")} `, h("span.faint", {}, unitText(members[0].unit))), list);
+    const element = h("div.group", { title: members[0].what }, all,
+      h("details", {}, h("summary", {}, `${group.replaceAll("_", " ")} `, h("span.faint", {}, unitText(members[0].unit))), list));
     element.check = () => {
       const on = members.filter((m) => settings.channels.includes(m.name)).length;
       all.checked = on === members.length;
@@ -54,5 +55,5 @@ export function channelPicker(catalogue, settings, changed) {
     preset.value = "";
   } }, h("option", { value: "" }, "Preset …"), PRESETS.map(([title], i) => h("option", { value: i }, title)));
   show();
-  return h("div.panel", {}, h("h2", {}, "Channels"), preset, h("div", { style: "margin-top:6px" }, details));
+  return h("div.panel.picker", {}, h("h2", {}, "Channels"), preset, h("div", { style: "margin-top:6px" }, details));
 }

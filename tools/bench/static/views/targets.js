@@ -23,9 +23,9 @@ export function mount(root, { link, navigate }) {
   const reports = h("div");
   const seed = () => Math.floor(Math.random() * 1e6);
 
-  root.append(h("div.cols", { style: "grid-template-columns:minmax(0,1fr) 270px" },
-    h("section.panel", { style: "padding:0;overflow:hidden" }, screen),
-    h("div.stack", { style: "overflow:auto" },
+  root.append(h("div.cols.targets", {},
+    h("section.panel", { style: "padding:0;overflow:hidden" }, h("div.chart", {}, screen)),
+    h("div.stack.side", {},
       h("section.panel.stack", { style: "gap:8px" }, user,
         segments([["position", "angle to place"], ["speed", "angle to speed"]], settings.mapping, (v) => { settings.mapping = v; settings.save(); }, "Mapping"),
         segments([["mouse", "mouse"], ["card", "motion card"]], settings.source, (v) => { settings.source = v; settings.save(); bench.hidden = v !== "card"; }, "Pointer"),

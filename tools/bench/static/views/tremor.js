@@ -33,17 +33,17 @@ export function mount(root, { link }) {
   gain.oninput = () => setGain(Number(gain.value));
   const onOff = segments([["0", "off"], ["1", "on"]], "1", (v) => setGain(Number(v)), "Compensation");
 
-  root.append(h("div.cols", { style: "grid-template:minmax(0,1fr) 200px / minmax(0,1fr) minmax(0,1fr) 250px" },
-    h("section.panel", { style: "display:flex;flex-direction:column" },
+  root.append(h("div.cols.tremor", {},
+    h("section.panel.fig.path", {},
       h("h2", {}, "Tip, last 0.7 s ", h("span", { style: "color:var(--c2)" }, "before"), h("span", { style: "color:var(--accent)" }, "after"),
         h("span.grow"), segments([["xy", "x y"], ["xz", "x z"], ["yz", "y z"]], settings.plane, (v) => { settings.plane = v; settings.save(); }, "Plane")),
-      h("div", { style: "flex:1;min-height:0" }, path)),
-    h("section.panel", { style: "display:flex;flex-direction:column" }, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div", { style: "flex:1;min-height:0" }, spectra)),
-    h("div.stack", { style: "overflow:auto" },
+      h("div.chart.square", {}, path)),
+    h("section.panel.fig", {}, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div.chart", {}, spectra)),
+    h("div.stack.side", {},
       h("section.panel", {}, h("h2", {}, "Compensation ", gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
       h("section.panel", {}, h("h2", {}, "Reduction, 4 s"), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
         h("p.note", {}, "The firmware's estimate against its own prediction; errors of the stacks are not in it (micron run has them)."))),
-    h("div", { style: "grid-column:1/4;display:flex;flex-direction:column;gap:6px;min-height:0" }, amplitude.element, frequency.element)));
+    h("div.strips.plots", {}, amplitude.element, frequency.element)));
 
   /** Tremor now and what is left of it: what was commanded acts `delay` later. */
   function split() {
