@@ -6,7 +6,6 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -19,9 +18,9 @@ pytestmark = pytest.mark.timeout(400)
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 THEMES = ("dark", "light")
 SIZES = {  # name: CSS width and height, device pixels per CSS pixel
-    "320": (320, 640, 2.0),
-    "390": (390, 844, 3.0),
-    "768": (768, 1024, 2.0),
+    "320": (320, 640, 1.0),
+    "390": (390, 844, 1.0),
+    "768": (768, 1024, 1.0),
     "1024": (1024, 768, 1.0),
     "1280": (1280, 720, 1.0),
     "1920": (1920, 1080, 1.0),
@@ -213,8 +212,9 @@ COLOURS = """() => {
         for (const layer of layers) { g.fillStyle = layer; g.fillRect(0, 0, 1, 1); }
         return [...g.getImageData(0, 0, 1, 1).data.slice(0, 3)];
     };
+    const linear = (v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4);
     const light = (rgb) => {
-        const [r, gr, b] = rgb.map((v) => v / 255).map((v) => (v <= 0.03928 ? v / 12.92 : ((v + 0.055) / 1.055) ** 2.4));
+        const [r, gr, b] = rgb.map((v) => linear(v / 255));
         return 0.2126 * r + 0.7152 * gr + 0.0722 * b;
     };
     const found = [];
@@ -241,7 +241,7 @@ COLOURS = """() => {
     // labels inside charts are drawn in these colours, on a panel
     for (const name of ["--faint", "--soft"]) {
         const style = getComputedStyle(document.documentElement);
-        const [p, q] = [light(paint([style.getPropertyValue("--panel")])), light(paint([style.getPropertyValue(name)]))];
+        const [p, q] = ["--panel", name].map((colour) => light(paint([style.getPropertyValue(colour)])));
         const [a, b] = [p, q].sort((x, y) => y - x);
         found.push([(a + 0.05) / (b + 0.05), name, "chart", ""]);
     }
