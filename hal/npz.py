@@ -21,6 +21,10 @@ from numpy.lib import format as npy
 from numpy.typing import NDArray
 
 MOST_BYTES = 2 << 30
+MOST_FREE_BYTES = 1 << 26
+MOST_RATIO = 200
+"""An archive may unpack to 64 MiB, and beyond that to 200 times its size: deflated zeros pack 1000 to 1."""
+_PART_BYTES = 1 << 20
 _BROKEN = (
     zipfile.BadZipFile, zlib.error, struct.error, OSError, EOFError, KeyError, NotImplementedError, RuntimeError,
     SyntaxError, TokenError, TypeError, AttributeError, OverflowError, UnicodeError, RecursionError, MemoryError,
@@ -53,17 +57,30 @@ class Npz:
                 need = dtype.itemsize * math.prod(shape)
                 if dtype.hasobject:
                     raise NpzError(f"array '{name}' holds pickled objects; save plain numbers")
-                if need > info.file_size or need > self._left:
+                if need > info.file_size:
                     raise NpzError(f"array '{name}' claims {need} bytes; the file holds {info.file_size}")
+                if need > self._left:
+                    raise NpzError(f"array '{name}' claims {need} bytes; of a file of this size {self._left} are read")
                 self._left -= need
-                data = file.read(need)
-                if len(data) != need:
-                    raise NpzError(f"array '{name}' ends early")
-            return np.frombuffer(data, dtype).reshape(shape, order="F" if order else "C").copy()
+                array = np.empty(shape, dtype, order="F" if order else "C")
+                _fill(file, array, name)
+            return array
         except NpzError:
             raise
         except _BROKEN as error:
             raise NpzError(f"array '{name}' cannot be read: {error}") from error
+
+
+def _fill(file: Any, array: NDArray[Any], name: str) -> None:
+    """Straight into the array, a part at a time: ``ZipExtFile.read`` of all would copy what it has for every part."""
+    raw = array.reshape(-1, order="A").view(np.uint8).data if array.size else memoryview(b"")
+    at = 0
+    while at < len(raw):
+        part = file.read(min(len(raw) - at, _PART_BYTES))
+        if not part:
+            raise NpzError(f"array '{name}' ends early")
+        raw[at : at + len(part)] = part
+        at += len(part)
 
 
 def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
@@ -85,4 +102,5 @@ def open_npz(path: Path, most_bytes: int = MOST_BYTES) -> Generator[Npz]:
     except _BROKEN as error:
         raise NpzError(f"not a readable npz file ({error})") from error
     with archive:
-        yield Npz(archive, most_bytes)
+        size = path.stat().st_size
+        yield Npz(archive, min(most_bytes, MOST_FREE_BYTES + MOST_RATIO * size))

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import json
-
 import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.frame import ACCELEROMETER_MORE, LAYOUT, PARITIES, PARITY, VOLTS
 from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.format import load_json
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.replay import ReplayReport, replay
 
@@ -25,7 +24,13 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     text = recording.metadata.get("stages")
     if not isinstance(text, str):
         raise RecordingError(f"{recording.path}: no stage configuration in its metadata; only runs can be replayed")
-    return StageConfigs.from_dict(json.loads(text), str(recording.path))
+    try:
+        tables = load_json(text)
+    except RecordingError as error:
+        raise RecordingError(f"{recording.path}: its stage configuration cannot be read: {error}") from error
+    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+        raise RecordingError(f"{recording.path}: its stage configuration is not a table for every stage")
+    return StageConfigs.from_dict(tables, str(recording.path))
 
 
 def replay_recording(recording: Recording) -> ReplayReport:

@@ -117,7 +117,7 @@ def _descriptor(
     if fmt.TIME_COLUMN in recording.names:
         lines.append(f"time_column = {_toml(fmt.TIME_COLUMN)}")
     else:
-        lines.append(f"rate_hz = {float(recording.metadata.get('tick_hz', 1000.0))}")
+        lines.append(f"rate_hz = {recording.tick_hz}")
     lines += ["", "[twin]", f"kind = {_toml(kind)}", "", "[twin.parameters]"]
     lines += [f"{key} = {_toml(value)}" for key, value in twin.items()]
     for channel in channels:

@@ -101,6 +101,14 @@ class Recording:
     def names(self) -> tuple[str, ...]:
         return tuple(c.name for c in self.columns)
 
+    @property
+    def tick_hz(self) -> float:
+        """Ticks per second of the run; 1000 where the recording does not say. ``RecordingError`` for no rate."""
+        rate_hz = self.metadata.get("tick_hz", 1000.0)
+        if not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < 1e9:
+            raise RecordingError(f"{self.path}: its tick_hz is not a rate")
+        return float(rate_hz)
+
     def unit(self, name: str) -> str:
         return self.columns[self._index(name)].unit
 
@@ -182,7 +190,7 @@ class Recording:
         try:
             value = fmt.decode_metadata(item.name, item.metadata)
             if item.name == fmt.LAYOUT_METADATA:
-                self._take_layout(fmt.layout_of_text(value))
+                self._take_layout(fmt.layout_of_text(value) if isinstance(value, str) else fmt.layout_of(value))
             elif item.name in self.metadata and self.metadata[item.name] != value:
                 raise RecordingError("it is there twice, with different texts; the first one is used")
             else:

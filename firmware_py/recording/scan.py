@@ -129,6 +129,41 @@ def chunk_records(content: bytes, budget: UnpackBudget | None = None) -> Iterato
         at = stop
 
 
+def mcap_records(file: BinaryIO) -> Iterator[Schema | Channel | ChunkMessage]:
+    """The schemas, channels and messages of any sound MCAP file, with or without chunks and CRCs, in its order.
+
+    ``RecordingError`` at the first damage. Sizes are bounded as for our own recordings.
+    """
+    size = file.seek(0, 2)
+    file.seek(0)
+    budget = UnpackBudget(size)
+    if file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
+        raise RecordingError("it does not begin like an MCAP file")
+    left = size - len(MCAP0_MAGIC)
+    while True:
+        frame = file.read(_FRAME.size)
+        if len(frame) < _FRAME.size:
+            raise RecordingError("it ends inside a record")
+        opcode, length = _FRAME.unpack(frame)
+        left -= _FRAME.size + length
+        if left < 0:
+            raise RecordingError(f"a record claims {length} bytes, beyond the end of the file")
+        if opcode == Opcode.CHUNK:
+            yield from chunk_records(_unpack_chunk(_bounded(file, length), budget, needs_crc=False), budget)
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            yield from chunk_records(frame + _bounded(file, length), budget)
+        elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            return  # what follows repeats the schemas and channels
+        else:
+            file.seek(length, 1)
+
+
+def _bounded(file: BinaryIO, length: int) -> bytes:
+    if length > _MOST_CHUNK_RECORD:
+        raise RecordingError(f"a record of {length} bytes; at most {_MOST_CHUNK_RECORD} are read")
+    return file.read(length)
+
+
 def message_at(content: bytes | memoryview, at: int) -> ChunkMessage:
     """The message whose record begins at ``at``. ``RecordingError`` when there is none."""
     view = memoryview(content)
@@ -270,8 +305,9 @@ class Scanner:
         return True
 
 
-def _unpack_chunk(body: bytes, budget: UnpackBudget | None) -> bytes:
-    """The content of a chunk record. ``mcap`` would take a CRC of 0 as 'not checked' and any size as true."""
+def _unpack_chunk(body: bytes, budget: UnpackBudget | None, *, needs_crc: bool = True) -> bytes:
+    """The content of a chunk record. ``mcap`` would take any size as true, and a CRC of 0 as 'not checked'; so does
+    this with ``needs_crc`` off, for files of others."""
     try:
         *_, size, crc, name_length = _CHUNK_HEAD.unpack_from(body)
         name_stop = _CHUNK_HEAD.size + name_length
@@ -282,11 +318,11 @@ def _unpack_chunk(body: bytes, budget: UnpackBudget | None) -> bytes:
     packed = memoryview(body)[name_stop + _U64.size :]
     if packed_length != len(packed):
         raise RecordingError(f"it claims {packed_length} packed bytes and holds {len(packed)}")
-    if crc == 0:
+    if crc == 0 and needs_crc:
         raise RecordingError("it has no CRC")
     if budget is not None:
         budget.spend(min(size, MOST_CHUNK_BYTES))
     content = unpack(compression, packed, size)
-    if zlib.crc32(content) != crc:
+    if crc and zlib.crc32(content) != crc:
         raise RecordingError("its CRC is wrong")
     return content

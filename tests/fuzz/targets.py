@@ -23,6 +23,7 @@ from drivers.motion_card_protocol import LineParser
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.gcs import GcsLink
 from drivers.specs import check_devices
+from firmware_py.control.replay import recorded_configs
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
@@ -34,6 +35,7 @@ from hal.errors import HalError
 from hal.types import CanFrame, CanStats, PortInfo, ScanConfig
 from sim_devices.plant.hand_file import HandFileError, load_hand
 from tests.conftest import DEFAULT_BENCH
+from tools.bench.collect import quick_look
 from tools.bench.viewer import Nonsense
 from tools.bench.viewer import _parse as parse_message
 from tools.cli.mismatch import _report as read_report
@@ -42,6 +44,7 @@ from tools.mismatch.recording import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.fmu import check_archive
+from tools.output import to_jsonable
 
 MS = 1_000_000
 
@@ -112,9 +115,25 @@ def bench_toml(data: bytes) -> None:
 def own_recording(data: bytes) -> None:
     def read(path: Path) -> None:
         recording = Recording(path)
-        for block in recording.blocks():
-            assert block.data.shape[0] == len(recording.columns)
-        recover(path, path.with_name("out.mcap"))
+        rows = sum(block.data.shape[1] for block in recording.blocks())
+        numbers = recording.row_numbers()
+        health = recording.health
+        assert rows == recording.n_rows == health.rows == len(numbers)
+        assert (np.diff(numbers) > 0).all()
+        assert health.missing_rows >= 0
+        assert health.missing_events >= 0
+        assert health.missing_ticks >= 0
+        json.dumps(to_jsonable(health.as_dict())).encode()
+        "\n".join(health.lines()).encode()
+        report = recover(path, path.with_name("out.mcap"))
+        again = Recording(report.out)
+        assert np.array_equal(again.row_numbers(), numbers)
+        assert again.array(recording.names).tobytes() == recording.array(recording.names).tobytes()
+        assert [e.content for e in again.events] == [e.content for e in recording.events]
+        with suppress(RecordingError, InputError):
+            json.dumps(quick_look(path, ["t", "tick", "nowhere"]), allow_nan=False)
+        with suppress(HalError):
+            recorded_configs(recording)
 
     _file(data, ".mcap", read, RecordingError)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import random
 import zipfile
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from drivers.motion_card_protocol import LineParser
+from firmware_py.recording.errors import RecordingError as OwnRecordingError
 from firmware_py.recording.reader import Recording
 from hal.bench import load_bench
 from hal.npz import NpzError, open_npz
 from sim_devices.plant.hand_file import load_hand
+from tests.fuzz.mcap_parts import change, change_some_bytes, put_together, take_apart
 from tests.fuzz.targets import TARGETS, seeds
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
@@ -95,9 +99,34 @@ def test_an_array_that_claims_more_than_the_file_holds_is_refused_before_it_is_m
     np.savez_compressed(path, x=np.zeros(100_000))
     with open_npz(path, most_bytes=1000) as npz, pytest.raises(NpzError, match="claims 800000 bytes"):
         npz["x"]
+    np.savez_compressed(path, x=np.zeros(1 << 24))
+    assert path.stat().st_size < 200_000
+    with open_npz(path) as npz, pytest.raises(NpzError, match="claims 134217728 bytes; of a file of this size"):
+        npz["x"]
     np.savez(path, x=np.array([{}], dtype=object))
     with open_npz(path) as npz, pytest.raises(NpzError, match="pickled"):
         npz["x"]
+
+
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.arange(300_000.0),
+        np.asfortranarray(np.arange(12.0).reshape(3, 4)),
+        np.array(7),
+        np.empty((0, 3)),
+        np.array([True, False]),
+        np.array([[1, 2], [3, 4]], dtype=">i2"),
+    ],
+)
+def test_arrays_of_every_shape_come_out_as_they_went_in(tmp_path: Path, array: np.ndarray) -> None:
+    np.savez_compressed(tmp_path / "a.npz", x=array)
+    with open_npz(tmp_path / "a.npz") as npz:
+        read = npz["x"]
+    assert read.dtype == array.dtype
+    assert read.shape == array.shape
+    assert np.array_equal(read, array)
+    assert read.flags.writeable
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -110,3 +139,30 @@ def test_damage_ends_in_a_value_or_a_clear_error(name: str) -> None:
         target(data)
 
     never_crashes()
+
+
+@pytest.mark.parametrize("name", ["own_recording", "columns_mcap"])
+def test_hostile_content_behind_right_crcs_ends_in_a_value_or_a_clear_error(name: str) -> None:
+    """The changes are those of the coverage-guided fuzzer (run.py): a recording taken apart and put together again."""
+    target = TARGETS[name]
+
+    @settings(max_examples=250, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck))
+    @given(st.sampled_from(SEEDS[name]), st.randoms(use_true_random=False))
+    def never_crashes(data: bytes, rng: random.Random) -> None:
+        target(change(data, rng, change_some_bytes))
+
+    never_crashes()
+
+
+def test_the_structural_changes_pass_the_crcs(tmp_path: Path) -> None:
+    """A mutator whose files are all refused at the first CRC would find nothing."""
+    path = tmp_path / "r.mcap"
+    opened = 0
+    for seed in range(200):
+        path.write_bytes(change(SEEDS["own_recording"][0], random.Random(seed), change_some_bytes))
+        with suppress(OwnRecordingError):
+            opened += "CRC" not in " ".join(Recording(path).health.lines())
+    assert opened > 60
+    path.write_bytes(put_together(take_apart(SEEDS["own_recording"][0]) or []))
+    assert not Recording(path).health.lost
+    assert Recording(path).n_rows == 20

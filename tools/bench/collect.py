@@ -13,8 +13,8 @@ from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
+from firmware_py.recording.format import TIME_COLUMN
 from firmware_py.recording.reader import Recording
-from tools.bench.history import extremes
 from tools.bench.jobs import Jobs
 from tools.bench.recorder import SUFFIX, check_name
 from tools.bench.requests import body, clear, text
@@ -61,21 +61,39 @@ def _open(path: Path, _modified: float) -> Recording:
 
 
 def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
-    """Smallest and largest value per pixel of a few channels over the whole recording."""
-    recording = _open(path, path.stat().st_mtime)
-    wanted = [name for name in channels if name in recording.names][:LOOK_CHANNELS]
-    index = [recording.names.index(name) for name in (*wanted, "t")]
-    parts = [block.data[index] for block in recording.blocks()]
-    if not parts:
-        raise InputError(f"{path.name} holds no ticks")
-    data = np.concatenate(parts, axis=1)
-    k = max(1, data.shape[1] // LOOK_PIXELS)
-    values = data[:-1].astype(np.float32)
-    low, high = extremes(values, values, k)
+    """Smallest and largest value per pixel of a few channels over the whole recording, one block at a time."""
+    try:
+        recording = _open(path, path.stat().st_mtime)
+    except OSError as error:
+        raise InputError(f"{path.name} cannot be read ({error.strerror})") from error
+    if not recording.n_rows or TIME_COLUMN not in recording.names:
+        raise InputError(f"{path.name} holds no ticks with a time")
+    wanted = [name for name in dict.fromkeys(channels) if name in recording.names][:LOOK_CHANNELS]
+    index = [recording.names.index(name) for name in (*wanted, TIME_COLUMN)]
+    k = max(1, recording.n_rows // LOOK_PIXELS)
+    n_buckets = -(-recording.n_rows // k)
+    low = np.full((len(wanted), n_buckets), np.nan, dtype=np.float32)
+    high = low.copy()
+    t_s = np.zeros(n_buckets)
+    row = 0
+    for block in recording.blocks():
+        data = block.data[index]
+        n = data.shape[1]
+        starts = np.concatenate(([0], np.arange(-row % k or k, n, k)))
+        first = row // k
+        stop = first + len(starts)
+        with np.errstate(over="ignore"):
+            values = data[:-1].astype(np.float32)
+        low[:, first:stop] = np.fmin(low[:, first:stop], np.fmin.reduceat(values, starts, axis=1))
+        high[:, first:stop] = np.fmax(high[:, first:stop], np.fmax.reduceat(values, starts, axis=1))
+        begun = (row + starts) % k == 0
+        t_s[first:stop][begun] = data[-1, starts[begun]]
+        row += n
+    units = {column.name: column.unit for column in recording.columns}
     return {
         "channels": wanted,
-        "units": [dict(recording.columns)[name] for name in wanted],
-        "t": data[-1, ::k].tolist(),
+        "units": [units[name] for name in wanted],
+        "t": np.nan_to_num(t_s).tolist(),
         "low": np.nan_to_num(low).tolist(),
         "high": np.nan_to_num(high).tolist(),
         "health": recording.health.lines(),
@@ -86,6 +104,7 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
 
 def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     recorder = session.recorder
+    looking = asyncio.Lock()
 
     def existing(request: Request) -> Path:
         path = recorder.path(check_name(request.path_params["name"]))
@@ -110,7 +129,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
 
     async def look(request: Request) -> Any:
         channels = request.query_params.get("channels", "command_1,command_2,command_3").split(",")
-        return await asyncio.to_thread(quick_look, existing(request), channels)
+        async with looking:  # each may hold a chunk of 64 MiB
+            return await asyncio.to_thread(quick_look, existing(request), channels)
 
     async def download(request: Request) -> Any:
         path = existing(request)

@@ -69,4 +69,6 @@ def export(
             json_file,
         )
         if recording.health.lost:
+            for line in recording.health.lines():
+                console().print(line, soft_wrap=True)
             raise typer.Exit(Exit.DATA_LOST)

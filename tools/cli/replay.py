@@ -29,7 +29,7 @@ def replay(
         started_s = time.perf_counter()
         report = replay_recording(opened)
         took_s = time.perf_counter() - started_s
-        tick_hz = float(opened.metadata.get("tick_hz", 1000))
+        tick_hz = opened.tick_hz
         recorded_s = report.rows / tick_hz
         say = console()
         for line in opened.health.lines():

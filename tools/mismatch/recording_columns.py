@@ -5,27 +5,24 @@ from __future__ import annotations
 import csv
 import itertools
 import json
-import struct
-from collections.abc import Mapping
+from array import array
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-from mcap.exceptions import McapError
+from mcap.records import Channel
 from numpy.typing import NDArray
-from zstandard import ZstdError
 
+from firmware_py.recording.errors import RecordingError as McapRecordingError
+from firmware_py.recording.scan import ChunkMessage, mcap_records
 from hal.npz import open_npz
 from tools.mismatch.recording import RecordingError
 
 Array = NDArray[np.float64]
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000
-MAX_RECORD_BYTES = 1 << 28
-_MCAP_BROKEN = (
-    McapError, ZstdError, struct.error, EOFError, OSError, ValueError, KeyError, IndexError, TypeError, OverflowError,
-    RecursionError, MemoryError, RuntimeError, AttributeError, AssertionError,
-)  # fmt: skip
-"""What the mcap package and its decompressors raise for a damaged file."""
+MAX_MESSAGE_BYTES = 1 << 24
+_NOT_JSON = (ValueError, RecursionError, OverflowError)
 
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
@@ -67,20 +64,42 @@ def column_names(path: Path) -> list[str]:
 
 
 def _mcap_names(path: Path) -> list[str]:
-    from mcap.reader import SeekingReader
-
     names: dict[str, None] = {}
-    try:
-        with path.open("rb") as f:
-            for _, (_schema, channel, message) in zip(
-                range(1000), SeekingReader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages(), strict=False
-            ):
-                if channel.message_encoding == "json":
-                    names.update(dict.fromkeys(_flatten(json.loads(message.data), channel.topic)))
-                    names[f"{channel.topic}.log_time_s"] = None
-    except _MCAP_BROKEN as error:
-        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
+    for topic, encoding, message in itertools.islice(_messages(path), 1000):
+        if encoding == "json":
+            try:
+                names.update(dict.fromkeys(_flatten(json.loads(bytes(message.data)), topic)))
+            except _NOT_JSON as error:
+                raise RecordingError(f"{path}: a message of '{topic}' is not JSON ({error})") from None
+            names[f"{topic}.log_time_s"] = None
     return list(names)
+
+
+def _messages(path: Path) -> Iterator[tuple[str, str, ChunkMessage]]:
+    """Topic, encoding and message, in the order of the file. Raises RecordingError.
+
+    ``mcap``'s own readers unpack whatever a chunk claims; here no size is believed (``firmware_py.recording.unpack``).
+    """
+    channels: dict[int, tuple[str, str]] = {}
+    try:
+        with path.open("rb") as file:
+            for record in mcap_records(file):
+                if isinstance(record, Channel):
+                    channels[record.id] = (record.topic, record.message_encoding)
+                elif isinstance(record, ChunkMessage):
+                    if record.channel_id not in channels:
+                        raise RecordingError(
+                            f"{path}: a message of channel {record.channel_id}, which is not described"
+                        )
+                    if len(record.data) > MAX_MESSAGE_BYTES:
+                        raise RecordingError(
+                            f"{path}: a message of {len(record.data)} bytes; at most {MAX_MESSAGE_BYTES}"
+                        )
+                    yield (*channels[record.channel_id], record)
+    except OSError as error:
+        raise RecordingError(f"{path}: cannot be read ({error.strerror})") from None
+    except McapRecordingError as error:
+        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
 
 
 def _missing(path: Path, name: str, have: list[str]) -> RecordingError:
@@ -160,39 +179,35 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
 
 
 def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
-    """JSON messages; a column is ``topic.field`` (``topic.field.0`` for list elements), or ``topic.log_time_s``."""
-    from mcap.reader import SeekingReader
-
+    """JSON messages in order of their log time; a column is ``topic.field`` (``topic.field.0`` for list elements), or
+    ``topic.log_time_s``."""
     wanted = {n: n.rsplit(".", 1)[0] for n in names}
-    found: dict[str, list[float]] = {n: [] for n in names}
+    found: dict[str, array[float]] = {n: array("d") for n in names}
+    times: dict[str, array[int]] = {n: array("Q") for n in names}
     seen: set[str] = set()
-    number = 0
-    try:
-        with path.open("rb") as f:
-            for _schema, channel, message in SeekingReader(f, record_size_limit=MAX_RECORD_BYTES).iter_messages():
-                number += 1
-                topic = channel.topic
-                if channel.message_encoding != "json":
-                    seen.add(f"{topic} ({channel.message_encoding})")
-                    continue
-                flat = _flatten(json.loads(message.data), topic)
-                flat[f"{topic}.log_time_s"] = message.log_time * 1e-9
-                seen.update(flat)
-                for n, owner in wanted.items():
-                    if n in flat:
-                        found[n].append(flat[n])
-                    elif owner == topic:
-                        raise RecordingError(f"{path}: message {number} of '{topic}' lacks '{n}'")
-    except RecordingError:
-        raise
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise RecordingError(f"{path}: message {number}: not JSON ({error})") from None
-    except _MCAP_BROKEN as error:
-        raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
+    for number, (topic, encoding, message) in enumerate(_messages(path), start=1):
+        if encoding != "json":
+            seen.add(f"{topic} ({encoding})")
+            continue
+        try:
+            flat = _flatten(json.loads(bytes(message.data)), topic)
+        except _NOT_JSON as error:
+            raise RecordingError(f"{path}: message {number}: not JSON ({error})") from None
+        flat[f"{topic}.log_time_s"] = message.log_time * 1e-9
+        if len(seen) < 10_000:
+            seen.update(flat)
+        for n, owner in wanted.items():
+            if n in flat:
+                found[n].append(flat[n])
+                times[n].append(message.log_time)
+            elif owner == topic:
+                raise RecordingError(f"{path}: message {number} of '{topic}' lacks '{n}'")
+    columns: dict[str, Array] = {}
     for name, values in found.items():
         if not values:
             raise _missing(path, name, sorted(seen))
-    return {n: np.asarray(v, np.float64) for n, v in found.items()}
+        columns[name] = np.array(values)[np.argsort(np.array(times[name]), kind="stable")]
+    return columns
 
 
 def _flatten(value: object, prefix: str) -> dict[str, float]:
