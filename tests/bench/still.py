@@ -12,7 +12,7 @@ import os
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from tools.bench.app import make_app
 from tools.bench.firmware import Choice
 from tools.bench.jobs import Jobs
 from tools.bench.routes import more_routes
-from tools.bench.serve import LOOPBACK, access_for, bind
+from tools.bench.serve import LOOPBACK, access_for, bind, config_for
 from tools.bench.session import Disk, Session
 
 SECONDS = 12
@@ -158,12 +158,18 @@ class Still:
     base: str
 
     @property
+    def place(self) -> tuple[str, int]:
+        """Address and port, for a socket."""
+        host, _, port = self.base.removeprefix("http://").partition(":")
+        return host, int(port)
+
+    @property
     def address(self) -> str:
         return f"{self.base}/#token={TOKEN}"
 
 
 @contextmanager
-def still_server(recordings: Path) -> Iterator[Still]:
+def still_server(recordings: Path, *, open_reading: bool = True) -> Iterator[Still]:
     """The page's own routes and guard in a thread of this process, on a free port."""
     fill(recordings)
     sock = bind(LOOPBACK, 0)
@@ -173,11 +179,9 @@ def still_server(recordings: Path) -> Iterator[Still]:
 
     async def run() -> None:
         session, jobs = StillSession(recordings), Jobs()
-        app = make_app(session, access_for(LOOPBACK, port, TOKEN), more_routes(session, jobs))
-        config = uvicorn.Config(
-            app, ws="websockets-sansio", access_log=False, log_level="error", timeout_graceful_shutdown=1
-        )
-        server = uvicorn.Server(config)
+        access = replace(access_for(LOOPBACK, port, TOKEN), open_reading=open_reading)
+        app = make_app(session, access, more_routes(session, jobs))
+        server = uvicorn.Server(config_for(app))
         held.extend((session, server))
         ready.set()
         await server.serve(sockets=[sock])

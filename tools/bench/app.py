@@ -25,6 +25,8 @@ from tools.errors import InputError
 
 STATIC = Path(__file__).with_name("static")
 MAX_VIEWERS = 16
+RESERVED_VIEWERS = 4
+"""Further places for pages that show the token within ``viewer.HELLO_S``."""
 
 
 def catalogue() -> list[dict[str, Any]]:
@@ -67,10 +69,11 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
         await session.stop()
 
     async def look(socket: WebSocket) -> None:
-        if len(viewers) >= MAX_VIEWERS:
+        if len(viewers) >= MAX_VIEWERS + RESERVED_VIEWERS:
             await socket.close(1013, "too many viewers")
             return
-        viewer = Viewer(socket, session, access)
+        crowded = len(viewers) >= MAX_VIEWERS
+        viewer = Viewer(socket, session, replace(access, open_reading=False) if crowded else access)
         viewers.add(viewer)
         try:
             await viewer.serve()

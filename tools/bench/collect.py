@@ -16,7 +16,7 @@ from starlette.routing import BaseRoute, Route
 from firmware_py.recording.format import TIME_COLUMN
 from firmware_py.recording.reader import Recording
 from tools.bench.jobs import Jobs
-from tools.bench.recorder import SUFFIX, check_name
+from tools.bench.recorder import SUFFIX, check_name, is_own_file
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -30,11 +30,13 @@ LOOK_CHANNELS = 8
 def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
     """Recordings in ``folder``, newest first; the one being written is marked."""
     found: list[dict[str, Any]] = []
-    files = sorted(folder.glob(f"*{SUFFIX}"), key=lambda p: p.stat().st_mtime, reverse=True)
+    files = sorted(
+        (p for p in folder.glob(f"*{SUFFIX}") if is_own_file(p)), key=lambda p: p.stat().st_mtime, reverse=True
+    )
     for path in files[:MAX_LISTED]:
         sidecar = path.with_suffix(".json")
         table: dict[str, Any] = {}
-        if sidecar.is_file():
+        if is_own_file(sidecar):
             try:
                 table = json.loads(sidecar.read_text(encoding="utf-8"))
             except ValueError:
@@ -108,7 +110,7 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
 
     def existing(request: Request) -> Path:
         path = recorder.path(check_name(request.path_params["name"]))
-        if not path.is_file():
+        if not is_own_file(path):
             raise InputError(f"there is no recording {path.stem!r}")
         return path
 

@@ -4,18 +4,26 @@
 * A request with an Origin must come from the page itself.
 * What changes state needs the token, in the header ``X-Micron-Token``; behind ``--listen`` everything but the static
   page does.
-* A body may have ``MAX_BODY_BYTES``; a longer one is refused before it is read.
+* A body may have ``MAX_BODY_BYTES`` and take ``BODY_S``; a longer one is refused before it is read, or where it becomes
+  too long.
+* Requests without the token have ``MAX_REQUESTS`` places, ``MAX_OF_CLIENT`` for one address. Those with the token are
+  not counted: an order always finds a place.
 """
 
 from __future__ import annotations
 
+import asyncio
 import hmac
+from collections import Counter
 from dataclasses import dataclass
 
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY_BYTES = 65_536
+BODY_S = 10.0
+MAX_REQUESTS = 48
+MAX_OF_CLIENT = 32
 SAFE_METHODS = ("GET", "HEAD")
 POLICY = (
     "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
@@ -44,12 +52,17 @@ class _TooLarge(Exception):
     pass
 
 
+class _TooSlow(Exception):
+    pass
+
+
 class Guard:
     """The layer."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
         self._access = access
+        self._open: Counter[str] = Counter()  # requests without the token that are in progress, by address
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -57,8 +70,10 @@ class Guard:
             return
         headers = {k.decode("latin-1").lower(): v.decode("latin-1") for k, v in scope["headers"]}
         refusal = self._refusal(scope, headers)
-        if refusal is None:
+        if refusal is None and scope["type"] == "websocket":
             await self._pass_on(scope, receive, send)
+        elif refusal is None:
+            await self._in_a_place(scope, headers, receive, send)
         elif scope["type"] == "websocket":
             await send({"type": "websocket.close", "code": 4403, "reason": refusal[1][:100]})
         else:
@@ -80,22 +95,32 @@ class Guard:
             return 403, "token missing or wrong: open the address that 'micron bench' printed"
         return None
 
+    async def _in_a_place(self, scope: Scope, headers: dict[str, str], receive: Receive, send: Send) -> None:
+        """A request that may be answered, counted unless it has the token, with its body read."""
+        client = "" if self._access.knows(headers.get("x-micron-token")) else (scope.get("client") or ("?",))[0]
+        if client and (self._open.total() >= MAX_REQUESTS or self._open[client] >= MAX_OF_CLIENT):
+            await _refuse(503, "too many requests at once; try again", scope, receive, send)
+            return
+        if client:
+            self._open[client] += 1
+        try:
+            announced = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
+            if announced or scope["method"] not in SAFE_METHODS:
+                receive = _replay(await _whole_body(receive), receive)
+            await self._pass_on(scope, receive, send)
+        except _TooLarge:
+            await _refuse(413, f"a request may have {MAX_BODY_BYTES} bytes", scope, receive, send)
+        except _TooSlow:
+            await _refuse(408, f"the body of the request took more than {BODY_S:.0f} s", scope, receive, send)
+        finally:
+            if client:
+                self._open[client] -= 1
+                if not self._open[client]:
+                    del self._open[client]
+
     async def _pass_on(self, scope: Scope, receive: Receive, send: Send) -> None:
-        started = False
-        got = 0
-
-        async def bounded_receive() -> Message:
-            nonlocal got
-            message = await receive()
-            got += len(message.get("body", b""))
-            if scope["type"] == "http" and got > MAX_BODY_BYTES:
-                raise _TooLarge
-            return message
-
         async def send_with_headers(message: Message) -> None:
-            nonlocal started
             if message["type"] == "http.response.start":
-                started = True
                 message["headers"] = [
                     *message.get("headers", []),
                     (b"content-security-policy", POLICY.encode()),
@@ -105,9 +130,43 @@ class Guard:
                 ]
             await send(message)
 
-        try:
-            await self._app(scope, bounded_receive, send_with_headers)
-        except _TooLarge:
-            if not started:
-                answer = JSONResponse({"error": f"a request may have {MAX_BODY_BYTES} bytes"}, 413)
-                await answer(scope, receive, send)
+        await self._app(scope, receive, send_with_headers)
+
+
+async def _refuse(status: int, why: str, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer and close: what is left of the request is not read."""
+    await JSONResponse({"error": why}, status, {"Connection": "close"})(scope, receive, send)
+
+
+async def _whole_body(receive: Receive) -> bytes:
+    """The body, at most ``MAX_BODY_BYTES``. ``_TooLarge`` and ``_TooSlow`` where a limit is passed."""
+    parts: list[bytes] = []
+    size = 0
+    try:
+        async with asyncio.timeout(BODY_S):
+            while True:
+                message = await receive()
+                if message["type"] != "http.request":  # the client has gone
+                    return b""
+                parts.append(message.get("body", b""))
+                size += len(parts[-1])
+                if size > MAX_BODY_BYTES:
+                    raise _TooLarge
+                if not message.get("more_body", False):
+                    return b"".join(parts)
+    except TimeoutError:
+        raise _TooSlow from None
+
+
+def _replay(body: bytes, receive: Receive) -> Receive:
+    """Give ``body`` first, then what ``receive`` says."""
+    given = False
+
+    async def again() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return again

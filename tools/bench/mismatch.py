@@ -12,7 +12,7 @@ from starlette.routing import BaseRoute, Route
 
 from tools.bench.applied import Applied
 from tools.bench.jobs import Jobs
-from tools.bench.recorder import SUFFIX
+from tools.bench.recorder import SUFFIX, is_own_file
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -34,8 +34,10 @@ def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[Base
     folder = session.recorder.folder
 
     def choices() -> dict[str, Path]:
-        files = {p.name: p for p in sorted(folder.glob(f"*{SUFFIX}"))}
-        return files | {f"{p.parent.name}/": p.parent for p in sorted(folder.glob("*/recording.toml"))}
+        files = {p.name: p for p in sorted(folder.glob(f"*{SUFFIX}")) if is_own_file(p)}
+        folders = (p.parent for p in sorted(folder.glob("*/recording.toml")))
+        own = (p for p in folders if not any(q.is_symlink() for q in (p, *p.iterdir())))
+        return files | {f"{p.name}/": p for p in own}
 
     async def recordings(_: Request) -> Any:
         names = [*choices(), *([DEMONSTRATION] if session.bench.description.emulated_buses() else [])]

@@ -33,6 +33,11 @@ def check_name(name: str) -> str:
     return name
 
 
+def is_own_file(path: Path) -> bool:
+    """A regular file that is no symbolic link: a link could lead to any file that the server may read."""
+    return path.is_file() and not path.is_symlink()
+
+
 class RunRecorder:
     """At most one recording at a time, in ``folder``."""
 
@@ -60,6 +65,8 @@ class RunRecorder:
         if not metadata:
             raise InputError("no firmware is running; start it, then record")
         name = check_name(name or datetime.now(UTC).strftime("run %Y-%m-%d %H.%M.%S"))
+        if self.path(name).is_symlink():
+            raise InputError(f"{self.path(name)} is a symbolic link; choose another name")
         columns = list(zip(LAYOUT.scalar_names(), LAYOUT.scalar_units(), strict=True))
         self._starting = True
         try:

@@ -14,8 +14,9 @@ import uvicorn
 
 from tools.bench.app import make_app
 from tools.bench.firmware import Choice
-from tools.bench.guard import Access
+from tools.bench.guard import Access, Guard
 from tools.bench.jobs import Jobs
+from tools.bench.limits import BoundedHttp
 from tools.bench.routes import more_routes
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -59,6 +60,21 @@ def _own_addresses() -> set[str]:
         return set()
 
 
+def config_for(app: Guard) -> uvicorn.Config:
+    """How uvicorn serves the page."""
+    return uvicorn.Config(
+        app,
+        http=BoundedHttp,  # has its own limits; uvicorn's would refuse orders, too
+        ws="websockets-sansio",
+        ws_max_size=MAX_MESSAGE_BYTES,
+        ws_per_message_deflate=False,  # costs more than a loopback saves
+        access_log=False,
+        log_level="warning",
+        server_header=False,
+        timeout_graceful_shutdown=1,
+    )
+
+
 def serve(
     choice: Choice,
     recordings: Path,
@@ -77,18 +93,7 @@ def serve(
         session = Session(choice, recordings)
         jobs = Jobs()
         app = make_app(session, access, more_routes(session, jobs))
-        config = uvicorn.Config(
-            app,
-            ws="websockets-sansio",
-            ws_max_size=MAX_MESSAGE_BYTES,
-            ws_per_message_deflate=False,  # costs more than a loopback saves
-            access_log=False,
-            log_level="warning",
-            server_header=False,
-            limit_concurrency=64,
-            timeout_graceful_shutdown=1,
-        )
-        server = uvicorn.Server(config)
+        server = uvicorn.Server(config_for(app))
         loop = asyncio.get_running_loop()
 
         def leave() -> None:

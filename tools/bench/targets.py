@@ -165,6 +165,6 @@ class Targets:
     def report(self, name: str) -> Path:
         """A report file. ``InputError`` when there is none of that name."""
         path = self._folder / Path(name).name
-        if not path.is_file():
+        if not path.is_file() or path.is_symlink():
             raise InputError(f"there is no report {name!r}")
         return path
