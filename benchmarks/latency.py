@@ -90,8 +90,8 @@ def echo_us(script: str = ECHO) -> np.ndarray:
 
 
 def outcome_of(bench: Path) -> dict[str, Any]:
-    run_in_process(RunRequest(bench, 0.5))  # kernels compiled or read, here and in the emulated world
-    outcome, _ = run_in_process(RunRequest(bench, SECONDS))
+    run_in_process(RunRequest(bench, 0.5, pace="realtime"))  # kernels compiled or read, here and in the emulated world
+    outcome, _ = run_in_process(RunRequest(bench, SECONDS, pace="realtime"))
     if not outcome["safe_state"]["normal"]:
         raise RuntimeError(f"the run ended early, nothing to measure: {outcome['safe_state']['reason']}")
     return outcome

@@ -89,10 +89,10 @@ def replay_rows() -> Iterator[Row]:
 def wire_against_simulated() -> Iterator[Row]:
     path = bench_path(None)
     bench = load_bench(path)
-    run_in_process(RunRequest(path, 0.5, virtual=True))
+    run_in_process(RunRequest(path, 0.5, pace="virtual"))
     simulate(bench, 0.5)
     started_s = time.process_time()
-    outcome, truth = run_in_process(RunRequest(path, WIRE_S, virtual=True))
+    outcome, truth = run_in_process(RunRequest(path, WIRE_S, pace="virtual"))
     wire_s = time.process_time() - started_s
     assert truth is not None
     without, over_wire = left_um(truth, outcome["armed_ns"], outcome["safe_ns"])

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.control.config import FirmwareConfig, load_firmware_config
+from firmware_py.control.config import load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
@@ -30,7 +30,7 @@ from firmware_py.inject import Injector, check_injections, parse_injection
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
-from firmware_py.run_request import RunRequest, describe_scheduling, open_requested, scheduling, truth_of
+from firmware_py.run_request import RunRequest, describe_host, describe_scheduling, open_requested, scheduling, truth_of
 from firmware_py.scheduler.realtime import RealtimeReport
 from hal.bench import BenchFile, OpenBench, Port, load_bench
 from hal.contracts import Clock
@@ -103,14 +103,14 @@ def run_in_process(
         report = RealtimeReport()
         summary: RecordingSummary | None = None
         try:
-            with scheduling(request.virtual or not request.realtime) as report:
+            with scheduling(request, opened) as report:
                 loop.run(request.seconds)
         finally:
             if recorder is not None:
                 summary = recorder.stop(loop.scheduler.snapshot().as_dict())
         if heart is not None and heart.noticed_ns:
             loop.counts.noticed.setdefault("no command for a while (guardian)", heart.noticed_ns)
-        outcome = make_outcome(request, bench, devices, loop, config, report, summary)
+        outcome = make_outcome(request, opened, devices, loop, report, summary)
         if injections:
             outcome["injected"] = injector.counts()
         return outcome, truth_of(opened)
@@ -146,10 +146,9 @@ def recording_metadata(bench: BenchFile, configs: StageConfigs, opened: OpenBenc
 
 def make_outcome(
     request: RunRequest,
-    bench: BenchFile,
+    opened: OpenBench,
     devices: Devices,
     loop: InstrumentLoop,
-    config: FirmwareConfig,
     report: RealtimeReport,
     recording: RecordingSummary | None,
 ) -> dict[str, Any]:
@@ -162,8 +161,8 @@ def make_outcome(
         reason += f"; neutral NOT confirmed ({supervisor.ramp_failure}): switch the amplifier off"
     return {
         "format": 1,
-        "bench": bench.description.name,
-        "clock": "virtual" if request.virtual else "real",
+        "bench": opened.file.description.name,
+        "clock": "virtual" if opened.virtual else "real",
         "seconds": request.seconds,
         "devices": devices.identities,
         "armed_ns": loop.armed_ns,
@@ -207,7 +206,8 @@ def make_outcome(
             "method": loop.stages.configs.sensing.kinematics_method,
             "fallbacks": loop.stages.sensing.fallbacks,
         },
-        "realtime": describe_scheduling(report, request.virtual),
+        "host": describe_host(opened.clock),
+        "realtime": describe_scheduling(report, opened.virtual),
         "recording": str(recording.path) if recording is not None else None,
         "recorder": {
             "ticks": recording.ticks if recording is not None else 0,

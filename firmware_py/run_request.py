@@ -13,6 +13,7 @@ from typing import Any
 from drivers.specs import check_devices
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.bench import BenchFile, OpenBench, Port, open_bench
+from hal.clock import Pace, PacedClock, VirtualClock
 from hal.contracts import Clock
 from hal.errors import Disconnected
 
@@ -25,7 +26,8 @@ class RunRequest:
 
     bench: Path
     seconds: float
-    virtual: bool = False
+    pace: Pace | None = None
+    """How bench time passes; None: paced where every bus is emulated, else real time."""
     hand_file: str | None = None
     hand_scale: float | None = None
     record: Path | None = None
@@ -34,8 +36,8 @@ class RunRequest:
     """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
     stale_ms: float | None = None
     """Another limit for missing or belated scans than the bench file's."""
-    realtime: bool = True
-    """Ask for a real-time policy, locked memory and no collector; without, for comparison only."""
+    policy: bool = True
+    """In real time: ask for a real-time policy, locked memory and no collector; without, for comparison only."""
     sense_only: bool = False
     """Nothing is armed; readings that would end a run are noticed."""
     method: str | None = None
@@ -72,7 +74,7 @@ def open_requested(
         yield stack.enter_context(
             open_bench(
                 bench,
-                virtual=request.virtual,
+                pace=request.pace,
                 runtime_dir=folder,
                 hand_file=Path(request.hand_file) if request.hand_file else None,
                 hand_scale=request.hand_scale,
@@ -95,8 +97,11 @@ def truth_of(opened: OpenBench) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def scheduling(plain: bool) -> Iterator[RealtimeReport]:
-    if plain:
+def scheduling(request: RunRequest, opened: OpenBench) -> Iterator[RealtimeReport]:
+    """Real-time settings for the length of the block, in real time and unless the request does without."""
+    if isinstance(opened.clock, PacedClock):
+        opened.clock.begin()
+    if opened.virtual or not request.policy:
         yield RealtimeReport()
         return
     with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
@@ -110,3 +115,10 @@ def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
     if not report.settings:
         return "no real-time settings asked for"
     return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
+
+
+def describe_host(clock: Clock) -> dict[str, Any]:
+    """How the host kept up with the run, as JSON values: the pace, and the pauses of the host."""
+    if not isinstance(clock, PacedClock):
+        return {"pace": "virtual" if isinstance(clock, VirtualClock) else "realtime"}
+    return {"pace": "paced", **asdict(clock.report())}

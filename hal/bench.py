@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import tomllib
-from collections.abc import Callable, Generator, Iterable
+from collections.abc import Callable, Generator, Iterable, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from hal.clock import MonotonicClock, VirtualClock
+from hal.clock import MonotonicClock, Pace, PacedClock, VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.validation import validate_table
@@ -221,6 +221,7 @@ class OpenBench:
 
     @property
     def virtual(self) -> bool:
+        """Whether bench time is emulated, paced or not."""
         return isinstance(self.clock, VirtualClock)
 
     def close(self) -> None:
@@ -243,11 +244,29 @@ class OpenBench:
         self.close()
 
 
+EMULATED_CLOCKS: Mapping[Pace, Callable[[int], VirtualClock]] = {"paced": PacedClock, "virtual": VirtualClock}
+
+
+def default_pace(description: BenchDescription) -> Pace:
+    """``paced`` where every bus is emulated; devices that are real run in real time."""
+    return "paced" if len(description.emulated_buses()) == len(description.bus) else "realtime"
+
+
+def check_pace(bench: BenchFile, pace: Pace | None) -> Pace:
+    """``pace``, or the default of this bench. Raises ``BenchError`` for emulated time with a real bus."""
+    default = default_pace(bench.description)
+    if pace in ("paced", "virtual") and default == "realtime":
+        emulated = bench.description.emulated_buses()
+        real = [name for name in bench.description.bus if name not in emulated]
+        raise BenchError(f"{bench.path}: virtual time needs every bus emulated, but {_names(real)} are real")
+    return pace or default
+
+
 @contextmanager
 def open_bench(
     bench: BenchFile,
     *,
-    virtual: bool,
+    pace: Pace | None,
     runtime_dir: Path,
     hand_file: Path | None = None,
     hand_scale: float | None = None,
@@ -258,18 +277,18 @@ def open_bench(
 ) -> Generator[OpenBench, None, None]:
     """Open all buses of ``bench``; emulated ones by their provider, all others by ``hal.backends``.
 
+    ``pace`` None is ``default_pace``.
+
     ``hand_file`` and ``hand_scale`` go to the emulated world, ``truth_s`` bounds the truth that it keeps;
     ``start_ns`` is where a virtual clock begins;
     ``wrap(bus, port, clock)`` may put middleware (trace, faults) around a port. Raises ``OpenFailed`` with every cause.
     """
     description = bench.description
     emulated = description.emulated_buses()
-    if virtual and len(emulated) < len(description.bus):
-        real = [name for name in description.bus if name not in emulated]
-        raise BenchError(f"{bench.path}: virtual time needs every bus emulated, but {_names(real)} are real")
+    pace = check_pace(bench, pace)
     if hand_file is not None and not emulated:
         raise BenchError(f"{bench.path}: --hand moves an emulated instrument, but this bench is all real")
-    clock = VirtualClock(start_ns) if virtual else MonotonicClock()
+    clock = EMULATED_CLOCKS[pace](start_ns) if pace != "realtime" else MonotonicClock()
     opened = OpenBench(bench, clock, {}, None, runtime_dir)
     try:
         if emulated:
@@ -281,7 +300,7 @@ def open_bench(
                 table["emulation"]["truth_s"] = truth_s
             world = _provider(bench)(
                 table,
-                clock=clock if virtual else None,
+                clock=clock if isinstance(clock, VirtualClock) else None,
                 runtime_dir=runtime_dir,
                 hand_file=hand_file,
                 hand_scale=hand_scale,

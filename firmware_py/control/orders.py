@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from firmware_py.control.incidents import Incidents
@@ -16,8 +17,8 @@ MAX_GAIN = 1.5
 
 
 class PageOrders:
-    """Obeys the orders that have arrived; one that makes no sense is dropped. ``asked_safe_ns``: when the safe state
-    was asked for, by the page's clock."""
+    """Obeys the orders that have arrived; one that makes no sense is dropped. ``asked_safe_ns`` is the bench time at
+    which the page asked for the safe state."""
 
     def __init__(
         self,
@@ -27,6 +28,7 @@ class PageOrders:
         supervisor: Supervisor,
         incidents: Incidents,
         clock: Clock,
+        host_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._link = link
         self._manual = manual
@@ -34,6 +36,7 @@ class PageOrders:
         self._supervisor = supervisor
         self._incidents = incidents
         self._clock = clock
+        self._host_ns = host_ns
         self.asked_safe_ns: int | None = None
 
     def obey_all(self) -> None:
@@ -45,7 +48,9 @@ class PageOrders:
         match order:
             case {"order": "safe"}:
                 asked_ns = order.get("t_ns")
-                self.asked_safe_ns = asked_ns if isinstance(asked_ns, int) else now_ns
+                # the page stamps with the host's clock, which is not the bench's where bench time is emulated
+                age_ns = self._host_ns() - asked_ns if isinstance(asked_ns, int) else 0
+                self.asked_safe_ns = now_ns - max(0, age_ns)
                 self._incidents.trip("stopped by the operator (safe button of the bench page)", normal=True)
             case {"order": "arm"} if self._supervisor.may_move:
                 self._manual.arm(now_ns, self._stages.command_V)

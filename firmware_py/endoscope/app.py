@@ -15,7 +15,7 @@ from firmware_py.endoscope.targets import GameState
 from firmware_py.endoscope.wiring import open_sensors
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
-from firmware_py.run_request import RunRequest, describe_scheduling, open_requested, scheduling, truth_of
+from firmware_py.run_request import RunRequest, describe_host, describe_scheduling, open_requested, scheduling, truth_of
 from firmware_py.sensing.fusion import Fusion
 from hal.bench import BenchFile, OpenBench, Port
 from hal.contracts import Clock
@@ -70,13 +70,17 @@ def run_endoscope(
             on_status=on_status,
             on_state=on_state,
         )
-        with scheduling(request.virtual) as report:
+        with scheduling(request, opened) as report:
             loop.run(request.seconds, until_done=until_done)
     finally:
         if recorder is not None:
             summary = recorder.stop({})
-    outcome = make_outcome(request, bench, loop, sensors.identities, summary)
-    return loop, {**outcome, "realtime": describe_scheduling(report, request.virtual)}
+    outcome = make_outcome(request, opened, loop, sensors.identities, summary)
+    return loop, {
+        **outcome,
+        "host": describe_host(opened.clock),
+        "realtime": describe_scheduling(report, opened.virtual),
+    }
 
 
 def _recorder(
@@ -97,7 +101,7 @@ def _recorder(
 
 def make_outcome(
     request: RunRequest,
-    bench: BenchFile,
+    opened: OpenBench,
     loop: EndoscopeLoop,
     identities: dict[str, str],
     recording: RecordingSummary | None,
@@ -121,8 +125,8 @@ def make_outcome(
     return {
         "format": 1,
         "instrument": "endoscope",
-        "bench": bench.description.name,
-        "clock": "virtual" if request.virtual else "real",
+        "bench": opened.file.description.name,
+        "clock": "virtual" if opened.virtual else "real",
         "seconds": request.seconds,
         "ran_s": ran_s,
         "devices": identities,

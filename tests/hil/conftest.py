@@ -43,7 +43,7 @@ def stand(request: pytest.FixtureRequest, bench_file: BenchFile, virtual: bool, 
     for name in marker.args if marker is not None else ():
         if name not in bench_file.description.device:
             pytest.skip(f"{bench_file.path} declares no device '{name}'")
-    with open_bench(bench_file, virtual=virtual, runtime_dir=tmp_path) as bench:
+    with open_bench(bench_file, pace="virtual" if virtual else "realtime", runtime_dir=tmp_path) as bench:
         devices = open_devices(bench)
         try:
             yield Stand(bench_file, bench, devices)

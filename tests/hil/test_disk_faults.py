@@ -46,7 +46,7 @@ def run_with(path: Path | None, *blows: tuple[int, Callable[[int], None]]) -> tu
         for at_ms, blow in blows:
             clock.at(at_ms * MS, lambda _, blow=blow: blow(recorder_pid()))
 
-    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, SECONDS, virtual=True, record=path), on_open=prepare)
+    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, SECONDS, pace="virtual", record=path), on_open=prepare)
     assert truth is not None
     return outcome, truth
 

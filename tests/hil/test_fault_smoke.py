@@ -38,7 +38,7 @@ def run_with(fault: str, target: str) -> tuple[dict[str, Any], dict[str, np.ndar
 
         clock.at(clock.now_ns() + FAULT_AFTER_NS, strike)
 
-    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, 3.0, virtual=True), on_open=schedule)
+    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, 3.0, pace="virtual"), on_open=schedule)
     assert truth is not None
     assert when, "the run ended before the fault"
     return outcome, truth, when[0]

@@ -19,10 +19,10 @@ def turned(tmp_path: Path) -> Path:
 
 
 def test_turned_by_hand(turned: Path):
-    armed, _ = run_in_process(RunRequest(turned, 3.0, virtual=True))
+    armed, _ = run_in_process(RunRequest(turned, 3.0, pace="virtual"))
     assert "disagree" in armed["safe_state"]["reason"]
     assert armed["commands"]["sent"] > 0
-    sensed, truth = run_in_process(RunRequest(turned, 3.0, virtual=True, sense_only=True))
+    sensed, truth = run_in_process(RunRequest(turned, 3.0, pace="virtual", sense_only=True))
     assert sensed["safe_state"]["normal"]
     assert sensed["noticed"].keys() >= {"parallel axes disagree"}
     assert (sensed["commands"]["sent"], sensed["armed_ns"]) == (0, None)

@@ -13,7 +13,7 @@ from tools.reports.run_report import summary_lines
 def test_only_what_left_is_counted_and_timed():
     """115200 baud carry a command every 10 ms."""
     bench = bench_path(None).with_name("micron-e727.toml")
-    outcome, _ = run_in_process(RunRequest(bench, 2.0, virtual=True))
+    outcome, _ = run_in_process(RunRequest(bench, 2.0, pace="virtual"))
     commands = outcome["commands"]
     assert commands["sent"] > 100
     assert commands["superseded"] == pytest.approx(9 * commands["sent"], abs=10)

@@ -15,7 +15,7 @@ BEFORE_NS = 1_000_000_000  # the mark falls into the run proper
 
 
 def run_from(start_ns: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, 0.8, virtual=True, clock_start_ns=start_ns))
+    outcome, truth = run_in_process(RunRequest(DEFAULT_BENCH, 0.8, pace="virtual", clock_start_ns=start_ns))
     assert truth is not None
     return outcome, truth
 

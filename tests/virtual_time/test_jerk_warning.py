@@ -22,7 +22,7 @@ def test_jerks_reach_the_report(tmp_path: Path) -> None:
     )
     bench = tmp_path / "twitching.toml"
     bench.write_text(text)
-    outcome, truth = run_in_process(RunRequest(bench, 20.0, virtual=True, seed=3))
+    outcome, truth = run_in_process(RunRequest(bench, 20.0, pace="virtual", seed=3))
     assert truth is not None
     assert outcome["warnings"]["jerk"] >= 1
     quiet = {"gain": None, "delay_ms": None}

@@ -81,7 +81,7 @@ def main(arguments: list[str]) -> int:
     try:
         with (
             tempfile.TemporaryDirectory(prefix="micron-") as folder,
-            open_bench(load_bench(Path(arguments[0])), virtual=False, runtime_dir=Path(folder)) as bench,
+            open_bench(load_bench(Path(arguments[0])), pace=None, runtime_dir=Path(folder)) as bench,
         ):
             stream(bench)
     except BrokenPipeError:

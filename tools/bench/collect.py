@@ -127,7 +127,7 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         return await session.stop_recording()
 
     async def note(request: Request) -> Any:
-        recorder.note(text(await body(request), "text"))
+        recorder.note(text(await body(request), "text"), session.bench_time_ns())
 
     async def look(request: Request) -> Any:
         channels = request.query_params.get("channels", "command_1,command_2,command_3").split(",")

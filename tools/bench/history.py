@@ -104,6 +104,11 @@ class History:
             return np.zeros(self._n_columns, dtype=np.float32)
         return self._fine.take(np.arange(self._n_columns), self.head - 1, self.head)[:, 0]
 
+    @property
+    def latest_t_s(self) -> float:
+        """Time of the newest row; 0 before the first."""
+        return float(self._fine_t[(self.head - 1) % self._fine.depth]) if self.head else 0.0
+
     def append(self, rows: Float64Array) -> None:
         """Add ``rows`` [n, columns]; more than the fine level holds is added in parts."""
         step = self._fine.depth // 2

@@ -90,11 +90,11 @@ class RunRecorder:
         for row in rows.values:
             recorder.push(row)
 
-    def note(self, text: str) -> None:
-        """Write a note into the running recording."""
+    def note(self, text: str, t_ns: int) -> None:
+        """Write a note into the running recording, at bench time ``t_ns``."""
         if self._recorder is None:
             raise InputError("no recording is running: a note needs one")
-        self._recorder.event({"event": "note", "text": text, "t_ns": time.monotonic_ns()})
+        self._recorder.event({"event": "note", "text": text, "t_ns": t_ns})
         self._sidecar["notes"].append(text)
         self._save()
 

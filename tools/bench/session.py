@@ -274,6 +274,13 @@ class Session:
             if self.shadow is not None:
                 self.shadow.follow(rows.values)
 
+    def bench_time_ns(self) -> int:
+        """Bench time of the newest row, which is emulated time on an emulated bench."""
+        status = self.run.status
+        if not status:
+            return 0
+        return status["now_ns"] + round((self.history.latest_t_s - status["t_s"]) * 1e9)
+
     async def compare(self, method: str) -> None:
         """Run another attitude filter beside the firmware's; an empty name ends that."""
         self.shadow = None

@@ -7,9 +7,19 @@ from typing import Annotated
 
 import typer
 
+from hal.clock import Pace
+
 BenchOption = Annotated[
     Path | None, typer.Option("--bench", metavar="FILE", help="Bench file; the default is the emulated bench.")
 ]
+VirtualOption = Annotated[
+    bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
+]
+
+
+def pace_of(virtual: bool) -> Pace | None:
+    """What ``--virtual`` asks for; without it an emulated bench is paced and a real one runs in real time."""
+    return "virtual" if virtual else None
 
 
 def bench_path(chosen: Path | None) -> Path:

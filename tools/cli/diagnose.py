@@ -14,14 +14,11 @@ from rich.table import Table
 from rich.text import Text
 
 from hal.bench import load_bench
-from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 
-VirtualOption = Annotated[
-    bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
-]
 YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
 
 
@@ -65,7 +62,7 @@ def scan(
         console().print(f"I2C probe '{probe}': {PROBES[probe]}")
         if probe is ProbeChoice.WRITE:
             _ask("Write to every address of every I2C bus of this bench?", yes)
-        with opened_bench(bench_path(bench), virtual=virtual) as opened:
+        with opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened:
             result = scan_bench(opened, probe.value, seconds, lambda text: console().print(text, style="dim"))
         out = data_console()
         out.print("ports of this machine: " + (", ".join(result.ports) or "none"))
@@ -112,7 +109,7 @@ def scope(
     with clear_errors():
         check_writable(json_file)
         with (
-            opened_bench(bench_path(bench), virtual=virtual) as opened,
+            opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened,
             Live(console=console(), refresh_per_second=8, transient=True) as live,
         ):
             seen = look(opened, seconds, lambda so_far: live.update(Text(text(so_far), no_wrap=True)))
@@ -213,7 +210,7 @@ def ramp(
                 f"[red]{error}[/]" if bad else error,
             )
 
-        with opened_bench(path, virtual=virtual) as opened:
+        with opened_bench(path, pace=pace_of(virtual)) as opened:
             found = climb(opened, channels, steps, dwell_s, show)
         data_console().print(table)
         worst = max(found, key=lambda s: abs(s.error_V))
@@ -259,7 +256,7 @@ def can_dump(
         if not buses:
             raise InputError(f"{path}: this bench has no CAN bus")
         heard = []
-        with opened_bench(path, virtual=virtual) as opened:
+        with opened_bench(path, pace=pace_of(virtual)) as opened:
             for one in listen(opened, buses, seconds, count):
                 heard.append(one.as_dict())
                 if json_file != "-":
@@ -288,7 +285,7 @@ def capture(
         check_writable(out, folders=True)
         if out.exists():
             raise InputError(f"{out}: is there already; a golden transcript is not overwritten")
-        counts = record(bench_path(bench), out, seconds, virtual=virtual)
+        counts = record(bench_path(bench), out, seconds, pace=pace_of(virtual))
         for bus, lines in counts.items():
             console().print(f"{bus}: {lines} transfers")
         write_json({"format": 1, "out": str(out), "transfers": counts}, json_file)

@@ -10,6 +10,7 @@ import typer
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from tools.cli.bench_option import pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
@@ -102,7 +103,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
     columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
-        open_bench(described, virtual=virtual, runtime_dir=Path(folder)) as opened,
+        open_bench(described, pace=pace_of(virtual), runtime_dir=Path(folder)) as opened,
         Progress(*columns, console=console(), transient=True) as bar,
     ):
         sensors = open_sensors(opened, only)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from rich.table import Table
 
-from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
 from tools.cli.common import JsonOption, clear_errors, data_console
-from tools.cli.diagnose import VirtualOption
 from tools.output import check_writable, write_json
 
 
@@ -20,7 +19,7 @@ def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: J
 
     with clear_errors():
         check_writable(json_file)
-        with opened_bench(bench_path(bench), virtual=virtual) as opened:
+        with opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened:
             values = read_sensors(opened)
         if json_file != "-":
             table = Table()

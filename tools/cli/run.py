@@ -14,7 +14,6 @@ from typing import Annotated, Any
 
 import typer
 from rich.live import Live
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.spinner import Spinner
 from rich.table import Table
 
@@ -22,7 +21,7 @@ from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import REPORT, describe
 from firmware_py.inject import check_injections, parse_injection
 from firmware_py.run_request import RunRequest
-from hal.bench import load_bench
+from hal.bench import check_pace, load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
@@ -38,7 +37,12 @@ SETTLE_S = 2.0
 def run(
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="How long to run.")] = 10.0,
-    virtual: Annotated[bool, typer.Option("--virtual", help="Virtual time: deterministic, as fast as it can.")] = False,
+    virtual: Annotated[
+        bool, typer.Option("--virtual", help="Emulated bench: as fast as it can instead of a second per second.")
+    ] = False,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
+    ] = False,
     hand: Annotated[
         str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
     ] = None,
@@ -72,6 +76,9 @@ def run(
 ) -> None:
     """Run the instrument in closed loop and report what was left of the tremor.
 
+    An emulated bench runs in emulated time, one second per second, and gives the same result on every machine. Real
+    devices always run in real time.
+
     Example: micron run --virtual --seconds 20 --json -
     """
     with clear_errors():
@@ -80,10 +87,14 @@ def run(
             raise InputError("--scale belongs to --hand FILE; give both or neither")
         if max_effect is not None and not inject:
             raise InputError("--max-effect belongs to --inject; give both or neither")
+        if virtual and realtime:
+            raise InputError("--virtual and --realtime exclude each other; give one of them")
+        file = load_bench(bench_path(bench))
+        pace = check_pace(file, "virtual" if virtual else "realtime" if realtime else None)
         request = RunRequest(
             bench=bench_path(bench),
             seconds=seconds,
-            virtual=virtual,
+            pace=pace,
             hand_file=hand,
             hand_scale=scale,
             record=record,
@@ -93,12 +104,12 @@ def run(
             max_effect=max_effect,
             method=None if method is None else estimator_name(method),
         )
-        check_injections(load_bench(request.bench), [parse_injection(text) for text in request.inject], max_effect)
-        if is_endoscope(load_bench(request.bench).description) and (hand is not None or html is not None or sense_only):
+        check_injections(file, [parse_injection(text) for text in request.inject], max_effect)
+        if is_endoscope(file.description) and (hand is not None or html is not None or sense_only):
             raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
-        if is_endoscope(load_bench(request.bench).description) and method is not None:
+        if is_endoscope(file.description) and method is not None:
             raise InputError("--method belongs to the instrument; an endoscope bench estimates no tremor")
-        outcome, truth = _run_virtual(request) if virtual else _run_real(request)
+        outcome, truth = _run_real(request) if pace == "realtime" else _run_emulated(request)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)
             return
@@ -144,19 +155,12 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
     return {**outcome, **figures}
 
 
-def _run_virtual(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+    """In emulated time nothing waits for the loop, so it runs in this process."""
     from firmware_py.app import run_in_process
 
-    with Progress(
-        TextColumn("virtual time"), BarColumn(), TextColumn("{task.fields[state]}"), TimeRemainingColumn(),
-        console=console(), transient=True,
-    ) as progress:  # fmt: skip
-        bar = progress.add_task("run", total=request.seconds, state="")
-
-        def show(status: dict[str, Any]) -> None:
-            progress.update(bar, completed=status["t_s"], state=status["state"])
-
-        return run_in_process(request, show)
+    with Live(console=console(), refresh_per_second=8, transient=True) as live:
+        return run_in_process(request, lambda status: live.update(_status_table(status, request.seconds)))
 
 
 def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from firmware_py.control.wiring import open_devices
 from hal.bench import OpenBench, load_bench
-from hal.clock import VirtualClock
+from hal.clock import Pace, VirtualClock
 from hal.contracts import Clock
 from hal.errors import HalError
 from hal.middleware.trace import Entry, TraceCan, TraceI2c, TraceSerial, read_transcript
@@ -72,11 +72,11 @@ def run_scenario(bench: OpenBench, seconds: float) -> None:
     devices.daq.stop()
 
 
-def capture(bench_file: Path, out: Path, seconds: float, *, virtual: bool) -> dict[str, int]:
+def capture(bench_file: Path, out: Path, seconds: float, *, pace: Pace | None) -> dict[str, int]:
     """Record the scenario on ``bench_file`` into the new folder ``out``; lines per bus. Raises ``HalError``."""
     out.mkdir(parents=True)
     counts: dict[str, int] = {}
-    with ExitStack() as files, opened_bench(bench_file, virtual=virtual) as bench:
+    with ExitStack() as files, opened_bench(bench_file, pace=pace) as bench:
         for name, spec in bench.file.description.bus.items():
             sink = files.enter_context((out / f"{name}{SUFFIX}").open("w", encoding="ascii"))
             bench.ports[name] = _traced(bench, name, spec.kind, sink)
@@ -121,7 +121,7 @@ def diff(folder: Path, bench_file: Path | None = None) -> GoldenReport:
     bench_path = bench_file or Path(facts["bench_file"])
     entries = {bus: _entries(folder, bus) for bus in facts["kinds"]}
     found = _against_driver(bench_path, entries, facts)
-    with opened_bench(bench_path, virtual=True) as bench:
+    with opened_bench(bench_path, pace="virtual") as bench:
         for bus, kind in facts["kinds"].items():
             if kind == "i2c":
                 found += _i2c_against_emulator(bench, bus, entries[bus])

@@ -125,7 +125,9 @@ def firmware_loop(bench: Path, seconds: float, policy: Policy) -> Lateness:
     fds = (memory.fd, theirs.fileno())
     try:
         with tempfile.TemporaryDirectory(prefix="micron-") as folder:
-            request = RunRequest(bench, seconds, live_fds=fds, truth_s=1.0, stale_ms=1000.0, realtime=policy == "fifo")
+            request = RunRequest(
+                bench, seconds, live_fds=fds, truth_s=1.0, stale_ms=1000.0, pace="realtime", policy=policy == "fifo"
+            )
             request_file = Path(folder) / "request.json"
             request_file.write_text(request.to_json(Path(folder)), encoding="utf-8")
             command = [sys.executable, "-m", "firmware_py.app", str(request_file)]

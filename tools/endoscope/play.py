@@ -62,7 +62,7 @@ def play_on_bench(
         raise InputError(f"{bench_file}: no endoscope bench (a motion card, and no DAQ or amplifier)")
     config = load_endoscope_config(bench)
     config = EndoscopeConfig(**{**config.model_dump(), "game": (game or config.game).model_dump()})
-    request = RunRequest(bench_file, limit_s, virtual=True, record=record, seed=seed)
+    request = RunRequest(bench_file, limit_s, pace="virtual", record=record, seed=seed)
     cards = bench.description.devices_with("motion_card")
     if not cards:
         raise InputError(f"{bench_file}: [device] declares no motion_card that a user could hold")

@@ -151,7 +151,7 @@ def with_wires(
             eighths.add(t_s, last["tip_m"] - last["intended_m"], last["tip_rigid_m"] - last["intended_m"])
         on_time(t_s)
 
-    request = RunRequest(bench, seconds, virtual=True, truth_s=2.0, clock_start_ns=start_ns)
+    request = RunRequest(bench, seconds, pace="virtual", truth_s=2.0, clock_start_ns=start_ns)
     outcome, truth = run_in_process(request, look, on_open=opened.append)
     assert truth is not None
     samples, ticks = outcome["samples"], outcome["ticks"]

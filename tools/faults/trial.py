@@ -121,7 +121,7 @@ def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observati
         far.strike(fault.how, seed)
 
     try:
-        outcome, truth = run_in_process(RunRequest(bench, 0.2, virtual=True, seed=seed), on_open=open_hook)
+        outcome, truth = run_in_process(RunRequest(bench, 0.2, pace="virtual", seed=seed), on_open=open_hook)
     except HalError as error:
         return Observation.refusal(fault.name, point, seed, str(error))
     assert truth is not None
@@ -170,7 +170,7 @@ def observe_running(
         far.attach(opened)
         far.clock.at(at_ns, at_strike)
 
-    request = RunRequest(bench, 60.0, virtual=True, seed=seed)
+    request = RunRequest(bench, 60.0, pace="virtual", seed=seed)
     try:
         outcome, truth = run_in_process(request, on_open=open_hook, wrap=far.wrap)
     except _AllStruck:

@@ -57,7 +57,7 @@ def _emulated() -> list[Row]:
     bench = load_bench(Path(benches.__file__).with_name("imus.toml"))
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
-        open_bench(bench, virtual=True, runtime_dir=Path(folder)) as opened,
+        open_bench(bench, pace="virtual", runtime_dir=Path(folder)) as opened,
     ):
         sensors = open_sensors(opened)
         sensors.start()

@@ -21,7 +21,7 @@ def test_ten_millivolts_are_a_degree():
 
 
 def test_the_room_is_read_through_the_daq():
-    with opened_bench(HERE / "bench.toml", virtual=True) as bench:
+    with opened_bench(HERE / "bench.toml", pace="virtual") as bench:
         (value,) = read_sensors(bench)
         true_C = bench.world.truth()["temperature_C"][-1]
     assert (value.quantity, value.unit) == ("room.temperature", "degC")

@@ -21,7 +21,7 @@ def bench(tmp_path):
 
 
 def test_the_instrument_runs_on_it(bench):
-    outcome, truth = run_in_process(RunRequest(bench, 2.0, virtual=True))
+    outcome, truth = run_in_process(RunRequest(bench, 2.0, pace="virtual"))
     assert set(outcome["devices"]) == {"daq", "piezo"}
     assert outcome["samples"]["lost"] == 0
     assert outcome["safe_state"]["normal"]

@@ -44,5 +44,5 @@ def test_the_instrument_runs_on_it(tmp_path):
     text = (home / "micron.toml").read_text().replace('"di4108"', '"linedaq"')
     text = text.replace("calibration/", f"{home}/calibration/").replace('daq0"\n\n', 'daq0"\nbaud = 1_000_000\n\n')
     file.write_text(text)
-    run, _ = run_in_process(RunRequest(file, 2.0, virtual=True))
+    run, _ = run_in_process(RunRequest(file, 2.0, pace="virtual"))
     assert (run["devices"]["daq"], run["samples"]["lost"], run["safe_state"]["normal"]) == ("linedaq 1", 0, True)

@@ -40,7 +40,7 @@ def test_the_emulator_answers_as_the_data_sheet_says():
 
 
 def test_the_room_is_read_over_the_bus():
-    with opened_bench(Path(__file__).with_name("bench.toml"), virtual=True) as bench:
+    with opened_bench(Path(__file__).with_name("bench.toml"), pace="virtual") as bench:
         (value,) = read_sensors(bench)
         true_C = bench.world.truth()["temperature_C"][-1]
     assert value.value == pytest.approx(true_C, abs=1 / 128)

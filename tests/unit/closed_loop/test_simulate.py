@@ -27,7 +27,7 @@ def left_um(truth, armed_ns: int, safe_ns: int) -> tuple[float, float]:
 
 
 def test_it_leaves_the_tremor_that_a_run_over_the_wire_leaves() -> None:
-    outcome, truth = run_in_process(RunRequest(BENCH, SECONDS, virtual=True))
+    outcome, truth = run_in_process(RunRequest(BENCH, SECONDS, pace="virtual"))
     assert truth is not None
     run = simulate(load_bench(BENCH), SECONDS)
     wire = left_um(truth, outcome["armed_ns"], outcome["safe_ns"])

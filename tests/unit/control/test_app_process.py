@@ -29,7 +29,7 @@ def start(request: RunRequest, folder: Path) -> int:
 
 
 def test_outcome_and_truth_are_left_where_the_request_says(tmp_path: Path, told: list[dict[str, object]]) -> None:
-    assert start(RunRequest(DEFAULT_BENCH, 0.3, virtual=True, seed=4), tmp_path) == 0
+    assert start(RunRequest(DEFAULT_BENCH, 0.3, pace="virtual", seed=4), tmp_path) == 0
     outcome = json.loads((tmp_path / "outcome.json").read_text())
     assert outcome["samples"]["lost"] == 0
     assert outcome["safe_state"]["normal"]
@@ -43,7 +43,7 @@ def test_a_bench_that_cannot_be_is_one_line_and_status_2(
 ) -> None:
     bench = copy_of_default_bench(tmp_path, "")
     bench.write_text(bench.read_text().replace("rate_hz = 1000", "rate_hz = 500"))
-    assert start(RunRequest(bench, 0.3, virtual=True), tmp_path) == 2
+    assert start(RunRequest(bench, 0.3, pace="virtual"), tmp_path) == 2
     said = capsys.readouterr().err
     assert said.startswith("micron: ")
     assert len(said.splitlines()) == 1

@@ -43,6 +43,9 @@ class Events:
         return True
 
 
+HOST_AHEAD_NS = 1_000_000_000_000
+
+
 class Desk:
     """A page at the other end of the control socket, and a loop that may move."""
 
@@ -66,7 +69,13 @@ class Desk:
             Stages,
             SimpleNamespace(command_V=np.array([40.0, 50.0, 60.0]), actuation=SimpleNamespace(params=self.params)),
         )
-        self.orders = PageOrders(self.link, self.manual, stages, self.supervisor, self.incidents, self.clock)
+        self.orders = PageOrders(
+            self.link, self.manual, stages, self.supervisor, self.incidents, self.clock, self.host_ns
+        )
+
+    def host_ns(self) -> int:
+        """The page stamps its orders with the host's clock, which is not the bench's in emulated time."""
+        return self.clock.now_ns() + HOST_AHEAD_NS
 
     def close(self) -> None:
         self.page.close()
@@ -95,7 +104,7 @@ def looking() -> Iterator[Desk]:
 def test_the_safe_button_is_the_operators_end_of_the_run(desk: Desk):
     desk.clock.burn_ns(7 * MS)
     desk.incidents.tick = 7
-    desk.say({"order": "safe", "t_ns": 6_500_000})
+    desk.say({"order": "safe", "t_ns": HOST_AHEAD_NS + 6_500_000})
     reason = "stopped by the operator (safe button of the bench page)"
     assert desk.supervisor.trip_cause == Trip(reason, 7, 7 * MS, normal=True)
     assert desk.orders.asked_safe_ns == 6_500_000

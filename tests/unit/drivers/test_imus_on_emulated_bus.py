@@ -51,7 +51,7 @@ def test_a_sensor_measures_gravity_tests_itself_and_fills_its_fifo(tmp_path: Pat
     path.write_text(BENCH)
     file = load_bench(path)
     options = check_devices(file.description, str(path))
-    with open_bench(file, virtual=True, runtime_dir=tmp_path) as bench:
+    with open_bench(file, pace="virtual", runtime_dir=tmp_path) as bench:
         clock = bench.clock
         imu = open_imu(file.description.device[name], options[name], bench.i2c("i2c0"), clock, name)
         imu.start()
@@ -81,7 +81,7 @@ def test_a_sensor_measures_gravity_tests_itself_and_fills_its_fifo(tmp_path: Pat
 def test_motion_card_on_its_line(tmp_path: Path):
     path = tmp_path / "bench.toml"
     path.write_text(BENCH)
-    with open_bench(load_bench(path), virtual=True, runtime_dir=tmp_path) as bench:
+    with open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path) as bench:
         card = MotionCard(bench.serial("card0"), bench.clock)
         card.probe()
         out = ImuSample()

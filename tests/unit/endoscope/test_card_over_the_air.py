@@ -54,7 +54,7 @@ def test_a_card_over_the_air_is_wired(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(
         bleak_gatt, "BleakGatt", lambda peripheral, clock: made.append(Radio(peripheral, clock)) or made[0]
     )
-    with open_bench(bench, virtual=False, runtime_dir=tmp_path) as opened:
+    with open_bench(bench, pace="realtime", runtime_dir=tmp_path) as opened:
         sensors = open_sensors(opened)
         assert sensors.identities == {"ring": "motion card, battery 42 %"}
         assert made[0].peripheral == "CONTROL.CMR"

@@ -71,7 +71,7 @@ def bench(folder: Path, **words: str) -> Path:
 
 
 def run(path: Path, seconds: float = 2.0, **more: Any) -> tuple[dict[str, Any], dict[str, Any]]:
-    outcome, truth = run_in_process(RunRequest(path, seconds, virtual=True), **more)
+    outcome, truth = run_in_process(RunRequest(path, seconds, pace="virtual"), **more)
     assert truth is not None
     return outcome, truth
 
@@ -127,7 +127,7 @@ def test_a_silent_card_holds_the_view_and_ends_the_run(tmp_path: Path) -> None:
 
 def test_it_records(tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
-    outcome, _ = run_in_process(RunRequest(bench(tmp_path), 1.0, virtual=True, record=file))
+    outcome, _ = run_in_process(RunRequest(bench(tmp_path), 1.0, pace="virtual", record=file))
     assert outcome["recorder"] == {"ticks": outcome["sensors"]["card"]["received"], "dropped": 0}
     recording = Recording(file)
     assert recording.column("view_x")[-1] == pytest.approx(outcome["view"]["x"], abs=1.0)

@@ -124,7 +124,7 @@ def test_the_firmware_itself_refuses_too(lab: Path):
 
 
 def test_an_injected_fault_happens_is_counted_and_named():
-    request = RunRequest(DEFAULT_BENCH, 0.5, virtual=True, inject=("daq0:silent_after_s=1.0",))
+    request = RunRequest(DEFAULT_BENCH, 0.5, pace="virtual", inject=("daq0:silent_after_s=1.0",))
     outcome, _ = run_in_process(request)
     assert outcome["injected"]["daq0"]["silenced"] > 0
     assert "daq: no new scan for 5 ms" in outcome["safe_state"]["reason"]

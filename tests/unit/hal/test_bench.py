@@ -80,7 +80,7 @@ def test_virtual_time_refuses_real_buses(tmp_path: Path):
     path = edited(tmp_path, 'uri = "sim://can0"', 'uri = "socketcan://can0"')
     with (
         pytest.raises(BenchError, match="virtual time needs every bus emulated"),
-        open_bench(load_bench(path), virtual=True, runtime_dir=tmp_path),
+        open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path),
     ):
         pass
 
@@ -89,7 +89,7 @@ def test_unknown_provider_is_named(tmp_path: Path):
     path = edited(tmp_path, "sim_devices.register:provider", "sim_devices.nowhere:provider")
     with (
         pytest.raises(BenchError, match=r"emulation.provider.*nowhere"),
-        open_bench(load_bench(path), virtual=True, runtime_dir=tmp_path),
+        open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path),
     ):
         pass
 
@@ -129,7 +129,7 @@ def test_all_ports_that_cannot_be_opened_are_told_at_once(tmp_path: Path):
     path.write_text(text.replace("sim://can0", "socketcan://nocan9"))
     with (
         pytest.raises(OpenFailed) as caught,
-        open_bench(load_bench(path), virtual=False, runtime_dir=tmp_path),
+        open_bench(load_bench(path), pace="realtime", runtime_dir=tmp_path),
     ):
         pass
     for word in ("/dev/no-daq", "97", "nocan9"):
@@ -149,6 +149,6 @@ def test_a_recorded_hand_moves_no_real_instrument(tmp_path: Path):
     path.write_text(text)
     with (
         pytest.raises(BenchError, match="--hand moves an emulated instrument, but this bench is all real"),
-        open_bench(load_bench(path), virtual=False, runtime_dir=tmp_path, hand_file=Path("hand.csv")),
+        open_bench(load_bench(path), pace="realtime", runtime_dir=tmp_path, hand_file=Path("hand.csv")),
     ):
         pass

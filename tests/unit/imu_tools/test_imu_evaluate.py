@@ -220,7 +220,7 @@ gyro_range_dps = 2000.0
 def test_auto_calibration_in_the_registers_of_each_chip(driver: str, tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     path.write_text(BENCH.format(driver=driver, address=CHIPS[driver]))
-    with open_bench(load_bench(path), virtual=True, runtime_dir=tmp_path) as opened:
+    with open_bench(load_bench(path), pace="virtual", runtime_dir=tmp_path) as opened:
         sensors = open_sensors(opened)
         sensors.start()
         chip = sensors.by_name["chip"]

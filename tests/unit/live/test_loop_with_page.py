@@ -17,7 +17,7 @@ def test_frames_histograms_and_numbers_reach_the_page():
     memory = LiveMemory.create(LAYOUT.size, 8192)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     told: list[dict[str, Any]] = []
-    request = RunRequest(DEFAULT_BENCH, 0.5, virtual=True, live_fds=(os.dup(memory.fd), theirs.detach()))
+    request = RunRequest(DEFAULT_BENCH, 0.5, pace="virtual", live_fds=(os.dup(memory.fd), theirs.detach()))
     try:
         outcome, _ = run_in_process(request, told.append)
         assert outcome["safe_state"]["normal"]

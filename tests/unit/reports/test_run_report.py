@@ -19,7 +19,7 @@ from tools.reports.run_report import headline, summary_lines, task_table
 @pytest.fixture(scope="module")
 def sensed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     bench: Path = DEFAULT_BENCH
-    return complete_result(*run_in_process(RunRequest(bench, 0.5, virtual=True, sense_only=True)))
+    return complete_result(*run_in_process(RunRequest(bench, 0.5, pace="virtual", sense_only=True)))
 
 
 def test_a_run_that_arms_nothing_says_so(sensed: dict[str, Any]):
