@@ -135,6 +135,7 @@ _ROTATION = Effect(
     sites=("output",),
     available=_turnable,
     shared=True,
+    vanishes_with=(("rotation_*",),),
 )
 
 MISALIGNMENT = Effect(
@@ -154,6 +155,7 @@ MISALIGNMENT = Effect(
     sites=("output",),
     available=_available,
     variants=(_ROTATION,),
+    vanishes_with=(("angle_to_*",),),
 )
 
 # -- soft iron --------------------------------------------------------------------------------------
@@ -202,6 +204,7 @@ SOFT_IRON = Effect(
     shared=True,
     twins=("magnetometer",),
     available=_available,
+    vanishes_with=(("x?", "y?", "z?"),),
 )
 
 # -- quadratic cross-axis bias ----------------------------------------------------------------------
@@ -247,6 +250,7 @@ CROSS_AXIS_NONLINEARITY = Effect(
     driven=False,
     sites=("output",),
     available=_available,
+    vanishes_with=(("k_*",),),
 )
 
 # -- scale factor that follows another axis ---------------------------------------------------------
@@ -294,4 +298,5 @@ SCALE_FACTOR_VARIATION = Effect(
     driven=False,
     sites=("output",),
     available=_available,
+    vanishes_with=(("scale_change_per_*",),),
 )

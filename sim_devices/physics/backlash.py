@@ -62,4 +62,6 @@ BACKLASH = Effect(
     guess=_guess,
     basis=_basis,
     report=_report,
+    vanishes_with=(("gap",), ("slope_lost_inside",)),
+    essential=("half_gap",),
 )

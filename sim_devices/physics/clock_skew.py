@@ -92,6 +92,8 @@ _SMOOTH_SKEW = Effect(
     apply=_skew_apply,
     report=_skew_report,
     sites=("output",),
+    vanishes_with=(("skew_ppm", "skew_change_ppm"),),
+    essential=("skew_ppm",),
 )
 
 

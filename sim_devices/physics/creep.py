@@ -100,4 +100,5 @@ CREEP = Effect(
     report=_report,
     # minus one is a mean that is lost (ac_coupling), several times the response at once is a lag
     limits={"total_fraction": (-0.8, 1.5)},
+    vanishes_with=(("fraction_per_decade", "total_fraction"),),
 )

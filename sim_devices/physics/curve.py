@@ -113,4 +113,5 @@ STATIC_NONLINEARITY = Effect(
     prepare=_curve_prepare,
     basis=_curve_basis,
     report=_curve_report,
+    vanishes_with=(("deviation_from_line",),),
 )

@@ -69,4 +69,6 @@ DEAD_ZONE = Effect(
     guess=_dead_guess,
     basis=_dead_basis,
     report=_dead_report,
+    vanishes_with=(("half_width",), ("slope_lost_inside",)),
+    essential=("half_width",),
 )

@@ -69,6 +69,8 @@ _SMOOTH_DELAY = Effect(
     guess=_delay_guess,
     apply=_delay_apply,
     report=_delay_report,
+    vanishes_with=(("delay_s",),),
+    essential=("delay_s",),
 )
 
 # an edge within one sample is late by a straight line or by a curve, and that alone may look like a lag
@@ -90,6 +92,8 @@ _SMOOTH_CHANNEL = Effect(
     apply=_delay_apply,
     report=_delay_report,
     sites=("output",),
+    vanishes_with=(("delay_s",),),
+    essential=("delay_s",),
 )
 
 _STRAIGHT_CHANNEL = replace(

@@ -216,6 +216,14 @@ class Effect:
         default_factory=dict[str, tuple[tuple[float, float], ...]]
     )
     """The same the other way round: ranges of human parameters that are by definition another effect's."""
+    vanishes_with: tuple[tuple[str, ...], ...] = ()
+    """Groups of human parameters (``report``; patterns such as ``amplitude_*``). The effect is absent when every
+    parameter of any one group is zero, so it is named only where the data exclude that. Empty: one group of all.
+    """
+    essential: tuple[str, ...] = ()
+    """Searched parameters without which the effect says nothing: it is not named when one ends at its bound."""
+    plain: str = ""
+    """Vocabulary name of the simpler effect that it generalises, tried in its place when it is not borne out."""
 
     @property
     def form(self) -> tuple[str, str, str]:

@@ -110,6 +110,7 @@ TEMPERATURE_SENSITIVITY = Effect(
     sites=("output",),
     needs=("temperature",),
     available=_temp_available,
+    vanishes_with=(("bias_per_K", "bias_per_K2", "scale_per_K"),),
 )
 
 # -- supply -----------------------------------------------------------------------------------------
@@ -149,6 +150,7 @@ SUPPLY_SENSITIVITY = Effect(
     sites=("output",),
     needs=("supply",),
     available=_supply_available,
+    vanishes_with=(("bias_per_V", "bias_per_V2", "scale_per_V", "ratiometric_share"),),
 )
 
 # -- current ----------------------------------------------------------------------------------------
@@ -195,4 +197,5 @@ CURRENT_COUPLING = Effect(
     driven=False,
     sites=("output",),
     available=_current_available,
+    vanishes_with=(("per_A", "per_A2"),),
 )

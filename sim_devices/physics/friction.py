@@ -164,6 +164,7 @@ SMOOTH_SPRING = Effect(
     basis=_lugre_basis,
     fill=_lugre_fill,
     report=_spring_report,
+    vanishes_with=(("force_loop_half_height",),),
 )
 
 _LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"
@@ -182,6 +183,7 @@ _BRISTLES = Effect(
     basis=_lugre_basis,
     fill=_lugre_fill,
     report=_lugre_report,
+    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
 )
 
 
@@ -236,6 +238,7 @@ _GENTLE = Effect(
     basis=_gentle_basis,
     fill=_gentle_fill,
     report=_gentle_report,
+    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
 )
 
 COULOMB_FRICTION = Effect(
@@ -253,6 +256,7 @@ COULOMB_FRICTION = Effect(
     fill=_coulomb_fill,
     report=_coulomb_report,
     variants=(_BRISTLES, _GENTLE),
+    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
 )
 
 
@@ -358,6 +362,7 @@ _STRIBECK_BRISTLES = Effect(
     basis=_stribeck_bristle_basis,
     fill=_stribeck_bristle_fill,
     report=_stribeck_bristle_report,
+    vanishes_with=(("coulomb_forward", "coulomb_backward", "static_friction"),),
 )
 
 STRIBECK_FRICTION = Effect(
@@ -376,4 +381,5 @@ STRIBECK_FRICTION = Effect(
     fill=_stribeck_fill,
     report=_stribeck_report,
     variants=(_STRIBECK_BRISTLES,),
+    vanishes_with=(("coulomb_forward", "coulomb_backward", "static_friction"),),
 )

@@ -375,6 +375,7 @@ _FORCE = Effect(
     basis=_force_basis,
     fill=_force_fill,
     report=_force_report,
+    vanishes_with=(("force_loop_half_height",),),
 )
 
 HYSTERESIS = Effect(
@@ -392,4 +393,5 @@ HYSTERESIS = Effect(
     basis=_basis,
     report=_report,
     variants=(_FORCE,),
+    vanishes_with=(("loop_width_share",),),
 )

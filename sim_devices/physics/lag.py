@@ -79,6 +79,8 @@ FIRST_ORDER_LAG = Effect(
     guess=_guess,
     apply=_apply,
     report=_report,
+    vanishes_with=(("time_constant_s",),),
+    essential=("time_constant_s",),
 )
 
 

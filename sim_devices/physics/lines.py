@@ -263,6 +263,7 @@ MAINS_INTERFERENCE = Effect(
     report=_line_report,
     driven=False,
     sites=("output",),
+    vanishes_with=(("amplitude_*",),),
 )
 
 VIBRATION = Effect(
@@ -284,4 +285,5 @@ VIBRATION = Effect(
     sites=("output",),
     # a mains line that wanders has skirts beside the band where its own search looks
     forbidden={"frequency_Hz": tuple((0.99 * m, 1.01 * m) for m in MAINS_HZ)},
+    vanishes_with=(("amplitude_*",),),
 )

@@ -127,4 +127,6 @@ RATE_DEPENDENT_HYSTERESIS = Effect(
     report=_report,
     # a loop that stays as wide over a factor of forty in speed is rate-independent memory, whatever fits it
     limits={"change_with_speed": (0.08, np.inf)},
+    vanishes_with=(("loop_width_share_*",), ("change_with_speed",)),
+    plain="hysteresis",
 )

@@ -126,4 +126,6 @@ RESONANCE = Effect(
     report=_report,
     # more damping makes a lag
     limits={"damping_ratio": (0.0, 0.5)},
+    vanishes_with=(("share", "rate_share"),),
+    essential=("frequency_Hz",),
 )

@@ -75,6 +75,7 @@ CENTRIPETAL_ACCELERATION = Effect(
     shared=True,
     twins=("accelerometer_cluster",),
     available=_available,
+    vanishes_with=(("share",),),
 )
 
 
@@ -127,4 +128,5 @@ SENSOR_POSITION_ERROR = Effect(
     shared=True,
     twins=("accelerometer_cluster",),
     available=_available,
+    vanishes_with=(("displacement_*",),),
 )

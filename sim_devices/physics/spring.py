@@ -67,6 +67,7 @@ _CUBIC = Effect(
     basis=_spring_basis,
     fill=_spring_fill,
     report=_spring_report,
+    vanishes_with=(("cubic_stiffness", "quadratic_stiffness", "quintic_stiffness"),),
 )
 
 
@@ -179,4 +180,6 @@ COGGING_FORCE = Effect(
     basis=_cog_basis,
     fill=_cog_fill,
     report=_cog_report,
+    vanishes_with=(("amplitude_*",),),
+    essential=("period",),
 )

@@ -196,6 +196,7 @@ _LEVELS = Effect(
     report=_step_report,
     driven=False,
     sites=("output",),
+    vanishes_with=(("step[0-9]*",),),
 )
 
 # -- steps seen by their edges ----------------------------------------------------------------------

@@ -146,6 +146,7 @@ _LATE = Effect(
     sites=("output",),
     # what rises within a fifth of the record (4.4 widths from a tenth to nine) is a step
     limits={"share_of_record": (0.05, np.inf)},
+    vanishes_with=(("drift_over_record",),),
 )
 
 _TWO = Effect(
@@ -164,6 +165,7 @@ _TWO = Effect(
     report=_warm_report,
     driven=False,
     sites=("output",),
+    vanishes_with=(("drift_over_record", "slow_amplitude", "fast_amplitude"),),
 )
 
 # two exponentials fitted to one leave both times loose: the simplest that serves has the interval that holds

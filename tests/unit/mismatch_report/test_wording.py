@@ -6,7 +6,7 @@ from dataclasses import replace
 import pytest
 
 from tests.unit.mismatch_report.canned import agrees, creep, missing_physics
-from tools.mismatch.engine.report import ParameterValue
+from tools.mismatch.engine.report import ParameterValue, Withheld
 from tools.mismatch.report import wording
 
 
@@ -101,3 +101,15 @@ def test_no_probability_is_believed_beyond_what_a_tail_can_say():
 
 def test_two_figures_side_by_side_need_no_power_of_ten() -> None:
     assert [wording.number(v) for v in (7064.2, 890.1, 0.0123456, 2.5e7)] == ["7060", "890", "0.0123", "2.5e+07"]
+
+
+def test_why_an_effect_is_not_named_is_said_with_the_figures_that_show_it():
+    gap = ParameterValue(7e-5, "um", (-2.9e-4, 4.3e-4))
+    held = Withheld("backlash", "displacement", "holds_zero", {"gap": gap}, ("gap",), 0.41, 0.4)
+    assert wording.why_withheld(held, "um") == (
+        "its size may be zero: gap 0.00007 (-0.00029 .. 0.00043) um; 0.41 without it, 0.4 with it (um rms, held out)"
+    )
+    stuck = replace(held, reason="at_limit", shown_by=("half_gap",), replaced_by="hysteresis")
+    said = wording.why_withheld(stuck, "um")
+    assert said.startswith("half gap ended at a limit of the search")
+    assert said.endswith("hysteresis is named instead")

@@ -28,6 +28,7 @@ from tools.mismatch.engine.report import (
     Report,
     Verdict,
     Window,
+    Withheld,
 )
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import held_rms
@@ -63,16 +64,17 @@ def assemble(
     said: Sequence[str] = (),
     official: Problem | None = None,
     jobs: int = 1,
+    withheld: Sequence[Withheld] = (),
 ) -> Report:
     """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
-    free run, when the decisions were made on shorter stretches.
+    free run, when the decisions were made on shorter stretches; ``withheld``: effects that are not named.
     """
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
     verdict, p = decide(problem, raw, base, selection, left, rule)
     cov = covariance(problem, fitted)
-    physics = physics_found(problem, selection, cov)
-    runners, groups = alternatives(problem, selection, rule)
+    runners, groups, alike = alternatives(problem, selection, rule)
+    physics = physics_found(problem, selection, cov, alike)
     looked = fitted if verdict == "unexplained" else base
     if verdict == "missing_physics":
         touched = [o for o in twin.outputs if any(o in f.outputs for f in physics)]
@@ -171,6 +173,7 @@ def assemble(
             }
             for t in selection.first
         ),
+        withheld=tuple(withheld),
         pictures=Pictures(
             rec.t[problem.index],
             held,

@@ -13,6 +13,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import assemble
 from tools.mismatch.engine.checks import messages
+from tools.mismatch.engine.evidence import weigh_evidence
 from tools.mismatch.engine.fit import Fit, fit, fit_base
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
@@ -165,6 +166,7 @@ def _diagnose(
         if strange is not None:
             # the effects only imitated it: nothing is named
             selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
+    selection, withheld = weigh_evidence(problem, selection, catalogue)
     fitted = selection.fitted
     outputs = twin.outputs
     remains: list[Leftover] = mapped(problem, leftover, [(problem, fitted, o) for o in outputs], jobs)
@@ -182,7 +184,7 @@ def _diagnose(
         official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
         base = over_the_whole(problem, official, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, official, selection.fitted))
-    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld)
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:

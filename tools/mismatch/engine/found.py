@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from scipy.stats import norm
 from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.identifiability import experiment
-from tools.mismatch.engine.parsimony import Rule, as_good
+from tools.mismatch.engine.parsimony import Rule, as_good, complexity
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Alternative, Equivalent, ParameterValue, PhysicsFound
 from tools.mismatch.engine.revise import reduced
@@ -72,8 +72,22 @@ def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: 
     return trial_unit.replace("{in}", units.get(source, "1")).replace("{out}", moves)
 
 
-def physics_found(problem: Problem, selection: Selection, cov: Array) -> list[PhysicsFound]:
-    """Accepted effects in the order of their acceptance, parameters from the joint fit and its covariance."""
+def parameters_of(
+    problem: Problem, placed: Placed, output: str, values: Mapping[str, ParameterValue]
+) -> dict[str, ParameterValue]:
+    """Human parameters of a placed effect with the units of the signals that it stands between."""
+    return {
+        n: ParameterValue(v.value, _units(problem, v.unit, placed.target, output, placed), v.ci95)
+        for n, v in values.items()
+    }
+
+
+def physics_found(
+    problem: Problem, selection: Selection, cov: Array, alike: Mapping[str, Sequence[Trial]]
+) -> list[PhysicsFound]:
+    """Accepted effects in the order of their acceptance, parameters from the joint fit and its covariance.
+    ``alike``: per label the rivals that this recording cannot tell from it.
+    """
     fitted = selection.fitted
     if not fitted.model.placed:
         return []
@@ -89,16 +103,15 @@ def physics_found(problem: Problem, selection: Selection, cov: Array) -> list[Ph
         step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
         sure = float(norm.cdf(min(c.z, 8.0)))
         if step is not None:
-            sure *= against_rivals(selection.steps[step], selection.rivals[step])
+            same = alike.get(placed.label, ())
+            others = [t for t in selection.rivals[step] if t.name not in {a.name for a in same}]
+            sure *= against_rivals(selection.steps[step], others) * share_among(selection.steps[step], same)
         a, b = fitted.model.slices(k)
         raw = {
             fitted.model.parameters[i].name.rsplit(".", 1)[-1]: float(fitted.theta[i])
             for i in (*range(a.start, a.stop), *range(b.start, b.stop))
         }
-        parameters = {
-            n: ParameterValue(v.value, _units(problem, v.unit, placed.target, worst, placed), v.ci95)
-            for n, v in values.get(placed.label, {}).items()
-        }
+        parameters = parameters_of(problem, placed, worst, values.get(placed.label, {}))
         out.append(
             PhysicsFound(
                 placed.effect.name,
@@ -135,10 +148,27 @@ def against_rivals(step: Trial, rivals: Sequence[Trial]) -> float:
     return sure
 
 
-def alternatives(problem: Problem, selection: Selection, rule: Rule) -> tuple[list[Alternative], list[Equivalent]]:
-    """Runners-up of each step with why not, and groups that this recording cannot tell apart."""
+PER_PARAMETER = 0.4
+"""Nats that a free parameter costs: the lower end of what two sets of generated cases gave (0.4 to 0.9), so that the
+plainer of two equals is preferred by no more than was seen."""
+
+
+def share_among(step: Trial, alike: Sequence[Trial]) -> float:
+    """Probability of the named effect among those that fit as well: their likelihoods count as equal, so only what
+    further parameters cost tells them apart. A rival with fewer parameters counts as much as the named effect.
+    """
+    odds = (np.exp(-PER_PARAMETER * max(complexity(t) - complexity(step), 0.0)) for t in alike)
+    return 1.0 / (1.0 + float(sum(odds)))
+
+
+def alternatives(
+    problem: Problem, selection: Selection, rule: Rule
+) -> tuple[list[Alternative], list[Equivalent], dict[str, list[Trial]]]:
+    """Runners-up of each step with why not, groups that this recording cannot tell apart, and the rivals of these
+    groups by the label of the effect that is named."""
     out: list[Alternative] = []
     groups: list[Equivalent] = []
+    same_by_label: dict[str, list[Trial]] = {}
     named = {p.effect.name for p in selection.fitted.model.placed}
     rows = problem.held_rows
     before = misfits(problem, selection.base)
@@ -161,4 +191,5 @@ def alternatives(problem: Problem, selection: Selection, rule: Rule) -> tuple[li
         if alike:
             names = (step.name, *(t.name for t in alike))
             groups.append(Equivalent(names, experiment(step.placed.effect, alike[0].placed.effect)))
-    return out, groups
+            same_by_label[step.label] = alike
+    return out, groups, same_by_label

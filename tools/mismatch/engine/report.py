@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
+WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance"]
 
 
 @dataclass(frozen=True)
@@ -67,6 +68,23 @@ class PhysicsFound:
     raw: Mapping[str, float]
     note: str = ""
     at_bound: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Withheld:
+    """An effect that lowered the residual and is not named. ``shown_by``: the parameters (of ``parameters``, or
+    searched ones) whose interval holds zero or that ended at a limit of the search. ``residual_rms_without`` and
+    ``_with`` are held out; ``replaced_by``: the plainer effect that is named in its place.
+    """
+
+    name: str
+    output: str
+    reason: WithheldReason
+    parameters: Mapping[str, ParameterValue]
+    shown_by: tuple[str, ...]
+    residual_rms_without: float
+    residual_rms_with: float
+    replaced_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -154,6 +172,8 @@ class Report:
     chain: tuple[str, ...]
     corrected_base: Mapping[str, Any]
     tested: tuple[Mapping[str, Any], ...] = ()
+    withheld: tuple[Withheld, ...] = ()
+    """Effects that were tried and are not named, with the reason."""
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
 
     def to_json(self) -> dict[str, Any]:

@@ -56,6 +56,7 @@ def html_page(report: Report) -> str:
         percent=percent,
         words=words,
         scaled=wording.scaled,
+        why_withheld=wording.why_withheld,
     )
 
 

@@ -163,6 +163,12 @@ def render(report: Report) -> RenderableType:
         parts.append(_section("Base parameters", _base(report)))
     if report.alternatives:
         parts.append(_section("Runners-up", _runners_up(report)))
+    if report.withheld:
+        of = [
+            (words(w.name), f"{w.output}: {wording.why_withheld(w, report.fit.unit.get(w.output, ''))}")
+            for w in report.withheld
+        ]
+        parts.append(_section("Tried and not named", _pairs(of)))
     if report.equivalent:
         lines = [f"{' = '.join(words(n) for n in e.names)}: {words(e.tell_apart_by)}" for e in report.equivalent]
         parts.append(_section("This recording cannot tell apart (what would)", Text("\n".join(lines))))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tools.mismatch.engine.report import BaseShift, FitSummary, Location, ParameterValue, PhysicsFound, Report
+from tools.mismatch.engine.report import BaseShift, FitSummary, Location, ParameterValue, PhysicsFound, Report, Withheld
 
 VERDICTS: Mapping[str, str] = {
     "agrees": "Agrees",
@@ -152,3 +152,23 @@ def before_after(p: PhysicsFound, unit: str) -> str:
     factor, unit = scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
     without, within = number(p.residual_rms_before * factor), number(p.residual_rms_after * factor)
     return f"{without} without it, {within} with it ({unit} rms, held out)"
+
+
+def why_withheld(w: Withheld, unit: str) -> str:
+    """Why an effect that lowered the residual is not named, with the figures that show it."""
+    names = ", ".join(words(n) for n in w.shown_by)
+    if w.reason == "below_tolerance":
+        why = "the difference that it makes is below your tolerance"
+    elif w.reason == "at_limit":
+        why = f"{names} ended at a limit of the search"
+    else:
+        shown = []
+        for n in w.shown_by[:3]:
+            p = w.parameters[n]
+            value, lo, hi = interval(p)
+            shown.append(f"{label(n, p.unit)} {value} ({lo} .. {hi}) {'' if p.unit == '1' else p.unit}".rstrip())
+        why = f"its size may be zero: {', '.join(shown)}"
+    factor, scaled_unit = scaled(max(w.residual_rms_without, w.residual_rms_with), unit)
+    without, within = number(w.residual_rms_without * factor), number(w.residual_rms_with * factor)
+    instead = f"; {words(w.replaced_by)} is named instead" if w.replaced_by else ""
+    return f"{why}; {without} without it, {within} with it ({scaled_unit} rms, held out){instead}"

@@ -1,0 +1,158 @@
+"""No name without evidence: recordings integrated here, an effect that is not in them, and what the report may say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import RATE, recording, wave
+from tools.mismatch.engine.diagnose import diagnose, prepared
+from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero, weigh_evidence
+from tools.mismatch.engine.found import share_among
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import ParameterValue, Report
+from tools.mismatch.engine.revise import added
+from tools.mismatch.engine.screen import Candidate, places
+from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.trial import Trial
+from tools.mismatch.placed import Placed
+from tools.mismatch.recording import Recording
+
+
+def stage(seed: int, *, coulomb: float = 0.0, late_samples: float = 0.0) -> Recording:
+    """A sprung stage in semi-implicit Euler steps, thirty to a sample; ``coulomb`` N of friction, force ``late``."""
+    rng = np.random.default_rng(seed)
+    n, sub = 3000, 30
+    force = 3.0 * wave(rng, n, low=0.3, high=6.0)
+    fine = np.interp((np.arange(n * sub) / sub) - late_samples, np.arange(n), force)
+    h, x, v = 1 / (RATE * sub), 0.0, 0.0
+    position = np.empty(n)
+    for i in range(n):
+        position[i] = x
+        for f in fine[i * sub : (i + 1) * sub]:
+            push = f - 4.0 * v - 900.0 * x
+            if coulomb > 0.0:
+                push = push - coulomb * np.sign(v) if v else push - np.clip(push, -coulomb, coulomb)
+            new = v + h * push / 0.5
+            v, x = (0.0 if coulomb and new * v < 0 else new), x + h * new
+    measured = position + rng.normal(0, 2e-6, n)
+    believed: dict[str, object] = {"mass": 0.5, "damping": 4.0, "stiffness": 900.0, "offset_force": 0.0}
+    return recording("mechanical_axis", {"force": force}, {"position": measured}, believed)
+
+
+def with_effect(made: Recording, name: str) -> tuple[Problem, Selection]:
+    """A selection that holds one effect, as if a search had accepted it."""
+    problem, _, base = prepared(made, 0.3, 0, False)
+    place = places(problem, [EFFECTS[name]], ())[0]
+    with np.errstate(all="ignore"):
+        fitted = added(problem, base, place)
+    return problem, Selection(problem, base, fitted, (), ())
+
+
+def borne_out(report: Report) -> None:
+    """Every name on the page has a size that is not zero and did not end at a limit that matters."""
+    for p in report.physics:
+        effect = EFFECTS[p.name]
+        assert not any(b.endswith(f".{n}") for b in p.at_bound for n in effect.essential)
+        assert any(not holds_zero(v) for v in p.parameters.values())
+    for group in report.equivalent:
+        named = [p for p in report.physics if p.name == group.names[0]]
+        assert all(p.confidence < 1.0 for p in named)
+
+
+@pytest.mark.parametrize("name", ["backlash", "dead_time", "first_order_lag", "coulomb_friction"])
+def test_an_effect_that_is_not_there_is_not_named_though_a_search_took_it(name: str) -> None:
+    problem, selection = with_effect(stage(3), name)
+    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
+    assert kept.fitted.model.placed == ()
+    assert [w.name for w in withheld] == [name]
+    assert withheld[0].reason in ("holds_zero", "at_limit")
+    assert withheld[0].shown_by
+
+
+def test_friction_that_is_there_stays() -> None:
+    problem, selection = with_effect(stage(4, coulomb=0.3), "coulomb_friction")
+    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
+    assert [p.effect.name for p in kept.fitted.model.placed] == ["coulomb_friction"]
+    assert withheld == ()
+
+
+@pytest.mark.parametrize(
+    ("seed", "coulomb"), [(0, 0.0), *(pytest.param(s, c, marks=pytest.mark.slow) for s in (1, 2) for c in (0.0, 0.2))]
+)
+def test_every_name_of_a_whole_diagnosis_is_borne_out(seed: int, coulomb: float) -> None:
+    report = diagnose(stage(20 + seed, coulomb=coulomb), jobs=1)
+    borne_out(report)
+    assert [p.name for p in report.physics] == (["coulomb_friction"] if coulomb else [])
+
+
+def test_which_groups_of_parameters_may_be_zero() -> None:
+    def value(v: float, half: float) -> ParameterValue:
+        return ParameterValue(v, "1", (v - half, v + half))
+
+    backlash = EFFECTS["backlash"]
+    assert absent_groups(backlash, {"gap": value(7e-5, 3.6e-4), "slope_lost_inside": value(1.0, 0.1)}) == [
+        (0, ("gap",))
+    ]
+    assert absent_groups(backlash, {"gap": value(1.0, 0.1), "slope_lost_inside": value(0.9, 0.1)}) == []
+    # any amplitude of a line will do
+    lines = EFFECTS["vibration"]
+    assert absent_groups(lines, {"amplitude_1": value(1.0, 0.1), "amplitude_2": value(0.0, 0.1)}) == []
+    # an interval that nobody could work out excludes nothing
+    assert holds_zero(ParameterValue(1.0, "1", (float("nan"), float("nan"))))
+    assert not holds_zero(ParameterValue(4.0, "1", (4.0, 4.0)))
+
+
+def test_a_loop_whose_change_with_speed_may_be_zero_is_a_plain_loop() -> None:
+    made = slow_loop()
+    problem, selection = with_effect(made, "rate_dependent_hysteresis")
+    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
+    names = [p.effect.name for p in kept.fitted.model.placed]
+    assert [(w.name, w.replaced_by) for w in withheld] == [("rate_dependent_hysteresis", "hysteresis")]
+    assert names == ["hysteresis"]
+    doubt = doubt_of(selection.fitted.model.placed[0], 0, RATE_FREE, ())
+    assert doubt is not None
+    assert doubt.shown_by == ("change_with_speed",)
+
+
+def slow_loop() -> Recording:
+    """Triangles of one speed through a Bouc-Wen loop, Euler steps."""
+    rng = np.random.default_rng(7)
+    t = np.arange(6000) / RATE
+    u = 50 + 40 * (2 * np.abs(2 * ((0.5 * t) % 1.0) - 1) - 1)
+    z = np.zeros(t.size)
+    for i in range(1, t.size):
+        d = (u[i] - u[i - 1]) / 16.0
+        z[i] = z[i - 1] + d - 0.5 * abs(d) * z[i - 1] - 0.5 * d * abs(z[i - 1])
+    y = 1.0 + 0.12 * u + 0.4 * z + rng.normal(0, 0.02, t.size)
+    return recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 0.12, "offset_um": 1.0})
+
+
+RATE_FREE = {
+    "loop_width_share_slow": ParameterValue(0.1, "1", (0.09, 0.11)),
+    "loop_width_share_fast": ParameterValue(0.11, "1", (0.1, 0.12)),
+    "change_with_speed": ParameterValue(0.1, "1", (-5.6, 5.7)),
+}
+
+
+def test_a_record_of_one_speed_does_not_say_that_a_loop_changes_with_speed() -> None:
+    report = diagnose(slow_loop(), jobs=1)
+    borne_out(report)
+    for p in report.physics:
+        if p.name == "rate_dependent_hysteresis":
+            assert not holds_zero(p.parameters["change_with_speed"])
+
+
+def test_those_that_cannot_be_told_apart_share_what_is_sure() -> None:
+    def trial(parameters: int) -> Trial:
+        line = EFFECTS["vibration"]
+        orders = tuple(float(i + 1) for i in range(parameters))
+        placed = Placed(line, "output", "position", "environment", ("position",), {"harmonics": orders})
+        return Trial(placed, Candidate(placed, 0.5, 1e-9, False, ()), None, None, {}, np.ones((3, 1)), 2)
+
+    step = trial(1)
+    assert share_among(step, ()) == 1.0
+    assert share_among(step, (step,)) == pytest.approx(0.5)
+    assert share_among(step, (step, step)) == pytest.approx(1 / 3)
+    assert 0.5 <= share_among(step, (trial(2),)) < 1.0
