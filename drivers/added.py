@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
-from drivers.options import BusLoad, DaqOptions, Options
-from hal.bench import BenchDescription, DeviceSpec, OpenBench
+from drivers.options import DaqOptions, Options
+from hal.bench import DeviceSpec, OpenBench
 from hal.errors import BenchError
 from hal.plugins import DRIVERS, load, offered
 from hal.types import ChannelInfo
@@ -70,17 +70,6 @@ def added_driver(name: str) -> AddedDriver | None:
 
 def added_names() -> list[str]:
     return sorted(offered(DRIVERS))
-
-
-def added_load(description: BenchDescription, name: str, options: Any) -> BusLoad | None:
-    """Bus time of device ``name`` if its driver is from another package and says what it takes."""
-    spec = description.device[name]
-    driver, bus = added_driver(spec.driver), description.bus.get(spec.bus or "")
-    if driver is None or bus is None or not (asked := driver.bits_per_s(options)):
-        return None
-    speed = {"i2c": "speed_hz", "serial": "baud", "can": "bitrate"}[bus.kind]
-    per_s: int = getattr(bus, speed)
-    return BusLoad(spec.bus or "", name, asked / per_s, f"{asked:g} bit/s / {per_s} Hz")
 
 
 def open_added(bench: OpenBench, name: str, options: Any, volts: Input) -> Any:

@@ -8,6 +8,7 @@ from hal.contracts import CanBus, Clock
 from hal.types import CanFrame
 
 HEARTBEAT_PERIOD_NS = 20_000_000
+HEARTBEAT_BYTES = 1
 
 
 def _crc_table() -> bytes:

@@ -12,6 +12,9 @@ from hal.types import CanFrame, ChannelInfo
 
 BUTTON_LIMIT_NS = 1_500_000_000  # three heartbeats of the button
 RECEIVE_LIMIT = 32
+BUTTON_HZ = 10.0  # while it is pressed; 2 Hz otherwise (micron.dbc)
+FRAMES = {"TELEMETRY_TREMOR": 8, "TELEMETRY_STATE": 8, "STOP_BUTTON": 2}
+"""Data bytes of what is repeated: the first two by ``send_tremor`` and ``send_state``, the last by the button."""
 
 
 class CanTelemetry:

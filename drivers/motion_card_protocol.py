@@ -57,6 +57,11 @@ def decode_battery(value: bytes) -> int:
     return value[0]
 
 
+def line_bytes(fields: Fields) -> int:
+    """Longest line that a card sends, for the load of its serial line."""
+    return LINE_BYTES if fields == "raw" else LONGEST_LINE
+
+
 def decode_line(line: bytes, fields: Fields) -> CardReading:
     """One line without its ``\\r\\n``: ``#:`` and eight numbers, each followed by ``:``. ``ValueError`` if not."""
     parts = line.split(b":")

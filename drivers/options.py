@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import Annotated, Literal
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+Channel = Annotated[int, Field(ge=0, le=7)]
 
 
 class Options(BaseModel):
     """A driver's own keys; unknown ones are refused."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class DaqOptions(Options):
@@ -19,6 +21,17 @@ class DaqOptions(Options):
     rate_hz: float = Field(gt=0)
     channels: tuple[int, ...] = Field(min_length=1)
     range_V: float = Field(gt=0)
+
+
+class OutputOptions(Options):
+    """What every analog output's entry says: limits of the volts at the stack, with the neutral position in between."""
+
+    @model_validator(mode="after")
+    def _neutral_is_between(self) -> OutputOptions:
+        low, neutral, high = (getattr(self, name) for name in ("lo_V", "neutral_V", "hi_V"))
+        if not low <= neutral <= high or low == high:
+            raise ValueError(f"lo_V = {low:g} <= neutral_V = {neutral:g} <= hi_V = {high:g} does not hold")
+        return self
 
 
 def one_of(*allowed: float) -> AfterValidator:
@@ -32,11 +45,128 @@ def one_of(*allowed: float) -> AfterValidator:
     return AfterValidator(check)
 
 
-@dataclass(frozen=True)
-class BusLoad:
-    """Seconds of bus time per second that one device asks for, and how that comes about."""
+class Di4108Options(DaqOptions):
+    """DATAQ DI-4108. ``rate_hz`` per channel must divide 60 MHz/375 (protocol manual, ``srate``)."""
 
-    bus: str
+    rate_hz: float = Field(gt=0, le=160_000)
+    channels: tuple[Channel, ...] = Field(min_length=1, max_length=8)
+    range_V: Annotated[float, one_of(10.0, 5.0, 2.0, 1.0, 0.5, 0.2)]
+
+
+class NiDaqOptions(DaqOptions):
+    """National Instruments analog input through the ``nidaqmx`` package."""
+
     device: str
-    share: float
-    arithmetic: str
+    rate_hz: float = Field(gt=0)
+    channels: tuple[Annotated[int, Field(ge=0, le=31)], ...] = Field(min_length=1)
+    range_V: float = Field(gt=0, le=10)
+
+
+class Adxl203Options(Options):
+    """One ADXL-203: the DAQ channel of each of its axes, named in the instrument's body frame."""
+
+    channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1, max_length=2)
+
+
+class AnalogOptions(Options):
+    """A plain analog quantity on one DAQ channel."""
+
+    channel: Channel
+
+
+class Ads1115Options(Options):
+    """ADS1115, single-ended channels one after the other.
+
+    ``rate_hz``: how often each input of a magnetometer is read, 100 Hz unless said otherwise. A converter that an
+    amplifier monitor reads has the monitor's rate.
+    """
+
+    rate_hz: float | None = Field(default=None, gt=0, le=286.0)
+    full_scale_V: Annotated[float, one_of(6.144, 4.096, 2.048, 1.024, 0.512, 0.256)] = 6.144
+
+
+class Hmc2003Options(Options):
+    """HMC-2003 behind an ADC: the channels of x, y, z; the strap hangs on two digital outputs of the DAQ."""
+
+    channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
+    strap_daq: str = "daq"
+
+
+class AmplifierMonitorOptions(Options):
+    """Monitor voltages of the amplifier's three outputs on an ADC: output volts = ADC volts x ``ratio``.
+
+    ``rate_hz``: readings per second, of one output each; two in five ticks unless said otherwise.
+    """
+
+    channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
+    ratio: float = Field(default=20.0, ge=0.01, le=1000)
+    tolerance_V: float = Field(default=0.5, ge=0.01, le=50.0)
+    settle_ms: float = Field(default=0.3, ge=0, le=10.0)
+    change_V: float = Field(default=0.15, ge=0.01, le=50.0)
+    rate_hz: float | None = Field(default=None, gt=0, le=860.0)
+
+
+class DacAmplifierOptions(OutputOptions):
+    """AD5696R and an amplifier: output volts = DAC volts x ``gain``.
+
+    ``read_back``: every command is read back within its own transfer; takes 0.21 ms more of the bus, and task budgets
+    that leave room for it.
+    """
+
+    gain: float = Field(default=20.0, ge=0.1, le=100)
+    lo_V: float = Field(default=0.0, ge=0)
+    hi_V: float = Field(default=100.0, le=150)
+    neutral_V: float = 50.0
+    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
+    read_back: bool = False
+
+
+class E727Options(OutputOptions):
+    """PI E-727 over GCS 2.0, open loop: volts are commanded as open-loop values."""
+
+    lo_V: float = Field(default=0.0, ge=-30)
+    hi_V: float = Field(default=100.0, le=120)
+    neutral_V: float = 50.0
+    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
+    rate_hz: float = Field(default=100.0, gt=0, le=200)
+
+
+class NiOutputOptions(OutputOptions):
+    """National Instruments analog outputs in front of the amplifier: output volts = card volts x ``gain``."""
+
+    device: str
+    channels: tuple[Annotated[int, Field(ge=0, le=31)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
+    gain: float = Field(default=20.0, ge=0.1, le=100)
+    lo_V: float = Field(default=0.0, ge=-150)
+    hi_V: float = Field(default=100.0, le=150)
+    neutral_V: float = 50.0
+    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
+
+
+class CanAmplifierOptions(Options):
+    """The CAN piezo node of ``drivers/dbc/micron.dbc``."""
+
+    neutral_V: float = Field(default=50.0, ge=0, le=100)
+    slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
+
+
+class CanTelemetryOptions(Options):
+    """Telemetry frames out, stop button in. ``stop_button`` says that a missing button heartbeat is a fault."""
+
+    stop_button: bool = True
+
+
+class MotionCardOptions(Options):
+    """Motion card behind its scanner card. ``fields``: does the text carry counts or g, deg/s and degC?"""
+
+    rate_hz: float = Field(default=100.0, gt=0, le=1000)
+    fields: Literal["raw", "scaled"] = "raw"
+    spike_filter: bool = True
+
+
+class BleMotionCardOptions(Options):
+    """Motion card over Bluetooth Low Energy (extra ``ble``): advertised name or address of the card."""
+
+    peripheral: str = "CONTROL.CMR"
+    rate_hz: float = Field(default=100.0, gt=0, le=100)
+    spike_filter: bool = True

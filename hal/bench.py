@@ -23,6 +23,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from hal.clock import MonotonicClock, Pace, PacedClock, VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
+from hal.toml_file import parse_toml, read_text
 from hal.validation import validate_table
 
 SIM_SCHEME = "sim://"
@@ -110,18 +111,17 @@ class BenchFile:
     description: BenchDescription
 
     def resolve(self, relative: str) -> Path:
-        """A path named in the bench file, relative to the file."""
+        """A path named in the bench file, relative to the file. ``BenchError`` for one that no file can have."""
+        if "\0" in relative:
+            raise BenchError(f"{self.path}: {relative!r} is no path; name a file")
         return (self.path.parent / relative).resolve()
 
 
 def load_bench(path: Path) -> BenchFile:
     """Read and check a bench file. Raises ``BenchError`` with file and key."""
+    text = read_text(path, "name an existing bench file with --bench")
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        raise BenchError(f"{path}: cannot be read ({error}); name an existing bench file with --bench") from error
-    try:
-        table = tomllib.loads(text)
+        table = parse_toml(text, str(path))
     except tomllib.TOMLDecodeError as error:
         raise BenchError(f"{path}: not valid TOML: {error}") from error
     description = validate_table(BenchDescription, table, str(path))

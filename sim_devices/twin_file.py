@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from hal.errors import BenchError
+from hal.toml_file import parse_toml, read_text
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import STAGES, Array, Context, Effect, Settings
 
@@ -101,8 +102,8 @@ def _pass(e: PlacedEffect, x: Array, drive: Array, ctx: Context) -> Array:
 def load_twin(path: Path) -> FileTwin:
     """The twin of a file that ``micron mismatch apply`` wrote. BenchError says what is wrong with it and where."""
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8")).get("twin")
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        table = parse_toml(read_text(path, "name the file that `micron mismatch apply` wrote"), str(path)).get("twin")
+    except tomllib.TOMLDecodeError as error:
         raise BenchError(f"{path}: {error}") from error
     if not isinstance(table, Mapping) or table.get("kind") not in KINDS:
         raise BenchError(f"{path}: no [twin] of a kind that can be run here: {', '.join(KINDS)}")

@@ -13,7 +13,8 @@ from collections.abc import Sequence
 
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, WrongDevice
-from hal.types import ChannelInfo, I2cRead, I2cWrite
+from hal.types import ChannelInfo, I2cOp, I2cRead, I2cWrite
+from hal.wire_bits import i2c_bits
 
 POINTER_CONVERSION, POINTER_CONFIG = 0, 1
 OS_START = 0x8000  # written: start a conversion; read: no conversion is running
@@ -24,6 +25,13 @@ PGA_CODES = {6.144: 0, 4.096: 1, 2.048: 2, 1.024: 3, 0.512: 4, 0.256: 5}
 RATE_CODES = {8: 0, 16: 1, 32: 2, 64: 3, 128: 4, 250: 5, 475: 6, 860: 7}
 WAKE_UP_NS = 50_000  # 25 us typical from power-down, doubled
 RATE_TOLERANCE = 0.10
+SAMPLES_PER_S = 860  # the fastest
+MAX_BUS_HZ = 400_000
+"""Fastest bus without the high-speed master code (data sheet, "High-speed I2C mode"), which no Linux adapter sends."""
+_ORDER: tuple[I2cOp, ...] = (I2cWrite(bytes(3)),)
+_READ: tuple[I2cOp, ...] = (I2cWrite(bytes(1)), I2cRead(2))
+WIRE_BITS = {"order": i2c_bits(_ORDER), "reading": i2c_bits(_READ + _ORDER)}
+"""Bits of ``start_conversion`` (once, and again after an error) and of ``exchange``, which the loop repeats."""
 ORDER_NS = 90_000
 """Address and three bytes at 400 kHz, the fastest without the high-speed master code: no conversion begins before."""
 EXCHANGE_NS = 205_000
@@ -40,7 +48,7 @@ class Ads1115:
         address: int = 0x48,
         *,
         full_scale_V: float = 6.144,
-        rate_sps: int = 860,
+        rate_sps: int = SAMPLES_PER_S,
         name: str = "adc",
     ) -> None:
         if full_scale_V not in PGA_CODES:

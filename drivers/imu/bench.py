@@ -1,7 +1,6 @@
 """Inertial sensors in a bench file: their options, their addresses, their bus time, and how one is made from that.
 
-Bus time is counted as the drivers talk: 9 bits a byte (address and register bytes included), 1 bit for each
-START, repeated START and STOP.
+Bus time is counted as the drivers talk (``hal.wire_bits``).
 """
 
 from __future__ import annotations
@@ -17,10 +16,12 @@ from drivers.imu.bmx055 import Bmx055
 from drivers.imu.bmx055_addresses import check_addresses
 from drivers.imu.lsm6ds3 import Lsm6ds3
 from drivers.imu.mpu6050 import Mpu6050
-from drivers.options import BusLoad, Options, one_of
+from drivers.options import Options, one_of
 from hal.bench import BenchDescription, DeviceSpec
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError
+from hal.types import I2cRead, I2cWrite
+from hal.wire_bits import i2c_bits
 
 
 class ImuOptions(Options):
@@ -61,6 +62,7 @@ IMU_OPTIONS: dict[str, type[ImuOptions]] = {
     "lsm6ds3": Lsm6ds3Options,
     "bmx055": Bmx055Options,
 }
+MAX_BUS_HZ = 400_000  # I2C fast mode, in the data sheets of all three
 LOWEST_ADDRESS = {"mpu6050": 0x68, "lsm6ds3": 0x6A, "bmx055": 0x18}  # the other one is one higher
 
 
@@ -158,8 +160,8 @@ def _strap(pin: str, name: str, address: int) -> str:
     return f"tie {pin} of '{name}' {_level(address ^ 1)} (address = 0x{address ^ 1:02x})"
 
 
-def bus_load(option: ImuOptions, bus: str, speed_hz: int, name: str) -> BusLoad:
-    """Bus time of one sensor, from what its driver transfers per sample, per emptying of its FIFO, and per field."""
+def transactions(option: ImuOptions, name: str) -> list[tuple[str, int, float]]:
+    """What one sensor's driver repeats: its name, bits on the wire, times per second."""
     match option:
         case Mpu6050Options():
             per_sample, per_drain, per_frame, frames_hz = (
@@ -175,17 +177,14 @@ def bus_load(option: ImuOptions, bus: str, speed_hz: int, name: str) -> BusLoad:
             per_sample = _bits(7) + _bits(6) + _bits(1) + _bits(6)
             per_drain, per_frame, frames_hz = _bits(7) + _bits(1) + 2 * _bits(0), 9 * 12, option.rate_hz
     if option.mode == "data ready":
-        bits_per_s = option.rate_hz * per_sample
-        text = f"{option.rate_hz:g} Hz x {per_sample} bit"
+        uses = [("sample", per_sample, option.rate_hz)]
     else:
-        bits_per_s = option.drain_hz * per_drain + frames_hz * per_frame
-        text = f"({option.drain_hz:g} Hz x {per_drain} bit + {frames_hz:g} Hz x {per_frame} bit)"
+        uses = [("emptying of the FIFO", per_drain, option.drain_hz), ("frame", per_frame, frames_hz)]
     if isinstance(option, Bmx055Options) and option.mag_rate_hz:
-        bits_per_s += option.mag_rate_hz * _bits(8)
-        text = f"({text} + {option.mag_rate_hz:g} Hz x {_bits(8)} bit)"
-    return BusLoad(bus, name, bits_per_s / speed_hz, f"{text} / {speed_hz} Hz")
+        uses.append(("field", _bits(8), option.mag_rate_hz))
+    return uses
 
 
 def _bits(n: int) -> int:
-    """Reading ``n`` bytes: address, register, address again, data; START, repeated START, STOP."""
-    return 9 * (3 + n) + 3
+    """Bits of reading ``n`` bytes from a register on."""
+    return i2c_bits((I2cWrite(bytes(1)), I2cRead(n)))

@@ -20,6 +20,7 @@ from hal.contracts import Clock, Float64Array, I2cBus
 from hal.errors import BenchError, HalError, ProtocolError, WrongDevice
 from hal.output_guard import OutputGuard
 from hal.types import ChannelInfo, I2cOp, I2cRead, I2cWrite, OutputLimit
+from hal.wire_bits import i2c_bits
 
 CHANNELS = 3
 WRITE_INPUT, UPDATE, POWER, LDAC_MASK, REFERENCE = 0x10, 0x20, 0x40, 0x50, 0x70
@@ -29,6 +30,16 @@ PATTERNS = (0x5AA5, 0x0000, 0xA55A)  # into DAC D; the last one stays there and 
 DAC_SPAN_V = 5.0
 CODES = 65536
 RAMP_TICK_S = 0.001
+MAX_BUS_HZ = 400_000  # data sheet, table 4: SCL frequency
+_COMMAND: tuple[I2cOp, ...] = (I2cWrite(bytes(3)),) * (CHANNELS + 1)
+_READ_BACK: tuple[I2cOp, ...] = (I2cWrite(bytes(1)), I2cRead(2 * CHANNELS))
+_VERIFY: tuple[I2cOp, ...] = (I2cWrite(bytes(1)), I2cRead(2 * (CHANNELS + 1)))
+WIRE_BITS = {
+    "command": i2c_bits(_COMMAND),
+    "command with read-back": i2c_bits(_COMMAND + _READ_BACK),
+    "verify": i2c_bits(_VERIFY),
+}
+"""Bits of what the loop repeats: ``write`` without and with ``read_back``, and ``verify``. Retries are left out."""
 READ_BACK_NS = 200_000  # pointer and six bytes at 400 kHz: the update has been in force for at least so long
 TRANSFER_NS = 365_000  # 4 segments of 4 bytes at 400 kHz, the fastest that the part allows, less a bit each
 

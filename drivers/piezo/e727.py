@@ -25,6 +25,10 @@ RATE_MAX_HZ = 200.0
 ASK_ERROR_EVERY = 20  # commands
 TICK_S = 0.001
 EPSILON_V = 1e-4  # four decimals are sent
+COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
+"""Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
+ERROR_BYTES = len("ERR?\n")
+"""What ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
 
 
 class E727:

@@ -6,15 +6,21 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
+from drivers.specs import check_devices
 from firmware_py.control.plausibility import PlausibilityLimits
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.stages import StageConfigs
+from firmware_py.control.tasks import Works, task_table
+from firmware_py.control.wiring import bus_plan
+from firmware_py.scheduler.check import check_table
+from firmware_py.scheduler.task import TickInfo
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.noise_file import noise_table
 from hal.bench import BenchFile
 from hal.errors import BenchError
+from hal.toml_file import parse_toml, read_text
 from hal.validation import validate_table
 
 STAGES = ("sensing", "tremor", "actuation")
@@ -27,6 +33,20 @@ class SelfTestLimits(BaseModel):
 
     watch_ms: float = Field(default=500.0, ge=50.0, le=10_000.0)
     limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)
+
+
+SAFETY_RANGES: Mapping[str, tuple[float, float]] = {
+    "stale_ms": (1.0, 10_000.0),
+    "temperature_C": (-100.0, 200.0),
+    "supply_V": (0.0, 10.0),
+    "saturated_ms": (1.0, 10_000.0),
+    "stalled_ms": (1.0, 10_000.0),
+    "magnetometer_ms": (1.0, 10_000.0),
+    "monitor_ms": (1.0, 10_000.0),
+    "guardian_notice_ms": (1.0, 1000.0),
+    "guardian_ms": (2.0, 1000.0),
+}
+"""What each limit of ``SafetyLimits`` may be; of a pair, both, the lower one first."""
 
 
 class FirmwareConfig(BaseModel):
@@ -45,6 +65,16 @@ class FirmwareConfig(BaseModel):
     tremor: dict[str, Any] = Field(default_factory=dict[str, Any])
     actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
 
+    @field_validator("safety")
+    @classmethod
+    def _check_ranges(cls, safety: SafetyLimits) -> SafetyLimits:
+        for name, (least, most) in SAFETY_RANGES.items():
+            value = getattr(safety, name)
+            both = value if isinstance(value, tuple) else (value,)
+            if not (least <= both[0] <= both[-1] <= most) or (len(both) == 2 and both[0] == both[1]):
+                raise ValueError(f"{name} = {value} is outside {least:g} to {most:g}, or its ends are exchanged")
+        return safety
+
 
 def load_firmware_config(
     bench: BenchFile, wired: Mapping[str, Any], method: str | None = None
@@ -56,6 +86,7 @@ def load_firmware_config(
     """
     where = str(bench.path)
     config = validate_table(FirmwareConfig, bench.description.firmware, f"{where}: firmware")
+    _check_tasks(bench, config)
     tables: dict[str, dict[str, Any]] = {name: dict(getattr(config, name)) for name in STAGES}
     for name in config.calibration:
         for stage, table in _calibration(bench, name).items():
@@ -69,13 +100,41 @@ def load_firmware_config(
     return config, StageConfigs.from_dict(tables, where)
 
 
+def _check_tasks(bench: BenchFile, config: FirmwareConfig) -> None:
+    """Raises ``BenchError`` where the rates and budgets of the bench do not fit its ticks, before it is opened."""
+    description, where = bench.description, str(bench.path)
+    polling, bus_us = bus_plan(description, check_devices(description, where))
+
+    def idle(_: TickInfo) -> None:
+        pass
+
+    works = Works(
+        sense=idle,
+        estimate=idle,
+        actuate=idle,
+        publish=idle,
+        supervise=idle,
+        magnetometer=idle if polling.magnetometer is not None else None,
+        verify=idle if polling.verify is not None else None,
+        monitor=idle if polling.monitor is not None else None,
+        telemetry=idle if polling.telemetry is not None else None,
+    )
+    tick_hz = description.clock.tick_hz
+    try:
+        check_table(task_table(works, tick_hz, config.budget_us, polling, bus_us), (), 1_000_000_000 // tick_hz)
+    except BenchError as error:
+        raise BenchError(f"{where}: {error}") from error
+
+
 def _calibration(bench: BenchFile, name: str) -> dict[str, dict[str, Any]]:
     path = bench.resolve(name)
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise BenchError(f"{bench.path}: [firmware.calibration] {path} cannot be read: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        text = read_text(path, "name a file of `micron calibrate`, relative to the bench file")
+    except BenchError as error:
+        raise BenchError(f"{bench.path}: [firmware.calibration] {error}") from error
+    try:
+        table = parse_toml(text, str(path))
+    except tomllib.TOMLDecodeError as error:
         raise BenchError(f"{path}: not a calibration file: {error}") from error
     stages = {key: value for key, value in table.items() if key in STAGES}
     unknown = sorted(set(table) - set(STAGES) - {"format", "title", "made_by", "report"})

@@ -11,6 +11,9 @@ from firmware_py.frame import MAGNETOMETER_FRESH, MAGNETOMETER_RAW
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
+USUAL_NS = 11_000_000
+"""Time between readings for which ``outlier_V`` is meant, with some reserve."""
+
 
 class FieldInput:
     """``limit_ms``: how long the field may be missing or stand still before the run ends. ``outlier_V``: a second
@@ -26,6 +29,7 @@ class FieldInput:
         self._outlier_V = outlier_V
         self._volts = np.zeros(3)
         self._before, self._slope = np.full(3, np.nan), np.full(3, np.nan)
+        self._before_ns = 0
         self._fresh = False
         self._hangs = False
 
@@ -47,7 +51,7 @@ class FieldInput:
                 if hangs and self._hangs:
                     incidents.notice("magnetometer's converter hangs")
                 self._hangs = hangs
-                self._look_for_outliers(volts)
+                self._look_for_outliers(volts, magnetometer.t_ns)
                 self._volts[:] = volts
                 self._fresh = not hangs
             reason = f"{magnetometer.name}: its converter gives one reading for all axes; it hangs"
@@ -57,9 +61,12 @@ class FieldInput:
             incidents.notice("magnetometer does not answer")
             incidents.bad_for("magnetometer", True, info.due_ns, self._limit_ms, str(error))
 
-    def _look_for_outliers(self, volts: NDArray[np.float64]) -> None:
-        """The I2C bus has no checksum: a flipped bit is a reading out of line with its neighbours."""
+    def _look_for_outliers(self, volts: NDArray[np.float64], t_ns: int) -> None:
+        """The I2C bus has no checksum: a flipped bit is a reading out of line with its neighbours. The second
+        difference of a turn grows with the square of the time between readings, and so does what is allowed."""
         slope = volts - self._before
-        if np.any(np.abs(slope - self._slope) > self._outlier_V):  # never of the first two: NaN
+        allowed_V = self._outlier_V * max(1.0, ((t_ns - self._before_ns) / USUAL_NS) ** 2)
+        self._before_ns = t_ns
+        if np.any(np.abs(slope - self._slope) > allowed_V):  # never of the first two: NaN
             self._incidents.notice(f"{self._magnetometer.name} read a value out of line with its neighbours")
         self._slope, self._before = slope, volts.copy()

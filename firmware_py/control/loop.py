@@ -119,7 +119,7 @@ class InstrumentLoop:
             monitor=self._watch.monitor_output if devices.monitor is not None else None,
             telemetry=self._send_telemetry if devices.telemetry is not None else None,
         )
-        tasks = task_table(works, tick_hz, config.budget_us)
+        tasks = task_table(works, tick_hz, config.budget_us, devices.polling, devices.bus_us)
         self.scheduler = Scheduler(tasks, clock, period_ns=self._period_ns, background=background)
         self.shown = LoopStatus(
             stages, self.counts, self.supervisor, self.manual, self.scheduler, clock, for_page=live is not None

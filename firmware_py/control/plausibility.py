@@ -13,11 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from firmware_py.frame import ACCELEROMETER, LAYOUT
 from hal.compiled import kernel
@@ -25,6 +25,10 @@ from hal.compiled import kernel
 SENSORS = 6
 PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
 """Places in AXES of two sensors along one body axis: 1x and 3x, 1z and 2z, 2y and 3y."""
+
+
+Rail = Annotated[float, Field(ge=-10.0, le=10.0)]
+Step = Annotated[float, Field(ge=0.001, le=50.0)]
 
 
 class PlausibilityLimits(BaseModel):
@@ -39,16 +43,22 @@ class PlausibilityLimits(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    jump_V: float = Field(default=0.03, gt=0.0)
-    rail_V: tuple[float, float] = (0.4, 4.6)
-    stuck_ticks: int = Field(default=20, ge=5)
-    pair_m_s2: float = Field(default=0.6, gt=0.0)
-    pair_s: float = Field(default=0.1, ge=0.02)
-    outlier_V: float = Field(default=0.005, gt=0.0)
-    supply_step_V: float = Field(default=0.004, gt=0.0)
-    magnetometer_outlier_V: float = Field(default=0.01, gt=0.0)
-    pair_step_m_s2: tuple[float, float, float] = (0.15, 0.03, 0.15)
-    pair_memory_s: float = Field(default=5.0, gt=0.0)
+    jump_V: float = Field(default=0.03, ge=0.001, le=5.0)
+    rail_V: tuple[Rail, Rail] = (0.4, 4.6)
+    stuck_ticks: int = Field(default=20, ge=5, le=10_000)
+    pair_m_s2: float = Field(default=0.6, ge=0.01, le=50.0)
+    pair_s: float = Field(default=0.1, ge=0.02, le=10.0)
+    outlier_V: float = Field(default=0.005, ge=0.0005, le=5.0)
+    supply_step_V: float = Field(default=0.004, ge=0.0005, le=5.0)
+    magnetometer_outlier_V: float = Field(default=0.01, ge=0.0005, le=5.0)
+    pair_step_m_s2: tuple[Step, Step, Step] = (0.15, 0.03, 0.15)
+    pair_memory_s: float = Field(default=5.0, ge=0.1, le=1000.0)
+
+    @model_validator(mode="after")
+    def _rails_in_order(self) -> PlausibilityLimits:
+        if not self.rail_V[0] < self.rail_V[1]:
+            raise ValueError(f"rail_V = {list(self.rail_V)}: the first value must be the smaller one")
+        return self
 
 
 NO_SLOPE = 1 << 40

@@ -1,29 +1,43 @@
-"""The instrument's task table: what runs in which tick, in which order, within which budget."""
+"""The instrument's task table: what runs in which tick, in which order, within which budget.
+
+How often a device is polled is the bench file's (``drivers.polling``); in which ticks that happens is found here, so
+that as few slow transfers as possible share a tick. A budget is the time that the wires take plus an allowance for the
+processor; ``[firmware.budget_us]`` overrides it by the task's name.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from firmware_py.scheduler.task import TaskSpec, TickInfo
+import numpy as np
+from numpy.typing import NDArray
 
-BUDGETS_US: Mapping[str, float] = {
+from drivers.polling import SUPERVISE, Polling, Polls
+from firmware_py.scheduler.check import MAX_HYPERPERIOD_TICKS
+from firmware_py.scheduler.task import TaskSpec, TickInfo
+from hal.errors import BenchError
+
+ALLOWANCE_US: Mapping[str, float] = {
     "sense": 60.0,
     "estimate": 50.0,
-    "actuate": 520.0,  # 390 us of bus time at 400 kHz
+    "actuate": 100.0,
     "publish": 30.0,
-    "magnetometer": 330.0,  # 212 us of bus time
     "supervise": 300.0,
+    "magnetometer": 100.0,
+    "verify": 100.0,
+    "monitor": 100.0,
     "telemetry": 300.0,
-    "verify": 340.0,  # 260 us of bus time
-    "monitor": 330.0,  # 212 us of bus time
 }
-MAGNETOMETER_PHASES = (0, 3, 6)
-VERIFY_PHASES = (1, 4, 8)  # in ticks that leave the bus free for it
-MONITOR_PHASES = (1, 4, 7, 9)
+"""Processor time that a task may take beside its time on the wires, us.
+
+100 us for a transfer are 1.4 to 3 times the median of a driver and its emulated device together (35 to 70 us on the
+two-core machine of the benchmarks, column ``cpu`` of a run in virtual time)."""
 MAY_WAIT_TICKS = 3
 """For what shares the bus with the outputs, and for telemetry: rather these a little late than the next command."""
-VERIFY_BESIDE_MONITOR = (8,)  # tick 15 of 20 stays free for background work
+
+LONGEST_US = 1e5  # the period of the slowest tick
 
 Work = Callable[[TickInfo], object]
 
@@ -43,39 +57,79 @@ class Works:
     telemetry: Work | None
 
 
-def task_table(works: Works, tick_hz: int, budget_us: Mapping[str, float]) -> list[TaskSpec]:
-    """Sense, estimate, actuate in every tick, then what can wait; ``budget_us`` overrides by name."""
-    budget = {**BUDGETS_US, **budget_us}
+def budgets_us(bus_us: Mapping[str, float], overrides: Mapping[str, float]) -> dict[str, float]:
+    """Budget of each task, us: ``bus_us``, its time on the wires, and its allowance, or what ``overrides`` says.
+
+    Raises ``BenchError`` for an override of no task, or one that is not a positive number.
+    """
+    for name, value in overrides.items():
+        if name not in ALLOWANCE_US:
+            raise BenchError(f"[firmware.budget_us.{name}] there is no such task; tasks are {', '.join(ALLOWANCE_US)}")
+        if not 1.0 <= value <= LONGEST_US:
+            raise BenchError(f"[firmware.budget_us.{name}] {value:g} is outside 1 to {LONGEST_US:g} us")
+    derived = {name: bus_us.get(name, 0.0) + allowance for name, allowance in ALLOWANCE_US.items()}
+    return {**derived, **overrides}
+
+
+def task_table(
+    works: Works,
+    tick_hz: int,
+    budget_us: Mapping[str, float],
+    polling: Polling,
+    bus_us: Mapping[str, float],
+) -> list[TaskSpec]:
+    """Sense, estimate, actuate in every tick, then what is due less often; what may wait comes last.
+
+    ``budget_us`` overrides budgets by name, ``bus_us`` is the time that a task's transaction takes on the wires.
+    """
+    budget = budgets_us(bus_us, budget_us)
     period_us = 1e6 / tick_hz
-
-    def task(
-        name: str,
-        work: Work,
-        order: int,
-        divider: int = 1,
-        phase: int = 0,
-        *,
-        catch_up: bool = False,
-        may_wait: int = 0,
-    ) -> None:
-        limit_us = budget[name.partition("_")[0]]
-        table.append(TaskSpec(name, work, divider, phase, order, limit_us, period_us, catch_up, may_wait))
-
-    def in_turn(names: Sequence[str], work: Work | None, phases: Sequence[int]) -> None:
-        for name, phase in zip(names, phases, strict=True):
-            if work is not None:
-                task(name, work, 4, 10, phase, may_wait=MAY_WAIT_TICKS)
-
     table: list[TaskSpec] = []
-    task("sense", works.sense, 0, catch_up=True)
-    task("estimate", works.estimate, 1, catch_up=True)
-    task("actuate", works.actuate, 2)
-    task("publish", works.publish, 3, catch_up=True)
-    task("supervise", works.supervise, 5, 10, 2)
-    in_turn([f"magnetometer_{axis}" for axis in "xyz"], works.magnetometer, MAGNETOMETER_PHASES)
-    phases = VERIFY_PHASES if works.monitor is None else VERIFY_BESIDE_MONITOR
-    in_turn([f"verify_{phase}" for phase in phases], works.verify, phases)
-    in_turn([f"monitor_{phase}" for phase in MONITOR_PHASES], works.monitor, MONITOR_PHASES)
-    if works.telemetry is not None:
-        task("telemetry", works.telemetry, 6, 20, 5, may_wait=MAY_WAIT_TICKS)
+    periodic = (
+        # name, work, polls, first tick that is tried, order, ticks that it may wait
+        ("supervise", works.supervise, SUPERVISE, 2, 4, 0),
+        ("verify", works.verify, polling.verify, 8, 5, MAY_WAIT_TICKS),
+        ("telemetry", works.telemetry, polling.telemetry, 5, 6, MAY_WAIT_TICKS),
+        ("monitor", works.monitor, polling.monitor, 0, 5, MAY_WAIT_TICKS),
+        ("magnetometer", works.magnetometer, polling.magnetometer, 0, 5, MAY_WAIT_TICKS),
+    )
+    for order, (name, work) in enumerate(
+        (("sense", works.sense), ("estimate", works.estimate), ("actuate", works.actuate), ("publish", works.publish))
+    ):
+        catch_up = name != "actuate"
+        table.append(TaskSpec(name, work, 1, 0, order, budget[name], period_us, catch_up))
+    load_us = np.zeros(
+        _hyperperiod([polls for _, work, polls, *_ in periodic if work is not None and polls is not None])
+    )
+    for name, work, polls, start, order, may_wait in periodic:
+        if work is None or polls is None:
+            continue
+        ticks = _emptiest(load_us, polls, start)
+        for k, tick in enumerate(ticks):
+            load_us[tick :: polls.divider] += budget[name]
+            spec_name = name if polls.count == 1 else f"{name}_{k + 1}"
+            table.append(
+                TaskSpec(spec_name, work, polls.divider, tick, order, budget[name], period_us, False, may_wait)
+            )
     return table
+
+
+def _hyperperiod(all_polls: list[Polls]) -> int:
+    ticks = math.lcm(*(polls.divider for polls in all_polls))
+    if ticks > MAX_HYPERPERIOD_TICKS:
+        dividers = ", ".join(str(polls.divider) for polls in all_polls)
+        raise BenchError(
+            f"[device] the rates repeat only after {ticks} ticks (every {dividers} ticks); choose rates that divide "
+            "one another"
+        )
+    return ticks
+
+
+def _emptiest(load_us: NDArray[np.float64], polls: Polls, start: int) -> tuple[int, ...]:
+    """The ticks for ``polls`` that carry the least already; of equal ones the first from ``start`` on."""
+
+    def fullest(first: int) -> float:
+        return max(float(load_us[tick :: polls.divider].max()) for tick in polls.ticks(first))
+
+    firsts = [(start + k) % polls.divider for k in range(polls.divider)]
+    return polls.ticks(min(firsts, key=fullest))

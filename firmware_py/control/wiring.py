@@ -10,6 +10,7 @@ from drivers.adc.ads1115 import Ads1115
 from drivers.added import open_added
 from drivers.amplifier_monitor import AmplifierMonitor
 from drivers.base import wait_s
+from drivers.bus_use import bus_uses
 from drivers.can_frames import HostHeartbeat
 from drivers.can_telemetry import CanTelemetry
 from drivers.daq.di4108 import Di4108
@@ -19,6 +20,7 @@ from drivers.options import DaqOptions
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
+from drivers.polling import Polling, polling_of
 from drivers.specs import (
     OPTIONS,
     Ads1115Options,
@@ -34,7 +36,7 @@ from drivers.specs import (
     check_devices,
 )
 from firmware_py.guardian.heart import Heart
-from hal.bench import DeviceSpec, OpenBench
+from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.middleware.share import SharedCan
@@ -53,6 +55,9 @@ class Daq(AnalogInputScan, Protocol):
     def write_digital(self, bits: int) -> None: ...
 
 
+NOT_POLLED = Polling()
+
+
 @dataclass
 class Devices:
     """The instrument's devices, configured and not yet running. ``identities`` is what each probe found.
@@ -60,7 +65,8 @@ class Devices:
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
     ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian``: heartbeats of the
-    firmware and of the guardian beside it, where there is one.
+    firmware and of the guardian beside it, where there is one. ``polling``: how often what is asked; ``bus_us``: what a
+    transaction of each task takes on the wires.
     """
 
     daq: Daq
@@ -74,6 +80,8 @@ class Devices:
     monitor: AmplifierMonitor | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
     guardian: Heart | None = None
+    polling: Polling = NOT_POLLED
+    bus_us: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 def open_devices(bench: OpenBench) -> Devices:
@@ -146,7 +154,18 @@ def open_devices(bench: OpenBench) -> Devices:
         f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature") if name in options
     )
     verify = amplifier.verify if isinstance(amplifier, DacAmplifier) else None
-    return Devices(daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities)
+    polling, bus_us = bus_plan(description, options)
+    return Devices(
+        daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities,
+        polling=polling, bus_us=bus_us,
+    )  # fmt: skip
+
+
+def bus_plan(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, dict[str, float]]:
+    """How often each device is polled, and what one transaction of each task takes on the wires, us."""
+    polling, _ = polling_of(description, options)
+    uses = bus_uses(description, options, polling)
+    return polling, {use.task: use.bus_us for use in uses if use.task}
 
 
 def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:

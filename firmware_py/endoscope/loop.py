@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from drivers.polling import poll_divider
 from firmware_py.endoscope.config import EndoscopeConfig
 from firmware_py.endoscope.control import INACTIVE
 from firmware_py.endoscope.targets import GameState, TargetGame
@@ -132,7 +133,7 @@ class EndoscopeLoop:
         for order, (name, track) in enumerate(self.tracks.items()):
             # the card's lines come when they come: asked twice as often as they are due
             per_sample = 2 if track.sensor.card is not None else 1
-            divider = max(1, int(self._tick_hz / (per_sample * track.sensor.rate_hz)))
+            divider = poll_divider(per_sample * track.sensor.rate_hz, self._tick_hz)
             kind = "card" if track.sensor.card is not None else "imu"
             table.append(
                 TaskSpec(name, self._reader(track), divider, order % divider, order, budget[kind], 5.0 * period_us)

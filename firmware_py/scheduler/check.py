@@ -10,6 +10,7 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_py.scheduler.task import BackgroundSpec, TaskSpec
 from hal.errors import BenchError
@@ -20,6 +21,7 @@ MAX_HYPERPERIOD_TICKS = 10_000
 def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec], period_ns: int) -> int:
     """Refuse a table that cannot keep its promises; return the hyperperiod in ticks.
 
+    Tasks that may wait are put off as the scheduler puts them off; they must find a tick within their patience.
     Raises ``BenchError`` with the arithmetic: which tick, which tasks, which sum.
     """
     if not tasks:
@@ -32,7 +34,7 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
             f"the dividers repeat only after {hyperperiod} ticks ({dividers}); "
             f"choose dividers with a common multiple of at most {MAX_HYPERPERIOD_TICKS}"
         )
-    ordered = in_order(tasks)
+    ordered = [task for task in in_order(tasks) if not task.may_wait]
     load_ns = np.zeros(hyperperiod, dtype=np.int64)
     for task in ordered:
         due = load_ns[task.phase :: task.divider]
@@ -49,6 +51,7 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
             f"the budgets do not fit tick {worst} of {hyperperiod}: {_sum_text(ordered, worst)} "
             f"> {period_ns / 1000:g} us. Shorten a budget or move a phase"
         )
+    load_ns = _with_waiting(load_ns, [task for task in in_order(tasks) if task.may_wait], period_ns)
     slack_ns = period_ns - int(load_ns.min())
     for item in background:
         if item.worst_step_ns > slack_ns:
@@ -57,6 +60,30 @@ def check_table(tasks: Sequence[TaskSpec], background: Sequence[BackgroundSpec],
                 f"the emptiest tick leaves {slack_ns / 1000:g} us. Make its steps shorter"
             )
     return hyperperiod
+
+
+def _with_waiting(load_ns: NDArray[np.int64], tasks: Sequence[TaskSpec], period_ns: int) -> NDArray[np.int64]:
+    """``load_ns`` with the tasks that may wait, each in the first tick from its own on that has room for it."""
+    hyperperiod = len(load_ns)
+    full_ns = load_ns.copy()
+    waiting: dict[str, tuple[TaskSpec, int]] = {}
+    for tick in range(2 * hyperperiod):  # what waits at the end of the first round runs in the second
+        index = tick % hyperperiod
+        full_ns[index] = load_ns[index]
+        due = {task.name: (task, 0) for task in tasks if tick % task.divider == task.phase}
+        for name, (task, waited) in {**due, **{n: w for n, w in waiting.items() if n not in due}}.items():
+            waiting.pop(name, None)
+            if full_ns[index] + task.budget_ns <= period_ns:
+                full_ns[index] += task.budget_ns
+            elif waited < task.may_wait:
+                waiting[name] = task, waited + 1
+            else:
+                raise BenchError(
+                    f"task {name!r} finds no room of {task.budget_us:g} us within {task.may_wait} ticks of the one in "
+                    f"which it is due (tick {index} of {hyperperiod} is full with {full_ns[index] / 1000:g} of "
+                    f"{period_ns / 1000:g} us). Lower a rate of the bench file, or shorten a budget"
+                )
+    return full_ns
 
 
 def in_order(tasks: Sequence[TaskSpec]) -> list[TaskSpec]:

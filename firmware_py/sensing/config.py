@@ -16,6 +16,7 @@ NotNegative = Annotated[float, Field(ge=0.0)]
 Pair = tuple[float, float]
 Input = Annotated[int, Field(ge=0, le=7)]
 Axis = Annotated[int, Field(ge=0, le=7)]
+FARTHEST_M = 1.0  # nobody holds a longer instrument
 LEAST_AXES, MOST_AXES = 6, 8
 """Six unknowns; the converter has eight inputs."""
 PER_AXIS = (
@@ -150,6 +151,8 @@ class SensingConfig(BaseModel):
             raise ValueError(
                 f"positions_m has {len(self.positions_m)} places: one for each of {n} axes, or for two each"
             )
+        if any(abs(part) > FARTHEST_M for place in (*self.positions_m, self.tip_m) for part in place):
+            raise ValueError(f"positions_m and tip_m are in m, at most {FARTHEST_M:g} from the origin")
         if any(i >= n for i in self.in_plane + self.out_of_plane):
             raise ValueError(f"in_plane and out_of_plane name axes 0 to {n - 1}")
         used = (*self.channels, *(c for c in (self.supply_channel, self.temperature_channel) if c is not None))

@@ -15,7 +15,9 @@ from typing import Literal
 import typer
 from rich.table import Table
 
-from drivers.specs import bus_loads, check_devices
+from drivers.bus_use import bus_shares, bus_uses
+from drivers.polling import polling_of
+from drivers.specs import check_devices
 from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, data_console
@@ -116,13 +118,18 @@ def bench_findings(bench: BenchFile) -> list[Finding]:
     """What the bench file asks for and whether it is there."""
     description = bench.description
     options = check_devices(description, str(bench.path))
+    uses = bus_uses(description, options, polling_of(description, options)[0])
+    shares = bus_shares(uses)
     findings: list[Finding] = []
     for name, spec in description.bus.items():
         findings.append(_bus_finding(name, spec.uri))
-    for load in bus_loads(description, options):
-        findings.append(
-            Finding(f"bus time of {load.bus} for {load.device}", "ok", f"{load.arithmetic} = {100 * load.share:.0f} %")
-        )
+    for name in description.bus:
+        if name in shares:
+            detail = f"{100 * shares[name]:.0f} % of its time: "
+            detail += "; ".join(str(use) for use in uses if use.bus == name)
+            findings.append(Finding(f"load of {name}", "ok", detail))
+        elif any(spec.bus == name and spec.driver == "di4108" for spec in description.device.values()):
+            findings.append(Finding(f"load of {name}", "ok", "USB: its baud does not limit it"))
     for name, spec in description.device.items():
         where = spec.bus or spec.daq or spec.adc or "-"
         address = f" at 0x{spec.address:02x}" if spec.address is not None else ""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from pathlib import Path
 
 import pytest
 
+from drivers.bus_use import bus_uses
 from drivers.imu.bench import make_imu
 from drivers.imu.bmx055 import Bmx055
 from drivers.imu.lsm6ds3 import Lsm6ds3
 from drivers.imu.mpu6050 import Mpu6050
-from drivers.specs import bus_loads, check_devices
+from drivers.polling import polling_of
+from drivers.specs import check_devices
 from hal.bench import BenchFile, load_bench
 from hal.clock import VirtualClock
 from hal.errors import BenchError
@@ -54,10 +57,18 @@ def imu(driver: str, more: str = "", bus: str = "i2c0") -> str:
     return f'driver = "{driver}"\nbus = "{bus}"\n{address}{more}'
 
 
+def shares(file: BenchFile) -> dict[str, float]:
+    """Part of its bus that each device asks for."""
+    options = check_devices(file.description, str(file.path))
+    found: dict[str, float] = defaultdict(float)
+    for use in bus_uses(file.description, options, polling_of(file.description, options)[0]):
+        found[use.device] += use.share
+    return found
+
+
 def test_endoscope_bench_is_valid():
     file = load_bench(Path(__file__).parents[3] / "benches" / "endoscope.toml")
-    options = check_devices(file.description, "endoscope.toml")
-    loads = {load.device: load.share for load in bus_loads(file.description, options)}
+    loads = shares(file)
     assert loads["imu"] == pytest.approx(100 * 165 / 400_000)
     assert loads["card"] == pytest.approx(100 * 55 * 10 / 115_200)
 
@@ -71,10 +82,10 @@ def test_three_imus_at_1_khz_are_refused_with_the_arithmetic(tmp_path: Path):
         imu("bmx055", "rate_hz = 1000\ngyro_address = 0x69\nmag_address = 0x11"),
     )
     assert "[bus.i2c0] is asked for 160 % of its time" in message
-    assert "dev0 1000 Hz x 165 bit / 400000 Hz = 41 %" in message
-    assert "dev1 1000 Hz x 174 bit / 400000 Hz = 44 %" in message
-    assert "dev2 (1000 Hz x 300 bit + 10 Hz x 102 bit) / 400000 Hz = 75 %" in message
-    assert "second bus" in message
+    assert "dev0 sample 1000/s x 165 bit = 41.2 %" in message
+    assert "dev1 sample 1000/s x 174 bit = 43.5 %" in message
+    assert "dev2 sample 1000/s x 300 bit = 75.0 %" in message
+    assert "lower rate_hz of 'dev2'" in message
 
 
 def test_fifo_bus_time_by_hand(tmp_path: Path):
@@ -85,7 +96,7 @@ def test_fifo_bus_time_by_hand(tmp_path: Path):
         imu("mpu6050", 'rate_hz = 1000\nmode = "fifo"'),
         imu("lsm6ds3", 'rate_hz = 1000\nmode = "fifo"', "i2c1"),
     )
-    loads = {load.device: load.share for load in bus_loads(file.description, check_devices(file.description, ""))}
+    loads = shares(file)
     assert loads["dev0"] == pytest.approx((50 * 117 + 1000 * 126) / 400_000)
     assert loads["dev1"] == pytest.approx((50 * 162 + 1660 * 108) / 400_000)
 
@@ -116,7 +127,7 @@ def test_two_of_one_family_need_two_straps(tmp_path: Path):
         (imu("mpu6050", 'mode = "interrupt"'), "mode"),
         ('driver = "mpu6050"', "needs 'bus = ...'"),
         ('driver = "mpu6050"\nbus = "i2c0"', "[device.dev0.address] is missing; it is 0x68 or 0x69"),
-        (imu("motion_card", "rate_hz = 1000", "card0"), "1000 Hz x 55 byte x 10 bit / 115200 bit/s = 477 %"),
+        (imu("motion_card", "rate_hz = 1000", "card0"), "line 1000/s x 550 bit = 477.4 %"),
     ],
 )
 def test_refusals(tmp_path: Path, device: str, words: str):

@@ -4,7 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from drivers.specs import bus_loads, check_devices
+from drivers.bus_use import bus_uses
+from drivers.polling import polling_of
+from drivers.specs import check_devices
 from hal.bench import OpenBench, load_bench, open_bench
 from hal.clock import VirtualClock
 from hal.errors import BenchError, BusError, OpenFailed
@@ -49,7 +51,7 @@ def test_default_bench_is_valid():
         ('driver = "hmc2003"', 'driver = "hmc2004"', ["no driver 'hmc2004'", "hmc2003"]),
         ("rate_hz = 1000", "rate_hz = 900", ["make them equal"]),
         ("rate_hz = 100\n", "rate_hz = 130\n", ["[device.mag_adc.rate_hz]", "does not divide"]),
-        ("speed_hz = 400_000", "speed_hz = 100_000", ["[bus.i2c0]", "% of its time", "1000 Hz x 156 bit"]),
+        ("speed_hz = 400_000", "speed_hz = 100_000", ["[bus.i2c0]", "% of its time", "1000/s x 149 bit"]),
         ('provider = "sim_devices.register:provider"\n', "", ["[emulation.provider] is missing"]),
         ("[clock]", "[clock", ["not valid TOML", "line"]),
         ('daq = "daq"', 'daq = "dak"', ["daq] no device named 'dak'", "devices are"]),
@@ -70,10 +72,18 @@ def test_missing_file_says_what_to_do(tmp_path: Path):
 
 
 def test_bus_time_by_hand():
-    """AD5696R: four times start, address and three bytes, stop = 16 x 9 + 4 x 3 bits, a thousand times a second."""
-    bench = load_bench(DEFAULT)
-    loads = {load.device: load.share for load in bus_loads(bench.description, check_devices(bench.description, ""))}
-    assert loads["piezo"] == pytest.approx(1000 * 156 / 400_000)
+    """AD5696R: four times START, address and three bytes, one STOP = 4 x (1 + 36) + 1 bits, a thousand times a second;
+    pointer, repeated START and eight bytes a hundred times. ADS1115: pointer, two bytes, three, 300 and 400 times."""
+    description = load_bench(DEFAULT).description
+    options = check_devices(description, "")
+    uses = bus_uses(description, options, polling_of(description, options)[0])
+    i2c = [(use.bus, use.device, use.bits, use.per_s) for use in uses if use.bus.startswith("i2c")]
+    assert i2c == [
+        ("i2c1", "mag_adc", 85, 300.0),
+        ("i2c1", "monitor_adc", 85, 400.0),
+        ("i2c0", "piezo", 149, 1000.0),
+        ("i2c0", "piezo", 102, 100.0),
+    ]
 
 
 def test_virtual_time_refuses_real_buses(tmp_path: Path):

@@ -1,0 +1,206 @@
+"""What each device asks of its bus: the transactions that its driver declares, at the rates of the firmware's tasks.
+
+An I2C bus gives ``speed_hz`` bits a second, a serial line ``baud``, a CAN bus ``bitrate`` with the worst case of stuff
+bits. A bus is refused that is asked for more than ``MOST`` of its time: what is left has to carry retries, the reads of
+a supervisor and the gaps that real adapters leave between bytes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers import can_frames, can_telemetry
+from drivers.adc import ads1115
+from drivers.added import added_driver
+from drivers.imu.bench import MAX_BUS_HZ as IMU_BUS_HZ
+from drivers.imu.bench import ImuOptions, transactions
+from drivers.motion_card_protocol import line_bytes
+from drivers.options import (
+    Ads1115Options,
+    CanAmplifierOptions,
+    CanTelemetryOptions,
+    DacAmplifierOptions,
+    E727Options,
+    MotionCardOptions,
+)
+from drivers.piezo import can_amplifier, dac_amplifier, e727
+from drivers.polling import Polling, poll_divider
+from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec
+from hal.wire_bits import can_bits, serial_bits
+
+MOST = 0.8
+"""Largest part of its time that a bus may be asked for."""
+TOP_BITRATE = 1_000_000  # CAN with classic frames
+
+
+@dataclass(frozen=True)
+class BusUse:
+    """One kind of transaction on one bus: ``bits`` on the wire, ``per_s`` times a second.
+
+    ``task``: the firmware's task that waits for it, empty where nobody does (CAN and serial frames are queued).
+    """
+
+    bus: str
+    device: str
+    what: str
+    bits: float
+    per_s: float
+    share: float
+    task: str = ""
+
+    @property
+    def bus_us(self) -> float:
+        """Time on the wire of one transaction, us."""
+        return 1e6 * self.share / self.per_s
+
+    def __str__(self) -> str:
+        return f"{self.device} {self.what} {self.per_s:g}/s x {self.bits:g} bit = {100 * self.share:.1f} %"
+
+
+def bus_uses(description: BenchDescription, options: Mapping[str, Any], polling: Polling) -> list[BusUse]:
+    """Everything that the devices of a bench ask of their buses over and over, in the order of the file."""
+    uses: list[BusUse] = []
+    with_heartbeat: set[str] = set()
+    for name, spec in description.device.items():
+        bus = description.bus.get(spec.bus or "")
+        if bus is None or spec.bus is None:
+            continue
+        speed = bits_per_s(bus)
+        for what, bits, per_s, task in _repeated(description, name, options[name], polling):
+            if per_s <= 0.0 or bits <= 0:
+                continue
+            if what == "HOST_HEARTBEAT":  # one per bus, whoever sends it
+                if spec.bus in with_heartbeat:
+                    continue
+                with_heartbeat.add(spec.bus)
+            uses.append(BusUse(spec.bus, name, what, bits, per_s, bits * per_s / speed, task))
+    return uses
+
+
+def bits_per_s(bus: SerialSpec | I2cSpec | CanSpec) -> int:
+    """What the bus can carry."""
+    match bus:
+        case I2cSpec():
+            return bus.speed_hz
+        case SerialSpec():
+            return bus.baud
+        case CanSpec():
+            return bus.bitrate
+
+
+def bus_shares(uses: Iterable[BusUse]) -> dict[str, float]:
+    """Part of its time that each bus is asked for."""
+    shares: dict[str, float] = defaultdict(float)
+    for use in uses:
+        shares[use.bus] += use.share
+    return dict(shares)
+
+
+def overloads(description: BenchDescription, uses: list[BusUse]) -> list[str]:
+    """A message for each bus that is set faster than its devices allow, or is asked for more than ``MOST``."""
+    problems: list[str] = []
+    for name, bus in description.bus.items():
+        slowest = _slowest(description, name)
+        if isinstance(bus, I2cSpec) and slowest is not None and bus.speed_hz > slowest[0]:
+            problems.append(
+                f"[bus.{name}.speed_hz] {bus.speed_hz} Hz is more than '{slowest[1]}' allows; set at most {slowest[0]}"
+            )
+    for name, share in bus_shares(uses).items():
+        if share > MOST:
+            here = sorted((use for use in uses if use.bus == name), key=lambda use: -use.share)
+            biggest = "; ".join(str(use) for use in here[:3]) + ("; ..." if len(here) > 3 else "")
+            problems.append(
+                f"[bus.{name}] is asked for {100 * share:.0f} % of its time, and at most {100 * MOST:.0f} % can be "
+                f"relied on ({biggest}): {', or '.join(_remedies(description, name, here))}"
+            )
+    return problems
+
+
+def _remedies(description: BenchDescription, name: str, here: list[BusUse]) -> Iterator[str]:
+    """What brings the load of bus ``name`` under ``MOST``, or helps; ``here`` are its uses, the largest first."""
+    bus = description.bus[name]
+    share = sum(use.share for use in here)
+    match bus:
+        case I2cSpec():
+            key, top = "speed_hz", (_slowest(description, name) or (3_400_000, ""))[0]
+        case SerialSpec():
+            key, top = "baud", 4_000_000
+        case CanSpec():
+            key, top = "bitrate", TOP_BITRATE
+    if (needed := math.ceil(bits_per_s(bus) * share / MOST)) <= top:
+        yield f"set {key} to {needed} or more (at most {top})"
+    of_device: dict[str, float] = defaultdict(float)
+    for use in here:
+        of_device[use.device] += use.share
+    first = here[0]
+    if "read-back" in first.what:
+        yield f"leave out read_back of '{first.device}'"
+    elif first.task == "actuate" or first.what == "SETPOINT":
+        yield "lower [clock] tick_hz"
+    else:
+        yield f"lower rate_hz of '{first.device}'"
+    enough = [device for device, part in of_device.items() if share - part <= MOST]
+    if enough and len(of_device) > 1:
+        yield f"put '{min(enough, key=of_device.__getitem__)}' on a bus of its own"
+
+
+def _slowest(description: BenchDescription, bus: str) -> tuple[int, str] | None:
+    """Fastest clock that all devices of an I2C bus allow, and the device that allows no more."""
+    limits = {"dac_amplifier": dac_amplifier.MAX_BUS_HZ, "ads1115": ads1115.MAX_BUS_HZ}
+    limits |= dict.fromkeys(("mpu6050", "lsm6ds3", "bmx055"), IMU_BUS_HZ)
+    there = [(limits[d.driver], n) for n, d in description.device.items() if d.bus == bus and d.driver in limits]
+    return min(there, default=None)
+
+
+def _repeated(
+    description: BenchDescription, name: str, option: Any, polling: Polling
+) -> Iterator[tuple[str, float, float, str]]:
+    """Name, bits, times per second and the task that waits, of what one device's driver repeats."""
+    tick_hz = description.clock.tick_hz
+    match option:
+        case DacAmplifierOptions(read_back=read_back):
+            command = "command with read-back" if read_back else "command"
+            yield command, dac_amplifier.WIRE_BITS[command], tick_hz, "actuate"
+            if polling.verify is not None:
+                yield "verify", dac_amplifier.WIRE_BITS["verify"], polling.verify.per_s(tick_hz), "verify"
+        case Ads1115Options():
+            readers = [spec.driver for spec in description.device.values() if spec.adc == name]
+            for driver, polls in (("hmc2003", polling.magnetometer), ("amplifier_monitor", polling.monitor)):
+                if driver in readers and polls is not None:
+                    task = "magnetometer" if driver == "hmc2003" else "monitor"
+                    yield "reading", ads1115.WIRE_BITS["reading"], polls.per_s(tick_hz), task
+        case E727Options(rate_hz=rate_hz):
+            yield "command", serial_bits(e727.COMMAND_BYTES), rate_hz, ""
+            yield "ERR?", serial_bits(e727.ERROR_BYTES), rate_hz / e727.ASK_ERROR_EVERY, ""
+        case CanAmplifierOptions():
+            frames_hz = {
+                "SETPOINT": float(tick_hz),
+                "STATUS": can_amplifier.STATUS_HZ,
+                "AMPLIFIER_HEARTBEAT": can_amplifier.NODE_HEARTBEAT_HZ,
+            }
+            for frame, n in can_amplifier.FRAMES.items():
+                yield frame, can_bits(n), frames_hz[frame], ""
+            yield _heartbeat()
+        case CanTelemetryOptions():
+            sent_hz = polling.telemetry.per_s(tick_hz) if polling.telemetry is not None else 0.0
+            for frame, n in can_telemetry.FRAMES.items():
+                yield frame, can_bits(n), can_telemetry.BUTTON_HZ if frame == "STOP_BUTTON" else sent_hz, ""
+            yield _heartbeat()
+        case MotionCardOptions(rate_hz=rate_hz, fields=fields):
+            yield "line", serial_bits(line_bytes(fields)), rate_hz, ""
+        case ImuOptions():
+            for what, bits, per_s in transactions(option, name):
+                looks_hz = tick_hz / poll_divider(option.rate_hz, tick_hz) if what == "sample" else 0.0
+                yield what, bits, max(per_s, looks_hz), ""
+        case _:
+            added = added_driver(description.device[name].driver)
+            if added is not None:
+                yield "in all", added.bits_per_s(option), 1.0, ""
+
+
+def _heartbeat() -> tuple[str, float, float, str]:
+    return "HOST_HEARTBEAT", can_bits(can_frames.HEARTBEAT_BYTES), 1e9 / can_frames.HEARTBEAT_PERIOD_NS, ""

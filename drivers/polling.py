@@ -1,0 +1,149 @@
+"""How often the instrument's tasks use their devices: whole ticks, from the rates of the bench file.
+
+The firmware's task table and the load of the buses are both made from this, so that neither can say something else.
+A rate that the ticks do not give is refused with the nearest rates that they do give.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from drivers.adc.ads1115 import RATE_TOLERANCE, SAMPLES_PER_S, WAKE_UP_NS, WIRE_BITS
+from drivers.options import (
+    Ads1115Options,
+    AmplifierMonitorOptions,
+    CanTelemetryOptions,
+    DacAmplifierOptions,
+    E727Options,
+    Hmc2003Options,
+)
+from hal.bench import BenchDescription, I2cSpec
+
+LONGEST_FRAME = 1000
+"""Ticks: nothing is polled less often than once in so many."""
+MOST_IN_FRAME = 4
+AXES = 3
+
+
+@dataclass(frozen=True)
+class Polls:
+    """``count`` polls, evenly spread, in every frame of ``divider`` ticks."""
+
+    divider: int
+    count: int = 1
+
+    def per_s(self, tick_hz: float) -> float:
+        return tick_hz * self.count / self.divider
+
+    def ticks(self, first: int) -> tuple[int, ...]:
+        """The ticks of a frame in which a poll is due when the first of them is due in tick ``first``."""
+        return tuple((first + k * self.divider // self.count) % self.divider for k in range(self.count))
+
+    @property
+    def shortest_gap(self) -> int:
+        return self.divider // self.count
+
+
+SUPERVISE = Polls(10)
+TELEMETRY = Polls(20)
+VERIFY = Polls(10, 3)
+VERIFY_BESIDE_MONITOR = Polls(10)
+MONITOR = Polls(5, 2)
+"""Default of an amplifier monitor: a fault must be seen soon, whatever rate other converters have."""
+
+
+@dataclass(frozen=True)
+class Polling:
+    """What each task of the instrument does how often; ``None``: this bench has no device for it."""
+
+    magnetometer: Polls | None = None
+    monitor: Polls | None = None
+    verify: Polls | None = None
+    telemetry: Polls | None = None
+
+
+def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, list[str]]:
+    """The polls of the bench's devices, and a message for each rate that the ticks do not give."""
+    tick_hz = description.clock.tick_hz
+    problems: list[str] = []
+    magnetometer = monitor = None
+    for name, spec in description.device.items():
+        option, adc = options[name], spec.adc or ""
+        if not isinstance(option, Hmc2003Options | AmplifierMonitorOptions) or not isinstance(
+            options.get(adc), Ads1115Options
+        ):
+            continue
+        gap = _ticks_of_conversion(description, adc)
+        asked = options[adc].rate_hz
+        if isinstance(option, Hmc2003Options):
+            asked = 100.0 if asked is None else asked
+            magnetometer = _polls(asked, AXES, tick_hz, gap)
+            if magnetometer is None:
+                problems.append(_refusal(adc, asked, AXES, tick_hz, gap, f"each of the {AXES} inputs is read so often"))
+        else:
+            if asked is not None:
+                problems.append(
+                    f"[device.{adc}.rate_hz] this converter is read by '{name}': remove this key and write "
+                    f"rate_hz = ... (readings per second, of one output each) under [device.{name}]"
+                )
+            monitor = MONITOR if option.rate_hz is None else _polls(option.rate_hz, 1, tick_hz, gap)
+            if monitor is None or monitor.shortest_gap < gap:
+                asked = tick_hz * MONITOR.count / MONITOR.divider if option.rate_hz is None else option.rate_hz
+                problems.append(_refusal(name, asked, 1, tick_hz, gap, "one output is read each time"))
+    for name, option in options.items():
+        if isinstance(option, E727Options) and _polls(option.rate_hz, 1, tick_hz, 1, most=1) is None:
+            problems.append(_refusal(name, option.rate_hz, 1, tick_hz, 1, "a command goes out so often", most=1))
+    verify = None
+    if any(isinstance(option, DacAmplifierOptions) for option in options.values()):
+        verify = VERIFY if monitor is None else VERIFY_BESIDE_MONITOR
+    telemetry = TELEMETRY if any(isinstance(option, CanTelemetryOptions) for option in options.values()) else None
+    return Polling(magnetometer, monitor, verify, telemetry), problems
+
+
+def poll_divider(rate_hz: float, tick_hz: int) -> int:
+    """Ticks between two looks at a sensor that samples by its own clock: often enough to see every sample."""
+    return max(1, int(tick_hz / rate_hz))
+
+
+def _ticks_of_conversion(description: BenchDescription, adc: str) -> int:
+    """Ticks from one poll of a converter to the next one that surely finds its conversion done."""
+    bus = description.bus.get(description.device[adc].bus or "")
+    transfer_s = WIRE_BITS["reading"] / bus.speed_hz if isinstance(bus, I2cSpec) else 0.0
+    conversion_s = WAKE_UP_NS * 1e-9 + (1.0 + RATE_TOLERANCE) / SAMPLES_PER_S
+    return math.ceil((conversion_s + transfer_s) * description.clock.tick_hz)
+
+
+def _polls(rate_hz: float, each: int, tick_hz: int, gap: int, most: int = MOST_IN_FRAME) -> Polls | None:
+    """``each * rate_hz`` polls a second in the shortest frame, at least ``gap`` ticks apart; ``None``: impossible."""
+    for count in range(1, most + 1):
+        divider = tick_hz * count / (each * rate_hz)
+        if not divider <= LONGEST_FRAME + 1:  # infinite, for a rate of next to nothing
+            continue
+        whole = round(divider)
+        if abs(divider - whole) > 1e-9 * divider or not 1 <= whole <= LONGEST_FRAME:
+            continue
+        polls = Polls(whole, count)
+        return polls if polls.shortest_gap >= gap else None
+    return None
+
+
+def _rates(each: int, tick_hz: int, gap: int, most: int) -> Iterator[float]:
+    """Rates that work and that a bench file can say in six digits."""
+    for divider in range(1, LONGEST_FRAME + 1):
+        for count in range(1, most + 1):
+            rate_hz = float(f"{tick_hz * count / divider / each:g}")
+            if _polls(rate_hz, each, tick_hz, gap, most) is not None:
+                yield rate_hz
+
+
+def _refusal(name: str, rate_hz: float, each: int, tick_hz: int, gap: int, what: str, most: int = MOST_IN_FRAME) -> str:
+    rates = set(_rates(each, tick_hz, gap, most))
+    below = max((rate for rate in rates if rate < rate_hz), default=None)
+    above = min((rate for rate in rates if rate > rate_hz), default=None)
+    nearest = " and ".join(f"{rate:g} Hz" for rate in (below, above) if rate is not None)
+    too_fast = _polls(rate_hz, each, tick_hz, 1, most) is not None
+    why = "is faster than its conversions on this bus" if too_fast else f"does not divide the tick of {tick_hz} Hz"
+    return f"[device.{name}.rate_hz] {rate_hz:g} Hz {why} ({what}); the nearest that work: {nearest or 'none'}"
