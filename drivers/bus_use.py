@@ -139,7 +139,7 @@ def _remedies(description: BenchDescription, name: str, here: list[BusUse]) -> I
     first = here[0]
     if "read-back" in first.what:
         yield f"leave out read_back of '{first.device}'"
-    elif first.task == "actuate" or first.what == "SETPOINT":
+    elif first.what == "command" and first.per_s >= description.clock.tick_hz:
         yield "lower [clock] tick_hz"
     else:
         yield f"lower rate_hz of '{first.device}'"
@@ -178,7 +178,7 @@ def _repeated(
             yield "ERR?", serial_bits(e727.ERROR_BYTES), rate_hz / e727.ASK_ERROR_EVERY, ""
         case CanAmplifierOptions():
             frames_hz = {
-                "SETPOINT": float(tick_hz),
+                "command": float(tick_hz),
                 "STATUS": can_amplifier.STATUS_HZ,
                 "AMPLIFIER_HEARTBEAT": can_amplifier.NODE_HEARTBEAT_HZ,
             }

@@ -30,7 +30,7 @@ CONFIRM_STEPS = 100
 COMMAND_EVERY = 5
 TICK_S = 0.001
 STATUS_HZ, NODE_HEARTBEAT_HZ = 100.0, 10.0  # frames of the node (micron.dbc)
-FRAMES = {"SETPOINT": 8, "STATUS": 8, "AMPLIFIER_HEARTBEAT": 1}
+FRAMES = {"command": 8, "STATUS": 8, "AMPLIFIER_HEARTBEAT": 1}
 """Data bytes of what is repeated: one SETPOINT per ``write``, the others by the node. COMMAND is not repeated."""
 RECEIVE_LIMIT = 32  # frames per call, so that a babbling bus cannot hold the tick
 

@@ -184,7 +184,7 @@ def test_can_frames_are_those_declared():
     assert found == {(288, 8): 1000, (289, 8): 100, (1793, 1): 10, (1792, 1): 50, (512, 8): 50, (513, 8): 50}
     declared = {use.what: (use.per_s, use.bits) for use in traffic.uses if use.bus == "can0"}
     assert declared == {
-        "SETPOINT": (1000, 135), "STATUS": (100, 135), "AMPLIFIER_HEARTBEAT": (10, 65), "HOST_HEARTBEAT": (50, 65),
+        "command": (1000, 135), "STATUS": (100, 135), "AMPLIFIER_HEARTBEAT": (10, 65), "HOST_HEARTBEAT": (50, 65),
         "TELEMETRY_TREMOR": (50, 135), "TELEMETRY_STATE": (50, 135), "STOP_BUTTON": (10, 75),
     }  # fmt: skip
     for n in (1, 2, 8):

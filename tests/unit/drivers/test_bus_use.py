@@ -92,7 +92,7 @@ def test_no_bus_of_ours_is_overloaded(path: Path):
          ["[bus.e7270] is asked for 97 %", "piezo command 100/s x 370 bit = 96.4 %", "set baud to 46563",
           "lower rate_hz of 'piezo'"]),
         ([("bitrate = 500_000", "bitrate = 125_000")], "micron-can",
-         ["[bus.can0] is asked for 133 %", "piezo SETPOINT 1000/s x 135 bit = 108.0 %", "set bitrate to 208313",
+         ["[bus.can0] is asked for 133 %", "piezo command 1000/s x 135 bit = 108.0 %", "set bitrate to 208313",
           "put 'piezo' on a bus of its own"]),
     ],
 )  # fmt: skip
