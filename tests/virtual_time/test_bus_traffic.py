@@ -118,7 +118,7 @@ def run(bench: Path, seconds: float = 1.3) -> Traffic:
             spies[name].line = line
             spies[name].bit_ns = 1e9 / opened.file.description.bus[name].speed_hz  # type: ignore[union-attr]
 
-    outcome, _ = run_in_process(RunRequest(bench, seconds, virtual=True), wrap=spy, on_open=look_at_lines)
+    outcome, _ = run_in_process(RunRequest(bench, seconds, pace="virtual"), wrap=spy, on_open=look_at_lines)
     assert outcome["safe_state"]["reason"] == "run finished"
     description = load_bench(bench).description
     options = check_devices(description, "")

@@ -118,7 +118,7 @@ def test_what_is_accepted_runs_and_ends(
     """A run of a twentieth of a second: it ends in the safe state, whatever the reason, or is refused."""
     path = with_number(tmp_path_factory.mktemp("absurd"), place, number)
     try:
-        outcome, _ = run_in_process(RunRequest(path, 0.05, virtual=True))
+        outcome, _ = run_in_process(RunRequest(path, 0.05, pace="virtual"))
     except HalError:
         return
     assert outcome["safe_state"]["reached"]
