@@ -45,7 +45,13 @@ def test_live_data_move(page: Any):
 
 def test_a_spike_of_two_milliseconds_is_seen_at_full_zoom_out(page: Any, server: Server, artefacts: Path):
     go(page, "scope")
-    page.evaluate("micron.scope.setWindow(600000)")
+    page.evaluate(
+        """Object.assign(micron.scope.settings, { channels: ["volts_0"], display: "shared" });
+        micron.scope.settings.traces.volts_0 = { coupling: "dc" };
+        micron.scope.settings.trigger.on = false;
+        micron.scope.changed();
+        micron.scope.setWindow(600000)"""
+    )
     page.wait_for_function("micron.scope.subscription.buckets.n > 1")
     top = "micron.scope.subscription.buckets.highs(0).reduce((m, v) => Math.max(m, v), -1e9)"
     before = page.evaluate(top)

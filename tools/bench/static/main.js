@@ -1,6 +1,7 @@
 // The frame of the page: views, vital signs, alerts, the safe button.
 import { get, post, setToken } from "./api.js";
 import { bytes, duration, h } from "./dom.js";
+import { figure, showHints } from "./figures.js";
 import { Link } from "./link.js";
 
 const VIEWS = [
@@ -84,19 +85,28 @@ function keepSafeNear() {
   place();
 }
 
+let vitals = new Map();
 function showVitals(state) {
   const s = state.status;
   const timing = state.timing["sample to command"];
   const outputs = s.tasks?.actuate; // rate, budget, runs, overruns, late, skipped
   const share = outputs ? (100 * outputs[5]) / Math.max(1, outputs[2] + outputs[5]) : 0;
-  const items = [
-    ["run time", s.t_s === undefined ? "–" : duration(s.t_s)],
-    ["sample to command p50", timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–"],
-    ["lost scans", s.lost ?? "–"],
-    ["outputs skipped", outputs ? `${share === 0 ? 0 : share < 0.1 ? "<0.1" : share.toFixed(1)} %` : "–"],
-    ["tremor", s.amplitude_um ? `${Math.hypot(...s.amplitude_um).toFixed(0)} µm` : "–"],
+  const items = [ // name, value, whether it is as it should be
+    ["run time", s.t_s === undefined ? "–" : duration(s.t_s), true],
+    ["sample to command p50", timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–", true],
+    ["lost scans", s.lost ?? "–", !s.lost],
+    ["outputs held", outputs ? `${share === 0 ? 0 : share < 0.1 ? "<0.1" : share.toFixed(1)} %` : "–", share < 1],
+    ["tremor", s.amplitude_um ? `${Math.hypot(...s.amplitude_um).toFixed(0)} µm` : "–", true],
   ];
-  byId("vitals").replaceChildren(...items.map(([name, value]) => h("div", {}, h("dt", {}, name), h("dd", {}, value))));
+  if (!vitals.size) {
+    vitals = new Map(items.map(([name]) => [name, h("dd")]));
+    byId("vitals").replaceChildren(...items.map(([name]) => h("div", {}, h("dt", {}, figure(name)), vitals.get(name))));
+  }
+  for (const [name, value, good] of items) {
+    const cell = vitals.get(name);
+    if (cell.textContent !== String(value)) cell.textContent = value;
+    cell.classList.toggle("warn-text", !good);
+  }
 }
 
 const PHASES = {
@@ -177,6 +187,7 @@ async function boot() {
   byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   byId("safe").onclick = byId("safe-near").onclick = goSafe;
   keepSafeNear();
+  showHints(byId("hint"));
   byId("log-toggle").onclick = () => {
     byId("log").hidden = !byId("log").hidden;
     byId("log-toggle").setAttribute("aria-expanded", String(!byId("log").hidden));

@@ -49,7 +49,11 @@ export function times(buckets, t0) {
 }
 
 export class Strip {
-  /** `traces`: [{label, unit, colour?}]; options: unit, sync, onSelect(x0, x1), onClick(x, shift), least (smallest span). */
+  /**
+   * `traces`: [{label, unit, colour?}]; options: sync, onSelect(x0, x1), onClick(x, shift), onWheel(direction, x),
+   * least (smallest span), xTitle, yTitle, ticks(heightPx): [{at, text}] of the vertical axis, more: series after the
+   * traces, in the colour of a fault.
+   */
   constructor(traces, options = {}) {
     this.traces = traces;
     this.options = options;
@@ -69,6 +73,7 @@ export class Strip {
   build() {
     this.plot?.destroy();
     const palette = colours();
+    const title = (text) => (text ? { label: text, labelSize: 15, labelGap: 0, labelFont: "10px " + css("--sans") } : {});
     const axis = { stroke: css("--faint"), grid: { stroke: css("--grid"), width: 1 }, ticks: { stroke: css("--line"), size: 4 }, font: "10px " + css("--mono") };
     this.legend.replaceChildren(
       ...this.traces.map((trace, i) => h("span", { style: `--dot:${trace.colour || palette[i % palette.length]}` }, trace.label, " ", this.values[i])),
@@ -87,8 +92,10 @@ export class Strip {
         },
         scales: { x: { time: false, range: () => this.x }, y: { range: (u, low, high) => this.fixed || this.range.follow(low, high) } },
         axes: [
-          { ...axis, size: this.options.noTimeAxis ? 6 : 30, values: this.options.noTimeAxis ? () => [] : undefined, label: undefined, gap: 2 },
-          { ...axis, size: 56, gap: 4, label: undefined, values: (u, splits) => splits.map((v) => digits(v, 3)) },
+          { ...axis, size: this.options.noTimeAxis ? 6 : this.options.xTitle ? 22 : 30, values: this.options.noTimeAxis ? () => [] : undefined, gap: 2, ...title(this.options.noTimeAxis ? "" : this.options.xTitle) },
+          { ...axis, size: 56, gap: 4, ...title(this.options.yTitle),
+            ...(this.options.ticks ? { splits: (u) => this.ticks(u).map((t) => t.at), values: (u) => this.ticks(u).map((t) => t.text) }
+              : { values: (u, splits) => splits.map((v) => digits(v, 3)) }) },
         ],
         series: [
           {},
@@ -96,6 +103,7 @@ export class Strip {
             stroke: trace.colour || palette[i % palette.length], width: trace.width || 1.25, points: { show: false },
             dash: trace.dash,
           })),
+          ...Array.from({ length: this.options.more || 0 }, () => ({ stroke: css("--bad"), width: 2.5, points: { show: false }, spanGaps: false })),
         ],
         hooks: {
           setSelect: [(u) => {
@@ -106,7 +114,7 @@ export class Strip {
           setCursor: [(u) => strip.options.onCursor?.(u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null)],
         },
       },
-      [[], ...this.traces.map(() => [])],
+      [[], ...this.traces.map(() => []), ...Array.from({ length: this.options.more || 0 }, () => [])],
       this.body,
     );
     let moved = 0;
@@ -115,6 +123,7 @@ export class Strip {
       if (Math.abs(event.clientX - moved) < 3) this.options.onClick?.(this.plot.posToVal(event.offsetX, "x"), event.shiftKey);
     });
     this.plot.over.addEventListener("dblclick", () => this.options.onDouble?.());
+    this.touch();
     this.plot.over.addEventListener("wheel", (event) => {
       if (!this.options.onWheel) return;
       event.preventDefault();
@@ -122,15 +131,42 @@ export class Strip {
     }, { passive: false });
   }
 
+  ticks(u) { return this.options.ticks(u.bbox.height / devicePixelRatio); }
+
+  /** Two fingers zoom in steps, as the wheel does; one finger taps (a cursor) or scrolls the page. */
+  touch() {
+    const fingers = new Map();
+    let apart = 0;
+    const { over } = this.plot;
+    const end = (event) => fingers.delete(event.pointerId);
+    over.addEventListener("pointerdown", (event) => {
+      if (event.pointerType === "touch") fingers.set(event.pointerId, event.clientX);
+      const [a, b] = fingers.values();
+      apart = b === undefined ? 0 : Math.abs(a - b);
+    });
+    over.addEventListener("pointermove", (event) => {
+      if (!fingers.has(event.pointerId)) return;
+      fingers.set(event.pointerId, event.clientX);
+      const [a, b] = fingers.values();
+      if (b === undefined || !apart) return;
+      const now = Math.max(1, Math.abs(a - b));
+      if (Math.abs(Math.log(now / apart)) < 0.3) return;
+      this.options.onWheel?.(now < apart ? 1 : -1, this.plot.posToVal((a + b) / 2 - over.getBoundingClientRect().left, "x"));
+      apart = now;
+    });
+    for (const name of ["pointerup", "pointercancel", "pointerleave"]) over.addEventListener(name, end);
+  }
+
   size() { return { width: Math.max(80, this.body.clientWidth), height: Math.max(40, this.body.clientHeight) }; }
   resize() { if (this.element.isConnected) this.plot.setSize(this.size()); }
 
-  /** New data: `x` seconds and one y array per trace, shown from x0 to x1. */
-  show(x, ys, x0, x1) {
+  /** New data: `x` seconds and one y array per series, shown from x0 to x1; `texts` instead of the newest values. */
+  show(x, ys, x0, x1, texts = null) {
     this.x = [x0, x1];
     this.data = [x, ...ys];
     this.plot.setData(this.data);
-    ys.forEach((y, i) => this.value(i, y.length ? y[y.length - 1] : NaN));
+    if (texts) texts.forEach((text, i) => { this.values[i].textContent = text; });
+    else ys.forEach((y, i) => this.value(i, y.length ? y[y.length - 1] : NaN));
   }
 
   value(i, number) { this.values[i].textContent = digits(number) + (this.traces[i].unit ? ` ${unitText(this.traces[i].unit)}` : ""); }
@@ -151,7 +187,7 @@ export class Strip {
 
   drawMarks(u) {
     const { ctx, bbox } = u;
-    for (const { x, y, colour, dash } of this.marks) {
+    for (const { x, y, colour, dash, label } of this.marks) {
       ctx.save();
       ctx.strokeStyle = colour;
       ctx.lineWidth = 1.2 * devicePixelRatio;
@@ -165,6 +201,12 @@ export class Strip {
         if (at >= bbox.top && at <= bbox.top + bbox.height) { ctx.moveTo(bbox.left, at); ctx.lineTo(bbox.left + bbox.width, at); }
       }
       ctx.stroke();
+      if (label) {
+        ctx.fillStyle = colour;
+        ctx.font = `600 ${11 * devicePixelRatio}px ${css("--mono")}`;
+        if (x !== undefined) ctx.fillText(label, u.valToPos(x, "x", true) + 3 * devicePixelRatio, bbox.top + 11 * devicePixelRatio);
+        else ctx.fillText(label, bbox.left + 4 * devicePixelRatio, u.valToPos(y, "y", true) - 3 * devicePixelRatio);
+      }
       ctx.restore();
     }
   }

@@ -1,5 +1,6 @@
 // The three stacks: volts, strokes, hysteresis; and driving them by hand while a button is held.
 import { canvas, colours, css, digits, h, persistent, segments } from "../dom.js";
+import { explained } from "../figures.js";
 import { Strip, interleave, times } from "../plot.js";
 
 const CHANNELS = ["command_1", "command_2", "command_3", "stroke_1", "stroke_2", "stroke_3", "clip"];
@@ -82,7 +83,7 @@ export function mount(root, { link }) {
       : link.mayOrder ? "Compensation drives the stacks. Arm to move them by hand." : "View only.";
   }
 
-  const strip = new Strip([1, 2, 3].map((n) => ({ label: `command ${n}`, unit: "V" })), { least: 10 });
+  const strip = new Strip([1, 2, 3].map((n) => ({ label: `command ${n}`, unit: "V" })), { least: 10, xTitle: "time, s", yTitle: "V" });
   const limits = h("div.row.num", { style: "font-size:12px;gap:16px" });
   root.append(h("div.cols.actuators", {},
     h("section.panel.row", {}, arm, h("span.soft", {}, "speed"),
@@ -141,7 +142,7 @@ export function mount(root, { link }) {
     for (const v of b.highs(6)) bits |= v;
     const s = link.state?.status || {};
     limits.replaceChildren(...CLIP.map(([bit, name]) => h("span", { className: bits & bit ? "warn-text" : "faint" }, `${name} ${bits & bit ? "limited" : "ok"}`)),
-      h("span.soft", {}, `${s.clipped ?? 0} of ${s.commands ?? 0} commands limited`));
+      h("span.soft", explained("limited"), `${s.clipped ?? 0} of ${s.commands ?? 0} commands limited`));
   }
   const off = link.on("state", showArm);
   const retheme = () => strip.build();

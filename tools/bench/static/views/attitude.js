@@ -36,7 +36,7 @@ export function mount(root, { link }) {
     h("h2", {}, "Beside it: ", gap), h("div.chart.square", {}, second));
   const numbers = h("table");
   const error = h("p.note");
-  const strip = new Strip(["x", "y", "z"].map((a) => ({ label: `rate ${a}`, unit: "°/s" })), { least: 2 });
+  const strip = new Strip(["x", "y", "z"].map((a) => ({ label: `rate ${a}`, unit: "°/s" })), { least: 2, xTitle: "time, s", yTitle: "°/s" });
 
   async function compare(method) {
     settings.compare = method;

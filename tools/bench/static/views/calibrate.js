@@ -17,7 +17,7 @@ export function mount(root, { link }) {
   const apply = (kind) => act(() => post("/api/calibrate/apply", { kind }));
   const wizard = poseWizard(link, apply, fail);
 
-  const strip = new Strip([{ label: "temperature of the sensors", unit: "°C" }], { least: 0.5 });
+  const strip = new Strip([{ label: "temperature of the sensors", unit: "°C" }], { least: 0.5, xTitle: "time, s", yTitle: "°C" });
   const warmth = h("b");
   const labStatus = h("span.soft.num");
   const labResult = h("div");

@@ -1,6 +1,6 @@
 // Recordings: start, stop, notes, list, quick look, export. The server records; this page may be closed.
 import { download, get, post } from "../api.js";
-import { bytes, colours, duration, h } from "../dom.js";
+import { bytes, colours, duration, h, unitText } from "../dom.js";
 import { Strip } from "../plot.js";
 
 const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["temperature", "temperature"]];
@@ -80,7 +80,7 @@ export function mount(root, { link }) {
     let data;
     try { data = await get(`/api/recordings/${encodeURIComponent(which)}/look?channels=${what}`); } catch (error) { look.replaceChildren(h("p.empty.bad", {}, error.message)); return; }
     const palette = colours();
-    strip = new Strip(data.channels.map((label, i) => ({ label, unit: data.units[i], colour: palette[i] })));
+    strip = new Strip(data.channels.map((label, i) => ({ label, unit: data.units[i], colour: palette[i] })), { xTitle: "time, s", yTitle: unitText(data.units[0] || "1") });
     const x = Float64Array.from(data.t.flatMap((t) => [t, t]));
     const ys = data.low.map((low, c) => Float32Array.from(low.flatMap((v, i) => [v, data.high[c][i]])));
     const picker = h("select", { "aria-label": "What to look at", onchange: () => { what = picker.value; show(which); } }, LOOKS.map(([value, title]) => h("option", { value, selected: value === what }, title)));

@@ -1,5 +1,6 @@
 // Where the time of a tick goes: one histogram per task against its budget, and from sample to command.
 import { canvas, css, h } from "../dom.js";
+import { explained, figure } from "../figures.js";
 
 const NAMES = { tick: "whole tick", lateness: "late by" };
 const LOW_US = 1;
@@ -8,19 +9,40 @@ const HIGH_US = 20000;
 const x = (us, width) => (width * Math.log(Math.max(us, LOW_US) / LOW_US)) / Math.log(HIGH_US / LOW_US);
 const us = (value) => (value >= 10000 ? `${(value / 1000).toFixed(1)} ms` : `${value < 100 ? value.toFixed(1) : value.toFixed(0)}`);
 
+/** p99 as a share of the budget: a bar of which two thirds are 100 %, with a line there. */
+function budgetBar() {
+  const fill = h("i");
+  const text = h("span");
+  const bar = h("div.budget", {}, h("div.track", {}, fill, h("b")), text);
+  bar.show = (share) => {
+    fill.style.width = `${Math.min(100, (100 * share) / 1.5)}%`;
+    fill.classList.toggle("over", share > 1);
+    text.textContent = `${(100 * share).toFixed(0)} %`;
+  };
+  return bar;
+}
+
 export function mount(root, { link }) {
   let counts = {};
   const rows = new Map();
   const big = canvas((g, w, hgt) => histogram(g, w, hgt, counts["sample to command"], null, true), "Histogram of sample to command");
   const headline = h("div.row.headline");
+  const said = new Map();
+  headline.say = (name, value, unit) => {
+    if (!said.has(name)) {
+      said.set(name, h("span"));
+      headline.append(h("div", {}, h("div.faint", {}, figure(name)), h("div.big", {}, said.get(name), unit ? h("span.unit", {}, unit) : null)));
+    }
+    said.get(name).textContent = value;
+  };
   const body = h("tbody");
-  const head = ["task", "rate", "distribution, log 1 µs to 20 ms", "p50", "p99", "p99.9", "worst", "budget", "over", "late", "skipped", "at tick"];
+  const head = ["task", "rate", "distribution, log 1 µs to 20 ms", "p50", "p99", "p99.9", "worst", "budget", "of budget", "over", "late", "held", "at tick"];
   root.append(h("div.cols.latency", {},
     h("section.panel.total", {},
       h("div", {}, h("h2", {}, "From sample to command"), headline),
       h("div.chart", {}, big)),
-    h("section.panel.tasks", {}, h("h2", {}, "Tasks ", h("small", {}, "µs since the start; line: budget. “over” counts runs beyond the budget, “late” runs that ended after the deadline")),
-      h("table.cards", {}, h("thead", {}, h("tr", {}, head.map((t, i) => h(i === 0 || i === 2 ? "th" : "th.num", {}, t)))), body))));
+    h("section.panel.tasks", {}, h("h2", {}, "Tasks ", h("small", {}, "µs since the start; line: budget. normal: p99 below the budget, nothing late, nothing held")),
+      h("table.cards", {}, h("thead", {}, h("tr", {}, head.map((t, i) => h(i === 0 || i === 2 ? "th" : "th.num", {}, i === 2 ? t : figure(t))))), body))));
 
   function histogram(g, w, hgt, data, budget, axis) {
     const floor = axis ? hgt - 18 : hgt - 1;
@@ -49,13 +71,15 @@ export function mount(root, { link }) {
 
   function row(name) {
     if (rows.has(name)) return rows.get(name);
-    const cells = head.slice(3).map((label) => h("td.num", { "data-label": label }));
+    const cells = head.slice(3).map((label) => h("td.num", { "data-label": label, ...explained(label) }));
     const picture = canvas((g, w, hgt) => histogram(g, w, hgt, counts[name], rows.get(name).budget), `Histogram of ${name}`);
-    const rate = h("td.num.soft", { "data-label": "rate" });
+    const rate = h("td.num.soft", { "data-label": "rate", ...explained("rate") });
     const line = h("tr", {}, h("td", {}, NAMES[name] || name.replaceAll("_", " ")), rate,
       h("td.picture.whole", {}, h("div.small", {}, picture)), cells);
     body.append(line);
-    const made = { cells, picture, rate, budget: null };
+    const use = budgetBar();
+    cells[5].append(use);
+    const made = { cells, use, picture, rate, budget: null };
     rows.set(name, made);
     return made;
   }
@@ -64,9 +88,8 @@ export function mount(root, { link }) {
     const { timing, status } = state;
     const total = timing["sample to command"];
     if (total?.[0]) {
-      const item = (name, value) => h("div", {}, h("div.faint", {}, name), h("div.big", {}, (value / 1000).toFixed(2), h("span.unit", {}, "ms")));
-      headline.replaceChildren(item("p50", total[1]), item("p99", total[2]), item("worst", total[4]),
-        h("div", {}, h("div.faint", {}, "skipped ticks"), h("div.big", {}, String(status.skipped ?? 0))));
+      for (const [name, value] of [["p50", total[1]], ["p99", total[2]], ["worst", total[4]]]) headline.say(name, (value / 1000).toFixed(2), "ms");
+      headline.say("held ticks", String(status.skipped ?? 0), "");
     }
     for (const [name, [n, p50, p99, p999, worst, tick]] of Object.entries(timing)) {
       if (name === "sample to command") continue;
@@ -74,8 +97,10 @@ export function mount(root, { link }) {
       const task = status.tasks?.[name];
       r.budget = task?.[1] ?? null;
       r.rate.textContent = task ? `${task[0]} Hz` : "";
-      const texts = n ? [us(p50), us(p99), us(p999), us(worst), task ? us(task[1]) : "", task?.[3] ?? "", task?.[4] ?? "", task?.[5] ?? "", tick] : [];
-      texts.forEach((text, i) => { r.cells[i].textContent = text; });
+      const texts = n ? [us(p50), us(p99), us(p999), us(worst), task ? us(task[1]) : "", null, task?.[3] ?? "", task?.[4] ?? "", task?.[5] ?? "", tick] : [];
+      texts.forEach((text, i) => { if (text !== null) r.cells[i].textContent = text; });
+      r.use.hidden = !(n && task);
+      if (n && task) r.use.show(p99 / task[1]);
       r.cells[1].classList.toggle("warn-text", Boolean(task && p99 > task[1]));
     }
   }

@@ -1,24 +1,35 @@
-// The oscilloscope: channels in strips by unit, live or paused, with zoom, cursors and a trigger.
-import { css, digits, h, persistent, segments, unitText } from "../dom.js";
-import { Strip, interleave, times } from "../plot.js";
+// The oscilloscope: traces in lanes, live or paused, with zoom, cursors, a trigger, maths and spectra.
+import { css, digits, h, persistent, segments } from "../dom.js";
+import { Strip, times } from "../plot.js";
+import { withUnit } from "../signals.js";
+import { analysis } from "./scope_analysis.js";
 import { channelPicker } from "./scope_channels.js";
+import { divisionOf, laneTicks, listTraces, mathsPanel, placeIn, samplesOf, tracePanel } from "./scope_traces.js";
 import { Trigger, triggerControls } from "./scope_trigger.js";
 
 const WINDOWS = [[500, "0.5 s"], [1000, "1 s"], [2000, "2 s"], [5000, "5 s"], [10000, "10 s"], [30000, "30 s"], [60000, "1 min"], [300000, "5 min"], [600000, "10 min"]];
+const MODES = [["time", "Time"], ["xy", "XY"], ["fft", "FFT"], ["spectrogram", "Spectrogram"]];
 const HZ = 1000;
+const MOST_PIXELS = 8192; // the server gives no more
+const ANALYSIS_MS = 200;
+const SLACK = 0.3; // further part of the window in which a trigger may be found
 
 export function mount(root, { link, catalogue }) {
-  const settings = persistent("scope", {
-    channels: catalogue.filter((c) => ["volts", "accelerometer", "magnetometer", "command"].includes(c.group)).slice(0, 20).map((c) => c.name),
-    rows: 5000, side: true, trigger: { on: false, channel: "volts_0", level: 2.5, slope: "up", mode: "auto" },
+  const settings = persistent("scope.2", {
+    channels: catalogue.filter((c) => ["tip_displacement", "command"].includes(c.group)).map((c) => c.name),
+    maths: [], traces: {}, rows: 2000, side: true, display: "lanes", mode: "time", top: 30, first: "", second: "",
+    trigger: { on: true, channel: "tip_displacement_x", level: 0, slope: "up", mode: "auto" },
   });
   const known = new Map(catalogue.map((c) => [c.name, c]));
+  let traces = [];
+  let columns = []; // what is subscribed to: channels shown, and what maths and trigger need
   let strips = [];
   let subscription = null;
   let paused = null; // {tEnd, head, view: [x0, x1], buckets}
   let cursors = [null, null];
   let dirty = true;
   let frame = 0;
+  let analysedAt = 0;
   const trigger = new Trigger(settings.trigger);
 
   const plots = h("div.plots");
@@ -26,41 +37,79 @@ export function mount(root, { link, catalogue }) {
   const rate = h("span.faint.num.rate");
   const pauseButton = h("button", { onclick: () => (paused ? resume() : pause()), title: "Pause or go on (Space)" }, "Pause");
   const windows = segments(WINDOWS, settings.rows, (rows) => setWindow(rows), "Window");
-  const picker = channelPicker(catalogue, settings, () => { settings.save(); rebuild(); });
-  const triggerBox = triggerControls(settings, catalogue, () => { settings.save(); trigger.configure(settings.trigger); dirty = true; });
-  const toolbar = h("div.toolbar", {}, pauseButton, windows,
-    h("button", { onclick: fit, title: "Fit the vertical axes to what is shown (F)" }, "Fit"),
+  windows.classList.add("wide");
+  const windowChoice = h("select.narrow", { "aria-label": "Window", onchange: () => setWindow(windowChoice.value) }, WINDOWS.map(([rows, text]) => h("option", { value: rows, selected: rows === settings.rows }, text)));
+  const modes = segments(MODES, settings.mode, (mode) => { settings.mode = mode; changed(); }, "What is drawn");
+  const displays = segments([["lanes", "lanes"], ["shared", "one axis"]], settings.display, (display) => { settings.display = display; changed(); }, "Traces");
+  displays.title = "Lanes: every trace has its own scale. One axis: all traces of a unit share one";
+  const picker = channelPicker(catalogue, settings, () => changed());
+  const triggerBox = triggerControls(settings, catalogue, () => { trigger.configure(settings.trigger); changed(); });
+  const analysed = analysis(settings, () => { settings.save(); dirty = true; analysedAt = 0; });
+  const toolbar = h("div.toolbar", {}, pauseButton, windows, windowChoice, modes, displays,
+    h("button", { onclick: fit, title: "Fit the scales to what is shown (F)" }, "Fit"),
     h("button", { onclick: () => { settings.side = !settings.side; settings.save(); side.hidden = !settings.side; } }, "Channels"), rate);
-  const side = h("div.stack.side", { hidden: !settings.side }, picker, triggerBox);
-  root.append(h("div.scope", {}, toolbar, h("div.body.stack", {}, h("div.stack.main", {}, plots, readout), side)));
+  const ownPanels = h("div.stack.own");
+  const side = h("div.stack.side", { hidden: !settings.side }, ownPanels, picker);
+  root.append(h("div.scope", {}, toolbar, triggerBox.element, h("div.body.stack", {}, h("div.stack.main", {}, plots, analysed.element, readout), side)));
+
+  function changed() {
+    settings.save();
+    rebuild();
+  }
 
   function groups() {
-    const byUnit = new Map();
-    settings.channels.forEach((name, index) => {
-      const channel = known.get(name);
-      if (!channel) return;
-      const key = `${channel.unit}|${["V", "1"].includes(channel.unit) ? channel.group : ""}`;
-      if (!byUnit.has(key)) byUnit.set(key, []);
-      byUnit.get(key).push({ ...channel, index });
-    });
-    return [...byUnit.values()];
+    const byGroup = new Map();
+    for (const trace of traces) {
+      if (!byGroup.has(trace.group)) byGroup.set(trace.group, []);
+      byGroup.get(trace.group).push(trace);
+    }
+    return [...byGroup.values()];
+  }
+
+  /** Whether something is computed that needs samples rather than smallest and largest values. */
+  const needsSamples = () => settings.mode !== "time" || traces.some((t) => t.op || t.set.filter !== "none");
+  const pixels = (rows) => (needsSamples() ? Math.min(MOST_PIXELS, rows) : plots.clientWidth || 1000);
+
+  function subscribe() {
+    link.drop(subscription);
+    const more = settings.trigger.on ? 1 + SLACK : 1;
+    subscription = columns.length ? link.subscribe(columns, settings.rows * more, Math.min(MOST_PIXELS, pixels(settings.rows) * more)) : null;
   }
 
   function rebuild() {
+    const lanes = new Map(traces.map((t) => [t.name, t.lane]));
+    traces = listTraces(settings, known);
+    traces.forEach((t) => { if (lanes.has(t.name)) t.lane = lanes.get(t.name); });
+    const { on, slope, channel } = settings.trigger;
+    columns = [...new Set([...traces.flatMap((t) => t.sources), ...(on ? [slope === "event" ? "status" : channel] : [])])].filter((name) => known.has(name));
+    const open = new Set([...ownPanels.querySelectorAll("details[open] > summary")].map((s) => s.textContent));
+    ownPanels.replaceChildren(tracePanel(settings, traces, changed), mathsPanel(settings, catalogue, changed));
+    ownPanels.querySelectorAll("details").forEach((d) => { d.open = open.has(d.firstChild.textContent); });
     strips.forEach(({ strip }) => strip.destroy());
-    const parts = groups();
-    strips = parts.map((channels, i) => {
-      const strip = new Strip(channels.map((c) => ({ label: c.name, unit: unitText(c.unit) })), {
+    const parts = settings.mode === "time" ? groups() : [];
+    plots.hidden = settings.mode !== "time";
+    analysed.element.hidden = settings.mode === "time";
+    displays.hidden = settings.mode !== "time";
+    if (settings.mode !== "time") analysed.mode();
+    plots.replaceChildren();
+    strips = parts.map((members, i) => {
+      const inLanes = settings.display === "lanes";
+      const made = { members, inLanes, divs: members.map(() => 1) };
+      const unit = members[0].unit === "m" ? "µm" : members[0].unit;
+      made.strip = new Strip(members.map((t) => ({ label: t.name, unit: t.unit })), {
         sync: "scope", noTimeAxis: i < parts.length - 1, onSelect: zoomTo, onClick: setCursor, onDouble: zoomOut, onWheel: wheel,
+        xTitle: "time, s", yTitle: inLanes ? "" : unit || "no unit", more: members.length,
+        ticks: inLanes ? (height) => laneTicks(members.length, made.divs, members.map((t) => t.unit), members.map((t) => t.set.offset), height / members.length, withUnit) : undefined,
       });
-      plots.append(strip.element);
-      return { strip, channels };
+      if (inLanes) made.strip.fixed = [0, members.length];
+      made.strip.element.style.setProperty("--lanes", inLanes ? Math.max(2, members.length) : 2);
+      plots.append(made.strip.element);
+      return made;
     });
-    if (!strips.length) plots.replaceChildren(h("p.empty", {}, "No channel is chosen. Tick some on the right."));
-    else plots.querySelectorAll(".empty").forEach((e) => e.remove());
-    link.drop(subscription);
-    subscription = settings.channels.length ? link.subscribe(settings.channels, settings.rows, plots.clientWidth || 1000) : null;
+    if (!traces.length) plots.replaceChildren(h("p.empty", {}, "No channel is chosen. Tick some in the list of channels."));
+    subscribe();
     if (paused) refetch();
+    analysedAt = 0;
     dirty = true;
   }
 
@@ -68,10 +117,11 @@ export function mount(root, { link, catalogue }) {
     settings.rows = Number(rows);
     settings.save();
     windows.show(rows);
+    windowChoice.value = rows;
     paused = null;
     pauseButton.textContent = "Pause";
-    link.drop(subscription);
-    subscription = link.subscribe(settings.channels, settings.rows, plots.clientWidth || 1000);
+    subscribe();
+    trigger.rearm();
     cursors = [null, null];
     dirty = true;
   }
@@ -139,9 +189,11 @@ export function mount(root, { link, catalogue }) {
     fetching = true;
     const [x0, x1] = paused.view;
     const asked = paused;
-    const buckets = await link.range(settings.channels, asked.head + x0 * HZ - 4, asked.head + x1 * HZ + 4, plots.clientWidth || 1000);
+    const wanted = columns;
+    const buckets = await link.range(columns, asked.head + x0 * HZ - 4, asked.head + x1 * HZ + 4, pixels(Math.ceil((x1 - x0) * HZ) + 8));
     fetching = false;
     if (paused !== asked) return;
+    if (wanted !== columns) { refetch(); return; }
     if (buckets.n) asked.buckets = buckets;
     dirty = true;
     if (asked.view[0] !== x0 || asked.view[1] !== x1) refetch();
@@ -154,53 +206,115 @@ export function mount(root, { link, catalogue }) {
 
   function fit() {
     strips.forEach(({ strip }) => strip.range.reset());
+    traces.forEach((t) => { t.lane.div = 0; });
     dirty = true;
+  }
+
+  /** What AC coupling takes from the channel of the trigger. */
+  function triggerBase(buckets) {
+    const trace = traces.find((t) => !t.op && t.name === settings.trigger.channel);
+    if (!trace || trace.set.coupling !== "ac") return 0;
+    return samplesOf({ ...trace, set: { ...trace.set, filter: "none" } }, buckets, columns, HZ).base;
   }
 
   function draw() {
     frame = requestAnimationFrame(draw);
-    if (!dirty || !strips.length) return;
+    if (!dirty || !traces.length) return;
+    if (settings.mode !== "time" && performance.now() - analysedAt < ANALYSIS_MS) return;
     dirty = false;
+    analysedAt = performance.now();
     const live = subscription?.buckets;
-    if (!paused && live?.n) {
-      const found = trigger.update(live, settings);
+    if (!paused && live?.n && settings.trigger.on) {
+      const found = trigger.update(live, { channels: columns, rows: settings.rows, base: triggerBase(live) });
       if (found === "single") pause();
     }
-    const buckets = paused ? paused.buckets : trigger.held || live;
-    if (!buckets?.n) return;
+    const held = settings.trigger.on && settings.mode === "time" ? trigger.held : null;
+    const buckets = paused ? paused.buckets : held || live;
+    if (!buckets?.n || buckets.channels !== columns.length) return;
     const t = buckets.times();
-    const tEnd = paused ? paused.tEnd : trigger.held ? trigger.heldAt : t[t.length - 1];
-    const [x0, x1] = paused ? paused.view : trigger.held ? trigger.view(settings.rows / HZ) : [-settings.rows / HZ, 0];
-    const x = times(buckets, tEnd);
-    const marks = cursors.flatMap((c, i) => (c === null ? [] : [{ x: c, colour: css(i ? "--c2" : "--accent"), dash: [4, 3] }]));
-    for (const { strip, channels } of strips) {
-      strip.marks = [...marks];
-      if (settings.trigger.on && settings.trigger.slope !== "event") {
-        if (channels.some((c) => c.name === settings.trigger.channel)) strip.marks.push({ y: settings.trigger.level, colour: css("--warn"), dash: [2, 3] });
-      }
-      strip.show(x, channels.map((c) => interleave(buckets, c.index)), x0, x1);
-    }
-    showReadout(tEnd);
+    const tEnd = paused ? paused.tEnd : held ? trigger.heldAt : t[t.length - 1];
+    const [x0, x1] = paused ? paused.view : held ? trigger.view(settings.rows / HZ) : [-settings.rows / HZ, 0];
+    const rateHz = HZ / buckets.perBucket;
+    const samples = new Map(traces.map((trace) => [trace, samplesOf(trace, buckets, columns, rateHz)]));
+    triggerBox.say(paused ? "paused" : settings.mode === "time" ? trigger.text() : "");
+    modes.show(settings.mode);
+    displays.show(settings.display);
+    if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused);
+    else analysed.show({ traces, samples: traces.map((trace) => samples.get(trace)), rateHz, seconds: t.length / rateHz });
+    showReadout(tEnd, samples, t);
   }
 
-  function showReadout(tEnd) {
+  function drawStrips(samples, x, twice, x0, x1, triggered) {
+    const marks = cursors.flatMap((c, i) => (c === null ? [] : [{ x: c, colour: css(i ? "--c2" : "--accent"), dash: [4, 3], label: "AB"[i] }]));
+    if (triggered) marks.push({ x: 0, colour: css("--warn"), dash: [2, 3], label: "T" });
+    for (const { strip, members, inLanes, divs } of strips) {
+      strip.marks = [...marks];
+      const texts = [];
+      const beyond = [];
+      const ys = members.map((trace, i) => {
+        const s = samples.get(trace);
+        const scale = trace.unit === "m" && !inLanes ? 1e6 : 1;
+        divs[i] = inLanes ? divisionOf(trace, s) : 1;
+        const place = inLanes ? placeIn(i, members.length, divs[i], Number(trace.set.offset)) : (v) => v * scale;
+        const limits = [trace.set.low, trace.set.high].map((v) => (v === "" ? null : Number(v) * (trace.unit === "m" ? 1e-6 : 1)));
+        const outside = (v) => (limits[0] !== null && v < limits[0]) || (limits[1] !== null && v > limits[1]);
+        const limited = limits[0] !== null || limits[1] !== null;
+        const y = new Float64Array(twice * s.low.length);
+        const red = limited ? new Array(y.length).fill(null) : new Array(y.length);
+        const zero = place(0);
+        const slope = place(1) - zero;
+        let out = 0;
+        for (let k = 0; k < s.low.length; k++) {
+          y[twice * k] = zero + slope * (s.low[k] - s.base);
+          if (twice === 2) y[2 * k + 1] = zero + slope * (s.high[k] - s.base);
+          if (limited && (outside(s.low[k]) || outside(s.high[k]))) {
+            out += 1;
+            for (let j = 0; j < twice; j++) red[twice * k + j] = y[twice * k + j];
+          }
+        }
+        beyond.push(limited ? red : new Array(y.length).fill(null));
+        for (const limit of limits) if (limit !== null) strip.marks.push({ y: zero + slope * (limit - s.base), colour: css("--bad"), dash: [6, 3] });
+        if (settings.trigger.on && settings.trigger.slope !== "event" && trace.name === settings.trigger.channel) {
+          strip.marks.push({ y: zero + slope * settings.trigger.level, colour: css("--warn"), dash: [2, 3], label: "T" });
+        }
+        const last = s.high.length ? s.high[s.high.length - 1] : NaN;
+        texts.push([withUnit(last, trace.unit, 4), inLanes ? `${withUnit(divs[i], trace.unit)}/div` : "", trace.set.coupling === "ac" ? "AC" : "DC",
+          trace.set.filter === "none" ? "" : s.note || "filtered", limited ? `${((100 * out) / Math.max(1, s.low.length)).toFixed(1)} % outside` : ""].filter(Boolean).join(" · "));
+        strip.values[i].classList.toggle("bad", out > 0);
+        return y;
+      });
+      strip.show(x, [...ys, ...beyond], x0, x1, texts);
+    }
+  }
+
+  /** Value of a trace at `x` seconds from `tEnd`: the bucket that holds it. */
+  function valueAt({ low, high }, t, x) {
+    let [a, b] = [0, t.length - 1];
+    while (a < b) {
+      const middle = (a + b + 1) >> 1;
+      if (t[middle] <= x) a = middle;
+      else b = middle - 1;
+    }
+    return t.length ? (low[a] + high[a]) / 2 : NaN;
+  }
+
+  function showReadout(tEnd, samples, t) {
     const [a, b] = cursors;
-    if (a === null) {
-      readout.replaceChildren(h("span.faint", {}, paused
-        ? "Drag to zoom, double click to zoom out, wheel to zoom; click sets cursor A, click again cursor B"
-        : trigger.text() || "Click sets a cursor, drag zooms and pauses, the wheel changes the window"));
+    if (a === null || settings.mode !== "time") {
+      readout.replaceChildren(h("span.faint", {}, settings.mode !== "time" ? "Computed from the samples of the window; AC-coupled traces are less their mean."
+        : paused ? "Drag to zoom, double click to zoom out, wheel to zoom; click sets cursor A, click again cursor B"
+          : "Click sets a cursor, drag zooms and pauses, wheel or two fingers change the window"));
       return;
     }
     const parts = [`A ${(tEnd + a).toFixed(4)} s`];
     if (b !== null) parts.push(`B ${(tEnd + b).toFixed(4)} s`, `Δ ${((b - a) * 1000).toFixed(2)} ms`, `1/Δ ${digits(1 / Math.abs(b - a), 4)} Hz`);
-    for (const { strip, channels } of strips) {
-      channels.slice(0, 3).forEach((c, i) => {
-        const va = strip.at(i, a);
-        parts.push(`${c.name} ${digits(va)}${b !== null ? ` Δ ${digits(strip.at(i, b) - va)}` : ""} ${unitText(c.unit)}`);
-      });
+    for (const trace of traces) {
+      const s = samples.get(trace);
+      const va = valueAt(s, t, tEnd + a);
+      parts.push(`${trace.name} ${withUnit(va, trace.unit, 4)}${b !== null ? `, Δ ${withUnit(valueAt(s, t, tEnd + b) - va, trace.unit, 4)}` : ""}`);
     }
-    readout.replaceChildren(...parts.slice(0, 9).map((text) => h("span", {}, text)),
-      h("button.quiet", { onclick: () => { cursors = [null, null]; dirty = true; }, style: "padding:0 6px" }, "clear"));
+    readout.replaceChildren(...parts.map((text) => h("span", {}, text)),
+      h("button.quiet", { onclick: () => { cursors = [null, null]; dirty = true; } }, "clear cursors"));
   }
 
   const onKey = (event) => {
@@ -209,20 +323,22 @@ export function mount(root, { link, catalogue }) {
   };
   document.addEventListener("keydown", onKey);
   const offData = link.on("data", (s) => { if (s === subscription && !paused) dirty = true; });
-  const offRun = link.on("run", () => { if (paused) resume(); strips.forEach(({ strip }) => strip.range.reset()); });
+  const offRun = link.on("run", () => { if (paused) resume(); trigger.rearm(); strips.forEach(({ strip }) => strip.range.reset()); });
   let frames = link.frames;
   let countedAt = performance.now();
   const timer = setInterval(() => {
     const now = performance.now();
     const got = (1000 * (link.frames - frames)) / (now - countedAt);
     [frames, countedAt] = [link.frames, now];
-    rate.textContent = `${settings.channels.length} channels · ${got.toFixed(0)} frames/s`;
+    rate.textContent = `${traces.length} traces · ${got.toFixed(0)} frames/s`;
   }, 1000);
   const retheme = () => { strips.forEach(({ strip }) => strip.build()); dirty = true; };
   window.addEventListener("themechange", retheme);
   rebuild();
   draw();
-  window.micron.scope = { get strips() { return strips; }, settings, setWindow, get subscription() { return subscription; } };
+  window.micron.scope = { 
+    get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get cursors() { return cursors; }, trigger, setCursor,
+  };
   return () => {
     cancelAnimationFrame(frame);
     clearInterval(timer);

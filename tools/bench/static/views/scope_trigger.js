@@ -1,5 +1,5 @@
 // The trigger: hold the picture where a channel crosses a level, or where the status changes.
-import { h, segments } from "../dom.js";
+import { h, segments, unitText } from "../dom.js";
 
 const PRE = 0.25; // share of the window before the trigger
 
@@ -26,20 +26,21 @@ export class Trigger {
   }
 
   /** Look for the newest trigger that has enough after it; says "single" when the picture shall stay. */
-  update(buckets, scope) {
+  update(buckets, scope) { // scope: {channels, rows, base}; base: what AC coupling takes from the trigger's channel
     const s = this.settings;
     if (!s.on) { this.held = null; return ""; }
     const c = scope.channels.indexOf(s.slope === "event" ? "status" : s.channel);
     if (c < 0) return "";
     const low = buckets.lows(c);
     const high = buckets.highs(c);
+    const level = s.level + (scope.base || 0);
     const after = Math.ceil(((1 - PRE) * scope.rows) / buckets.perBucket);
     const before = Math.ceil((PRE * scope.rows) / buckets.perBucket);
-    for (let i = low.length - after; i > Math.min(before, low.length - after - 1) && i > 0; i--) {
+    for (let i = low.length - after; i >= Math.max(1, before); i--) {
       if (buckets.first + i <= this.lastSeen) break;
       const hit = s.slope === "event" ? high[i] !== high[i - 1]
-        : s.slope === "up" ? low[i - 1] < s.level && high[i] >= s.level
-          : high[i - 1] > s.level && low[i] <= s.level;
+        : s.slope === "up" ? low[i - 1] < level && high[i] >= level
+          : high[i - 1] > level && low[i] <= level;
       if (hit) {
         this.lastSeen = buckets.first + i;
         this.held = Object.assign(Object.create(Object.getPrototypeOf(buckets)), buckets, {
@@ -55,17 +56,28 @@ export class Trigger {
   }
 }
 
+/** The controls, in one row above the traces. The level is in the channel's unit (lengths in µm). */
 export function triggerControls(settings, catalogue, changed) {
   const t = settings.trigger;
-  const set = (key) => (value) => { t[key] = value; changed(); };
+  const unitOf = (name) => catalogue.find((c) => c.name === name)?.unit;
+  const scale = () => (unitOf(t.channel) === "m" ? 1e-6 : 1);
+  const unit = h("span.soft");
+  const set = (key) => (value) => { t[key] = value; show(); changed(); };
   const on = h("input", { type: "checkbox", checked: t.on, onchange: () => set("on")(on.checked) });
-  const channel = h("select", { "aria-label": "Trigger channel", style: "width:100%", onchange: () => set("channel")(channel.value) },
+  const channel = h("select", { "aria-label": "Trigger channel", onchange: () => set("channel")(channel.value) },
     catalogue.map((c) => h("option", { value: c.name, selected: c.name === t.channel }, c.name)));
-  const level = h("input", { type: "number", step: "any", value: t.level, "aria-label": "Trigger level", style: "width:90px", onchange: () => set("level")(Number(level.value)) });
-  return h("div.panel", {}, h("h2", {}, h("label", {}, on, "Trigger")),
-    h("div.stack", { style: "gap:8px" }, channel,
-      h("div.row", {}, h("span.soft", {}, "level"), level),
-      segments([["up", "rising"], ["down", "falling"], ["event", "event"]], t.slope, set("slope"), "Slope"),
-      segments([["auto", "auto"], ["normal", "normal"], ["single", "single"]], t.mode, set("mode"), "Mode"),
-      h("p.note", {}, "Event: a change of the status bits. The channel must be one that is shown (status for events).")));
+  const level = h("input", { type: "number", step: "any", "aria-label": "Trigger level", onchange: () => set("level")(Number(level.value) * scale()) });
+  const slopes = segments([["up", "rising"], ["down", "falling"], ["event", "event"]], t.slope, set("slope"), "Slope");
+  const modes = segments([["auto", "auto"], ["normal", "normal"], ["single", "single"]], t.mode, set("mode"), "Mode");
+  const state = h("span.num.soft", { role: "status" });
+  slopes.title = "Event: a change of the status bits";
+  modes.title = "Auto: goes on without a trigger after 1 s. Normal: waits. Single: stays at the first";
+  function show() {
+    unit.textContent = scale() === 1 ? unitText(unitOf(t.channel) || "1") : "µm";
+    if (document.activeElement !== level) level.value = String(Number((t.level / scale()).toPrecision(6)));
+    for (const element of [channel, level]) element.disabled = !t.on || t.slope === "event";
+  }
+  show();
+  const element = h("div.toolbar.trigger", {}, h("label", {}, on, h("b", {}, "Trigger")), channel, h("span.soft", {}, "at"), level, unit, slopes, modes, state);
+  return { element, say(text) { if (state.textContent !== text) state.textContent = text; } };
 }

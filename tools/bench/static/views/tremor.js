@@ -1,6 +1,7 @@
 // The tremor as the firmware sees it: path of the tip before and after, size and pace over time, spectrum, reduction.
-import { canvas, colours, css, digits, h, persistent, segments } from "../dom.js";
+import { canvas, css, digits, h, persistent, segments } from "../dom.js";
 import { spectrum } from "../fourier.js";
+import { figure } from "../figures.js";
 import { Strip, interleave, times } from "../plot.js";
 
 const AXES = ["x", "y", "z"];
@@ -25,8 +26,9 @@ export function mount(root, { link }) {
   const reduction = h("div.big");
   const bar = h("i", { style: "width:0" });
   const table = h("table");
-  const amplitude = new Strip(AXES.map((a) => ({ label: `amplitude ${a}`, unit: "µm" })), { noTimeAxis: true, least: 5 });
-  const frequency = new Strip(AXES.map((a) => ({ label: `frequency ${a}`, unit: "Hz" })), { least: 2 });
+  const rows = [];
+  const amplitude = new Strip(AXES.map((a) => ({ label: `amplitude ${a}`, unit: "µm" })), { noTimeAxis: true, least: 5, yTitle: "µm" });
+  const frequency = new Strip(AXES.map((a) => ({ label: `frequency ${a}`, unit: "Hz" })), { least: 2, xTitle: "time, s", yTitle: "Hz" });
   const gain = h("input", { type: "range", min: 0, max: 1.2, step: 0.05, value: 1, "aria-label": "Gain of the compensation", style: "flex:1" });
   const gainText = h("b.num");
   const setGain = (value) => { link.order("gain", { value }); gain.value = value; };
@@ -40,8 +42,8 @@ export function mount(root, { link }) {
       h("div.chart.square", {}, path)),
     h("section.panel.fig", {}, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div.chart", {}, spectra)),
     h("div.stack.side", {},
-      h("section.panel", {}, h("h2", {}, "Compensation ", gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
-      h("section.panel", {}, h("h2", {}, "Reduction, 4 s"), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
+      h("section.panel", {}, h("h2", {}, figure("gain", "Compensation"), gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
+      h("section.panel", {}, h("h2", {}, figure("reduction", "Reduction, 4 s")), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
         h("p.note", {}, "The firmware's estimate against its own prediction; errors of the stacks are not in it (micron run has them)."))),
     h("div.strips.plots", {}, amplitude.element, frequency.element)));
 
@@ -158,9 +160,12 @@ export function mount(root, { link }) {
     reduction.replaceChildren(percent > 0.5 ? percent.toFixed(0) : "0", h("span.unit", {}, "% less"));
     bar.style.width = `${Math.max(0, Math.min(100, percent))}%`;
     const s = link.state?.status || {};
-    const palette = colours();
-    table.replaceChildren(h("tr", {}, ...["rms", "before", "after"].map((n, i) => h(i ? "th.num" : "th", {}, n))),
-      ...AXES.map((axis, c) => h("tr", {}, h("td", { style: `color:${palette[c]}` }, axis), h("td.num", {}, `${rms([before[c]]).toFixed(1)} µm`), h("td.num", {}, `${rms([after[c]]).toFixed(1)} µm`))));
+    if (!rows.length) {
+      rows.push(...AXES.map(() => [h("td.num"), h("td.num")]));
+      table.replaceChildren(h("tr", {}, ...["rms", "before", "after"].map((n, i) => h(i ? "th.num" : "th", {}, figure(n)))),
+        ...AXES.map((axis, c) => h("tr", {}, h("td", { style: `color:var(--c${c + 1})` }, axis), rows[c])));
+    }
+    AXES.forEach((_, c) => [before, after].forEach((part, i) => { rows[c][i].textContent = `${rms([part[c]]).toFixed(1)} µm`; }));
     if (s.gain !== undefined) {
       gainText.textContent = `gain ${s.gain.toFixed(2)}`;
       if (document.activeElement !== gain) gain.value = s.gain;

@@ -1,0 +1,274 @@
+"""The scope of the page: what it opens on, what it computes (beside scipy), where it draws, what it says.
+
+Over data that stand still (tests/bench/still.py): no firmware, no real time.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from firmware_py.frame import LAYOUT
+from tests.bench.conftest import go
+from tests.bench.still import TREMOR_HZ, Still, made_up_rows, still_server
+
+pytestmark = pytest.mark.timeout(400)
+
+TIP = ["tip_displacement_x", "tip_displacement_y", "tip_displacement_z"]
+COMMANDS = ["command_1", "command_2", "command_3"]
+FRAMES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))"
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
+    with still_server(tmp_path_factory.mktemp("scope") / "recordings") as served:
+        yield served
+
+
+@pytest.fixture
+def scope(browser: Any, still: Still) -> Iterator[Any]:
+    """The page, on the scope as it opens for somebody who was never there."""
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
+    tab.goto(still.address)
+    tab.wait_for_function("window.micron && micron.scope && micron.scope.subscription.buckets.n > 100")
+    tab.evaluate(FRAMES)
+    yield tab
+    context.close()
+    assert not errors
+
+
+def use(scope: Any, **settings: Any) -> None:
+    """Other settings, drawn."""
+    scope.evaluate("(s) => { Object.assign(micron.scope.settings, s); micron.scope.changed(); }", settings)
+    scope.wait_for_function("micron.scope.subscription.buckets.n > 100")
+    scope.evaluate(FRAMES)
+
+
+def column(name: str) -> np.ndarray:
+    return made_up_rows()[:, LAYOUT.scalar_names().index(name)]
+
+
+NO_TRIGGER = {"on": False, "channel": "volts_0", "level": 0, "slope": "up", "mode": "auto"}
+
+
+def test_it_opens_on_tip_and_commands_with_units_and_a_trigger(scope: Any):
+    traces = scope.evaluate("micron.scope.traces.map((t) => [t.name, t.set.coupling])")
+    assert traces == [[name, "ac"] for name in TIP + COMMANDS]
+    ticks = scope.evaluate("micron.scope.strips.map(({ strip }) => strip.ticks(strip.plot).map((t) => t.text))")
+    assert all(re.fullmatch(r"0|-?[0-9.]+ µm", text) for text in ticks[0])
+    assert all(re.fullmatch(r"0|-?[0-9.]+ V", text) for text in ticks[1])
+    assert scope.evaluate("micron.scope.strips.at(-1).strip.plot.axes[0].label") == "time, s"
+    assert scope.locator("text=Trigger >> visible=true").count()
+    marks = scope.evaluate("micron.scope.strips[0].strip.marks.filter((m) => m.label === 'T').length")
+    assert marks == 2, "its level and its instant"
+
+
+def test_the_trigger_holds_where_the_trace_rises_through_the_level(scope: Any):
+    tip, t_s = column(TIP[0]), column("t")
+    held_s = scope.evaluate("micron.scope.trigger.heldAt")
+    assert held_s > 0
+    buckets = scope.evaluate("micron.scope.subscription.buckets.perBucket")
+    at = round(held_s * 1000)
+    mean = tip[-2600:].mean()
+    assert tip[at - 2 * buckets : at].min() < mean
+    assert tip[at : at + 2 * buckets].max() >= mean - 1e-6
+    assert np.polyfit(t_s[at - 10 : at + 10], tip[at - 10 : at + 10], 1)[0] > 0
+    assert f"Triggered at {held_s:.3f} s" in scope.locator(".trigger").inner_text()
+
+
+def test_eight_inputs_have_eight_lanes_and_each_is_seen(scope: Any):
+    use(scope, channels=[f"volts_{i}" for i in range(8)], trigger=NO_TRIGGER)
+    lanes = scope.evaluate(
+        """micron.scope.strips[0].strip.plot.data.slice(1, 9).map((y) => [Math.min(...y), Math.max(...y)])"""
+    )
+    for i, (low, high) in enumerate(lanes):
+        assert 7 - i <= low < high <= 8 - i, f"volts_{i} leaves its lane"
+        assert high - low > 0.2, f"volts_{i} is flat"
+
+
+def test_a_trace_a_hundred_times_smaller_is_seen_as_well(scope: Any):
+    use(scope, channels=["command_1", "tip_displacement_x", "temperature", "volts_0"], trigger=NO_TRIGGER)
+    spans = scope.evaluate(
+        """micron.scope.strips.flatMap(({ strip, members }) => members.map((_, i) => {
+            const y = strip.plot.data[i + 1];
+            return Math.max(...y) - Math.min(...y);
+        }))"""
+    )
+    assert min(spans) > 0.2
+
+
+@pytest.mark.parametrize(("kind", "hz", "q"), [("low", 30.0, 2**-0.5), ("high", 2.0, 2**-0.5), ("band", 9.8, 2.45)])
+def test_filters_are_those_of_the_book(scope: Any, kind: str, hz: float, q: float):
+    values = column("volts_0")[:3000]
+    coefficients, out = scope.evaluate(
+        """async ([values, kind, hz, q]) => {
+            const { section, run } = await import("/static/signals.js");
+            const c = section(kind, hz, q, 1000);
+            return [c, [...run(Float64Array.from(values), c)]];
+        }""",
+        [values.tolist(), kind, hz, q],
+    )
+    b, a = np.array(coefficients[:3]), np.array([1.0, *coefficients[3:]])
+    if kind == "band":
+        expected_b, expected_a = signal.iirpeak(hz, q, fs=1000.0)
+    else:
+        expected_b, expected_a = signal.butter(2, hz, kind, fs=1000.0)
+    assert b == pytest.approx(expected_b, rel=1e-6, abs=1e-12)
+    assert a == pytest.approx(expected_a, rel=1e-6)
+    state = signal.lfilter_zi(b, a) * values[0]
+    assert out == pytest.approx(signal.lfilter(b, a, values, zi=state)[0], abs=1e-9)
+
+
+def test_maths_beside_numpy(scope: Any):
+    a, b = column("volts_0")[:2000], column("volts_1")[:2000]
+    found = scope.evaluate(
+        """async ([a, b]) => {
+            const { calculate } = await import("/static/signals.js");
+            const [p, q] = [a, b].map((v) => Float64Array.from(v));
+            return ["sum", "difference", "derivative", "rms"].map((op) => [...calculate(op, p, q, 1000)]);
+        }""",
+        [a.tolist(), b.tolist()],
+    )
+    assert found[0] == pytest.approx(a + b)
+    assert found[1] == pytest.approx(a - b)
+    assert found[2][1:-1] == pytest.approx(np.gradient(a, 1e-3)[1:-1])
+    windows = np.lib.stride_tricks.sliding_window_view(a, 500)
+    assert found[3][499:] == pytest.approx(windows.std(axis=1), abs=1e-9)
+
+
+def test_a_computed_trace_is_drawn_with_its_unit(scope: Any):
+    maths = [
+        {"op": "derivative", "a": "tip_displacement_x", "b": ""},
+        {"op": "difference", "a": "volts_0", "b": "volts_1"},
+    ]
+    use(scope, channels=[], maths=maths, trigger=NO_TRIGGER)
+    assert scope.evaluate("micron.scope.traces.map((t) => t.unit)") == ["m/s", "V"]
+    assert scope.evaluate("micron.scope.subscription.buckets.perBucket") == 1, "maths needs samples"
+    lows = scope.evaluate("micron.scope.strips.map(({ strip }) => strip.plot.data[1].length)")
+    assert min(lows) >= 2000
+
+
+def test_steps_and_units_of_the_axes(scope: Any):
+    steps, texts = scope.evaluate(
+        """async () => {
+            const { step125, withUnit } = await import("/static/signals.js");
+            return [[0.0011, 0.02, 0.021, 3, 7, 10].map(step125),
+                [[4e-5, "m"], [0.02, "V"], [2.1, "V"], [-3e-6, "m"], [9.81, "m/s²"], [0, "V"], [NaN, "V"], [12, ""]]
+                    .map(([v, u]) => withUnit(v, u))];
+        }"""
+    )
+    assert steps == pytest.approx([0.002, 0.02, 0.05, 5, 10, 10])
+    assert texts == ["40 µm", "20 mV", "2.1 V", "-3 µm", "9.81 m/s²", "0 V", "–", "12"]
+
+
+def test_what_is_outside_its_limits_is_red_and_counted(scope: Any):
+    tip = column(TIP[0])[-2000:]
+    limits = {"coupling": "ac", "div": "auto", "offset": 0, "filter": "band", "low": "", "high": "20"}
+    use(scope, channels=[TIP[0]], traces={TIP[0]: limits}, trigger=NO_TRIGGER)
+    said = scope.locator(".plot .legend").inner_text()
+    share = float(re.search(r"([0-9.]+) % outside", said)[1])  # type: ignore[index]
+    assert share == pytest.approx(100 * np.mean(tip > 20e-6), abs=4)
+    red = scope.evaluate("micron.scope.strips[0].strip.plot.data[2].filter((v) => v !== null).length")
+    assert red > 100
+    assert scope.evaluate("micron.scope.strips[0].strip.values[0].classList.contains('bad')")
+
+
+def test_cursors_give_differences_of_every_trace(scope: Any):
+    use(scope, trigger=NO_TRIGGER)
+    scope.evaluate("micron.scope.setCursor(-1.0, false); micron.scope.setCursor(-0.5, false)")
+    scope.evaluate(FRAMES)
+    said = scope.locator(".readout").inner_text()
+    assert "Δ 500.00 ms" in said
+    assert "2.000 Hz" in said
+    for name in TIP + COMMANDS:
+        assert f"{name} " in said
+    tip = column(COMMANDS[0])
+    found = float(re.search(r"command_1 \S+ V, Δ (\S+) V", said)[1])  # type: ignore[index]
+    step = np.abs(np.diff(tip)).max() * 4
+    assert found == pytest.approx(tip[-501] - tip[-1001], abs=step)
+
+
+def test_spectra_have_the_tremor_where_it_is(scope: Any):
+    found = scope.evaluate(
+        """async (values) => {
+            const { pieces } = await import("/static/views/scope_analysis.js");
+            const p = pieces(Float64Array.from(values), 1000, 2.0);
+            return p.columns.map((c) => c.indexOf(Math.max(...c)) * p.step);
+        }""",
+        column(TIP[0])[-8000:].tolist(),
+    )
+    assert len(found) > 10
+    assert found == pytest.approx([TREMOR_HZ] * len(found), abs=0.5)
+
+
+@pytest.mark.parametrize("mode", ["xy", "fft", "spectrogram"])
+def test_other_ways_to_look_are_drawn_and_labelled(scope: Any, mode: str):
+    scope.click(f"text={ {'xy': 'XY', 'fft': 'FFT', 'spectrogram': 'Spectrogram'}[mode] } >> visible=true")
+    scope.wait_for_function(
+        "micron.scope.subscription.buckets.perBucket === 1 && micron.scope.subscription.buckets.n > 1500"
+    )
+    drawn = """() => {
+        const c = document.querySelector(".analysis canvas");
+        const data = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
+        const seen = new Set();
+        for (let i = 0; i < data.length; i += 4) if (data[i + 3]) seen.add((data[i] << 16) | (data[i + 1] << 8) | data[i + 2]);
+        return seen.size;
+    }"""
+    scope.wait_for_function(f"({drawn})() > 20")
+    assert scope.locator(".analysis").is_visible()
+    assert not scope.locator(".plots").is_visible()
+
+
+def test_settings_come_back_after_a_reload(scope: Any):
+    use(scope, channels=["volts_3"], trigger=NO_TRIGGER, traces={"volts_3": {"offset": "1", "filter": "low"}})
+    scope.reload()
+    scope.wait_for_function("window.micron && micron.scope && micron.scope.traces.length === 1")
+    trace = scope.evaluate("micron.scope.traces[0]")
+    assert (trace["name"], trace["set"]["offset"], trace["set"]["filter"]) == ("volts_3", "1", "low")
+
+
+def test_channels_of_different_units_do_not_add_up(scope: Any):
+    scope.select_option("select[aria-label='Channel a']", "tip_displacement_x")
+    scope.select_option("select[aria-label='Channel b']", "command_1")
+    scope.click("text=Add trace")
+    assert "they do not add up" in scope.locator(".own").inner_text()
+    assert scope.evaluate("micron.scope.settings.maths.length") == 0
+
+
+def test_every_figure_says_what_it_is(scope: Any):
+    for view, selector in (("scope", "#vitals dt"), ("latency", "thead th:not(:nth-child(3))"), ("tremor", "table th")):
+        go(scope, view)
+        scope.wait_for_selector(selector, state="attached")
+        unexplained = scope.evaluate(
+            f"[...document.querySelectorAll('{selector}')].filter((e) => !e.querySelector('[data-hint][title]'))"
+            ".map((e) => e.textContent)"
+        )
+        assert unexplained == []
+    scope.locator("#vitals .what", has_text="outputs held").click()
+    assert "Normal: 0 %" in scope.locator("#hint").inner_text()
+    assert scope.locator("#vitals div", has_text="outputs held").locator("dd").inner_text() == "0 %"
+    scope.locator("#view").click(position={"x": 3, "y": 3})
+    assert not scope.locator("#hint").is_visible()
+
+
+def test_budget_bars_have_a_line_at_a_hundred_percent(scope: Any):
+    go(scope, "latency")
+    scope.wait_for_function("document.querySelectorAll('.budget i').length >= 5")
+    scope.wait_for_function("document.querySelector('.budget span').textContent !== ''")
+    bars = scope.evaluate(
+        """[...document.querySelectorAll(".budget")].map((b) => {
+            const [track, fill, line] = [".track", "i", "b"].map((s) => b.querySelector(s).getBoundingClientRect());
+            return [parseFloat(b.textContent), (fill.width) / track.width, (line.left - track.left) / track.width];
+        })"""
+    )
+    assert [bar[0] for bar in bars] == [42, 80, 57, 60, 18]
+    for percent, fill, line in bars:
+        assert fill / line == pytest.approx(percent / 100, abs=0.03)

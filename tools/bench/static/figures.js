@@ -1,0 +1,46 @@
+// What every figure of the page means and what is normal, shown where it is pointed at, tapped or focused.
+import { h } from "./dom.js";
+
+export const FIGURES = {
+  "run time": "Time since the firmware's first scan.",
+  "sample to command p50": "Time from the instant at which a sample was taken to the acknowledged command, median since the start. Normal: below 2 ms, the delay over which the tremor is predicted.",
+  "lost scans": "Scans of the converter that never reached the firmware. Normal: 0.",
+  "outputs held": "Share of ticks in which the outputs kept their last value because a new command would have come too late. Normal: 0 %; short holds do no harm.",
+  tremor: "Amplitude of the estimated tremor at the tip, all three axes together.",
+  task: "One step of a tick, or a task of its own rate.",
+  rate: "How often the task is due.",
+  p50: "Median since the start of the run, µs.",
+  p99: "99 of 100 runs took no longer, µs. Normal: below the budget.",
+  "p99.9": "999 of 1000 runs took no longer, µs.",
+  worst: "The longest run since the start, µs.",
+  budget: "What the task may take, from the task table, µs.",
+  "of budget": "p99 as a share of the budget. The line is 100 %. Normal: left of the line.",
+  over: "Runs that took longer than the budget. Normal: 0, or a few on a machine without real-time scheduling.",
+  late: "Runs that ended after their deadline. Normal: 0.",
+  held: "Runs that were left out because they would have come too late; the outputs are held meanwhile. Normal: 0.",
+  "at tick": "Number of the tick with the longest run.",
+  "held ticks": "Ticks that were left out altogether because the one before had not ended. Normal: 0.",
+  reduction: "1 less the ratio of rms after to rms before, last 4 s. By the firmware's own estimate.",
+  rms: "Root of the mean square of the last 4 s.",
+  before: "The estimated tremor, as it would be without compensation.",
+  after: "The tremor less what was commanded one loop delay before.",
+  gain: "Factor on the compensation. Normal: 1.",
+  limited: "Commands that ran into the workspace, the amplifier's range or its slew limit. Normal: few, in large movements.",
+};
+
+/** Attributes that explain a figure: for a pointer, a finger and a screen reader. */
+export const explained = (name) => (FIGURES[name] ? { title: FIGURES[name], "data-hint": name } : {});
+
+/** The name of a figure, with its explanation. */
+export const figure = (name, text = name) => h("span.what", { tabIndex: 0, ...explained(name) }, text);
+
+/** Fingers have no pointer that rests: a tap on a figure, or Enter, says its explanation at the foot of the page. */
+export function showHints(box) {
+  const say = (event) => {
+    const name = event.target.closest?.("[data-hint]")?.dataset.hint;
+    box.hidden = !name;
+    if (name) box.replaceChildren(h("b", {}, name), ` ${FIGURES[name]}`);
+  };
+  document.addEventListener("click", say);
+  document.addEventListener("keydown", (event) => { if (event.key === "Enter" && event.target.matches?.("[data-hint]")) say(event); });
+}
