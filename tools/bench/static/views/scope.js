@@ -34,7 +34,7 @@ export function mount(root, { link, catalogue }) {
 
   const plots = h("div.plots");
   const readout = h("div.row.num.readout");
-  const rate = h("span.faint.num.rate");
+  const rate = h("span.faint.num.rate", { title: "Traces, and messages from the server a second" }, "\u00a0");
   const pauseButton = h("button", { onclick: () => (paused ? resume() : pause()), title: "Pause or go on (Space)" }, "Pause");
   const windows = segments(WINDOWS, settings.rows, (rows) => setWindow(rows), "Window");
   windows.classList.add("wide");
@@ -47,7 +47,8 @@ export function mount(root, { link, catalogue }) {
   const analysed = analysis(settings, () => { settings.save(); dirty = true; analysedAt = 0; });
   const toolbar = h("div.toolbar", {}, pauseButton, windows, windowChoice, modes, displays,
     h("button", { onclick: fit, title: "Fit the scales to what is shown (F)" }, "Fit"),
-    h("button", { onclick: () => { settings.side = !settings.side; settings.save(); side.hidden = !settings.side; } }, "Channels"), rate);
+    h("button", { onclick: () => { settings.side = !settings.side; settings.save(); side.hidden = !settings.side; } }, "Channels"));
+  triggerBox.element.append(rate);
   const ownPanels = h("div.stack.own");
   const side = h("div.stack.side", { hidden: !settings.side }, ownPanels, picker);
   root.append(h("div.scope", {}, toolbar, triggerBox.element, h("div.body.stack", {}, h("div.stack.main", {}, plots, analysed.element, readout), side)));
@@ -330,7 +331,7 @@ export function mount(root, { link, catalogue }) {
     const now = performance.now();
     const got = (1000 * (link.frames - frames)) / (now - countedAt);
     [frames, countedAt] = [link.frames, now];
-    rate.textContent = `${traces.length} traces · ${got.toFixed(0)} frames/s`;
+    rate.textContent = `${traces.length} traces · ${got.toFixed(0)} /s`;
   }, 1000);
   const retheme = () => { strips.forEach(({ strip }) => strip.build()); dirty = true; };
   window.addEventListener("themechange", retheme);
