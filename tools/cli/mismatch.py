@@ -253,6 +253,29 @@ def real(
 
 
 @app.command()
+def cut(
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml).")],
+    out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],
+    start: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing before this time.")] = None,
+    stop: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing from this time on.")] = None,
+) -> None:
+    """Keep the longest stretch without gaps, on a uniform clock, as a recording of its own.
+
+    Example: micron mismatch cut rec --out whole
+    """
+    with _clear_errors():
+        _check_folder(out)
+        from tools.mismatch.cut import cut as cut_recording
+
+        kept = cut_recording(recording, out, start, stop)
+        console().print(
+            f"{kept.samples} samples at {kept.rate_hz:.6g} Hz, {kept.start_s:g} to {kept.stop_s:g} s of the original"
+            f" ({kept.parts} {'stretch' if kept.parts == 1 else 'stretches'}), {kept.filled} samples filled: {out}",
+            soft_wrap=True,
+        )
+
+
+@app.command()
 def apply(
     recording: RecordingArgument,
     report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],

@@ -109,7 +109,8 @@ def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, 
     old = make(recording)
     if set(shifts) != {p.name for p in old.parameters}:
         return theta
-    fitted = np.array([shifts[p.name] for p in old.parameters])
+    exported = report.get("corrected_parameters") or [shifts[p.name] for p in old.parameters]
+    fitted = np.array([float(v) for v in exported])
     theta = theta.copy()
     for k, placed in enumerate(model.placed):
         if placed.site == "output":

@@ -20,6 +20,7 @@ MIN_SAMPLES = 50
 MIN_SPAN = 30  # samples of a [split] range
 LONGEST_GAP = 20.0  # usual steps of a time column
 MOST_MISSING = 0.02  # of the time
+CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch without gaps"
 MOST_SIZE = 1e100  # of any value: squares must stay finite
 _TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
 _CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution"}
@@ -78,9 +79,7 @@ def load(path: Path | str) -> Recording:
         if bad.any():
             i = int(np.argmax(bad))
             line = f" (line {i + 2})" if data_path.suffix.lower() == ".csv" else ""
-            raise RecordingError(
-                f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; fill the gap or cut the recording there"
-            )
+            raise RecordingError(f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; {CUT}")
     if time_column is not None:
         stamps = columns[time_column]
         dt, grid = _step(data_path, time_column, stamps, rate, notes)
@@ -134,6 +133,11 @@ def load(path: Path | str) -> Recording:
 
         return in_twin_units(recording)
     return recording
+
+
+def descriptor(path: Path) -> dict[str, Any]:
+    """The text of a descriptor, unchecked. RecordingError when it is not there or not TOML."""
+    return _toml(path)
 
 
 def _toml(path: Path) -> dict[str, Any]:
@@ -296,8 +300,7 @@ def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[
     if gap.any() and (d.max() > LONGEST_GAP * median or missing > MOST_MISSING * (stamps[-1] - stamps[0])):
         i = int(np.argmax(d)) + 1
         raise RecordingError(
-            f"{path}: time column '{name}' jumps by {d[i - 1]:g} s at sample {i}, the usual step is {median:g} s;"
-            " resample to uniform steps or cut the recording there"
+            f"{path}: time column '{name}' jumps by {d[i - 1]:g} s at sample {i}, the usual step is {median:g} s; {CUT}"
         )
     grid: Array | None = None
     off = np.abs(stamps - (stamps[0] + dt * np.arange(stamps.size)))

@@ -19,6 +19,7 @@ class View:
 
     ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
     and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
+    ``fit``: ranges whose samples set the start states of a linear run, all of them (none: the first samples do).
     ``memo`` remembers columns that do not change between calls; do not share it between processes.
     """
 
@@ -26,6 +27,7 @@ class View:
     ranges: tuple[tuple[int, int], ...]
     init: int = 0
     lead: int = 0
+    fit: tuple[tuple[int, int], ...] = ()
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
 
     def __getstate__(self) -> dict[str, object]:
@@ -53,14 +55,26 @@ class View:
 
     def scored(self, twin: Twin) -> np.ndarray:
         """(m,) bool: samples that count (not used to set a state)."""
-        if self.init == 0:
+        if self.init == 0 and not self.fit:
             return np.ones(sum(b - a for a, b in self.ranges), np.bool_)
-        first = 0 if twin.restart else self.init
         out: list[np.ndarray] = []
         for a, b in self.ranges:
-            i = np.arange(a, b)
-            out.append(i >= a + self.init if twin.restart else i >= first)
+            first = a + self.init if twin.restart else self.init
+            if self.fit and (not twin.restart or (a, b) in self.fit):
+                first = a  # its start is fitted like any parameter
+            out.append(np.arange(a, b) >= first)
         return np.concatenate(out)
+
+    def setting(self, twin: Twin) -> NDArray[np.int64] | None:
+        """Samples that set the start states of a linear run: those of the fit and, where a twin starts every range
+        afresh, the first ``init`` of the others. None: the first samples after each start.
+        """
+        if not self.fit:
+            return None
+        spans = list(self.fit)
+        if twin.restart:
+            spans += [(a, min(a + self.init, b)) for a, b in self.ranges if (a, b) not in self.fit]
+        return np.concatenate([np.arange(a, b) for a, b in sorted(spans)])
 
     def measured(self, output: str) -> Array:
         """(m,) the recorded output on the view."""
@@ -82,4 +96,5 @@ def view_run(twin: Twin, view: View) -> Run:
     if twin.restart:
         starts = tuple(dict.fromkeys((0, *(max(0, a - view.lead) for a, _ in view.ranges))))
         window += view.lead
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo)
+    setting = view.setting(twin)
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting)

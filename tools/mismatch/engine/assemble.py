@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
+from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.found import alternatives, physics_found
 from tools.mismatch.engine.identifiability import detection
@@ -75,6 +76,10 @@ def assemble(
     cov = covariance(problem, fitted)
     runners, groups, alike = alternatives(problem, selection, rule)
     physics = physics_found(problem, selection, cov, alike)
+    exported = without_events(problem, fitted)
+    raws = raw_values(exported)
+    labels = [p.label for p in fitted.model.placed]
+    physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
     looked = fitted if verdict == "unexplained" else base
     if verdict == "missing_physics":
         touched = [o for o in twin.outputs if any(o in f.outputs for f in physics)]
@@ -160,7 +165,8 @@ def assemble(
         seconds=0.0,
         seed=problem.seed,
         chain=twin.chain,
-        corrected_base=twin.to_text(fitted.theta[: Model(twin).n_base]),
+        corrected_base=twin.to_text(exported.theta[: Model(twin).n_base]),
+        corrected_parameters=tuple(float(v) for v in exported.theta[: Model(twin).n_base]),
         tested=tuple(
             {
                 "name": t.name,

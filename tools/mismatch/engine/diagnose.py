@@ -14,16 +14,18 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.assemble import assemble
 from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.evidence import weigh_evidence
-from tools.mismatch.engine.fit import Fit, fit, fit_base
+from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.reduce import LONG, SLOW, excerpt, thinned_copy
+from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.residual import residuals
+from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.select import search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
+from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.recording import Recording
@@ -49,7 +51,25 @@ def make_split(recording: Recording, held_out: float, seed: int, restart: bool) 
     signals = np.column_stack([*recording.signals.values()]) if recording.signals else np.empty((recording.n, 0))
     guard = max(4, recording.n // 2000)
     begin = 0 if restart else int(UNKNOWN_START * recording.n)
+    if "x0" in recording.twin.parameters or recording.twin.kind in ("state_space", "mechanical_axis"):
+        begin = before_the_blow(recording, begin)
     return own_split(signals, held_out=held_out, seed=seed, guard=guard, segments=3 if restart else 6, begin=begin)
+
+
+LEAST_MOVED = 0.06
+"""Share of an input's movement that may be lost with the start of a record."""
+
+
+def before_the_blow(recording: Recording, begin: int) -> int:
+    """The last sample up to ``begin`` before which the inputs hardly moved.
+
+    A record whose excitation is at its start (a hammer blow, one step) would lose all that it shows.
+    """
+    for x in recording.inputs.values():
+        moved = np.cumsum(np.diff(x, prepend=x[0]) ** 2)
+        if moved[-1] > 0:
+            begin = min(begin, int(np.searchsorted(moved, LEAST_MOVED * moved[-1])))
+    return max(0, begin - 1)
 
 
 def ranges_of(recording: Recording) -> tuple[tuple[int, int], tuple[int, int]] | None:
@@ -95,13 +115,6 @@ def gross(recording: Recording, twin: Twin, raw: Fit) -> list[str]:
         simulated = raw.model.simulate(whole, raw.theta)
     drives = {o: twin.drive(o) for o in twin.outputs}
     return messages(recording.inputs, recording.outputs, recording.context, simulated, drives, recording.dt)
-
-
-def as_given(problem: Problem) -> Fit:
-    """The twin as the engineer believes it to be."""
-    model = problem.base()
-    theta = model.start(problem.recording)
-    return Fit(model, theta, residuals(problem, model, theta), np.nan, (), 1)
 
 
 def set_floors(problem: Problem, base: Fit) -> Problem:
@@ -151,13 +164,16 @@ def _diagnose(
 ) -> Report:
     recording, was_joined = joined(recording)
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
-    if recording.n > LONG:
+    if is_long(recording, make(recording)):
         catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
     twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
     problem, strange = selection.problem, selection.strange
+    discarded = broken(problem, as_given(problem).residual, selection.fitted.theta, selection.fitted.residual)
+    if discarded:
+        selection = replace(selection, fitted=base, steps=(), rivals=())
     if strange is None:
         said = {t.name for t in selection.steps}
         known = {s for t in selection.first for s in about(t.placed.effect)}
@@ -178,8 +194,10 @@ def _diagnose(
         if found is not None:
             left[found.output] = left[found.output].led_by(found)
     remarks = gross(recording, twin, raw)
+    if discarded:
+        remarks.append(f"{discarded} It was discarded, and nothing is named.")
     official = None
-    if not problem.split.own and twin.restart:
+    if not problem.split.own and twin.restart and not problem.settle:
         whole = make_split(recording, held_out, seed, True)
         official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
         base = over_the_whole(problem, official, base)
@@ -209,27 +227,63 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     twin = make(recording)
     init = recording.split.initialization or 0
     own = ranges_of(recording) is None
+    drifts = twin.restart
     if own:
         twin, init = free_run(recording, twin)
-    split = make_split(recording, held_out, seed, twin.restart)
-    if not own and was_joined and hasattr(twin, "fastest_per_s"):
+        drifts = twin.restart
+    split = make_split(recording, held_out, seed, drifts)
+    dynamic = hasattr(twin, "fastest_per_s")
+    if not own and dynamic and not drifts and (was_joined or starts_anew(recording, twin, split, init)):
         # the second recording has a start of its own
         twin = restarting(twin, True)
     if not own and twin.restart:
-        init = max(init, 20)
+        init = max(init, 20) if drifts or not init else init
+    if not own and drifts:
         split = shot(split, init)
     else:
         # of a short record something must be left to score
         init = min(init, min(b - a for a, b in split.held_out) // 3)
     problem = Problem(recording, twin, split, init, seed)
-    raw = as_given(problem)
+    settle = dynamic and not drifts
+    # the engineer's start state is that of one run
+    raw = as_given(replace(problem, settle=settle and (twin.restart or "x0" not in recording.twin.parameters)))
+    problem = replace(problem, settle=settle)
     rough = {o: max(float(np.std(r)), 1e-300) for o, r in raw.residual.items()}
     problem = problem.with_floors(
         {o: noise_floor(problem.measured[o], raw.residual[o], 1 / recording.dt, declared=rough[o]) for o in rough}
     )
-    base = fit_base(problem)
-    problem = set_floors(problem, base)
-    return problem, raw, fit_base(problem)
+    problem = set_floors(problem, preferred(problem, fit_base(problem)))
+    return problem, raw, preferred(problem, fit_base(problem))
+
+
+def starts_anew(recording: Recording, twin: Twin, split: Split, init: int) -> bool:
+    """Whether the test part of an official split is another run: where its first samples may set a state and the twin,
+    run on from the fitted part, is far off there at once, by more than it ever is on average.
+    """
+    if init <= 0:
+        return False
+    raw = as_given(Problem(recording, twin, split, 0, 0))
+    begin = min(a for a, _ in split.held_out) - init
+    row = raw.model.twin.outputs
+    simulated = raw.model.simulate(View.whole(recording), raw.theta)
+    fit = split.fit_mask()
+    for o in row:
+        r = recording.outputs[o] - simulated[o]
+        if float(np.median(np.abs(r[begin : begin + init]))) > ANEW * float(np.sqrt(np.mean(r[fit] ** 2))):
+            return True
+    return False
+
+
+ANEW = 3.0
+"""Residual at the start of a test part over that of the fitted part: beyond it the test is a run of its own."""
+
+
+def preferred(problem: Problem, base: Fit) -> Fit:
+    """The re-fitted base, or the engineer's own values where the re-fit does worse on held-out samples."""
+    given = as_given(problem)
+    if not given.ok or not stayed(problem, given.residual):
+        return base
+    return base if base.ok and misfit(problem, base) <= misfit(problem, given) else given
 
 
 def nominated(
@@ -242,14 +296,23 @@ def nominated(
     rule: Rule,
 ) -> tuple[Effect, ...]:
     """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals."""
+    recording = fitted_part(recording)
+    if recording.n < 2 * part_of(recording):
+        return catalogue
     names: set[str] = set()
-    slow = tuple(e for e in catalogue if e.name in SLOW)
-    for part, allowed in ((excerpt(recording), catalogue), (thinned_copy(recording), slow)):
+    parts = [(excerpt(recording, part_of(recording)), catalogue)]
+    if getattr(make(recording), "hold", "") == "discrete":
+        # its difference equation holds at its own rate alone
+        names |= set(OVER_ALL)
+    else:
+        slow = tuple(e for e in catalogue if e.name in SLOW)
+        parts.append((thinned_copy(recording, part_of(recording)), slow))
+    for part, allowed in parts:
         problem, _, base = prepared(part, held_out, seed, False)
         stride = max(1, problem.fit_rows.size // 12000)
         found = search(problem, base, allowed, rule=rule, stride=stride, jobs=jobs, progress=progress)
         names |= {t.name for t in found.steps}
-        names |= {t.name for rivals in found.rivals for t in rivals[:2]}
+        names |= {t.name for rivals in found.rivals for t in rivals[:1]}
     return tuple(e for e in catalogue if e.name in names)
 
 

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected
 from tools.mismatch.engine.residual import residuals
+from tools.mismatch.engine.trust import fit_loss, stayed, to_search
 from tools.mismatch.placed import Free
 from tools.mismatch.simulate import Model
 
@@ -22,6 +23,10 @@ Array = NDArray[np.float64]
 
 LEAST_ROWS = 2000  # that a coarse search looks at
 MOST_ROWS = 300_000  # that any search looks at
+SEARCH_ROWS = 12_000
+"""Rows on which a long search finds its way."""
+LAST_ITERATIONS = 4
+"""Steps on all rows after that."""
 
 
 @dataclass(frozen=True)
@@ -51,10 +56,6 @@ def _inside(p: Free, v: float) -> float:
     return float(min(max(v, p.lo), p.hi))
 
 
-def _forward(p: Free, v: float) -> float:
-    return float(np.log(max(v, 1e-300))) if p.log and p.lo > 0 else v
-
-
 def _backward(p: Free, v: float) -> float:
     return _inside(p, float(np.exp(min(v, 700.0))) if p.log and p.lo > 0 else v)
 
@@ -70,7 +71,7 @@ def _step_size(p: Free, v: float) -> float:
 def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     """``theta`` with parameter ``i`` moved by a small step, inside its bounds."""
     p = model.parameters[i]
-    z, h = _forward(p, theta[i]), _step_size(p, theta[i])
+    z, h = to_search(p, theta[i]), _step_size(p, theta[i])
     shifted = theta.copy()
     shifted[i] = _backward(p, z + h)
     if shifted[i] == theta[i]:
@@ -85,7 +86,7 @@ def _slopes(projected: Projected, theta: Array, residual: Array) -> Array:
     for c, i in enumerate(projected.free):
         p = model.parameters[i]
         shifted = moved_a_little(model, theta, i)
-        moved = _forward(p, shifted[i]) - _forward(p, theta[i])
+        moved = to_search(p, shifted[i]) - to_search(p, theta[i])
         if moved != 0.0:
             out[:, c] = (projected.evaluate(shifted)[0] - residual) / moved
     return out
@@ -110,7 +111,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
     for _ in range(iterations):
         if not np.all(np.isfinite(jacobian)):
             break
-        z = np.array([_forward(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
+        z = np.array([to_search(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
         gradient = jacobian.T @ residual
         hessian = jacobian.T @ jacobian
         scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
@@ -119,8 +120,8 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
             system = hessian / np.outer(scale, scale) + damping * np.eye(len(free))
             step = -np.linalg.lstsq(system, gradient / scale, rcond=1e-12)[0] / scale
             for c, p in enumerate(parameters):
-                if p.log and p.lo > 0:
-                    step[c] = float(np.clip(step[c], -1.6, 1.6))
+                reach = 1.6 if p.log and p.lo > 0 else projected.width[free[c]]
+                step[c] = float(np.clip(step[c], -reach, reach))
             candidate = theta.copy()
             for c, (p, i) in enumerate(zip(parameters, free, strict=True)):
                 candidate[i] = _backward(p, z[c] + step[c])
@@ -130,7 +131,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
             new = float(trial @ trial)
             if np.isfinite(new) and new < cost:
                 gain = (cost - new) / max(cost, 1e-300)
-                taken = np.array([_forward(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
+                taken = np.array([to_search(p, solved[i]) for p, i in zip(parameters, free, strict=True)]) - z
                 length = float(taken @ taken)
                 if length > 0.0:
                     jacobian += np.outer((trial - residual - jacobian @ taken) / length, taken)
@@ -154,7 +155,7 @@ def _at_bound(model: Model, theta: Array) -> tuple[str, ...]:
     for i, p in enumerate(model.parameters):
         if i < model.n_base or not np.isfinite(p.hi - p.lo):
             continue
-        z, lo, hi = _forward(p, theta[i]), _forward(p, p.lo), _forward(p, p.hi)
+        z, lo, hi = to_search(p, theta[i]), to_search(p, p.lo), to_search(p, p.hi)
         if z - lo < 1e-3 * (hi - lo) or hi - z < 1e-3 * (hi - lo):
             stuck.append(p.name)
     return tuple(stuck)
@@ -221,7 +222,7 @@ def fit(
     residual = residuals(problem, model, theta, outputs)
     if keep is not None:
         residual = {o: residual.get(o, keep.residual[o]) for o in problem.twin.outputs}
-    ok = (give_up or bool(np.isfinite(cost))) and all(np.all(np.abs(r) < 1e11) for r in residual.values())
+    ok = (give_up or bool(np.isfinite(cost))) and bool(np.all(np.isfinite(theta))) and stayed(problem, residual)
     return Fit(model, theta, residual, cost, _at_bound(model, theta), evaluations, ok)
 
 
@@ -266,6 +267,12 @@ def _finely(
     tolerance: float,
 ) -> tuple[Array, float, int]:
     """(theta, cost, evaluations) after a search on ``rows`` and another with outliers weighed down."""
+    before = 0
+    if rows > 2 * SEARCH_ROWS:
+        # the way is found on part of the rows; all of them decide where it ends
+        part = Projected(problem, model, outputs, SEARCH_ROWS)
+        theta, _ = _search(part, theta, iterations, tolerance)
+        before, iterations = part.evaluations, min(iterations, LAST_ITERATIONS)
     projected = Projected(problem, model, outputs, rows)
     cost = np.inf
     for round_ in range(rounds):
@@ -274,10 +281,54 @@ def _finely(
             break
         if round_ + 1 < rounds:
             projected.reweight(residuals(problem, model, theta, outputs))
-    return theta, cost, projected.evaluations
+    return theta, cost, before + projected.evaluations
+
+
+def as_given(problem: Problem) -> Fit:
+    """The twin as the engineer believes it to be."""
+    model = problem.base()
+    theta = model.start(problem.recording)
+    return Fit(model, theta, residuals(problem, model, theta), np.nan, (), 1)
+
+
+POOR = 0.5
+"""Share of the mean square as given: a re-fit that leaves more is tried from other starts too."""
+ENOUGH = 4.0
+"""Noise variances: a re-fit that leaves less is good enough from one start."""
+FACTORS = ((0.8, 1.0), (1.25, 1.0), (1.0, 3.0), (1.0, 0.33))
+"""Other starts: factors on what is searched by its logarithm (rates, frequencies) and on other searched parameters
+(damping ratios)."""
+
+
+def around(model: Model, theta: Array) -> list[Array]:
+    """``theta`` and a few places around it, as starts of a search of the base parameters."""
+    out = [theta]
+    for rate, other in FACTORS:
+        moved = theta.copy()
+        for i in model.nonlinear:
+            p = model.parameters[i]
+            moved[i] = _inside(p, theta[i] * (rate if p.log and p.lo > 0 else other))
+        if not any(np.array_equal(moved, t) for t in out):
+            out.append(moved)
+    return out
 
 
 def fit_base(problem: Problem) -> Fit:
-    """The base parameters alone, from where the engineer believes them to be."""
-    model = problem.base()
-    return fit(problem, model, [model.start(problem.recording)])
+    """The base parameters alone, fitted from where the engineer believes them to be.
+
+    Where that leads to little, a few places around are tried, too. Never worse on the fitted samples than as given.
+    """
+    model, given = problem.base(), as_given(problem)
+    found = fit(problem, model, [given.theta])
+    believed = fit_loss(problem, given.residual)
+    left = fit_loss(problem, found.residual)
+    rates = any(model.parameters[i].log for i in model.nonlinear)
+    if rates and not (found.ok and (left < POOR * believed or left < ENOUGH)):
+        others = fit(problem, model, around(model, given.theta), tries=4)
+        if others.ok and fit_loss(problem, others.residual) < 0.98 * left:
+            found, left = others, fit_loss(problem, others.residual)
+    if not (found.ok and left <= believed):
+        # weights that bound outliers may prefer what plain squares do not
+        found = fit(problem, model, [given.theta], rounds=1)
+        left = fit_loss(problem, found.residual)
+    return found if found.ok and left <= believed else given

@@ -23,7 +23,9 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Problem:
     """What every step of a diagnosis shares. ``view`` covers fit and held-out samples, ``fit_view`` the fit alone:
-    only the latter is shown to whatever chooses settings, starting points or parameters.
+    only the latter is shown to whatever chooses settings, starting points or parameters. ``settle``: the start state of
+    a linear run is fitted to all samples of the fit, like any parameter; otherwise it is the engineer's, or the first
+    samples set it.
     """
 
     recording: Recording
@@ -32,6 +34,7 @@ class Problem:
     init: int
     seed: int
     floors: Mapping[str, NoiseFloor] = field(default_factory=dict[str, NoiseFloor])
+    settle: bool = False
 
     def __getstate__(self) -> dict[str, object]:
         """Fields alone: what is derived (and what views remember) is rebuilt in a worker process."""
@@ -43,11 +46,11 @@ class Problem:
     @cached_property
     def view(self) -> View:
         ranges = tuple(sorted((*self.split.fit, *_with_init(self.split.held_out, self.init, self.twin, self.split))))
-        return View(self.recording, ranges, self.init)
+        return View(self.recording, ranges, self.init, fit=self.split.fit if self.settle else ())
 
     @cached_property
     def fit_view(self) -> View:
-        return View(self.recording, self.split.fit, self.init)
+        return View(self.recording, self.split.fit, self.init, fit=self.split.fit if self.settle else ())
 
     @cached_property
     def index(self) -> NDArray[np.int64]:
@@ -122,6 +125,11 @@ class Problem:
                 return replace(self, recording=_first(self.recording, samples), split=self.split.first(samples))
             samples += samples // 3
         return None
+
+    @cached_property
+    def given(self) -> Array:
+        """Base parameters as the engineer gave them."""
+        return self.twin.start(self.recording)
 
     def sigma(self, output: str) -> float:
         return self.floors[output].rms if output in self.floors else 1.0

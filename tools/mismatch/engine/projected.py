@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tools.mismatch.engine.problem import Problem, spread
+from tools.mismatch.engine.trust import belief, to_search
 from tools.mismatch.simulate import Model
 
 Array = NDArray[np.float64]
@@ -49,6 +50,10 @@ class Projected:
         self.measured = {o: problem.measured[o][rows] for o in self.outputs}
         self.usual = {o: 1.0 - model.excused(self.view, o)[rows] for o in self.outputs}
         self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
+        prior = belief(problem, model)
+        believed = [i for i in range(model.n_base) if i in design_free and np.isfinite(prior.width[i])]
+        self.believed = np.array(believed, int)
+        self.centre, self.width = prior.centre, prior.width
         self.evaluations = 0
 
     @property
@@ -64,14 +69,21 @@ class Projected:
             robust[self.problem.lively[self.rows]] = 1.0
             self.weight[o] = self.usual[o] * robust / self.problem.sigma(o)
 
+    def _from_belief(self, theta: Array) -> Array:
+        """Residuals of the prior: how far base parameters are from the engineer's own values."""
+        at = [to_search(self.model.parameters[i], float(theta[i])) for i in self.believed]
+        return (np.array(at) - self.centre[self.believed]) / self.width[self.believed]
+
     def evaluate(self, theta: Array) -> tuple[Array, Array]:
-        """Weighted residuals on the rows (all outputs joined) and theta with its linear part solved."""
+        """Weighted residuals on the rows (all outputs joined, then those of the prior) and theta with its linear part
+        solved.
+        """
         self.evaluations += 1
         theta = theta.copy()
         design = self.model.design(self.view, theta, self.outputs, self.samples)
         if self.linear.size == 0:
             parts = [(self.measured[o] - design.constant[o]) * self.weight[o] for o in self.outputs]
-            return np.concatenate(parts), theta
+            return np.concatenate([*parts, self._from_belief(theta)]), theta
         k = self.linear.size
         gram = np.zeros((k, k))
         cross = np.zeros(k)
@@ -87,7 +99,12 @@ class Projected:
             kept.append((a, b, at))
         if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross))):
             # a plant that ran away: no cost, and LAPACK must not see it
-            return np.full(sum(b.size for _, b, _ in kept), np.inf), theta
+            return np.full(sum(b.size for _, b, _ in kept) + self.believed.size, np.inf), theta
+        # parameters of effects have no prior: their centre is zero and their width infinite
+        centre = self.centre[self.linear]
+        prior = 1.0 / self.width[self.linear] ** 2
+        gram[np.diag_indices(k)] += prior
+        cross += prior * centre
         size = np.sqrt(np.maximum(np.diag(gram), 1e-300))
         scaled = gram / np.outer(size, size)
         if np.any(self.penalty):
@@ -95,10 +112,11 @@ class Projected:
             rows = self.penalty * (0.02 * np.median(size[np.any(self.penalty != 0, axis=0)]))
             scaled = scaled + (rows.T @ rows) / np.outer(size, size)
         scaled[np.diag_indices(k)] += 1e-11
+        target = cross / size + 1e-11 * size * centre
         try:
-            solution = np.linalg.solve(scaled, cross / size) / size
+            solution = np.linalg.solve(scaled, target) / size
         except np.linalg.LinAlgError:
-            solution = np.linalg.lstsq(scaled, cross / size, rcond=1e-10)[0] / size
+            solution = np.linalg.lstsq(scaled, target, rcond=1e-10)[0] / size
         solution = np.clip(solution, self.lo, self.hi)
         theta[self.linear] = solution
-        return np.concatenate([b - a @ solution[at] for a, b, at in kept]), theta
+        return np.concatenate([*(b - a @ solution[at] for a, b, at in kept), self._from_belief(theta)]), theta

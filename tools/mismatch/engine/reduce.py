@@ -7,9 +7,15 @@ from dataclasses import replace
 import numpy as np
 
 from tools.mismatch.recording import Recording, Split
+from tools.mismatch.twins.base import Twin
 
-LONG = 200_000  # samples above which the search starts on reduced copies
-PART = 60_000
+LONG = 80_000
+"""Samples (of all outputs, for a twin with modes) above which the search starts on reduced copies."""
+PART = 10_000
+"""Samples of a reduced copy of a record that is not longer than ``VERY_LONG``."""
+VERY_LONG = 200_000
+LONG_PART = 60_000
+"""Samples of a reduced copy of a longer record."""
 SLOW = (
     "thermal_drift",
     "temperature_sensitivity",
@@ -25,9 +31,33 @@ SLOW = (
     "static_nonlinearity",
 )
 """What a thinned copy may nominate: slower than its samples, or grown over the whole record."""
+OVER_ALL = ("thermal_drift", "random_walk", "step_shift", "clock_skew", "dropped_samples")
+"""What shows over the whole record only, and is nominated unseen where no thinned copy can be simulated."""
 
 
-def excerpt(recording: Recording, samples: int = PART) -> Recording:
+def is_long(recording: Recording, twin: Twin) -> bool:
+    """Whether a search on the whole record takes minutes."""
+    modes = hasattr(twin, "fastest_per_s")
+    return recording.n * (len(recording.outputs) if modes else 1) > LONG
+
+
+def part_of(recording: Recording) -> int:
+    """Samples of its reduced copies."""
+    return LONG_PART if recording.n > VERY_LONG else PART
+
+
+def fitted_part(recording: Recording) -> Recording:
+    """The part of a recording that its own split says may be fitted, alone; all of it where it brings no split."""
+    fit, test = recording.split.fit, recording.split.test
+    if isinstance(fit, tuple):
+        return _part(recording, slice(*fit), recording.dt)
+    if isinstance(test, tuple):
+        rest = max((0, test[0]), (test[1], recording.n), key=lambda r: r[1] - r[0])
+        return _part(recording, slice(*rest), recording.dt)
+    return recording
+
+
+def excerpt(recording: Recording, samples: int = LONG_PART) -> Recording:
     """The contiguous stretch in which the inputs are busiest (largest mean square rate), at full rate."""
     n = recording.n
     if n <= samples:
@@ -42,7 +72,7 @@ def excerpt(recording: Recording, samples: int = PART) -> Recording:
     return _part(recording, slice(a, a + samples), recording.dt)
 
 
-def thinned_copy(recording: Recording, samples: int = PART) -> Recording:
+def thinned_copy(recording: Recording, samples: int = LONG_PART) -> Recording:
     """Block means of every channel, so that about ``samples`` are left."""
     k = max(1, recording.n // samples)
     if k == 1:

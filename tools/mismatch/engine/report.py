@@ -153,7 +153,9 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Report:
-    """What ``diagnose`` says. ``chain``: the twin's stages in order."""
+    """What ``diagnose`` says. ``chain``: the twin's stages in order; ``corrected_parameters``: the base parameters that
+    ``corrected_base`` was written from, in the order of ``fit.base_parameters``.
+    """
 
     recording: str
     twin: str
@@ -174,6 +176,7 @@ class Report:
     tested: tuple[Mapping[str, Any], ...] = ()
     withheld: tuple[Withheld, ...] = ()
     """Effects that were tried and are not named, with the reason."""
+    corrected_parameters: tuple[float, ...] = ()
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
 
     def to_json(self) -> dict[str, Any]:

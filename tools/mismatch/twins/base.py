@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Effect, Human, Parameter, Settings, Stage
 from tools.mismatch.recording import Recording
@@ -55,7 +56,8 @@ class Run:
     """The stretch of a recording that is simulated, and from where.
 
     ``starts``: samples of the stretch where the base physics starts afresh. ``window``: samples of measured output
-    after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,).
+    after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,). ``setting``:
+    sorted sample numbers that may set the states of a linear run instead (None: those of the window).
     """
 
     t: Array
@@ -66,6 +68,7 @@ class Run:
     starts: tuple[int, ...]
     window: int
     memo: dict[object, object]
+    setting: NDArray[np.int64] | None = None
 
 
 class Twin(Protocol):

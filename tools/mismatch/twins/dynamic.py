@@ -13,7 +13,16 @@ from sim_devices.physics.forces import UNCENTRED
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, remember, travelled
 from tools.mismatch.twins.feedback import Rows, pack, run_feedback
 from tools.mismatch.twins.head import Head
-from tools.mismatch.twins.linear import Discrete, Hold, StartState, discretise, run_states, start_state
+from tools.mismatch.twins.linear import (
+    Discrete,
+    Hold,
+    StartState,
+    discretise,
+    run_output,
+    run_pair,
+    run_states,
+    start_state,
+)
 
 CONSTANT = ""  # the input "1"
 MOST_SUBSTEPS = 24
@@ -35,23 +44,33 @@ class Link:
 
 @dataclass(frozen=True)
 class Plant:
-    """Continuous (or discrete) ``x' = a x + b w`` at given nonlinear parameters."""
+    """Continuous (or discrete) ``x' = a x + b w`` at given nonlinear parameters.
+
+    ``blocks``: first row and last row + 1 of each block of a block-diagonal ``a``; empty where ``a`` is one block.
+    Blocks run by themselves: one that stays as it was is not run again.
+    """
 
     a: Array
     b: Array
+    blocks: tuple[tuple[int, int], ...] = ()
+
+    @property
+    def parts(self) -> tuple[tuple[int, int], ...]:
+        """The blocks, one where none are named."""
+        return self.blocks or ((0, self.a.shape[0]),)
 
 
 @dataclass(frozen=True)
 class DynamicTwin(Head):
     """Common part; ``plant_of(theta)`` builds the plant from the nonlinear base parameters.
 
-    ``groups``: outputs that share one state, with their state rows. ``fixed_free(n)`` is the response to the
-    engineer's own start state, used when no sample may set it.
+    ``groups``: outputs that share one state, with their state rows (one of each block). ``fixed_free(n)`` is the
+    response to the engineer's own start state, used when no sample may set it; ``start_given``: the engineer gave one.
     """
 
     hold: Hold
     links: tuple[Link, ...]
-    groups: tuple[Mapping[str, int], ...]
+    groups: tuple[Mapping[str, int | tuple[int, ...]], ...]
     begin: Array
     plant_of: Callable[[Array], Plant]
     fixed_free: Callable[[int], Mapping[str, Array]] | None
@@ -63,6 +82,7 @@ class DynamicTwin(Head):
     static: bool = False
     apart: bool = False
     counted: Counted = ""
+    start_given: bool = False
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -103,20 +123,22 @@ class DynamicTwin(Head):
         self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
     ) -> dict[str, Signal]:
         """See Twin."""
-        # one state and one input: a single run from the right start state does, without columns
-        if forces or (join and len(self.inputs) == 1 and len(self.groups) == 1):
-            return self._with_forces(run, inputs, theta, forces)
         n = run.t.size
         plant = self.plant_of(theta)
-        d = discretise(plant.a, plant.b, run.dt, self.hold)
-        tag = (d.ad.tobytes(), run.starts)
+        # one state and one input: a single run from the right start state does, without columns
+        alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2
+        if forces or (alone and run.setting is None):
+            return self._with_forces(run, inputs, theta, forces)
+        d = discretise_blocks(plant, run.dt, self.hold)
+        where = {r: (k, r - a) for k, (a, b) in enumerate(plant.parts) for r in range(a, b)}
+        tags = [(d[k].ad.tobytes(), d[k].g0.tobytes(), d[k].g1.tobytes(), run.starts) for k in range(len(d))]
         value: dict[str, Array] = {o: np.zeros(n) for o in self.outputs}
         columns: dict[int, dict[str, Array]] = {}
         folded: list[float] = []
 
-        def states(u: Array, token: object) -> Array:
-            key = ("states", token, tag)
-            return remember(run.memo, key, lambda: _states(d, u, run.starts))
+        def states(u: Array, token: object, k: int) -> Array:
+            key = ("states", token, tags[k])
+            return remember(run.memo, key, lambda: _states(d[k], u, run.starts))
 
         def add(j: int, output: str, column: Array) -> None:
             if join:
@@ -146,33 +168,54 @@ class DynamicTwin(Head):
                 folded += keys
                 parts = [(-1, np.asarray(total), (*drive.token, keys))]
             for j, u, token in parts:
-                x = states(u, token) if any(link.row >= 0 for link in links) else np.zeros((0, 0))
+                needed = sorted({where[link.row][0] for link in links if link.row >= 0})
+                x = {k: states(u, token, k) for k in needed}
                 for link in links:
-                    column = u if link.row < 0 else x[:, link.row]
+                    if link.row < 0:
+                        column = u
+                    else:
+                        k, r = where[link.row]
+                        column = x[k][:, r]
                     add(link.j if j < 0 else j, link.output, column)
-        token = ("plant", d.ad.tobytes(), d.g0.tobytes(), d.g1.tobytes(), run.starts, run.window)
+        token = ("plant", tuple(tags), run.window)
         token = (*token, *(x.token for x in inputs.values()), tuple(folded))
         if join:
             token = (*token, theta[: len(self.parameters)].tobytes())
-        return self._settle(run, d.ad, value, columns, token)
+        return self._settle(run, _whole(d, plant), plant.blocks, value, columns, token)
 
     def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
         """See Twin."""
         source = signal or self.inputs[0]
         plant = self.plant_of(theta)
-        d = discretise(plant.a, plant.b, run.dt, self.hold)
+        d = discretise_blocks(plant, run.dt, self.hold)
         normal = self._gain_index(source) >= 0
         group = next((g for g in self.groups if output in g), None)
+        outputs = tuple(group or (output,))
         links = [link for link in self.links if link.source == source and (link.output == output or normal)]
-        ss = self._start_state(run, d.ad, group) if group is not None else None
+        ss = self._start_state(run, _whole(d, plant), plant.blocks, group) if group is not None else None
+        rows = {o: np.zeros(plant.a.shape[0]) for o in outputs}
+        direct = dict.fromkeys(outputs, 0.0)
+        for link in links:
+            if link.output in rows:
+                gain = 1.0 if normal and not signal else float(theta[link.j])
+                if link.row >= 0:
+                    rows[link.output][link.row] += gain
+                else:
+                    direct[link.output] += gain
+        at = np.array(run.starts, np.int64)
 
         def carry(change: Array) -> Array:
-            x = _states(d, change, run.starts)
-            y = {o: np.zeros(change.size) for o in (group or (output,))}
-            for link in links:
-                if link.output in y:
-                    gain = 1.0 if normal and not signal else theta[link.j]
-                    y[link.output] += gain * (x[:, link.row] if link.row >= 0 else change)
+            u = _once(change)
+            y = {o: direct[o] * u for o in outputs}
+            for o in outputs:
+                for part, (a, b) in zip(d, plant.parts, strict=True):
+                    c = rows[o][a:b]
+                    if not np.any(c):
+                        continue
+                    if b - a == 2:
+                        y[o] += run_pair(part.ad, part.g0, part.g1, c[0], c[1], u, at)
+                    else:
+                        y[o] += run_output(part.ad, part.g0, part.g1, c, u, at)
             if ss is not None:
                 y[output] += ss.response(ss.states({o: -v for o, v in y.items()}), output, change.size)
             return y[output]
@@ -183,6 +226,7 @@ class DynamicTwin(Head):
         self,
         run: Run,
         ad: Array,
+        blocks: tuple[tuple[int, int], ...],
         value: dict[str, Array],
         columns: dict[int, dict[str, Array]],
         token: tuple[object, ...],
@@ -190,32 +234,39 @@ class DynamicTwin(Head):
         """Add the free response of the start states: the engineer's, or what the first samples say."""
         n = run.t.size
         zero = np.zeros(n)
-        if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
+        given = self.start_given or run.window == 0
+        if given and run.setting is None and self.fixed_free is not None and run.starts == (0,):
             for o, y in self.fixed_free(n).items():
                 value[o] = value[o] + y
         else:
             for group in self.groups:
                 # a value and its columns are settled alike: the start state is an affine function of them
-                ss = self._start_state(run, ad, group)
+                ss = self._start_state(run, ad, blocks, group)
                 x0 = ss.states({o: run.measured[o] - value[o] for o in group})
                 for o in group:
-                    value[o] = value[o] + ss.response(x0, o, n)
+                    value[o] = ss.added(value[o].copy(), x0, o)
                 for entry in columns.values():
                     if not any(o in entry for o in group):
                         continue
-                    x0 = ss.states({o: -entry.get(o, zero) for o in group})
+                    x0 = -ss.states({o: entry.get(o, zero) for o in group})
                     for o in group:
-                        entry[o] = entry.get(o, zero) + ss.response(x0, o, n)
+                        # a column may be one that is remembered
+                        entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
         return {o: Signal(value[o], {j: e[o] for j, e in columns.items() if o in e}, (*token, o)) for o in self.outputs}
 
-    def _start_state(self, run: Run, ad: Array, group: Mapping[str, int]) -> StartState:
+    def _start_state(
+        self, run: Run, ad: Array, blocks: tuple[tuple[int, int], ...], group: Mapping[str, int | tuple[int, ...]]
+    ) -> StartState:
         rows: dict[str, Array] = {}
         for o, r in group.items():
             c = np.zeros(ad.shape[0])
-            c[r] = 1.0
+            c[list(r) if isinstance(r, tuple) else r] = 1.0
             rows[o] = c
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        return start_state(ad, rows, run.measured, run.starts, run.t.size, window, run.memo)
+        starts, n = run.starts, run.t.size
+        return start_state(
+            ad, rows, run.measured, starts, n, window, run.memo, setting=run.setting, blocks=blocks
+        )  # fmt: skip
 
     def _substeps(self, run: Run, packed: Rows, push: float) -> int:
         """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (powers of two, so
@@ -296,7 +347,8 @@ class DynamicTwin(Head):
             )  # fmt: skip
 
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        if run.window == 0 and self.fixed_free is not None and run.starts == (0,):
+        if self.fixed_free is not None and run.starts == (0,) and (self.start_given or run.window == 0):
+            # forces make the start state no linear function of what was measured: the engineer's own stands
             free = self.fixed_free(run.t.size)
             x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
             return {o: Signal(x @ rows[o] + extra[o] + free[o], {}, (*token, o)) for o in self.outputs}
@@ -320,6 +372,21 @@ class DynamicTwin(Head):
             x0 = x0 + ss.states(need)
         x = go(x0, u, starts, ends)
         return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
+
+
+def discretise_blocks(plant: Plant, dt: float, hold: Hold) -> list[Discrete]:
+    """The difference equation of every block."""
+    return [discretise(np.ascontiguousarray(plant.a[a:b, a:b]), plant.b[a:b], dt, hold) for a, b in plant.parts]
+
+
+def _whole(d: Sequence[Discrete], plant: Plant) -> Array:
+    """The transition matrix (s, s) of all blocks."""
+    if len(d) == 1:
+        return d[0].ad
+    ad = np.zeros(plant.a.shape)
+    for part, (a, b) in zip(d, plant.parts, strict=True):
+        ad[a:b, a:b] = part.ad
+    return ad
 
 
 def _states(d: Discrete, u: Array, starts: tuple[int, ...]) -> Array:

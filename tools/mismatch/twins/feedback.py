@@ -77,6 +77,7 @@ def run_feedback(
     out = np.zeros((n, s))
     x = np.zeros(s)
     z = np.zeros(s)
+    free = np.zeros(s)
     e = np.empty(thresholds.size)
     gv = 0.0
     for i in range(s):
@@ -109,6 +110,11 @@ def run_feedback(
                 for i in range(s):
                     p += cp[i] * x[i]
                     v += cv[i] * x[i]
+                    # where it would go without forces: the same in every pass
+                    a = g0[i] * w0 + g1[i] * w1
+                    for j in range(s):
+                        a += ad[i, j] * x[j]
+                    free[i] = a
                 f0 = 0.0
                 if any_smooth:
                     f0 = smooth_force(p, v, spring, cogging, friction)
@@ -124,10 +130,7 @@ def run_feedback(
                 passes = 2 if any_smooth or e.size > 0 or stiff > 0.0 else 1
                 for turn in range(passes):
                     for i in range(s):
-                        a = g0[i] * (w0 + f0) + g1[i] * (w1 + f1)
-                        for j in range(s):
-                            a += ad[i, j] * x[j]
-                        z[i] = a
+                        z[i] = free[i] + g0[i] * f0 + g1[i] * f1
                     if turn + 1 < passes:
                         pn = 0.0
                         vn = 0.0

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array
@@ -116,6 +117,29 @@ def run_states(ad, g0, g1, u, x0, starts):
 
 
 @kernel
+def run_pair(ad, g0, g1, c0, c1, u, starts):
+    """``c0 x[0] + c1 x[1]`` (n,) of a second-order plant for one input (n,), from zero state at each start."""
+    n = u.size
+    out = np.empty(n)
+    a00, a01, a10, a11 = ad[0, 0], ad[0, 1], ad[1, 0], ad[1, 1]
+    b0, b1, d0, d1 = g0[0], g0[1], g1[0], g1[1]
+    p = 0.0
+    q = 0.0
+    at = 0
+    for k in range(n):
+        if at < starts.size and k == starts[at]:
+            p = 0.0
+            q = 0.0
+            at += 1
+        else:
+            v = a00 * p + a01 * q + b0 * u[k - 1] + d0 * u[k]
+            q = a10 * p + a11 * q + b1 * u[k - 1] + d1 * u[k]
+            p = v
+        out[k] = c0 * p + c1 * q
+    return out
+
+
+@kernel
 def run_output(ad, g0, g1, c, u, starts):
     """``c @ x`` (n,) for one input (n,) and one output row c (s,), from zero state at each start."""
     n, s = u.size, ad.shape[0]
@@ -156,6 +180,14 @@ def free_response(ad: Array, c: Array, length: int) -> Array:
     return out
 
 
+def free_by_blocks(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
+    """``free_response`` of a block-diagonal ``ad``: each block (first row, last row + 1) runs by itself."""
+    if len(blocks) < 2:
+        return free_response(ad, c, length)
+    parts = (free_response(np.ascontiguousarray(ad[a:b, a:b]), np.ascontiguousarray(c[a:b]), length) for a, b in blocks)
+    return np.concatenate(list(parts), axis=1)
+
+
 def felt_at_most(ad: Array, longest: int) -> int:
     """Samples after which a free response has decayed below 1e-12 of its largest for sure, ``longest`` at most."""
     slowest = float(np.max(np.abs(np.linalg.eigvals(ad)), initial=0.0))
@@ -174,35 +206,42 @@ def _while_felt(free: Array, window: int) -> Array:
 
 @dataclass(frozen=True)
 class StartState:
-    """Sets the state at each start by least squares over the first measured samples, for every column alike.
+    """Sets the state at each start by least squares over some measured samples, for every column alike.
 
-    ``free[o]`` (while felt, s) and ``solve`` (s, outputs * window): least-squares inverse of the stacked, weighted
-    free responses over the window.
+    ``free[o]`` (while felt, s); ``samples`` of each start that may set its state, and ``solvers`` (s, outputs *
+    samples): the least-squares inverse of the stacked, weighted free responses there.
     """
 
     outputs: tuple[str, ...]
     free: dict[str, Array]
     weight: dict[str, float]
     spans: tuple[tuple[int, int], ...]
-    solvers: dict[int, Array]
-    windows: tuple[int, ...]
+    samples: tuple[NDArray[np.int64], ...]
+    solvers: tuple[Array, ...]
 
     def states(self, need: dict[str, Array]) -> Array:
-        """(starts, s): start states whose free response meets ``need`` (n,) per output over the windows."""
+        """(starts, s): start states whose free response meets ``need`` (n,) per output at the samples."""
         rows: list[Array] = []
-        for (a, _), w in zip(self.spans, self.windows, strict=True):
-            stacked = np.concatenate([need[o][a : a + w] * self.weight[o] for o in self.outputs])
-            rows.append(self.solvers[w] @ stacked)
+        for at, solver in zip(self.samples, self.solvers, strict=True):
+            stacked = np.concatenate([need[o][at] * self.weight[o] for o in self.outputs])
+            rows.append(solver @ stacked)
         return np.stack(rows)
 
     def response(self, states: Array, output: str, n: int) -> Array:
         """Free response (n,) of one output for states (starts, s)."""
-        y = np.zeros(n)
+        return self.added(np.zeros(n), states, output)
+
+    def added(self, y: Array, states: Array, output: str) -> Array:
+        """``y`` (n,), changed in place, with the free response of one output added while it is felt."""
         free = self.free[output]
         for (a, b), x0 in zip(self.spans, states, strict=True):
             m = min(b - a, free.shape[0])
-            y[a : a + m] = free[:m] @ x0
+            y[a : a + m] += free[:m] @ x0
         return y
+
+
+MOST_SETTING = 4000
+"""Samples that set one start state at most; of more, as many at irregular distances are taken."""
 
 
 def start_state(
@@ -214,29 +253,68 @@ def start_state(
     window: int,
     memo: dict[object, object],
     whole: bool = True,
+    setting: NDArray[np.int64] | None = None,
+    blocks: tuple[tuple[int, int], ...] = (),
 ) -> StartState:
     """Prepare the least squares for output rows c (s,) of the outputs that may set the state.
 
-    Without ``whole``, free responses reach over the windows only: states can be had, responses cannot.
+    The first ``window`` samples after each start set its state; with ``setting`` (sorted sample numbers) those of them
+    that lie behind the start do, as long as the start is felt. Without ``whole``, free responses reach over the windows
+    only: states can be had, responses cannot. ``blocks``: of a block-diagonal ``ad``.
     """
-    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, window, whole)
+    how = ("set", setting.size) if setting is not None else ("window", window)
+    key = ("start state", ad.tobytes(), tuple((o, c.tobytes()) for o, c in rows.items()), starts, n, how, whole)
     found = memo.get(key)
     if isinstance(found, StartState):
         return found
     spans = tuple(zip(starts, (*starts[1:], n), strict=True))
     longest = max(b - a for a, b in spans) if whole else window
     longest = max(window, felt_at_most(ad, longest))
-    free = {o: _while_felt(free_response(ad, c, longest), window) for o, c in rows.items()}
-    windows = tuple(min(window, b - a) for a, b in spans)
+    free = {o: _while_felt(free_by_blocks(ad, c, longest, blocks), window) for o, c in rows.items()}
+    felt = max(f.shape[0] for f in free.values())
+    at = tuple(_setting(a, min(b, a + felt), window, setting) for a, b in spans)
     weight = dict.fromkeys(rows, 1.0)
     if len(rows) > 1:
         # outputs of different units weigh alike over the samples that may set the state
-        seen = np.concatenate([np.arange(a, a + w) for (a, _), w in zip(spans, windows, strict=True)])
+        seen = np.concatenate(at)
         weight = {o: 1.0 / (float(np.std(measured[o][seen])) or 1.0) for o in rows}
-    solvers: dict[int, Array] = {}
-    for w in set(windows):
-        stacked = np.concatenate([free[o][:w] * weight[o] for o in rows])
-        solvers[w] = np.asarray(np.linalg.pinv(stacked, rcond=1e-9), np.float64)
-    made = StartState(tuple(rows), free, weight, spans, solvers, windows)
+    known: dict[bytes, Array] = {}
+    solvers: list[Array] = []
+    for (a, _), samples in zip(spans, at, strict=True):
+        since = samples - a
+        name = since.tobytes()
+        if name not in known:
+            stacked = np.concatenate([_padded(free[o], since) * weight[o] for o in rows])
+            known[name] = np.asarray(np.linalg.pinv(stacked, rcond=1e-9), np.float64)
+        solvers.append(known[name])
+    made = StartState(tuple(rows), free, weight, spans, at, tuple(solvers))
     memo[key] = made
     return made
+
+
+def _setting(start: int, stop: int, window: int, setting: NDArray[np.int64] | None) -> NDArray[np.int64]:
+    """Sample numbers from ``start`` to ``stop`` that may set the state at ``start``."""
+    first = np.arange(start, min(start + window, stop))
+    if setting is None:
+        return first
+    inside = setting[np.searchsorted(setting, start) : np.searchsorted(setting, stop)]
+    if inside.size < min(window, LEAST_SETTING):
+        return first
+    if inside.size > MOST_SETTING:
+        edges = np.linspace(0, inside.size, MOST_SETTING + 1).astype(np.int64)
+        width = np.diff(edges)
+        # a regular stride would fold lines of the spectrum
+        inside = inside[edges[:-1] + (width * np.random.default_rng(inside.size).random(width.size)).astype(np.int64)]
+    return inside
+
+
+LEAST_SETTING = 8
+"""Samples that may set a state, below which the first samples after the start do."""
+
+
+def _padded(free: Array, since: NDArray[np.int64]) -> Array:
+    """Rows of a free response, zero where it has decayed."""
+    out = np.zeros((since.size, free.shape[1]))
+    felt = since < free.shape[0]
+    out[felt] = free[since[felt]]
+    return out

@@ -7,7 +7,8 @@ data can say are the poles and, per input and output, the numerator coefficients
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,8 @@ from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete")
-MAX_ORDER = 12
+MAX_ORDER = 64
+"""Modes of a plant at most."""
 
 
 Complex = NDArray[np.complex128]
@@ -41,70 +43,79 @@ class Matrices:
 
 def state_space_twin(recording: Recording) -> DynamicTwin:
     """theta = pole parameters, numerator coefficients (in units of the given scale), y0 of every output."""
-    m = _matrices(recording)
+    m = without_constant(_matrices(recording), recording.dt)
     inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
-    dt, s = recording.dt, m.a.shape[0]
-    poles = np.asarray(np.linalg.eigvals(m.a), np.complex128)
-    modes, fixed = _modes(poles, m.discrete, dt)
-    # companion states are scaled by omega^k so that they are of one size
-    omega = 1.0 / dt if m.discrete else _omega(poles, recording.n * dt)
+    dt = recording.dt
+    poles = felt_poles(m)
+    if poles.size > MAX_ORDER:
+        raise RecordingError(
+            f"{recording.path}: [twin.parameters] A has {poles.size} modes that inputs move and outputs show;"
+            f" at most {MAX_ORDER} are handled"
+        )
+    s = poles.size
+    modes = _modes(poles, m.discrete, dt)
+    chains = _chains(modes, dt)
+    blocks: list[tuple[int, int]] = []
+    for chain in chains:
+        at = blocks[-1][1] if blocks else 0
+        blocks.append((at, at + sum(modes[i].order for i in chain)))
+    omegas = [_omega(np.concatenate([_roots(modes[i], m.discrete, dt) for i in c]), recording.n * dt) for c in chains]
+    free = [mode for mode in modes if mode.kind != "fixed"]
     parameters: list[Parameter] = []
     begin: list[float] = []
-    for i, (kind, value) in enumerate(modes):
-        tag = f"_{i + 1}" if len(modes) > 1 else ""
-        if kind == "pair":
-            w, z = abs(value), -value.real / abs(value)
+    place: dict[int, int] = {}
+    for i, mode in enumerate(modes):
+        if mode.kind == "fixed":
+            continue
+        tag = f"_{free.index(mode) + 1}" if len(free) > 1 else ""
+        place[i] = len(parameters)
+        if mode.kind == "pair":
+            w, z = abs(mode.value), -mode.value.real / abs(mode.value)
+            # what is stable as given stays so
+            least = 0.0 if z >= 0 else -0.5
             parameters.append(Parameter(f"natural_frequency{tag}", "rad/s", w / 30, w * 30, True, scale=0.01 * w))
-            parameters.append(Parameter(f"damping_ratio{tag}", "1", -0.5, 0.9999, scale=max(0.02 * abs(z), 1e-3)))
+            parameters.append(Parameter(f"damping_ratio{tag}", "1", least, 0.9999, scale=max(0.02 * abs(z), 1e-3)))
             begin += [w, z]
         else:
-            r = abs(value.real)
+            r = abs(mode.value.real)
             parameters.append(Parameter(f"pole_rate{tag}", "1/s", r / 100, r * 100, True, scale=0.01 * r))
             begin.append(r)
-    signs = [float(np.sign(v.real)) for _, v in modes]
-    kinds = [k for k, _ in modes]
 
-    def denominator(theta: Array) -> Array:
-        roots: list[complex] = list(fixed)
-        at = 0
-        for kind, sign in zip(kinds, signs, strict=True):
-            if kind == "pair":
-                w, z = theta[at], theta[at + 1]
-                p = complex(-z * w, w * np.sqrt(max(1 - z * z, 0.0)))
-                roots += [p, p.conjugate()]
-                at += 2
-            else:
-                roots.append(complex(sign * theta[at]))
-                at += 1
-        if m.discrete:
-            done = roots[len(fixed) :]
-            roots = [*fixed, *(np.exp(p * dt) for p in done)]
-        return np.asarray(np.real(np.poly(roots)), np.float64) if roots else np.ones(1)
+    def roots_of(i: int, theta: Array) -> Complex:
+        mode = modes[i]
+        if mode.kind == "fixed":
+            return _roots(mode, m.discrete, dt)
+        at = place[i]
+        if mode.kind == "pair":
+            w, z = theta[at], theta[at + 1]
+            value = complex(-z * w, w * np.sqrt(max(1 - z * z, 0.0)))
+        else:
+            value = complex(float(np.sign(mode.value.real)) * theta[at])
+        return _roots(Mode(mode.kind, value), m.discrete, dt)
 
     def plant_of(theta: Array) -> Plant:
-        den = denominator(theta)
-        a = np.zeros((s, s))
-        b = np.zeros(s)
-        if s:
-            scale = 1.0 if m.discrete else omega
-            a[:-1, 1:] = scale * np.eye(s - 1)
-            a[-1, :] = -den[:0:-1] / (scale ** np.arange(s - 1, -1, -1.0))
-            b[-1] = 1.0 if m.discrete else scale
-        return Plant(a, b)
+        a, b = np.zeros((s, s)), np.zeros(s)
+        for chain, omega, (first, last) in zip(chains, omegas, blocks, strict=True):
+            roots = np.concatenate([roots_of(i, theta) for i in chain])
+            a[first:last, first:last], b[first:last] = companion(roots, omega, m.discrete)
+        return Plant(a, b, tuple(blocks) if len(blocks) > 1 else ())
 
-    rows = _numerators(m, plant_of(np.array(begin)))
+    rows = _numerators(m, plant_of(np.array(begin)), poles)
     links: list[Link] = []
+    single = len(inputs) * len(outputs) == 1
     for i, u in enumerate(inputs):
         for k, o in enumerate(outputs):
             c, direct = rows[k, i]
-            worst = float(np.max(np.abs(c))) if s else 0.0
-            for r in range(s):
-                if worst > 0 and abs(c[r]) > 1e-7 * worst:
-                    unit = f"{recording.unit[o]}/({recording.unit[u]})"
-                    name = f"numerator_{r}" if len(inputs) * len(outputs) == 1 else f"numerator_{r}[{u},{o}]"
-                    links.append(Link(len(parameters), o, u, r))
-                    parameters.append(Parameter(name, unit, scale=abs(c[r])))
-                    begin.append(float(c[r]))
+            unit = f"{recording.unit[o]}/({recording.unit[u]})"
+            for first, last in blocks:
+                worst = float(np.max(np.abs(c)))
+                for r in range(first, last):
+                    if worst > 0 and abs(c[r]) > 1e-7 * worst:
+                        name = f"numerator_{r}" if single else f"numerator_{r}[{u},{o}]"
+                        links.append(Link(len(parameters), o, u, r))
+                        # where two numerators nearly cancel, their sizes say nothing: a trust region as wide as theirs
+                        parameters.append(Parameter(name, unit, scale=max(abs(c[r]), 1e-3 * worst)))
+                        begin.append(float(c[r]))
             if direct != 0.0:
                 links.append(Link(len(parameters), o, u, -1))
                 parameters.append(Parameter(f"direct[{u},{o}]", "1", scale=abs(direct)))
@@ -145,7 +156,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
 
     continuous = list(poles) if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
     slowest = min((-p.real for p in continuous), default=np.inf)
-    single = len(inputs) == 1
+    seen = tuple(first for first, _ in blocks)
     return DynamicTwin(
         kind="state_space",
         inputs=inputs,
@@ -155,15 +166,16 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         parameters=tuple(parameters),
         hold="discrete" if m.discrete else m.hold,
         links=tuple(links),
-        groups=tuple({o: 0} for o in outputs) if s else (),
+        groups=tuple({o: seen} for o in outputs) if s else (),
         begin=np.array(begin),
         plant_of=plant_of,
         fixed_free=fixed_free,
         human_of=human_of,
         text_of=text_of,
-        restart=bool(slowest * recording.n * dt < 5.0),
-        feedback_on=outputs[0] if single and s else "",
+        restart=bool(slowest * recording.n * dt < INTEGRATES),
+        feedback_on=outputs[0] if len(inputs) == 1 and s else "",
         fastest_per_s=float(np.max(np.abs(continuous))) if continuous else 0.0,
+        start_given="x0" in recording.twin.parameters,
     )
 
 
@@ -199,8 +211,6 @@ def _matrices(recording: Recording) -> Matrices:
     s, p, q = a.shape[0], len(recording.inputs), len(recording.outputs)
     if a.shape[1] != s:
         raise RecordingError(f"{recording.path}: [twin.parameters] A has shape {a.shape}, it must be square")
-    if s > MAX_ORDER:
-        raise RecordingError(f"{recording.path}: [twin.parameters] A is of order {s}; at most {MAX_ORDER} are handled")
     hold = text.get("hold", "linear")
     if hold not in ("zero", "linear"):
         raise RecordingError(f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {hold!r}")
@@ -221,16 +231,65 @@ def _matrices(recording: Recording) -> Matrices:
     )
 
 
-def _omega(poles: Complex, span: float) -> float:
-    sizes = np.abs(poles)
+def without_constant(m: Matrices, dt: float) -> Matrices:
+    """The same twin with a state that stays 1 (an eigenvalue of zero that no input moves) written as an offset.
+
+    Such a state is how an affine model is written as a linear one. Its value is a parameter of the twin and no start
+    state: it goes into ``y0``, together with what it drives in the long run. Where it drives an integrator it stays.
+    """
+    s = m.a.shape[0]
+    if not s or not np.any(m.x0):
+        return m
+    zero = 1.0 if m.discrete else 0.0
+    size = max(float(np.max(np.abs(m.a))), 1e-300)
+    # rows of A that hold their state, and columns of B that do not move it
+    still = [
+        i
+        for i in range(s)
+        if np.all(np.abs(m.a[i] - zero * (np.arange(s) == i)) <= 1e-12 * size) and not np.any(m.b[i])
+    ]
+    rest = [i for i in range(s) if i not in still]
+    if not still:
+        return m
+    held = m.x0[still]
+    a = m.a[np.ix_(rest, rest)]
+    push = m.a[np.ix_(rest, still)] @ held
+    settled = np.zeros(len(rest))
+    if np.any(push):
+        system = zero * np.eye(len(rest)) - a
+        if np.linalg.cond(system) > 1e10:
+            return m
+        settled = np.linalg.solve(system, push)
+    y0 = m.y0 + m.c[:, still] @ held + m.c[:, rest] @ settled
+    return replace(m, a=a, b=m.b[rest], c=m.c[:, rest], x0=m.x0[rest] - settled, y0=y0)
+
+
+def _omega(roots: Complex, span: float) -> float:
+    """The typical size of some roots: companion states are scaled by its powers so that they are of one size."""
+    sizes = np.abs(roots)
     sizes = sizes[sizes > 1e-9 * (sizes.max() if sizes.size else 1.0)]
     return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0 / span
 
 
-def _modes(poles: Complex, discrete: bool, dt: float) -> tuple[list[tuple[str, complex]], list[complex]]:
-    """Free modes ("pair" or "real") in continuous terms, and poles that stay as given (integrators, z <= 0)."""
-    modes: list[tuple[str, complex]] = []
-    fixed: list[complex] = []
+@dataclass(frozen=True)
+class Mode:
+    """One mode in continuous terms: a ``pair`` of complex poles, a ``real`` one, or a pole that stays as given.
+
+    A pole is ``fixed`` where it integrates, or where no continuous one stands for it; ``value`` is then that of s or z.
+    """
+
+    kind: Literal["pair", "real", "fixed"]
+    value: complex
+
+    @property
+    def order(self) -> int:
+        """How many poles it has."""
+        return 2 if self.kind == "pair" else 1
+
+
+def _modes(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
+    """The modes of a set of poles that is closed under conjugation."""
+    modes: list[Mode] = []
     size = max(float(np.max(np.abs(poles))), 1e-300) if poles.size else 1.0
     for p in poles:
         z = complex(p)
@@ -238,40 +297,160 @@ def _modes(poles: Complex, discrete: bool, dt: float) -> tuple[list[tuple[str, c
             if z.imag < -1e-12:
                 continue
             if z.imag <= 1e-12 and (z.real <= 0 or abs(z.real - 1) < 1e-9):
-                fixed.append(complex(z.real))
+                modes.append(Mode("fixed", complex(z.real)))
                 continue
             c = complex(np.log(z)) / dt
-            modes.append(("pair", c) if z.imag > 1e-12 else ("real", complex(c.real)))
+            modes.append(Mode("pair", c) if z.imag > 1e-12 else Mode("real", complex(c.real)))
             continue
         if z.imag < -1e-9 * size:
             continue
         if abs(z) < 1e-9 * size:
-            fixed.append(0j)
+            modes.append(Mode("fixed", 0j))
         else:
-            modes.append(("pair", z) if z.imag > 1e-9 * size else ("real", complex(z.real)))
-    return modes, fixed
+            modes.append(Mode("pair", z) if z.imag > 1e-9 * size else Mode("real", complex(z.real)))
+    return modes
 
 
-def _numerators(m: Matrices, plant: Plant) -> dict[tuple[int, int], tuple[Array, float]]:
+def _roots(mode: Mode, discrete: bool, dt: float) -> Complex:
+    """Its poles: of s, or of z - 1 for a discrete twin (G. C. Goodwin et al., the delta operator: companion states
+    stay apart however fast it is sampled).
+    """
+    if mode.kind == "fixed":
+        return np.array([mode.value - (1.0 if discrete else 0.0)])
+    both = np.array([mode.value, mode.value.conjugate()] if mode.kind == "pair" else [mode.value], np.complex128)
+    return np.expm1(both * dt) if discrete else both
+
+
+def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Array]:
+    """Companion form (s, s) and its input (s,) of these roots of s or z - 1, states scaled by powers of ``omega``."""
+    s = roots.size
+    den = np.real(np.poly(roots))
+    a = np.zeros((s, s))
+    a[:-1, 1:] = omega * np.eye(s - 1)
+    a[-1, :] = -den[:0:-1] / (omega ** np.arange(s - 1, -1, -1.0))
+    b = np.zeros(s)
+    b[-1] = omega
+    return (a + np.eye(s) if discrete else a), b
+
+
+SMALL = 4
+"""A plant of so few modes is one chain: its numerators keep the zeros that the engineer's have."""
+SPREAD = 1e3
+"""... unless its poles are of sizes that differ by more than this factor."""
+ALIKE = 0.98
+"""Correlation of the impulse responses of two modes above which their residues mean nothing one by one."""
+MOST_CHAINED = 6  # poles
+
+
+def _chains(modes: Sequence[Mode], dt: float) -> list[list[int]]:
+    """Which modes make one companion form: all of a small plant, else those too much alike for partial fractions.
+
+    Partial fractions stay well conditioned at any order as long as poles lie apart; companion forms do where they are
+    few and of one size.
+    """
+    sizes = [abs(x.value) for x in modes if x.kind != "fixed"]
+    narrow = not sizes or max(sizes) < SPREAD * min(sizes)
+    if sum(x.order for x in modes) <= SMALL and narrow:
+        return [list(range(len(modes)))] if modes else []
+    chains: list[list[int]] = []
+    order = sorted(range(len(modes)), key=lambda i: (modes[i].kind == "fixed", abs(modes[i].value)))
+    for i in order:
+        near = [c for c in chains if any(_alike(modes[i], modes[j]) > ALIKE for j in c)]
+        room = next((c for c in near if sum(modes[j].order for j in c) + modes[i].order <= MOST_CHAINED), None)
+        if room is None:
+            chains.append([i])
+        else:
+            room.append(i)
+    return [sorted(c) for c in chains]
+
+
+def _alike(a: Mode, b: Mode) -> float:
+    """Correlation of two decays; poles that are fixed go with each other."""
+    if "fixed" in (a.kind, b.kind):
+        return 1.0 if a.kind == b.kind else 0.0
+    p, q = a.value, b.value
+    least = 1e-6 * max(abs(p), abs(q), 1e-300)
+    decay = max(abs(p.real), least), max(abs(q.real), least)
+    return float(2 * np.sqrt(decay[0] * decay[1]) / abs(complex(sum(decay), p.imag - q.imag)))
+
+
+def felt_poles(m: Matrices) -> Complex:
+    """Poles (closed under conjugation) of the modes that some output shows: those that an input moves, then those that
+    only start somewhere. A pole that several inputs move through copies of one block counts once.
+    """
+    linked = m.a != 0.0
+    shown = _reached(linked.T, np.any(m.c != 0.0, axis=0))
+    moved = np.zeros_like(shown)
+    found: list[complex] = []
+    for i in range(m.b.shape[1]):
+        here = _reached(linked, m.b[:, i] != 0.0)
+        found = _joined(found, _eigenvalues(m.a, here & shown))
+        moved |= here
+    return np.array([*found, *_eigenvalues(m.a, shown & ~moved)], np.complex128)
+
+
+def _reached(linked: NDArray[np.bool_], begin: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """States (s,) that can be reached from those of ``begin``; ``linked[i, j]``: state j moves state i."""
+    found = begin.copy()
+    while True:
+        more = found | np.any(linked[:, found], axis=1)
+        if np.array_equal(more, found):
+            return found
+        found = more
+
+
+def _eigenvalues(a: Array, states: NDArray[np.bool_]) -> list[complex]:
+    """Eigenvalues of these states, block by block: copies of one block give the same figures to the last digit."""
+    left = np.flatnonzero(states).tolist()
+    linked = (a != 0.0) | (a != 0.0).T
+    out: list[complex] = []
+    while left:
+        begin = np.zeros(a.shape[0], np.bool_)
+        begin[left[0]] = True
+        block = _reached(linked & states & states[:, None], begin)
+        rows = np.flatnonzero(block)
+        out += [complex(p) for p in np.linalg.eigvals(a[np.ix_(rows, rows)])]
+        left = [r for r in left if not block[r]]
+    return out
+
+
+def _joined(found: list[complex], more: Sequence[complex]) -> list[complex]:
+    """``found`` with those of ``more`` that are not in it yet."""
+    rest = list(found)
+    out = list(found)
+    for p in more:
+        near = min(rest, key=lambda q: abs(q - p), default=None)
+        if near is not None and abs(near - p) <= SAME_POLE * max(abs(p), abs(near), 1e-300):
+            rest.remove(near)
+        else:
+            out.append(p)
+    return out
+
+
+INTEGRATES = 0.5
+"""Decay over the whole record (nepers) below which a pole integrates: a run then starts afresh in every stretch."""
+SAME_POLE = 1e-6
+"""Relative distance of two poles of different inputs that are one pole."""
+
+
+def _numerators(m: Matrices, plant: Plant, poles: Complex) -> dict[tuple[int, int], tuple[Array, float]]:
     """Rows c with c (p - a)^-1 b equal to the given transfer function, per output and input.
 
-    Matched at points of the complex plane away from the poles (exact for polynomials of that degree).
+    Matched at points of the complex plane beside every pole, where each mode shows most.
     """
-    s = m.a.shape[0]
+    s, n = plant.a.shape[0], m.a.shape[0]
+    size = float(np.max(np.abs(poles - (1.0 if m.discrete else 0.0)), initial=0.0)) or 1.0
+    away = 0.3 * np.maximum(np.abs(poles - (1.0 if m.discrete else 0.0)), 1e-3 * size)
+    points = np.concatenate([poles + away, poles + away * np.exp(2.1j), poles + away * np.exp(4.4j)])
+    both = lambda x: np.concatenate([x.real, x.imag])  # noqa: E731
     out: dict[tuple[int, int], tuple[Array, float]] = {}
-    size = float(np.max(np.abs(np.linalg.eigvals(plant.a)))) if s else 1.0
-    points = (size or 1.0) * (1.5 + 0.5 * np.arange(s)) * np.exp(1j * (0.3 + 0.9 * np.arange(s)))
-    rows = [np.linalg.solve(p * np.eye(s) - plant.a, plant.b) for p in points]
-    basis = np.asarray(rows, np.complex128)
+    basis = np.array([np.linalg.solve(p * np.eye(s) - plant.a, plant.b) for p in points]).reshape(points.size, s)
+    want = np.array([m.c @ np.linalg.solve(p * np.eye(n) - m.a, m.b) for p in points])
+    rows = both(basis)
+    scale = np.linalg.norm(rows, axis=0) if s else np.zeros(0)
     for k in range(m.c.shape[0]):
         for i in range(m.b.shape[1]):
-            want = [m.c[k] @ np.linalg.solve(p * np.eye(s) - m.a, m.b[:, i]) for p in points]
-            values = np.asarray(want, np.complex128)
-            if s:
-                both = np.concatenate([basis.real, basis.imag])
-                c = np.linalg.lstsq(both, np.concatenate([values.real, values.imag]), rcond=None)[0]
-            else:
-                c = np.zeros(0)
+            c = np.linalg.lstsq(rows / scale, both(want[:, k, i]), rcond=None)[0] / scale if s else np.zeros(0)
             out[k, i] = (np.asarray(c, np.float64), float(m.d[k, i]))
     return out
 

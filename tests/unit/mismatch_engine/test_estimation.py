@@ -1,0 +1,90 @@
+"""Estimation holds: what the data do not determine stays where the engineer put it, and no figure runs away."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.fit import fit_base
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.score import fit_rms, held_rms
+from tools.mismatch.engine.split import own_split
+from tools.mismatch.recording import Recording
+from tools.mismatch.twins.opaque import opaque_twin
+
+Array = np.ndarray
+N = 1500
+
+
+def two_tanks(seed: int = 0) -> Recording:
+    """Two tanks with an outflow that grows with the root of the level; the twin is linear, with a constant state 1."""
+    pump = 4.0 + 2.5 * wave(np.random.default_rng(seed), N, 0.3, 3.0)
+    dt, x = 1 / 500, np.array([4.0, 4.0])
+    level = np.empty(N)
+    for i in range(N):
+        level[i] = x[1]
+        for _ in range(4):
+            upper, lower = 12.0 * np.sqrt(np.maximum(x, 1e-9))
+            x = x + dt / 4 * np.array([6.0 * pump[i] - upper, upper - lower])
+    level += 0.01 * np.random.default_rng(seed + 1).standard_normal(N)
+    a = [[-3.0, 0.0, -12.0], [3.0, -3.0, 0.0], [0.0, 0.0, 0.0]]
+    given = {"A": a, "B": [[6.0], [0.0], [0.0]], "C": [[0.0, 1.0, 0.0]], "x0": [4.0, 4.0, 1.0]}
+    return recording("state_space", {"pump": pump}, {"level": level}, given)
+
+
+def test_a_state_that_is_the_constant_one_leaves_every_figure_in_the_range_of_the_data() -> None:
+    rec = two_tanks()
+    problem, raw, base = prepared(rec, 0.3, 0, False)
+    size = float(np.max(np.abs(rec.outputs["level"])))
+    for p, v in zip(base.model.parameters, base.theta, strict=True):
+        assert abs(v) < 100 * max(size, abs(p.scale)), (p.name, v)
+    assert problem.floors["level"].rms < size
+    assert held_rms(problem, base)["level"] <= held_rms(problem, raw)["level"]
+    assert fit_rms(problem, base)["level"] <= fit_rms(problem, raw)["level"]
+
+
+def own_problem(rec: Recording, call: Any) -> Problem:
+    """The problem of a recording whose twin is a Python function."""
+    twin = opaque_twin(rec, call, "a test")
+    inputs = np.column_stack([*rec.inputs.values()])
+    return Problem(rec, twin, own_split(inputs), 0, 0)
+
+
+def geared(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+    """The gear cancels but for rounding; only the product of both gains matters."""
+    gear = parameters["gear"]
+    return {"y": parameters["k1"] * parameters["k2"] * (gear * inputs["u"]) / gear + parameters["offset"]}
+
+
+@pytest.mark.parametrize("gear", [3.0, -0.02, 1e5])
+def test_a_parameter_that_no_output_depends_on_stays_as_given(gear: float) -> None:
+    rng = np.random.default_rng(3)
+    u = wave(rng, N)
+    given: dict[str, object] = {"k1": 2.0, "k2": 0.5, "offset": 0.1, "gear": gear}
+    rec = recording("own", {"u": u}, {"y": 1.7 * u + 0.3 + 0.01 * rng.standard_normal(N)}, given)
+    problem = own_problem(rec, geared)
+    found = dict(zip(given, fit_base(problem).theta.tolist(), strict=True))
+    assert found["gear"] == pytest.approx(gear, rel=1e-3)
+    assert found["k1"] * found["k2"] == pytest.approx(1.7, rel=0.01)
+    # the product says nothing about its factors: each stays near what was believed
+    assert 0.5 < found["k1"] / 2.0 < 2.0
+    assert 0.5 < found["k2"] / 0.5 < 2.0
+    assert found["offset"] == pytest.approx(0.3, abs=0.01)
+
+
+def test_a_refit_that_loses_on_held_out_data_is_not_used() -> None:
+    """The held-out half has another gain than the fitted one; the engineer's own is the right one there."""
+    rng = np.random.default_rng(5)
+    u = wave(rng, N)
+    y = np.where(np.arange(N) < N // 2, 3.0, 1.0) * u + 0.01 * rng.standard_normal(N)
+    rec = recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 1.0, "offset_um": 0.0})
+    rec = replace(rec, split=replace(rec.split, fit=(0, N // 2), test=(N // 2, N)))
+    problem, raw, base = prepared(rec, 0.3, 0, False)
+    assert held_rms(problem, base) == held_rms(problem, raw)
+    np.testing.assert_array_equal(base.theta, raw.theta)

@@ -1,0 +1,80 @@
+"""A recording with gaps and an irregular clock becomes one that can be diagnosed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.errors import InputError
+from tools.mismatch.cut import cut
+from tools.mismatch.recording import RecordingError
+from tools.mismatch.recording_load import load
+
+TEXT = """format = 1
+title = "a stack"
+data = "data.csv"
+{clock}
+
+[twin]
+kind = "piezo_stack"
+[twin.parameters]
+gain_um_per_V = 0.12
+
+[split]
+fit = [0, 300]
+
+[[channels]]
+column = "u"
+role = "input"
+signal = "command"
+unit = "V"
+
+[[channels]]
+column = "z"
+role = "output"
+signal = "displacement"
+unit = "um"
+"""
+
+
+def write(folder: Path, t: np.ndarray, u: np.ndarray, clock: str) -> Path:
+    rows = [f"{a:.9f},{b:.9f},{0.12 * b + 0.01:.9f}" for a, b in zip(t, u, strict=True)]
+    (folder / "data.csv").write_text("\n".join(["t,u,z", *rows]))
+    (folder / "recording.toml").write_text(TEXT.format(clock=clock))
+    return folder
+
+
+def test_the_longest_stretch_is_kept_on_a_uniform_clock(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    t = np.concatenate([np.arange(200) * 0.01, 10 + np.arange(600) * 0.01])
+    t[1:] += rng.uniform(-0.001, 0.001, 799)
+    u = np.sin(t)
+    u[700:703] = np.nan
+    folder = write(tmp_path, t, u, 'time_column = "t"')
+    with pytest.raises(RecordingError, match="micron mismatch cut RECORDING --out FOLDER"):
+        load(folder)
+    kept = cut(folder, tmp_path / "new")
+    assert (kept.parts, kept.samples) == (2, 600)
+    assert kept.rate_hz == pytest.approx(100, rel=1e-3)
+    assert 1 <= kept.filled <= 4
+    found = load(tmp_path / "new")
+    assert found.n == 600
+    assert found.split.fit is None
+    grid = kept.start_s + np.arange(600) / kept.rate_hz
+    np.testing.assert_allclose(found.inputs["command"], np.sin(grid), atol=0.012)
+    assert found.twin.parameters == {"gain_um_per_V": 0.12}
+
+
+def test_a_gap_in_a_record_without_a_clock_and_a_wanted_part(tmp_path: Path) -> None:
+    u = np.sin(np.arange(900) * 0.01)
+    u[400:500] = np.nan
+    folder = write(tmp_path, np.arange(900) * 0.01, u, "rate_hz = 100.0")
+    kept = cut(folder, tmp_path / "late")
+    assert (kept.samples, kept.parts, kept.filled) == (400, 2, 0)
+    assert cut(folder, tmp_path / "early", stop_s=3.0).samples == 300
+    np.testing.assert_allclose(load(tmp_path / "late").inputs["command"], u[:400], atol=1e-8)
+    with pytest.raises(InputError, match="usable samples"):
+        cut(folder, tmp_path / "none", start_s=8.9)
+    assert not (tmp_path / "none").exists()

@@ -1,0 +1,86 @@
+"""Keeps a fit near the engineer's own values where the data say nothing, and checks what every fit must hold.
+
+A weak normal prior on the base parameters is centred on the values of the recording's twin. What the data determine
+is not moved by it (its weight is that of less than one sample); what they do not determine stays as given: a parameter
+that no output depends on, an offset beside an integrator, the free directions of a change of coordinates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.placed import Free
+from tools.mismatch.simulate import Model
+
+Array = NDArray[np.float64]
+
+LOG_WIDTH = 1.5
+"""Standard deviation of the prior of a parameter that is searched by its logarithm: a factor of 4.5."""
+TIMES_GIVEN = 10.0
+"""Standard deviation of the prior of any other parameter, in units of the engineer's own value."""
+TIMES_SCALE = 1000.0
+"""The same in units of the parameter's typical step, where that is wider (an offset that was given as zero)."""
+FAR = 1e3
+"""A simulation whose residual exceeds the largest recorded value by this factor has run away."""
+
+
+def to_search(p: Free, v: float) -> float:
+    """A parameter in the coordinate that is searched: its logarithm where only its size is uncertain."""
+    return float(np.log(max(v, 1e-300))) if p.log and p.lo > 0 else v
+
+
+@dataclass(frozen=True)
+class Belief:
+    """Centre and width (parameters,) of the prior, in search coordinates; an infinite width is no prior."""
+
+    centre: Array
+    width: Array
+
+
+def belief(problem: Problem, model: Model) -> Belief:
+    """The prior of every parameter of ``model``: normal for base parameters, none for those of effects."""
+    centre, width = np.zeros(len(model.parameters)), np.full(len(model.parameters), np.inf)
+    given = problem.given
+    for i, p in enumerate(model.parameters[: model.n_base]):
+        centre[i] = to_search(p, given[i])
+        if p.log and p.lo > 0:
+            width[i] = LOG_WIDTH
+        elif np.isfinite(p.hi - p.lo):
+            width[i] = p.hi - p.lo
+        else:
+            width[i] = max(TIMES_GIVEN * abs(given[i]), TIMES_SCALE * abs(p.scale)) or np.inf
+    return Belief(centre, width)
+
+
+def stayed(problem: Problem, residual: Mapping[str, Array]) -> bool:
+    """Whether a simulation stayed within reach of the recording: finite, and within ``FAR`` times its largest value."""
+    return all(
+        bool(np.all(np.abs(r) <= FAR * float(np.max(np.abs(problem.recording.outputs[o])))))
+        for o, r in residual.items()
+    )
+
+
+def fit_loss(problem: Problem, residual: Mapping[str, Array]) -> float:
+    """Mean square over noise variance on the fitted samples, averaged over outputs; every sample counts alike."""
+    rows = problem.fit_rows
+    return float(np.mean([np.mean((r[rows] / problem.sigma(o)) ** 2) for o, r in residual.items()]))
+
+
+def broken(problem: Problem, given: Mapping[str, Array], theta: Array, residual: Mapping[str, Array]) -> str:
+    """Which of the things that every accepted fit must hold is broken ("" if none), as one sentence.
+
+    ``given``: the residual of the twin as given. A fit is finite, its simulation stays within reach of the recording,
+    and it is no worse on the fitted samples than the twin as given.
+    """
+    if not np.all(np.isfinite(theta)):
+        return "A fitted parameter was not finite."
+    if not stayed(problem, residual):
+        return f"The fitted simulation left the recording by more than {FAR:g} times its largest value."
+    if stayed(problem, given) and fit_loss(problem, residual) > (1 + 1e-9) * fit_loss(problem, given):
+        return "The fit was worse on the fitted samples than the twin as given."
+    return ""
