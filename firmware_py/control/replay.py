@@ -36,7 +36,7 @@ def recorded_configs(recording: Recording) -> StageConfigs:
 def replay_recording(recording: Recording) -> ReplayReport:
     """Run the recorded configuration over the recorded inputs."""
     stages = Stages(recorded_configs(recording))
-    stages.warm_up()
+    stages.warm_up(batch=True)
     known = [i for i, name in enumerate(_NAMES) if name in recording.names or name not in LATER_COLUMNS]
     outputs = [i for i in known if i >= VOLTS]
 

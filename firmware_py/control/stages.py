@@ -106,10 +106,23 @@ class Stages:
         self.command_V[:] = command_V
         self.frame[STATUS] = int(self.frame[STATUS]) | MANUAL
 
-    def warm_up(self) -> None:
-        """Compile or load every kernel, then forget what that did. A cold start takes minutes, a tick may not."""
+    def warm_up(self, *, batch: bool = False) -> None:
+        """Compile or load the kernels of ``step``, then forget what that did: a cold start takes a minute, a tick may
+        not. ``batch``: those of ``run`` as well, which only replay needs."""
         self.step()
-        self.run(np.zeros((1, LAYOUT.size)))
+        if batch:
+            self.run(np.zeros((1, LAYOUT.size)))
+        self.reset()
+
+    def warm_up_motion(self) -> None:
+        """Compile the stages after sensing, apart from the step that calls them all: two processes share the work."""
+        for stage in (self.tremor, self.detectors, self.actuation):
+            stage.step(self.frame)
+        self.reset()
+
+    def warm_up_sensing(self) -> None:
+        """Compile the sensing stage, apart from the step."""
+        self.sensing.step(self.frame)
         self.reset()
 
     def reset(self) -> None:

@@ -5,29 +5,35 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import RenderableType
 from rich.live import Live
+from rich.markup import escape
 from rich.spinner import Spinner
-from rich.table import Table
+from rich.text import Text
 
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import REPORT, describe
 from firmware_py.inject import check_injections, parse_injection
 from firmware_py.run_request import RunRequest
 from hal.bench import check_pace, load_bench
+from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
 from tools.errors import InputError
+from tools.prepare import prepare
 from tools.output import check_writable, write_json
 from tools.output import write_text_atomic as write_text
+
+if TYPE_CHECKING:
+    from tools.reports.run_live import TipWatch
 
 GUARDIAN_S = 3.0
 SETTLE_S = 2.0
@@ -109,12 +115,18 @@ def run(
             raise InputError("--hand, --html and --sense-only belong to the instrument; an endoscope bench has none")
         if is_endoscope(file.description) and method is not None:
             raise InputError("--method belongs to the instrument; an endoscope bench estimates no tremor")
+        if not is_endoscope(file.description):
+            from tools.reports.run_live import opening_lines
+
+            for line in opening_lines(file, seconds, pace, hand, seed):
+                console().print(escape(line))
+            prepare(file, request.method, console())
         outcome, truth = _run_real(request) if pace == "realtime" else _run_emulated(request)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)
             return
         # only now: the firmware did not wait for what draws
-        from tools.reports.run_report import html_page, picture, print_report, save_picture
+        from tools.reports.run_report import html_page, next_steps, picture, print_report, save_picture
 
         result = complete_result(outcome, truth)
         if truth is not None and result["tremor"]["reduction_percent"] is not None:
@@ -127,6 +139,8 @@ def run(
         print_report(result, console())
         if png is not None:
             console().print(f"picture: {image}")
+        for line in next_steps(result):
+            console().print(escape(line), soft_wrap=True)
         write_json(result, json_file)
         if not result["safe_state"]["normal"]:
             raise typer.Exit(Exit.FAILED)
@@ -158,9 +172,13 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
 def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """In emulated time nothing waits for the loop, so it runs in this process."""
     from firmware_py.app import run_in_process
+    from tools.reports.run_live import TipWatch
 
+    watch = TipWatch()
     with Live(console=console(), refresh_per_second=8, transient=True) as live:
-        return run_in_process(request, lambda status: live.update(_status_table(status, request.seconds)))
+        return run_in_process(
+            request, lambda status: live.update(_shown(status, request.seconds, watch)), on_open=watch.attach
+        )
 
 
 def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
@@ -170,7 +188,10 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
         request_file = runtime_dir / "request.json"
         request_file.write_text(request.to_json(runtime_dir))
         process = subprocess.Popen(
-            [sys.executable, "-m", "firmware_py.app", str(request_file)], stdout=subprocess.PIPE, text=True
+            child_command("firmware_py.app", str(request_file)),
+            stdout=subprocess.PIPE,
+            text=True,
+            env=child_environment(),
         )
         try:
             _watch(process, request.seconds)
@@ -207,10 +228,13 @@ def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
 def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     """Draw the status lines of the firmware until it ends."""
     assert process.stdout is not None
+    from tools.reports.run_live import TipWatch
+
+    watch = TipWatch()
     starting = "starting the emulated world and the firmware; the first run on a machine compiles, one to three minutes"
     with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
-            live.update(_status_table(json.loads(line), seconds))
+            live.update(_shown(json.loads(line), seconds, watch))
 
 
 def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None, json_file: str | None) -> None:
@@ -226,19 +250,11 @@ def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | Non
         raise typer.Exit(Exit.DATA_LOST)
 
 
-def _status_table(status: dict[str, Any], seconds: float) -> Table:
+def _shown(status: dict[str, Any], seconds: float, watch: TipWatch) -> RenderableType:
     if "view" in status:
         from tools.endoscope.run_report import status_table
 
         return status_table(status, seconds)
-    table = Table(title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}]", title_justify="left")
-    for column in ("", "x", "y", "z"):
-        table.add_column(column, justify="left" if not column else "right")
-    table.add_row("tremor amplitude (um)", *(f"{v:.1f}" for v in status["amplitude_um"]))
-    table.add_row("tremor frequency (Hz)", *(f"{v:.2f}" for v in status["frequency_hz"]))
-    table.add_row("command (V)", *(f"{v:.1f}" for v in status["command_V"]))
-    table.add_row("sample to command p50, p99 (us)", *(f"{v:.0f}" for v in status["latency_us"]), "")
-    table.add_row("scans lost, ticks skipped", str(status["lost"]), str(status["skipped"]), "")
-    if "fallbacks" in status:
-        table.add_row("numeric kinematics fell back (ticks)", str(status["fallbacks"]), "", "")
-    return table
+    from tools.reports.run_live import live_line
+
+    return Text(live_line(status, seconds, watch), no_wrap=True)

@@ -10,12 +10,16 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich import box
 from rich.console import Console, Group
+from rich.markup import escape
 from rich.table import Table
 
 from tools.reports.tremor_figures import AXES, TREMOR_BAND_HZ, band_pass
 
 Array = NDArray[np.float64]
+NOTHING_UM = 0.2
+"""Below this a percentage says nothing: the change is given in um."""
 
 
 def headline(result: Mapping[str, Any]) -> str:
@@ -24,11 +28,11 @@ def headline(result: Mapping[str, Any]) -> str:
     if result["armed_ns"] is None:
         return "Nothing was armed, so there is nothing to compare."
     if tremor["reduction_percent"] is None:
-        return "No tremor figure: it needs an emulated bench (the truth is its) and a run of more than a few seconds."
+        return "No tremor figure: it needs an emulated bench, which knows the truth, and a run of more than 3 s."
+    low_hz, high_hz = tremor["band_hz"]
     return (
-        f"Tip tremor {tremor['uncompensated_rms_um']:.1f} um rms without, "
-        f"{tremor['compensated_rms_um']:.1f} um rms with compensation: "
-        f"{tremor['reduction_percent']:.0f} % less in {tremor['band_hz'][0]:g}-{tremor['band_hz'][1]:g} Hz."
+        f"Tip tremor {low_hz:g}-{high_hz:g} Hz: {tremor['uncompensated_rms_um']:.1f} um rms without, "
+        f"{tremor['compensated_rms_um']:.1f} with compensation: {tremor['reduction_percent']:.0f} % less."
     )
 
 
@@ -36,52 +40,88 @@ def _number(value: float | None, pattern: str = "{:.1f}") -> str:
     return "-" if value is None or not np.isfinite(value) else pattern.format(value)
 
 
+def _compared(without_um: float | None, with_um: float | None) -> str:
+    """The change in per cent, or in um where there was next to nothing to begin with."""
+    if without_um is None or with_um is None:
+        return "-"
+    if without_um < NOTHING_UM or with_um > 2.0 * without_um:
+        return f"adds {with_um - without_um:.2f} um"
+    return f"{100.0 * (1.0 - with_um / without_um):.0f} % less"
+
+
 def tremor_table(result: Mapping[str, Any]) -> Table:
-    """Tremor without and with compensation, per axis and as a vector."""
-    table = Table(title="Tip tremor and tip error (truth)", title_justify="left")
-    for column in ("", "without (um rms)", "with (um rms)", "less (%)"):
+    """Tremor without and with compensation, per axis and as a vector, then the error of the tip in each band."""
+    table = Table(title="Motion of the tip, um rms (physical truth)", title_justify="left", box=box.SIMPLE_HEAD)
+    for column in ("", "without", "with", "compensation"):
         table.add_column(column, justify="left" if not column else "right")
+
+    def add(name: str, without_um: float | None, with_um: float | None) -> None:
+        figures = (_number(v, "{:.2f}") for v in (without_um, with_um))
+        table.add_row(name, *figures, _compared(without_um, with_um))
+
     tremor = result["tremor"]
-    rows = [(f"{axis}, tremor band", tremor["per_axis"][axis]) for axis in AXES]
-    rows += [
-        ("vector, tremor band", tremor),
-        ("vector, all bands, against intended path", tremor["whole_band_error"]),
-    ]
-    for name, figures in rows:
-        table.add_row(
-            name,
-            _number(figures["uncompensated_rms_um"], "{:.2f}"),
-            _number(figures["compensated_rms_um"], "{:.2f}"),
-            _number(figures["reduction_percent"]),
-        )
+    for name, figures in [*((f"tremor 8-12 Hz, {axis}", tremor["per_axis"][axis]) for axis in AXES)]:
+        add(name, figures["uncompensated_rms_um"], figures["compensated_rms_um"])
+    add("tremor 8-12 Hz, all axes", tremor["uncompensated_rms_um"], tremor["compensated_rms_um"])
+    for band in tremor.get("bands", ()):
+        low, high = band["low_Hz"], band["high_Hz"]
+        name = f"below {high:g} Hz" if low == 0 else f"{low:g}-{high:g} Hz"
+        add(f"error of path, {name}", band["without_um"], band["with_um"])
     return table
 
 
 def task_table(result: Mapping[str, Any]) -> Table:
-    """Every task against its budget, times in us; whole on eighty columns."""
-    title = "Tasks: us of budget and runs; CPU of a run; runs over budget, releases skipped, times put off"
-    table = Table(title=title, title_justify="left", box=None, padding=(0, 1, 0, 0), pad_edge=False)
-    figures = ("budget", "p50", "p99", "p99.9", "max", "cpu", "over", "skip", "off")
-    for column in ("task", "Hz", "runs", *figures):
-        table.add_column(column, justify="left" if column == "task" else "right", no_wrap=True)
+    """Every task's time and CPU time against its budget, in us; fits eighty columns."""
+    time = "wall" if result.get("clock") == "real" else "emulated"
+    table = Table(
+        title=f"Tasks: {time} time and host CPU time of a run, us", title_justify="left",
+        box=None, padding=(0, 1, 0, 0), pad_edge=False,
+    )  # fmt: skip
+    short = time[:4]
+    figures = (f"{short}\np50", f"{short}\np99", f"{short}\nmax", "CPU\np50", "CPU\np99", "bud-\nget")
+    for column in ("\ntask", "\nHz", "\nruns", *figures, "runs\nover", "put\noff"):
+        table.add_column(column, justify="left" if "task" in column else "right", no_wrap=True)
     for name, task in result["tasks"].items():
         duration, cpu = task["duration_us"], task["cpu_us"]
         table.add_row(
             name,
             _number(task["rate_hz"], "{:g}"),
             str(task["runs"]),
+            *(_number(duration[key], "{:.0f}") for key in ("p50", "p99", "max")),
+            *(_number(cpu[key], "{:.0f}") for key in ("p50", "p99")),
             _number(task["budget_us"], "{:g}"),
-            *(_number(duration[key], "{:.0f}") for key in ("p50", "p99", "p99_9", "max")),
-            _number(cpu["p50"], "{:.0f}"),
             str(task["overruns"]),
-            str(task["skipped"]),
             str(task["put_off"]),
         )
     return table
 
 
+def task_legend(result: Mapping[str, Any]) -> str:
+    """What the two times of the task table are."""
+    if result.get("clock") == "real":
+        return "wall: from the start of a run to its end on this machine; CPU: without the waiting for buses."
+    return (
+        "emul: bus and device time, exact, the same on every machine; CPU: what this\n"
+        "machine spent, its emulated devices included. Budgets are for the first."
+    )
+
+
+def host_line(result: Mapping[str, Any]) -> str:
+    """How the host kept up; a pause of the host is no fault in emulated time."""
+    host = result.get("host", {})
+    if host.get("pace") != "paced":
+        return f"scheduling: {result['realtime']}"
+    emulated_s, wall_s = host["emulated_s"], host["wall_s"]
+    line = f"pace: {emulated_s:.1f} s of emulated time took {wall_s:.1f} s"
+    if wall_s > 1.05 * emulated_s:
+        line += "; the result does not change"
+    if host["stalls"]:
+        line += f"\n{host['stalls']} pauses of the host, longest {host['longest_stall_ms']:.0f} ms, were waited out"
+    return line
+
+
 def summary_lines(result: Mapping[str, Any]) -> list[str]:
-    """What is not a table: latency, scans, voluntary motion, safe state, recording."""
+    """What is not a table: latency, scans, holds, voluntary motion, safe state, recording."""
     latency = result["latency"]["sample_to_command_us"]
     samples, safe, voluntary = result["samples"], result["safe_state"], result["voluntary"]
     lines = [
@@ -91,8 +131,9 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
             for name, key in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p99_9"), ("max", "max"))
         ),
         f"scans: {samples['received']} of {samples['expected']} received, {samples['lost']} lost; "
-        f"{result['ticks']['skipped']} ticks skipped, {result['ticks']['caught_up']} caught up without a command of "
-        f"their own, {result['commands']['clipped']} commands clipped",
+        f"commands: {result['commands']['sent']} sent, {result['commands']['clipped']} clipped",
+        f"ticks: {result['ticks']['run']} run, {result['ticks']['skipped']} skipped, {result['ticks']['caught_up']} "
+        "caught up without a command",
     ]
     if passed_over := result["commands"].get("superseded"):
         sent = result["commands"]["sent"]
@@ -102,26 +143,42 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
     kinematics = result.get("kinematics", {})
     if kinematics.get("method") == "numeric":
         lines.append(f"numeric kinematics: {kinematics['fallbacks']} ticks fell back to the analytic solution")
+    for hold in result.get("holds", ()):
+        lines.append(f"hold at {hold['t_s']:.1f} s for {hold['length_s']:.2f} s ({hold['class']}): {hold['cause']}")
     if result["noticed"]:
         lines.append("noticed: " + ", ".join(result["noticed"]))
     if voluntary["gain"] is not None:
         lines.append(f"voluntary motion below 1 Hz: gain {voluntary['gain']:.4f}, delay {voluntary['delay_ms']:.2f} ms")
     if any(result.get("warnings", {}).values()):
-        lines.append("hand: " + ", ".join(f"{n} {what}(s)" for what, n in result["warnings"].items() if n))
+        lines.append(
+            "hand, noted without consequence: "
+            + ", ".join(f"{what} {n} times" for what, n in result["warnings"].items() if n)
+        )
     reached = "reached" if safe["reached"] else "NOT CONFIRMED"
     lines.append(f"safe state {reached}: {safe['reason']}")
-    lines.append(f"scheduling: {result['realtime']}")
+    lines.append(host_line(result))
     if result["recording"]:
         lines.append(f"recording: {result['recording']}")
     return lines
 
 
+def next_steps(result: Mapping[str, Any]) -> list[str]:
+    """Commands that make sense after this run."""
+    replay = result["recording"] or "out/first.mcap"
+    steps = ["micron bench                           the live page of the instrument"]
+    if not result["recording"]:
+        steps.append("micron run --record out/first.mcap     record a run")
+    steps.append(f"micron replay {replay:<24} run it again, bit for bit")
+    steps.append("micron mismatch --help                 what a simulation lacks")
+    return ["next:", *(f"  {step}" for step in steps)]
+
+
 def print_report(result: Mapping[str, Any], console: Console) -> None:
-    """The whole report for a terminal."""
-    parts: list[Any] = []
+    """The whole report for a terminal: the result in one sentence, the tables, what to do next."""
+    parts: list[Any] = ["", f"[bold]{headline(result)}[/]", ""]
     if result["tremor"]["reduction_percent"] is not None:
         parts.append(tremor_table(result))
-    parts += [task_table(result), *summary_lines(result), f"[bold]{headline(result)}[/]"]
+    parts += [task_table(result), f"[dim]{task_legend(result)}[/]", "", *map(escape, summary_lines(result)), ""]
     console.print(Group(*parts))
 
 

@@ -17,6 +17,8 @@ Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
 TREMOR_BAND_HZ = (8.0, 12.0)
 VOLUNTARY_HZ = 1.0
+BANDS_HZ = ((0.0, 2.0), (2.0, 8.0), TREMOR_BAND_HZ, (20.0, 500.0), (2.0, 500.0))
+"""Bands in which the error against the intended path is reported: what compensation adds elsewhere counts, too."""
 
 
 @dataclass(frozen=True)
@@ -30,13 +32,15 @@ class BandFigures:
 
 @dataclass(frozen=True)
 class TremorFigures:
-    """Tip tremor in ``band_hz`` as a vector and per axis, and the error against the intended path, all bands."""
+    """Tip tremor in ``band_hz`` as a vector and per axis; the error against the intended path in each of ``bands`` and
+    over all frequencies."""
 
     band_hz: tuple[float, float]
     evaluated_s: tuple[float, float]
     vector: BandFigures
     per_axis: dict[str, BandFigures]
     whole_band: BandFigures
+    bands: dict[tuple[float, float], BandFigures]
     voluntary_gain: float
     voluntary_delay_ms: float
 
@@ -49,14 +53,32 @@ class TremorFigures:
                 **asdict(self.vector),
                 "per_axis": {axis: asdict(figures) for axis, figures in self.per_axis.items()},
                 "whole_band_error": asdict(self.whole_band),
+                "bands": [
+                    {
+                        "low_Hz": low,
+                        "high_Hz": high,
+                        "without_um": figures.uncompensated_rms_um,
+                        "with_um": figures.compensated_rms_um,
+                    }
+                    for (low, high), figures in self.bands.items()
+                ],
             },
             "voluntary": {"gain": self.voluntary_gain, "delay_ms": self.voluntary_delay_ms},
         }
 
 
 def band_pass(x: Array, rate_hz: float, band_hz: tuple[float, float]) -> Array:
-    """``x`` (n, k) in ``band_hz``, without phase shift (fourth-order Butterworth, forwards and backwards)."""
-    sos = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
+    """``x`` (n, k) in ``band_hz``, without phase shift (fourth-order Butterworth, forwards and backwards).
+
+    A band that begins at 0 Hz is a low-pass, one that ends at or above half of ``rate_hz`` a high-pass.
+    """
+    low_hz, high_hz = band_hz
+    if low_hz <= 0.0:
+        sos = butter(4, high_hz, btype="lowpass", fs=rate_hz, output="sos")
+    elif high_hz >= 0.5 * rate_hz:
+        sos = butter(4, low_hz, btype="highpass", fs=rate_hz, output="sos")
+    else:
+        sos = butter(4, band_hz, btype="bandpass", fs=rate_hz, output="sos")
     return np.asarray(sosfiltfilt(sos, x, axis=0))
 
 
@@ -84,8 +106,10 @@ def tremor_figures(
     rigid_band, tip_band = (band_pass(x, rate_hz, band_hz)[keep] for x in (rigid, tip))
     per_axis = {a: _compare(rigid_band[:, [i]], tip_band[:, [i]]) for i, a in enumerate(AXES)}
     # the manipulator's own rest offset is no error of the path: means are taken out
-    errors = [x[keep] - intended[keep] for x in (rigid, tip)]
-    whole = _compare(*(e - e.mean(axis=0) for e in errors))
+    errors = [x - intended for x in (rigid, tip)]
+    centred = [e - e[keep].mean(axis=0) for e in errors]
+    whole = _compare(*(e[keep] for e in centred))
+    bands = {band: _compare(*(band_pass(e, rate_hz, band)[keep] for e in centred)) for band in BANDS_HZ}
     gain, delay_ms = _voluntary_response(rigid, tip, rate_hz, keep)
     return TremorFigures(
         band_hz,
@@ -93,6 +117,7 @@ def tremor_figures(
         _compare(rigid_band, tip_band),
         per_axis,
         whole,
+        bands,
         gain,
         delay_ms,
     )

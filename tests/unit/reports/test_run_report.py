@@ -28,7 +28,7 @@ def test_a_run_that_arms_nothing_says_so(sensed: dict[str, Any]):
 
 
 def test_a_run_too_short_for_a_figure_says_what_it_needs(sensed: dict[str, Any]):
-    assert "a run of more than a few seconds" in headline({**sensed, "armed_ns": 1})
+    assert "a run of more than 3 s" in headline({**sensed, "armed_ns": 1})
 
 
 def test_what_was_noticed_and_caught_up_is_told(sensed: dict[str, Any]):

@@ -1,0 +1,25 @@
+"""How this program starts itself in further processes: our packages, whatever folder the user stands in."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def child_command(module: str, *arguments: str) -> list[str]:
+    """The command line that runs ``module`` of ours as a program.
+
+    ``-P`` keeps the current folder off the import path: a ``random.py`` that lies there is not ours to run.
+    """
+    return [sys.executable, "-P", "-m", module, *arguments]
+
+
+def child_environment() -> dict[str, str]:
+    """The environment for ``child_command``: from a source tree, this tree comes first on the import path."""
+    environment = dict(os.environ)
+    if (ROOT / "pyproject.toml").exists():
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), environment.get("PYTHONPATH"))))
+    return environment

@@ -1,0 +1,99 @@
+"""What ``micron run`` shows before and while it runs: what runs, and one line that moves."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, sosfilt, sosfilt_zi
+
+from hal.bench import BenchFile, OpenBench
+from hal.clock import Pace, VirtualClock
+from sim_devices.lockstep_world import LockstepWorld
+from tools.reports.tremor_figures import TREMOR_BAND_HZ
+
+LOOK_NS = 10_000_000
+"""Time between two looks at the tip: 100 Hz shows a tremor of 12 Hz."""
+WINDOW_S = 1.0
+"""Time constant of the rms that is shown."""
+
+PACES: Mapping[Pace, str] = {
+    "paced": "emulated time, one second per second; the same result on every machine",
+    "virtual": "emulated time, as fast as this machine can; the same result on every machine",
+    "realtime": "the wall clock; a 1 kHz loop in processes of its own",
+}
+
+
+def opening_lines(bench: BenchFile, seconds: float, pace: Pace, hand: str | None, seed: int | None) -> list[str]:
+    """What is about to run, in lines of at most 80 columns."""
+    description = bench.description
+    emulated, n_buses = len(description.emulated_buses()), len(description.bus)
+    devices = "emulated devices" if emulated == n_buses else "real devices" if not emulated else "mixed devices"
+    shown_seed = description.emulation.get("seed", 1) if seed is None else seed
+    lines = [f"bench: {description.name}, {devices} on {', '.join(description.bus)}"]
+    if emulated:
+        lines.append(f"hand:  {hand or 'synthetic'}, seed {shown_seed}")
+    lines.append(f"run:   {seconds:g} s after the self-test")
+    lines.append(f"pace:  {PACES[pace]}")
+    return [line if len(line) <= 80 else line[:79] + "…" for line in lines]
+
+
+class TipWatch:
+    """Tremor of the tip without and with compensation while an emulated bench runs, from the physical truth.
+
+    ``attach`` it to a bench that is opened in emulated time; anywhere else it stays silent. It only looks: the world
+    is not advanced and no result changes.
+    """
+
+    def __init__(self) -> None:
+        rate_hz = 1e9 / LOOK_NS
+        self._sos = butter(2, TREMOR_BAND_HZ, btype="bandpass", fs=rate_hz, output="sos")
+        self._state: NDArray[np.float64] | None = None
+        self._power = np.zeros(2)
+        self._forget = LOOK_NS * 1e-9 / WINDOW_S
+        self._n = 0
+
+    def attach(self, opened: OpenBench) -> None:
+        """Look at the tip of ``opened`` every ``LOOK_NS`` of its time."""
+        world, clock = opened.world, opened.clock
+        if not isinstance(world, LockstepWorld) or not isinstance(clock, VirtualClock):
+            return
+
+        def look(t_ns: int) -> None:
+            row = world.world.plant.truth_row()
+            self.add(np.concatenate([row["tip_rigid_m"], row["tip_m"]]))
+            clock.at(t_ns + LOOK_NS, look)
+
+        clock.at(clock.now_ns() + LOOK_NS, look)
+
+    def add(self, tips_m: NDArray[np.float64]) -> None:
+        """One look (6,): the tip with the manipulator at rest, the tip, in metres."""
+        if self._state is None:
+            self._state = sosfilt_zi(self._sos)[:, :, None] * tips_m
+        out, self._state = sosfilt(self._sos, tips_m[None, :], axis=0, zi=self._state)
+        power = 1e12 * np.array([np.sum(out[0, :3] ** 2), np.sum(out[0, 3:] ** 2)])
+        self._n += 1
+        self._power += max(self._forget, 1.0 / self._n) * (power - self._power)
+
+    def rms_um(self) -> tuple[float, float] | None:
+        """Tremor without and with compensation over the last second or so; None before there is any."""
+        if self._n * LOOK_NS < WINDOW_S * 1e9:
+            return None
+        without, with_ = np.sqrt(self._power)
+        return float(without), float(with_)
+
+
+def live_line(status: Mapping[str, Any], seconds: float, watch: TipWatch) -> str:
+    """One line of at most 80 columns: time, state, tremor without and with compensation, holds, time left."""
+    t_s = status["t_s"]
+    tip = watch.rms_um()
+    if tip is not None:
+        tremor = f"tremor {tip[0]:5.1f} um without, {tip[1]:5.1f} with"
+    else:
+        tremor = f"tremor estimated {float(np.linalg.norm(status['amplitude_um'])):5.1f} um"
+    holds = f"  holds {status['holds']}" if "holds" in status else ""
+    lost = f"  LOST {status['lost']}" if status["lost"] else ""
+    left_s = max(0.0, seconds - t_s)
+    return f"{t_s:6.1f} s  {status['state']:<9} {tremor}{holds}{lost}  {left_s:.0f} s left"[:80]
