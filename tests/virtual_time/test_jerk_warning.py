@@ -26,6 +26,9 @@ def test_jerks_reach_the_report(tmp_path: Path) -> None:
     assert truth is not None
     assert outcome["warnings"]["jerk"] >= 1
     quiet = {"gain": None, "delay_ms": None}
-    assert any("jerk(s)" in line for line in summary_lines({**outcome, "voluntary": quiet}))
+    assert any(
+        line.startswith("hand, noted without consequence: jerk")
+        for line in summary_lines({**outcome, "voluntary": quiet})
+    )
     if outcome["warnings"]["drift"]:
         pytest.xfail("a jerk of 0.6 mm counts as a drift, too: docs/limits.md")

@@ -57,7 +57,7 @@ def test_the_strongest_stretch_of_a_swing() -> None:
 def test_the_page_says_which_hands_miss_the_goal_and_why(share: float, rest_um: float, said: str) -> None:
     def row(hand: str, method: str, left_um: float) -> HandRow:
         vector = BandFigures(20.0, left_um, 100.0 * (1.0 - left_um / 20.0))
-        figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, 1.0, 0.0)
+        figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, {}, 1.0, 0.0)
         return HandRow(hand, "-", method, figures, 1.5, 4.0, 2.0, Swing(14.0, 3.0, share, 74.0, rest_um))
 
     page = markdown([row("calm", "adaptive", 4.0), row("calm", "kalman", 9.0), row("wild", "adaptive", 8.0)], 40.0, "x")
@@ -70,7 +70,7 @@ def test_the_page_says_which_hands_miss_the_goal_and_why(share: float, rest_um: 
 
 def test_a_page_of_hands_that_all_reach_the_goal_explains_none() -> None:
     vector = BandFigures(20.0, 4.0, 80.0)
-    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, 1.0, 0.0)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, {}, 1.0, 0.0)
     page = markdown(
         [HandRow("calm", "-", "adaptive", figures, 1.5, 4.0, 2.0, Swing(9.0, 3.0, 0.9, 74.0, 5.0))], 8.0, "x"
     )

@@ -36,18 +36,18 @@ def test_what_was_noticed_and_caught_up_is_told(sensed: dict[str, Any]):
     told["ticks"] = {**sensed["ticks"], "caught_up": 41}
     lines = summary_lines(told)
     assert "noticed: scans came late, parallel axes disagree" in lines
-    assert any("41 caught up without a command of their own" in line for line in lines)
+    assert any("41 caught up without a command" in line for line in lines)
 
 
 def test_no_figure_of_a_task_is_cut_on_eighty_columns():
     large = {"p50": 1234.4, "p99": 12345.4, "p99_9": 23456.4, "max": 34567.4}
     task = {
         "rate_hz": 1000.0, "runs": 1_800_000, "budget_us": 520.0, "duration_us": large, "cpu_us": large,
-        "overruns": 12345, "skipped": 23456, "put_off": 34567,
+        "overruns": 12345, "put_off": 34567,
     }  # fmt: skip
     console = Console(width=80, record=True, file=io.StringIO())
     console.print(task_table({"tasks": {"magnetometer_x": task}}))
     words = console.export_text().split()
-    for figure in ("1800000", "520", "1234", "12345", "23456", "34567"):
+    for figure in ("1800000", "520", "1234", "12345", "34567"):
         assert figure in words
     assert words.count("34567") == 2
