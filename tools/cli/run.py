@@ -28,9 +28,9 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
 from tools.errors import InputError
-from tools.prepare import prepare
 from tools.output import check_writable, write_json
 from tools.output import write_text_atomic as write_text
+from tools.prepare import prepare
 
 if TYPE_CHECKING:
     from tools.reports.run_live import TipWatch
