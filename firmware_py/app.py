@@ -192,6 +192,7 @@ def make_outcome(
             "limited": loop.stages.actuation.limited,
         },
         "magnetometer_errors": counts.magnetometer_errors,
+        "holds": loop.list_holds(),
         "warnings": dict(supervisor.warnings),
         "safe_state": {
             "reached": supervisor.safe_reached,

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.actuation.stage import actuate_kernel
+from firmware_py.actuation.stage import actuate_kernel, rest_kernel
 from firmware_py.control.manual import follow_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STATUS, VOLTS, FrameStatus
 from firmware_py.records import Record
@@ -24,7 +24,8 @@ from hal.compiled import kernel
 
 COMMANDED = int(FrameStatus.COMMANDED)
 MANUAL = int(FrameStatus.MANUAL)
-GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE | FrameStatus.COMMANDED | FrameStatus.MANUAL)
+HELD = int(FrameStatus.HELD)
+GIVEN_BITS = int(FrameStatus.GAP | FrameStatus.STALE) | COMMANDED | MANUAL | HELD
 """Bits of ``status`` that the caller sets before a step; the kernels add the others."""
 
 
@@ -53,8 +54,9 @@ def _the_one(dtype: np.dtype[Any]) -> np.dtype[Any]:
 def step_kernel(memory: Record) -> None:
     """One tick: the frame's columns left of the volts and the ``GIVEN_BITS`` of its status are the input.
 
-    COMMANDED: a command is computed. MANUAL: ``command`` is given and the actuation stage follows it. Neither: the
-    outputs are not free to move, or a newer scan is there already; the last command stays in its column.
+    COMMANDED: a command is computed. MANUAL: ``command`` is given and the actuation stage follows it. HELD: the same,
+    and compensation begins where the outputs are then. None: the outputs are not free to move, or a newer scan is there
+    already; the last command stays in its column.
     ``memory`` (1,) is of ``memory_dtype``.
     """
     m = memory[0]
@@ -65,8 +67,10 @@ def step_kernel(memory: Record) -> None:
     status = int(frame[STATUS])
     if status & COMMANDED:
         actuate_kernel(frame, m.actuate_state, m.actuate_params)
-    elif status & MANUAL:
+    elif status & (MANUAL | HELD):
         follow_kernel(frame, m.actuate_state, m.actuate_params)
+        if status & HELD:
+            rest_kernel(m.actuate_state)
 
 
 @kernel
@@ -83,7 +87,7 @@ def run_kernel(rows: NDArray[np.float64], memory: Record) -> None:
         for i in range(VOLTS):
             frame[i] = row[i]
         frame[STATUS] = status
-        if status & MANUAL:
+        if status & (MANUAL | HELD):
             for i in range(COMMAND, COMMAND + 3):
                 frame[i] = row[i]
         step_kernel(memory)

@@ -91,6 +91,7 @@ class FrameStatus(IntFlag):
     MANUAL = 256  # the command was chosen by hand (bench page), not computed
     JERK = 512  # the hand twitches: a burst between voluntary motion and tremor
     DRIFT = 1024  # acceleration has stayed away from zero: bias or attitude drifts
+    HELD = 4096  # a hold: the command is the ramp to neutral, or neutral (loop)
     FALLBACK = 2048  # the numeric kinematics did not converge: this tick is the analytic solution
 
 

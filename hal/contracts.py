@@ -139,6 +139,11 @@ class AnalogOutput(Protocol):
         """``write`` calls whose values left for the device; a slow one may pass some over for newer ones."""
         ...
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        """What the device was told last, by ``write`` or on the way to its safe state."""
+        ...
+
     def arm(self) -> None:
         """Allow ``write``. Raises ``SafetyTrip`` when the self-test fails."""
         ...

@@ -113,6 +113,10 @@ class SafetyTrip(HalError):
     default_kind = ErrorKind.SAFETY
 
 
+class LeaseLost(SafetyTrip):
+    """A command came too late: a guardian has the outputs, or will have them."""
+
+
 class Closed(HalError):
     """Used after ``close()``."""
 

@@ -163,6 +163,14 @@ class OutputGuard:
         self.last_V[:] = [float(v) for v in values_V]
         self._ramp_done = -1
 
+    def brought_to_safe_state(self) -> None:
+        """Somebody else has taken the device to its safe state and read that back."""
+        self.next_V[:] = [limit.safe_V for limit in self.limits]
+        self._offered_ns = self._clock.now_ns()
+        self._ramp_done = -1
+        self.last_V[:] = self.next_V
+        self.told.append(Told(self._offered_ns, self._offered_ns, tuple(self.next_V)))
+
     def at_safe_state(self) -> bool:
         return all(v == limit.safe_V for v, limit in zip(self.last_V, self.limits, strict=True))
 

@@ -128,6 +128,10 @@ class CanAmplifier:
     def commands_sent(self) -> int:
         return self.guard.writes
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
     def write(self, values_V: Float64Array) -> int:
         """See ``AnalogOutput.write``. Also raises when the node has left the armed state or fallen silent."""
         self.poll()

@@ -135,6 +135,10 @@ class DacAmplifier:
     def commands_sent(self) -> int:
         return self.guard.writes
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
     def write(self, values_V: Float64Array) -> int:
         """``ProtocolError`` with ``read_back``: the DAC holds something else than it was told just now."""
         mask = self.guard.admit(values_V)

@@ -108,6 +108,10 @@ class E727:
     def commands_sent(self) -> int:
         return self.guard.writes
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
     def write(self, values_V: Float64Array) -> int:
         """See ``AnalogOutput.write``: between two commands only the newest values count, the others are
         ``superseded``. Raises what the controller reports, some commands later."""

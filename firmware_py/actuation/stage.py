@@ -55,6 +55,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
         [
             ("gain", "f8"),
             ("ramp_step", "f8"),
+            ("rest_keep", "f8"),
             ("min_confidence", "f8"),
             ("tick_hz", "f8"),
             ("yield_keep", "f8"),
@@ -81,6 +82,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
             ("yielding", YIELD_STATE),
             ("strokes", "f8", (3, TAPS)),  # wanted ones, newest first
             ("target", "f8", (3,)),  # stroke from neutral that was asked of the stack, m
+            ("rest", "f8", (3,)),  # what hysteresis had left of the stroke when a hold ended, m; fades
             ("command_V", "f8", (3,)),
             ("plays", "f8", (3, n_plays)),
             ("creep", "f8", (3, n_creep)),
@@ -110,6 +112,7 @@ def actuate_params(config: ActuationConfig) -> Record:
         actuate_dtype(*sizes),
         gain=config.gain,
         ramp_step=1.0 / (config.ramp_s * config.tick_hz),
+        rest_keep=exp(-1.0 / (config.ramp_s * config.tick_hz)),
         min_confidence=config.min_confidence,
         tick_hz=config.tick_hz,
         yield_keep=exp(-1.0 / (config.yield_s * config.tick_hz)),
@@ -216,6 +219,8 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
         target = 0.0
         for k in range(len(past)):
             target += param.taps[i, k] * past[k]
+        target += state.rest[i]
+        state.rest[i] *= param.rest_keep
         command, limited = command_stack(
             target, state.plays[i], state.creep[i], state.slopes, state.target[i], state.command_V[i], i, param
         )
@@ -226,6 +231,16 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     frame[CLIP] = clip
     for bit in range(len(state.limited)):
         state.limited[bit] += (clip >> bit) & 1
+
+
+@kernel
+def rest_kernel(states: Record) -> None:
+    """After ``follow_kernel``: the stroke that hysteresis has left at neutral is kept, and fades as compensation fades
+    in, so that the first command after a hold is neutral itself."""
+    state = states[0]
+    for i in range(3):
+        state.rest[i] = state.target[i]
+        state.strokes[i, :] = 0.0
 
 
 class Actuation:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.hmc2003 import Hmc2003
+from firmware_py.control.findings import Finding
 from firmware_py.control.incidents import Incidents, LoopCounts
 from firmware_py.frame import MAGNETOMETER_FRESH, MAGNETOMETER_RAW
 from firmware_py.scheduler.task import TickInfo
@@ -16,7 +17,7 @@ USUAL_NS = 11_000_000
 
 
 class FieldInput:
-    """``limit_ms``: how long the field may be missing or stand still before the run ends. ``outlier_V``: a second
+    """``limit_ms``: how long the field may be missing or stand still before the outputs hold. ``outlier_V``: a second
     difference of an axis' readings beyond it is noticed; a hand turns and trembles too slowly for it."""
 
     def __init__(
@@ -54,12 +55,14 @@ class FieldInput:
                 self._look_for_outliers(volts, magnetometer.t_ns)
                 self._volts[:] = volts
                 self._fresh = not hangs
-            reason = f"{magnetometer.name}: its converter gives one reading for all axes; it hangs"
-            incidents.bad_for("magnetometer", self._hangs, info.due_ns, self._limit_ms, reason)
+            incidents.bad_for(Finding.MAGNETOMETER_SILENT, False, info.due_ns, self._limit_ms, error="")
+            incidents.bad_for(
+                Finding.MAGNETOMETER_HANGS, self._hangs, info.due_ns, self._limit_ms, device=magnetometer.name
+            )
         except HalError as error:
             self._counts.magnetometer_errors += 1
             incidents.notice("magnetometer does not answer")
-            incidents.bad_for("magnetometer", True, info.due_ns, self._limit_ms, str(error))
+            incidents.bad_for(Finding.MAGNETOMETER_SILENT, True, info.due_ns, self._limit_ms, error=error)
 
     def _look_for_outliers(self, volts: NDArray[np.float64], t_ns: int) -> None:
         """The I2C bus has no checksum: a flipped bit is a reading out of line with its neighbours. The second

@@ -1,4 +1,4 @@
-"""What went wrong or was remarkable, in one place: counted, written to the recording, made the reason of a trip."""
+"""What went wrong or was remarkable, in one place: counted, written to the recording, and answered by the table."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.safety import State, Supervisor
+from firmware_py.control.findings import CauseClass, Finding
+from firmware_py.control.holds import Holds
+from firmware_py.control.safety import SafetyLimits, State, Supervisor
 from firmware_py.scheduler.histogram import DurationHistogram
 from hal.contracts import Clock
 from hal.errors import HalError
@@ -44,15 +46,24 @@ class LoopCounts:
 
 
 class Incidents:
-    """The one way from a finding to its consequence. ``tick`` is kept by the loop; ``error`` is the first hardware
-    error that ended a run."""
+    """The one way from a finding to its consequence, which ``findings.Finding`` states. ``tick`` is kept by the loop;
+    ``error`` is the first hardware error that ended a run."""
 
-    def __init__(self, supervisor: Supervisor, counts: LoopCounts, clock: Clock, recorder: Recorder | None) -> None:
+    def __init__(
+        self,
+        supervisor: Supervisor,
+        counts: LoopCounts,
+        clock: Clock,
+        recorder: Recorder | None,
+        limits: SafetyLimits | None = None,
+    ) -> None:
+        self._limits = limits or SafetyLimits()
         self._supervisor = supervisor
         self._counts = counts
         self._clock = clock
         self._recorder = recorder
-        self._bad_since: dict[str, int] = {}
+        self._bad_since: dict[Finding, int] = {}
+        self.holds = Holds(self._limits, supervisor)
         self.tick = -1
         self.error: HalError | None = None
 
@@ -65,27 +76,74 @@ class Incidents:
         """Something that does not end the run: when it was first seen is kept."""
         self._counts.noticed.setdefault(what, self._clock.now_ns())
 
-    def trip(self, reason: str, *, normal: bool = False) -> None:
-        """Decide for the safe state; the first reason is the one that is told."""
-        if self._supervisor.trip_cause is not None:
-            return
-        self._supervisor.trip(reason, tick=self.tick, t_ns=self._clock.now_ns(), normal=normal)
-        self.note({"event": "safe state", "reason": reason})
+    def report(self, finding: Finding, **words: object) -> None:
+        """Do what the table says: hold, or decide for the safe state. ``words`` fill the finding's message."""
+        self._answer(finding, finding.value.says.format(**words))
 
-    def doubt(self, what: str, reason: str) -> None:
-        """A reading that nothing may be moved by: ``reason`` of a trip; where nothing is armed, ``what`` is noticed."""
+    def doubt(self, finding: Finding, **words: object) -> None:
+        """Report a reading that nothing may be moved by; where nothing is armed, it is noticed only."""
         if self._supervisor.state is State.SENSING_ONLY:
-            self.notice(what)
+            self.notice(finding.value.title)
         else:
-            self.trip(reason)
+            self.report(finding, **words)
 
-    def trip_for(self, device: str, error: HalError) -> None:
-        """Trip with the bench's name of the device in front: a port knows only its path."""
-        self.trip(f"{error}" if str(error).startswith(device) else f"{device}: {error}")
+    def report_error(self, finding: Finding, device: str, error: HalError, **words: object) -> None:
+        """Report ``error`` with the bench's name of the device in front: a port knows only its path."""
+        text = f"{error}" if str(error).startswith(device) else f"{device}: {error}"
+        self.report(finding, error=text, **words)
+        if self._supervisor.trip_cause is not None and self.error is None:
+            self.error = error
 
-    def bad_for(self, what: str, bad: bool, t_ns: int, limit_ms: float, reason: str) -> None:
-        """Doubt when ``bad`` has held for ``limit_ms``."""
+    def bad_for(self, finding: Finding, bad: bool, t_ns: int, patience_ms: float, **words: object) -> None:
+        """Doubt when ``bad`` has held for ``patience_ms``."""
         if not bad:
-            self._bad_since.pop(what, None)
-        elif (t_ns - self._bad_since.setdefault(what, t_ns)) * 1e-6 >= limit_ms:
-            self.doubt(f"{what}: beyond its limit", reason)
+            self._bad_since.pop(finding, None)
+        elif (t_ns - self._bad_since.setdefault(finding, t_ns)) * 1e-6 >= patience_ms:
+            if self._supervisor.state is State.SENSING_ONLY:
+                self.notice(f"{finding.value.title}: beyond its limit")
+            else:
+                self.report(finding, **words)
+
+    def _answer(self, finding: Finding, reason: str) -> None:
+        supervisor, now_ns = self._supervisor, self._clock.now_ns()
+        if supervisor.trip_cause is not None:
+            return
+        if not finding.value.recoverable:
+            self._trip(finding, reason)
+        elif supervisor.is_holding or supervisor.state is State.SELF_TEST:
+            self.holds.interrupt(now_ns, reason)
+            self.notice(finding.value.title)
+        elif supervisor.state is not State.RUNNING or self._limits.holds_per_minute == 0:
+            self._trip(finding, reason)
+        elif (count := self.holds.within_a_minute(now_ns) + 1) > self._limits.holds_per_minute:
+            text = Finding.TOO_MANY_HOLDS.value.says.format(
+                count=count, limit=self._limits.holds_per_minute, what=reason
+            )
+            self._trip(Finding.TOO_MANY_HOLDS, text, finding.value.cause)
+        else:
+            supervisor.hold(finding, reason, tick=self.tick, t_ns=now_ns)
+            self.holds.interrupt(now_ns, reason)
+            cause = finding.value.cause.value
+            self.note({"event": "hold begins", "reason": reason, "finding": finding.name.lower(), "class": cause})
+
+    def give_hold_up(self) -> None:
+        """The hold has lasted too long: its finding ends the run."""
+        hold = self.holds.current
+        if hold is None:
+            return
+        waits_for = self.holds.waits_for
+        text = Finding.HOLD_TOO_LONG.value.says.format(
+            what=hold.reason if waits_for == hold.reason else f"{hold.reason}; then {waits_for}",
+            limit_ms=self._limits.hold_limit_ms,
+        )
+        self._trip(Finding.HOLD_TOO_LONG, text, hold.cause)
+
+    def end_hold(self) -> None:
+        """The outputs move again."""
+        hold = self.holds.end(self._clock.now_ns())
+        assert hold.end_ns is not None
+        self.note({"event": "hold ends", "reason": hold.reason, "length_s": (hold.end_ns - hold.t_ns) * 1e-9})
+
+    def _trip(self, finding: Finding, reason: str, cause: CauseClass | None = None) -> None:
+        self._supervisor.trip(finding, reason, tick=self.tick, t_ns=self._clock.now_ns(), cause=cause)
+        self.note({"event": "safe state", "reason": reason})

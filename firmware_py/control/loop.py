@@ -14,12 +14,14 @@ import numpy as np
 
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.field_input import FieldInput
+from firmware_py.control.findings import Finding, finding_of_button, finding_of_output, finding_of_scans
+from firmware_py.control.host_gaps import HostGaps
 from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
 from firmware_py.control.plausibility import ScanCheck, turns_of_pairs
 from firmware_py.control.redundancy import Redundancy
-from firmware_py.control.safety import FINISHED, State, Supervisor
+from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.control.status import LoopStatus
 from firmware_py.control.tasks import Works, task_table
@@ -84,7 +86,12 @@ class InstrumentLoop:
         self._interrupted = ""
         self.counts = LoopCounts()
         self.supervisor = Supervisor(devices.amplifier)
-        self.incidents = Incidents(self.supervisor, self.counts, clock, recorder)
+        self.incidents = Incidents(self.supervisor, self.counts, clock, recorder, config.safety)
+        self.holds = self.incidents.holds
+        self.host_gaps = HostGaps(config.safety.stale_ms)
+        self._scan_failed = False
+        self._was_silent = False
+        self._rearm_signalled = False
         self.armed_ns: int | None = None
         self.safe_reached_ns: int | None = None
         actuation = stages.configs.actuation
@@ -122,8 +129,9 @@ class InstrumentLoop:
         tasks = task_table(works, tick_hz, config.budget_us, devices.polling, devices.bus_us)
         self.scheduler = Scheduler(tasks, clock, period_ns=self._period_ns, background=background)
         self.shown = LoopStatus(
-            stages, self.counts, self.supervisor, self.manual, self.scheduler, clock, for_page=live is not None
-        )
+            stages, self.counts, self.supervisor, self.holds, self.manual, self.scheduler, clock,
+            for_page=live is not None,
+        )  # fmt: skip
 
     @property
     def error(self) -> HalError | None:
@@ -134,6 +142,10 @@ class InstrumentLoop:
     def asked_safe_ns(self) -> int | None:
         """When the page asked for the safe state."""
         return self._orders.asked_safe_ns if self._orders is not None else None
+
+    def list_holds(self) -> list[dict[str, Any]]:
+        """Every hold of the run, as its JSON has them."""
+        return self.holds.as_list(self._started_ns, self._clock.now_ns())
 
     # -- running ------------------------------------------------------------------------------------------
 
@@ -149,9 +161,9 @@ class InstrumentLoop:
             self._run_ticks(seconds)
         except HalError as error:
             self.incidents.error = error
-            self.incidents.trip(f"{error}")
+            self.incidents.report(Finding.DEVICE_FAILED, error=error)
         except BaseException as error:
-            self.incidents.trip(f"{type(error).__name__}: {error}")
+            self.incidents.report(Finding.FIRMWARE_FAILED, error=f"{type(error).__name__}: {error}")
             raise
         finally:
             self._ramp_without_scans()
@@ -165,8 +177,12 @@ class InstrumentLoop:
         def interrupt(number: int, _frame: object) -> None:
             self._interrupted = signal.Signals(number).name
 
+        def rearm(number: int, _frame: object) -> None:
+            self._rearm_signalled = True
+
         try:
-            return {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+            previous = {s: signal.signal(s, interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+            return {**previous, signal.SIGUSR1: signal.signal(signal.SIGUSR1, rearm)}
         except ValueError:  # not the main thread: whoever started the loop there handles signals
             return {}
 
@@ -188,40 +204,137 @@ class InstrumentLoop:
         )
         end_ns: int | None = None
         while self.supervisor.state is not State.SAFE and not self.supervisor.must_not_wait:
-            ticks = ticker.wait()
+            ticks = self._wait(ticker)
+            awake_ns = self._clock.now_ns()
             self._ticks = ticks
             self.incidents.tick = ticks.k0
-            if ticks.n > 1:
-                self.incidents.notice("scans came late")
-                if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
-                    self.incidents.trip(
-                        f"the host stood still: {ticks.n} scans of {self._devices.daq.name} came at once"
-                    )
             newest_ns = ticks.due_ns + (ticks.n - 1) * ticks.dt_ns
-            if ticks.source is TimeSource.HOST:
-                self.incidents.trip(f"{self._devices.daq.name}: no new scan for {limits.stale_ms:g} ms; check its link")
-            elif self._interrupted:
-                self.incidents.trip(f"stopped by the operator ({self._interrupted})", normal=True)
-            elif end_ns is not None and newest_ns >= end_ns:
-                self.incidents.trip(FINISHED, normal=True)
+            self._look_at(ticks)
+            if self._interrupted:
+                self.incidents.report(Finding.STOPPED, signal=self._interrupted)
+            elif end_ns is not None and newest_ns >= end_ns and self._may_finish():
+                self.incidents.report(Finding.FINISHED)
             elif end_ns is None and self._sense_only:
                 end_ns = newest_ns + round(seconds * 1e9)
             self.scheduler.run(ticks)
-            if self.supervisor.state is State.SELF_TEST and self._watch.self_test_passed(
-                (newest_ns - self._started_ns) * 1e-6
-            ):
+            self.host_gaps.look(awake_ns + self._period_ns, self._clock.now_ns())
+            if self.supervisor.state is State.SELF_TEST and self._self_test_passed():
                 self.scheduler.ignore_next("arming")
                 self.supervisor.arm()
                 self.armed_ns = self._clock.now_ns()
                 end_ns = self.armed_ns + round(seconds * 1e9)
+            elif self.supervisor.is_holding:
+                self._look_after_hold()
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
 
+    def _wait(self, ticker: ScanTicker) -> Ticks:
+        """The next ticks. A scan that failed is reported, and the host clock drives the loop until it runs again."""
+        try:
+            return ticker.wait()
+        except HalError:
+            if self.supervisor.trip_cause is not None:
+                raise
+        self._block = ScanBlock(0, self._clock.now_ns(), self._period_ns, 0, TimeSource.HOST)
+        return ticker.tick_without_scan()
+
+    def _look_at(self, ticks: Ticks) -> None:
+        """What the arrival of ``ticks`` says of the link and of this host."""
+        limits, name = self._config.safety, self._devices.daq.name
+        if ticks.n > 1:
+            self.incidents.notice("scans came late")
+            if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
+                self.incidents.report(Finding.HOST_LATE, scans=ticks.n, device=name)
+            elif self.supervisor.is_holding and ticks.n * ticks.dt_ns > limits.stale_ms * 1e6:
+                self.holds.interrupt(self._clock.now_ns(), "scans that come in time")
+        if ticks.source is not TimeSource.HOST:
+            # bytes may have been lost: only a scan that is started anew is known to be whole, and when it was taken
+            self._scan_failed = self._was_silent
+            self._was_silent = False
+        elif not self._scan_failed:
+            self._was_silent = True
+            if stall_ms := self._host_stalled_ms():
+                self.incidents.report(Finding.HOST_OVERSLEPT, stall_ms=stall_ms, device=name)
+            else:
+                self.incidents.report(Finding.SCANS_MISSING, device=name, limit_ms=limits.stale_ms)
+
+    def _host_stalled_ms(self) -> float:
+        """How long this host has stood still just now, 0 if it has not."""
+        return self.host_gaps.recent_ms(self._clock.now_ns(), 2.0 * self._config.safety.stale_ms)
+
+    def _self_test_passed(self) -> bool:
+        if self._scan_failed:
+            self._restart_scan()
+        now_ns = self._clock.now_ns()
+        watched_ms = min((now_ns - self._started_ns) * 1e-6, self.holds.good_ms(now_ns))
+        return self._watch.self_test_passed(watched_ms, (now_ns - self._started_ns) * 1e-6)
+
+    def _may_finish(self) -> bool:
+        """A run does not end within a hold whose cause has not passed: it would hide what it was."""
+        return not self.supervisor.is_holding or self.holds.is_ready
+
+    def _look_after_hold(self) -> None:
+        """Outputs are on their way to neutral or there: end the hold, wait, or give it up."""
+        now_ns = self._clock.now_ns()
+        self.manual.stop()
+        if self.supervisor.state is not State.HOLD:
+            self.holds.interrupt(now_ns, self.holds.waits_for)
+            return
+        if self._scan_failed:
+            self._restart_scan()
+        if waiting := self._watch.waiting_for():
+            self.holds.interrupt(now_ns, ", ".join(waiting))
+        if self._rearm_signalled:
+            self._rearm_signalled = False
+            self.holds.ask()
+        if self.holds.may_end(now_ns):
+            self._resume()
+        elif self.holds.is_too_long(now_ns):
+            self.incidents.give_hold_up()
+
+    def _resume(self) -> None:
+        self.scheduler.ignore_next("arming after a hold")
+        try:
+            self.supervisor.resume()
+        except HalError as error:
+            self.incidents.report_error(finding_of_output(error), self._devices.amplifier.name, error)
+        else:
+            self.incidents.end_hold()
+
+    def _restart_scan(self) -> None:
+        """Begin a new scan after one that failed, with outputs at neutral: the driver may take a while for it. What the
+        device has taken meanwhile is lost."""
+        daq = self._devices.daq
+        try:
+            daq.stop()
+            daq.start()
+        except HalError as error:
+            self.incidents.report_error(finding_of_scans(error, 0.0), daq.name, error, stall_ms=0.0)
+            return
+        self._scan_failed = False
+        self.holds.interrupt(self._clock.now_ns(), f"scans of {daq.name}")
+        if self._last_scan_ns:
+            lost = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
+            self.counts.lost += lost
+            self.counts.expected += lost
+            self._last_scan_ns = 0
+
     def _read(self, timeout_s: float) -> ScanBlock:
+        began_ns = self._clock.now_ns()
+        due_ns = began_ns + round(timeout_s * 1e9)
+        if self._scan_failed:
+            self._clock.sleep_until_ns(due_ns)
+            self._block = ScanBlock(0, due_ns, self._period_ns, 0, TimeSource.HOST)
+            return self._block
         try:
             block = self._devices.daq.read_scans(self._rows, timeout_s)
         except HalError as error:
-            self.incidents.trip_for(self._devices.daq.name, error)
+            self.host_gaps.look(due_ns, self._clock.now_ns())
+            stall_ms = self._host_stalled_ms()
+            finding = finding_of_scans(error, stall_ms)
+            self.incidents.report_error(finding, self._devices.daq.name, error, stall_ms=stall_ms)
+            self._scan_failed = True
             raise
+        self.host_gaps.look(due_ns, self._clock.now_ns())
         self._block = block
         if block.n:
             self._last_scan_ns = block.t0_ns + (block.n - 1) * block.dt_ns
@@ -243,8 +356,7 @@ class InstrumentLoop:
         """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
         while self.supervisor.state is State.SAFE_RAMP:
             due_ns = self._clock.now_ns() + self._period_ns
-            if self.supervisor.step():
-                self._note_safe()
+            self._step_ramp()
             self._clock.sleep_until_ns(due_ns)
         self._clock.sleep_until_ns(self._clock.now_ns() + SETTLE_TICKS * self._period_ns)
 
@@ -278,25 +390,30 @@ class InstrumentLoop:
         frame, block, ticks = self._frame, self._block, self._ticks
         assert block is not None
         assert ticks is not None
-        frame[TICK] = self.incidents.tick = info.k
+        self.incidents.tick = info.k
         frame[TIME] = (info.due_ns - self._started_ns) * 1e-9
-        if block.n == 0:
+        if block.n == 0:  # nothing to compute with: the filters coast when the next scan is there
             frame[STATUS] = FrameStatus.STALE
-        else:
-            row = info.k - ticks.k0
-            frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
-            scan = self._rows[row]
-            frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
-            impossible = self._check.scan(scan, info.k)
-            if impossible and (impossible := self._redundancy.impossible(self._check.channel, impossible)):
-                self.incidents.doubt("an input read something impossible", impossible)
+            return
+        row = info.k - ticks.k0
+        frame[TICK] = info.k
+        frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
+        scan = self._rows[row]
+        frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
+        impossible = self._check.scan(scan, info.k)
+        if impossible and (impossible := self._redundancy.impossible(self._check.channel, impossible)):
+            self.incidents.doubt(Finding.INPUT_IMPOSSIBLE, what=impossible)
         if self._field is not None:
             self._field.fill(frame)
 
     def _estimate(self, info: TickInfo) -> None:
         """The whole step in one compiled call; of scans that came late only the newest is commanded."""
         assert self._ticks is not None
-        if self.supervisor.may_move and info.k == self._ticks.k0 + self._ticks.n - 1:
+        if int(self._frame[STATUS]) & FrameStatus.STALE:
+            return
+        if self.supervisor.is_holding:
+            self.stages.hold(self._devices.amplifier.told_V)
+        elif self.supervisor.may_move and info.k == self._ticks.k0 + self._ticks.n - 1:
             if self.manual.active:
                 self.stages.follow(self.manual.step(self._clock.now_ns()))
             else:
@@ -306,9 +423,9 @@ class InstrumentLoop:
         # before the command goes out: a sensor that contradicts its twin must not move anything
         if self._redundancy.there:
             if unclear := self._redundancy.agree(self._frame):
-                self.incidents.doubt("axes contradict each other", unclear)
+                self.incidents.doubt(Finding.AXES_CONTRADICT, what=unclear)
         elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
-            self.incidents.doubt("parallel axes disagree", apart)
+            self.incidents.doubt(Finding.PAIRS_DISAGREE, what=apart)
         status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:
             for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):
@@ -324,8 +441,7 @@ class InstrumentLoop:
             try:
                 clipped = amplifier.write(self.stages.command_V)
             except HalError as error:
-                self.incidents.error = error
-                self.incidents.trip_for(amplifier.name, error)
+                self.incidents.report_error(finding_of_output(error), amplifier.name, error)
                 return
             self.counts.clipped += bool(clipped != 0 or int(self._frame[CLIP]) & ~CLIP_YIELD)
             if amplifier.commands_sent == sent:
@@ -336,14 +452,21 @@ class InstrumentLoop:
                 self.incidents.notice("commands were late")
             self.counts.latency.add(latency_ns, info.k)
             self.counts.commands += 1
-        elif self.supervisor.step():
-            self._note_safe()
+        else:
+            self._step_ramp()
 
-    def _note_safe(self) -> None:
-        if self.safe_reached_ns is None:
+    def _step_ramp(self) -> None:
+        was_holding = self.supervisor.is_holding
+        if self.supervisor.step() and self.safe_reached_ns is None:
             self.safe_reached_ns = self._clock.now_ns()
+        trip = self.supervisor.trip_cause
+        if was_holding and trip is not None:
+            self.incidents.note({"event": "safe state", "reason": trip.reason})
 
     def _publish(self, info: TickInfo) -> None:
+        """Rows are scans: a tick without one leaves none, so that a replay sees what the filters saw."""
+        if int(self._frame[STATUS]) & FrameStatus.STALE:
+            return
         if self._live is not None:
             self._live.publish(self._frame)
         if self._recorder is not None:
@@ -360,11 +483,14 @@ class InstrumentLoop:
         assert telemetry is not None
         frame, state = self._frame, int(self.supervisor.state)
         telemetry.heartbeat.state = state
-        telemetry.send_tremor(self.shown.amplitude_um(), float(frame[TREMOR_FREQUENCY]))
         scheduler = self.scheduler
-        telemetry.send_state(
-            state, int(frame[STATUS]), self.counts.lost, scheduler.skipped_ticks, scheduler.worst_tick_ns * 1e-3
-        )
+        try:
+            telemetry.send_tremor(self.shown.amplitude_um(), float(frame[TREMOR_FREQUENCY]))
+            telemetry.send_state(
+                state, int(frame[STATUS]), self.counts.lost, scheduler.skipped_ticks, scheduler.worst_tick_ns * 1e-3
+            )
+        except HalError as error:
+            self.incidents.report_error(finding_of_button(error), telemetry.name, error)
 
     def _report_status(self) -> Generator[bool, None, None]:
         assert self._on_status is not None

@@ -48,6 +48,12 @@ class ManualDrive:
     def disarm(self) -> None:
         self._armed_until_ns = self._hold_until_ns = 0
 
+    def stop(self) -> None:
+        """The outputs have been taken to neutral: nothing is left to return from."""
+        self.disarm()
+        self._target_V[:] = self._neutral_V
+        self.active = False
+
     def jog(self, now_ns: int, channel: int, rate_V_per_s: float) -> None:
         """Move ``channel`` 0..2 for the next ``HOLD_S``; nothing happens when not armed or when it makes no sense."""
         if self.armed(now_ns) and channel in (0, 1, 2) and math.isfinite(rate_V_per_s):

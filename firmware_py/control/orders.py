@@ -1,4 +1,4 @@
-"""What the bench page may ask of a running loop: the safe state, jogging by hand, the gain of the compensation."""
+"""What the bench page may ask of a running loop: safe state, end of a hold, jogging by hand, gain of compensation."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from firmware_py.control.findings import Finding
 from firmware_py.control.incidents import Incidents
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.safety import Supervisor
@@ -51,7 +52,10 @@ class PageOrders:
                 # the page stamps with the host's clock, which is not the bench's where bench time is emulated
                 age_ns = self._host_ns() - asked_ns if isinstance(asked_ns, int) else 0
                 self.asked_safe_ns = now_ns - max(0, age_ns)
-                self._incidents.trip("stopped by the operator (safe button of the bench page)", normal=True)
+                self._incidents.report(Finding.STOPPED_ON_PAGE)
+            case {"order": "rearm"}:
+                if not self._incidents.holds.ask():
+                    self._incidents.note({"event": "rearm refused", "reason": self._incidents.holds.waits_for})
             case {"order": "arm"} if self._supervisor.may_move:
                 self._manual.arm(now_ns, self._stages.command_V)
             case {"order": "disarm"}:

@@ -72,7 +72,7 @@ SQUARE = 0.5  # sine between two levers
 PAIR_PLACES = np.array([(i, j) for i, j, _ in PAIRS])
 
 
-class Finding(IntEnum):
+class Implausible(IntEnum):
     """What is wrong with an input."""
 
     NONE = 0
@@ -82,9 +82,10 @@ class Finding(IntEnum):
 
 
 WORDS = {
-    Finding.RAIL: "is at the end of its range; broken wire or short circuit",
-    Finding.JUMP: "jumped faster than its filter allows; loose contact, crossed wires, a damaged transfer or a blow",
-    Finding.STUCK: "has repeated one reading {n} times; the sensor or the converter is stuck",
+    Implausible.RAIL: "is at the end of its range; broken wire or short circuit",
+    Implausible.JUMP: "jumped faster than its filter allows; "
+    "loose contact, crossed wires, a damaged transfer or a blow",
+    Implausible.STUCK: "has repeated one reading {n} times; the sensor or the converter is stuck",
 }
 
 
@@ -105,7 +106,7 @@ def check_counts(
     hi: int,
     stuck: int,
 ) -> int:
-    """16 * channel + Finding of the first impossible input, else 0; only the first ``noisy`` can be stuck.
+    """16 * channel + Implausible of the first impossible input, else 0; only the first ``noisy`` can be stuck.
 
     ``last``, ``same`` (n,) are the state: the last counts (``same[0] < 0`` before the first scan) and how often they
     have come in a row. ``steps``: ticks since the last scan that was seen. ``slope`` (n,): last change or NO_SLOPE.
@@ -289,7 +290,7 @@ class ScanCheck:
         if supply is not None and supply_before and abs(int(self._counts[supply]) - supply_before) > self._jump // 2:
             # the sensors are ratiometric: all of them follow their supply
             return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
-        return f"{self._labels[channel]} {WORDS[Finding(finding)].format(n=self.limits.stuck_ticks)}"
+        return f"{self._labels[channel]} {WORDS[Implausible(finding)].format(n=self.limits.stuck_ticks)}"
 
     def ignore(self, channel: int) -> None:
         """Whatever ``channel`` reads from now on: it counts as healthy."""

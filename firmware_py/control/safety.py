@@ -1,16 +1,21 @@
 """The supervisor: one state machine that decides whether the actuators may move.
 
-Outputs are armed only after the self-test. Whatever goes wrong, the first reason wins, the amplifier ramps to
-neutral within ``RAMP_TICKS``, and stays there: there is no way back to RUNNING in one run.
+Outputs are armed only after the self-test. Whatever goes wrong, the amplifier ramps to neutral within ``RAMP_TICKS``.
+After a latched finding it stays there, and the first reason wins. After a recoverable one it holds there until
+``Holds`` lets it resume::
+
+    RUNNING -> HOLD_RAMP -> HOLD -> RUNNING        any of them -> SAFE_RAMP -> SAFE
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
+from firmware_py.control.findings import CauseClass, Finding
 from hal.contracts import AnalogOutput
 from hal.errors import HalError, I2cNack
 
@@ -18,7 +23,6 @@ RAMP_TICKS = 20
 """Neutral within 20 ms of the decision; the amplifier's ramp is shorter, so that steps can be tried again."""
 ATTEMPTS = 3
 """Of a step that nobody acknowledged, within its tick: a refusal takes a tenth of the time of a transfer."""
-FINISHED = "run finished"
 
 
 class State(IntEnum):
@@ -30,6 +34,13 @@ class State(IntEnum):
     SAFE_RAMP = 3
     SAFE = 4
     SENSING_ONLY = 5
+    HOLD_RAMP = 6
+    HOLD = 7
+
+    @property
+    def words(self) -> str:
+        """For people; the ramp of a hold is part of the hold."""
+        return "hold" if self is State.HOLD_RAMP else self.name.lower().replace("_", " ")
 
 
 class SafetyLimits(BaseModel):
@@ -41,6 +52,10 @@ class SafetyLimits(BaseModel):
     ``monitor_ms``: how long the amplifier's monitor may be deaf.
     ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
     ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
+    ``hold_ms``: after a recoverable finding, scans and self-test must have been good for so long without interruption
+    before the outputs move again. ``hold_limit_ms``: a hold that has not become good for so long ends the run.
+    ``holds_per_minute``: one more within a minute ends the run; with 0 every finding does.
+    ``rearm``: who ends a hold whose cause has passed, the firmware or a person (button of the page, key, SIGUSR1).
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -55,16 +70,40 @@ class SafetyLimits(BaseModel):
     guardian: bool = True
     guardian_notice_ms: float = 8.0
     guardian_ms: float = 40.0
+    hold_ms: float = Field(default=200.0, ge=20.0, le=60_000.0)
+    hold_limit_ms: float = Field(default=3000.0, ge=100.0, le=600_000.0)
+    holds_per_minute: int = Field(default=3, ge=0, le=1000)
+    rearm: Literal["automatic", "operator"] = "automatic"
 
 
 @dataclass(frozen=True)
 class Trip:
-    """Why and when the outputs were taken to their safe state; ``normal`` for the end of an ordinary run."""
+    """Why and when the outputs were taken to their safe state. ``cause``: where the cause is."""
 
+    finding: Finding
     reason: str
     tick: int
     t_ns: int
-    normal: bool = False
+    cause: CauseClass
+
+    @property
+    def normal(self) -> bool:
+        """The end of an ordinary run."""
+        return self.finding.value.normal
+
+
+@dataclass
+class Hold:
+    """One hold. ``t_ns``: when it was decided, bench clock; ``end_ns``: when the outputs were free again or the run
+    was ended, ``None`` while it lasts."""
+
+    finding: Finding
+    reason: str
+    tick: int
+    t_ns: int
+    cause: CauseClass
+    end_ns: int | None = None
+    resumed: bool = False
 
 
 class Supervisor:
@@ -77,6 +116,7 @@ class Supervisor:
         self.trip_cause: Trip | None = None
         self.safe_reached = False
         self.ramp_failure = ""
+        self.holds: list[Hold] = []
         self.warnings: dict[str, int] = {"jerk": 0, "drift": 0}
         """How often each was reported: what the run's report shows beside the reason of its end."""
 
@@ -89,7 +129,13 @@ class Supervisor:
     def must_not_wait(self) -> bool:
         """A ramp that somebody or something asked for runs on the host clock: the loop would wait for scans, and they
         may be what broke. Only the planned end of a run is recorded to its last step."""
-        return self.state is State.SAFE_RAMP and self.trip_cause is not None and self.trip_cause.reason != FINISHED
+        trip = self.trip_cause
+        return self.state is State.SAFE_RAMP and trip is not None and trip.finding is not Finding.FINISHED
+
+    @property
+    def is_holding(self) -> bool:
+        """On the way to neutral, or there, until a hold ends."""
+        return self.state in (State.HOLD_RAMP, State.HOLD)
 
     def begin_self_test(self) -> None:
         if self.state is State.BOOT:
@@ -106,11 +152,29 @@ class Supervisor:
             self._amplifier.arm()
             self.state = State.RUNNING
 
-    def trip(self, reason: str, *, tick: int, t_ns: int, normal: bool = False) -> None:
-        """Decide for the safe state; later reasons do not replace the first."""
-        if self.trip_cause is None:
-            self.trip_cause = Trip(reason, tick, t_ns, normal)
-            self.state = State.SAFE_RAMP
+    def hold(self, finding: Finding, reason: str, *, tick: int, t_ns: int) -> None:
+        """Leave work for neutral, to come back; nothing but running can be held."""
+        if self.state is State.RUNNING:
+            self.holds.append(Hold(finding, reason, tick, t_ns, finding.value.cause))
+            self._ramp_ticks = 0
+            self.state = State.HOLD_RAMP
+
+    def resume(self) -> None:
+        """Arm the amplifier again (it reads neutral back) and allow motion. After an error it still holds."""
+        if self.state is State.HOLD:
+            self._amplifier.arm()
+            self.state = State.RUNNING
+
+    def trip(self, finding: Finding, reason: str, *, tick: int, t_ns: int, cause: CauseClass | None = None) -> None:
+        """Decide for the safe state; later reasons do not replace the first. ``cause``: of a hold that is given up."""
+        if self.trip_cause is not None:
+            return
+        self.trip_cause = Trip(finding, reason, tick, t_ns, finding.value.cause if cause is None else cause)
+        if self.is_holding:
+            self.holds[-1].end_ns = t_ns
+        if self.state is not State.HOLD_RAMP:  # a ramp that is under way keeps its time
+            self._ramp_ticks = 0
+        self.state = State.SAFE_RAMP
 
     def warn(self, what: str) -> None:
         """Something is not as it should be and does not end the run."""
@@ -122,19 +186,30 @@ class Supervisor:
         A transfer that is refused is tried again at once, one that fails otherwise on the next tick, until twice the
         ramp's time is over; then the report says that neutral could not be confirmed, and why.
         """
-        if self.state is not State.SAFE_RAMP:
+        if self.state not in (State.SAFE_RAMP, State.HOLD_RAMP):
             return self.state is State.SAFE
         self._ramp_ticks += 1
+        at_neutral = False
         for _ in range(ATTEMPTS):
             try:
-                if self._amplifier.safe_step():
-                    self.state, self.safe_reached, self.ramp_failure = State.SAFE, True, ""
+                at_neutral = self._amplifier.safe_step()
             except HalError as error:
                 self.ramp_failure = str(error)
                 if isinstance(error, I2cNack):
                     continue
             break
-        if self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS:
-            self.state = State.SAFE
-            self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
+        if at_neutral:
+            self.ramp_failure = ""
+            self.safe_reached = self.state is State.SAFE_RAMP
+            self.state = State.SAFE if self.safe_reached else State.HOLD
+        elif self._ramp_ticks >= 2 * RAMP_TICKS:
+            self._give_up()
         return self.state is State.SAFE
+
+    def _give_up(self) -> None:
+        """Neutral was not confirmed in time. A hold without it is none: its finding becomes the end of the run."""
+        self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
+        if self.state is State.HOLD_RAMP:
+            hold = self.holds[-1]
+            self.trip(Finding.NEUTRAL_NOT_REACHED, hold.reason, tick=hold.tick, t_ns=hold.t_ns, cause=hold.cause)
+        self.state = State.SAFE

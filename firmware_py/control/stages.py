@@ -6,7 +6,7 @@ estimates and commands.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.chain import COMMANDED, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
+from firmware_py.chain import COMMANDED, HELD, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STATUS
 from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig
@@ -105,6 +105,11 @@ class Stages:
         """The tick's step shall follow ``command_V`` (3,), chosen by hand."""
         self.command_V[:] = command_V
         self.frame[STATUS] = int(self.frame[STATUS]) | MANUAL
+
+    def hold(self, told_V: Sequence[float]) -> None:
+        """The tick's step shall follow ``told_V`` (3,), the way to neutral and the rest there: a hold."""
+        self.command_V[:] = told_V
+        self.frame[STATUS] = int(self.frame[STATUS]) | HELD
 
     def warm_up(self, *, batch: bool = False) -> None:
         """Compile or load the kernels of ``step``, then forget what that did: a cold start takes a minute, a tick may

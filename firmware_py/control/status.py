@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from firmware_py.control.holds import Holds
 from firmware_py.control.incidents import LoopCounts
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.safety import Supervisor
@@ -20,6 +21,7 @@ class LoopStatus:
         stages: Stages,
         counts: LoopCounts,
         supervisor: Supervisor,
+        holds: Holds,
         manual: ManualDrive,
         scheduler: Scheduler,
         clock: Clock,
@@ -30,6 +32,7 @@ class LoopStatus:
         self._frame = stages.frame
         self._counts = counts
         self._supervisor = supervisor
+        self._holds = holds
         self._manual = manual
         self._scheduler = scheduler
         self._clock = clock
@@ -50,7 +53,9 @@ class LoopStatus:
         return {
             **(self._page_numbers() if self._for_page else {}),
             "t_s": float(frame[TIME]),
-            "state": self._supervisor.state.name.lower().replace("_", " "),
+            "state": self._supervisor.state.words,
+            "holds": len(self._supervisor.holds),
+            "hold": self._holds.as_status(self._clock.now_ns()),
             "amplitude_um": self.amplitude_um(),
             "frequency_hz": [float(v) for v in frame[TREMOR_FREQUENCY : TREMOR_FREQUENCY + 3]],
             "command_V": [float(v) for v in frame[COMMAND : COMMAND + 3]],

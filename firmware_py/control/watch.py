@@ -6,19 +6,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.findings import Finding, finding_of_button, finding_of_output
 from firmware_py.control.incidents import Incidents
 from firmware_py.control.plausibility import ScanCheck
-from firmware_py.control.safety import Supervisor
+from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
 GUARDIAN_SILENT_NS = 100_000_000
+ROOM_MS = 100.0
+"""How long temperature or supply may be outside: they are smoothed, and change slowly."""
 
 
 class Watch:
-    """Reads the frame and the devices; its only consequence is a trip."""
+    """Reads the frame and the devices; its only consequence is a finding."""
 
     def __init__(
         self,
@@ -42,32 +45,34 @@ class Watch:
         status = int(frame[STATUS])
         t_ns = info.due_ns
         if status & FrameStatus.INVALID:
-            incidents.doubt("not a number", "a reading or estimate is not a number; see the recording")
-        incidents.bad_for(
-            "saturation",
-            bool(status & FrameStatus.SATURATED),
-            t_ns,
-            limits.saturated_ms,
-            f"an accelerometer has been beyond its range for {limits.saturated_ms:g} ms; is the instrument falling?",
-        )
-        for name, value, unit, (lo, hi) in (
-            ("temperature", frame[TEMPERATURE], "degC", limits.temperature_C),
-            ("supply", frame[SUPPLY], "V", limits.supply_V),
-        ):
-            outside = not lo <= value <= hi and not status & FrameStatus.ALIGNING
-            reason = f"{name} {value:.2f} {unit} is outside {lo:g}..{hi:g} {unit}"
-            incidents.bad_for(name, outside, t_ns, 100.0, reason)
+            incidents.doubt(Finding.NOT_A_NUMBER)
+        beyond, limit_ms = bool(status & FrameStatus.SATURATED), limits.saturated_ms
+        incidents.bad_for(Finding.SATURATED, beyond, t_ns, limit_ms, limit_ms=limit_ms)
+        known = not status & FrameStatus.ALIGNING
+        low, high = limits.temperature_C
+        value = float(frame[TEMPERATURE])
+        outside = known and not low <= value <= high
+        incidents.bad_for(Finding.TEMPERATURE_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
+        low, high = limits.supply_V
+        value = float(frame[SUPPLY])
+        outside = known and not low <= value <= high
+        incidents.bad_for(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         if odd := self._check.odd():
             incidents.notice(odd)
         self._look_after_the_guardian(t_ns)
-        telemetry = self._devices.telemetry
-        if telemetry is not None:
+        self._listen_to_the_button()
+
+    def _listen_to_the_button(self) -> None:
+        telemetry, incidents = self._devices.telemetry, self._incidents
+        if telemetry is None:
+            return
+        try:
             if telemetry.poll():
-                incidents.trip("stop button pressed")
-            elif telemetry.button_silent() and self._supervisor.may_move:
-                incidents.trip(
-                    f"{telemetry.name}: the stop button is not heard any more; check the CAN bus and the button"
-                )
+                incidents.report(Finding.BUTTON_PRESSED)
+        except HalError as error:
+            incidents.report_error(finding_of_button(error), telemetry.name, error)
+        if telemetry.button_silent() and (self._supervisor.may_move or self._supervisor.is_holding):
+            incidents.report(Finding.BUTTON_SILENT, device=telemetry.name)
 
     def _look_after_the_guardian(self, t_ns: int) -> None:
         """Heartbeats go both ways: without a guardian the run goes on, but somebody should know."""
@@ -84,42 +89,41 @@ class Watch:
         name = self._devices.amplifier.name
         try:
             if wrong := self._devices.verify_output():
-                self._incidents.trip(f"{name}: {self._taken() or f'{wrong}; check its supply and the bus'}")
+                self._report_difference(f"{wrong}; check its supply and the bus")
         except HalError as error:
-            self._incidents.error = error
-            self._incidents.trip_for(name, error)
+            self._incidents.report_error(finding_of_output(error), name, error)
 
-    def _taken(self) -> str:
-        """What a stall of this process looks like from an output that the guardian has moved meanwhile."""
-        heart = self._devices.guardian
-        if heart is None or not heart.taken_ns:
-            return ""
-        return "the host stood still: the guardian has the outputs and takes them to neutral"
+    def _report_difference(self, what: str) -> None:
+        """A stall of this process looks like that, too: the guardian has moved the outputs meanwhile."""
+        heart, name = self._devices.guardian, self._devices.amplifier.name
+        if heart is not None and heart.taken_ns:
+            self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
+        else:
+            self._incidents.report(Finding.OUTPUT_DIFFERS, device=name, what=what)
 
     def monitor_output(self, info: TickInfo) -> None:
-        """Task, 400 Hz: what arrives at the stacks must be what was told."""
+        """Task, 400 Hz: what arrives at the stacks must be what was told, also at neutral in a hold."""
         monitor = self._devices.monitor
         assert monitor is not None
-        if not self._supervisor.may_move:
+        if not (self._supervisor.may_move or self._supervisor.state is State.HOLD):
             monitor.forget()
             return
-        name, limit_ms = self._devices.amplifier.name, self._config.safety.monitor_ms
+        limit_ms = self._config.safety.monitor_ms
         deaf, reason = False, ""
         try:
             if wrong := monitor.poll():
-                self._incidents.trip(f"{name}: {self._taken() or wrong}")
+                self._report_difference(wrong)
         except HalError as error:
             deaf, reason = True, f"{monitor.name}: {error}"
             monitor.forget()
             self._incidents.notice("amplifier monitor does not answer")
-        self._incidents.bad_for("monitor", deaf, info.due_ns, limit_ms, reason)
+        self._incidents.bad_for(Finding.MONITOR_DEAF, deaf, info.due_ns, limit_ms, error=reason)
 
-    def self_test_passed(self, watched_ms: float) -> bool:
-        """Sensors have been watched long enough and are sane; trips when that takes too long."""
-        limits = self._config.self_test
+    def waiting_for(self) -> list[str]:
+        """What is not as it must be before outputs are armed, for the first time or after a hold."""
         status = int(self._frame[STATUS])
         telemetry = self._devices.telemetry
-        waiting = [
+        return [
             name
             for name, wrong in (
                 ("attitude is not aligned", status & FrameStatus.ALIGNING),
@@ -129,8 +133,14 @@ class Watch:
             )
             if wrong
         ]
-        if not waiting:
-            return watched_ms >= limits.watch_ms
-        if watched_ms > limits.limit_ms:
-            self._incidents.trip(f"self-test: {', '.join(waiting)} after {limits.limit_ms:g} ms")
+
+    def self_test_passed(self, watched_ms: float, since_start_ms: float) -> bool:
+        """Sensors have been watched for ``watched_ms`` without interruption and are sane; trips when that takes too
+        long. An interruption names itself in ``Holds.waits_for``."""
+        limits = self._config.self_test
+        waiting = self.waiting_for()
+        if not waiting and watched_ms >= limits.watch_ms:
+            return True
+        if (what := ", ".join(waiting) or self._incidents.holds.waits_for) and since_start_ms > limits.limit_ms:
+            self._incidents.report(Finding.SELF_TEST_FAILED, what=what, limit_ms=limits.limit_ms)
         return False

@@ -3,14 +3,19 @@ guardian has taken the outputs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
+from drivers.base import wait_s
 from drivers.piezo.dac_amplifier import DacAmplifier
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Heart, Phase
 from hal.contracts import Clock, Float64Array
+from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
+GIVE_BACK_NS = 200_000_000
+"""So long the guardian may take to give the outputs back at neutral, of which it watches over them for 50 ms."""
+STEP_S = 0.001
 PATIENCE_NS = 22_000_000
 """So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
 
@@ -29,9 +34,16 @@ class GuardedAmplifier:
         self._evict = evict
         self._gate = LeaseGate(heart, clock, inner.name, lease_ms)
         self._lost_ns = 0
+        self._asked = False
         inner.gate = self._gate
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self._inner.told_V
+
     def arm(self) -> None:
+        """Raises ``SafetyTrip`` when the outputs are the guardian's and it does not give them back."""
+        self._take_up_again()
         self._heart.say(Phase.ARMING)
         self._inner.arm()
         self._heart.beat(self._clock.now_ns())
@@ -42,10 +54,11 @@ class GuardedAmplifier:
         return self._inner.commands_sent
 
     def write(self, values_V: Float64Array) -> int:
-        """Raises ``SafetyTrip`` when the guardian has the outputs, or will have them because the lease is over."""
+        """Raises ``LeaseLost`` when the guardian has the outputs, or will have them because the lease is over."""
         return self._inner.write(values_V)
 
     def safe_step(self) -> bool:
+        self._take_up_if_given_back()
         if (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
             return bool(self._heart.reached_ns)
         done = self._inner.safe_step()
@@ -64,12 +77,35 @@ class GuardedAmplifier:
         self._inner.close()  # where this fails, the guardian goes on trying
         self._heart.say(Phase.IDLE)
 
+    def _take_up_again(self) -> None:
+        """After a hold: the guardian must have given the outputs back, or be none of whose business they are."""
+        heart, gate = self._heart, self._gate
+        if gate.alone:
+            raise SafetyTrip(
+                "the guardian of the outputs had to be ended and nobody watches over them; start the run again",
+                device=self.name,
+            )
+        limit_ns = self._clock.now_ns() + GIVE_BACK_NS
+        while heart.taken_ns:
+            if self._clock.now_ns() > limit_ns:
+                raise SafetyTrip("the guardian does not give the outputs back; start the run again", device=self.name)
+            wait_s(self._clock, STEP_S)
+        self._take_up_if_given_back()
+
+    def _take_up_if_given_back(self) -> None:
+        if self._asked and not self._heart.taken_ns:
+            self._asked, self._lost_ns = False, 0
+            self._gate.take_up()
+
     def _is_ours_again(self) -> bool:
         """After the guardian has taken the outputs: only when it has not reached neutral in time and is gone."""
         heart, now_ns = self._heart, self._clock.now_ns()
         if heart.reached_ns:
+            self._inner.guard.brought_to_safe_state()
             self._inner.lose_position()
             heart.say(Phase.IDLE)
+            heart.ask_back(now_ns)
+            self._asked = True
             return False
         self._gate.lost = True
         heart.say(Phase.YIELDED)

@@ -7,13 +7,16 @@ No command of the firmware goes out after the guardian has the outputs:
 2. The guardian waits until the lease has certainly expired (same clock, plus a margin), sets ``taken_ns``, and then
    looks at ``inside``, a step later at the earliest. Empty: whatever comes now finds ``taken_ns`` set. Not empty: the
    firmware stands still within a command; see ``Guardian``.
+3. Once the guardian has reached neutral and has watched over it for a while, and the firmware asks (``heart.asked``
+   later than ``taken_ns``, no command inside), it clears ``taken_ns``. Only then does the firmware take its lease up
+   again; it reads back where the outputs are before it moves them.
 """
 
 from __future__ import annotations
 
 from firmware_py.guardian.heart import Heart, Order, Phase
 from hal.contracts import Clock
-from hal.errors import SafetyTrip
+from hal.errors import LeaseLost
 
 LEASE_MARGIN_MS = 1.0
 """The guardian waits so much longer than the firmware's lease lasts."""
@@ -24,7 +27,7 @@ class LeaseGate:
 
     def __init__(self, heart: Heart, clock: Clock, name: str, lease_ms: float) -> None:
         self.lost = False
-        """The lease is over or the guardian has the outputs: for the rest of the run, or until ``regain``."""
+        """The lease is over or the guardian has the outputs: until it has given them back or is gone."""
         self._heart = heart
         self._clock = clock
         self._name = name
@@ -33,7 +36,7 @@ class LeaseGate:
         self._last = (-1, -1, -1)
 
     def enter(self, codes: tuple[int, int, int]) -> None:
-        """Raises ``SafetyTrip`` when the outputs are not the firmware's any more: then nothing may be sent."""
+        """Raises ``LeaseLost`` when the outputs are not the firmware's any more: then nothing may be sent."""
         heart = self._heart
         heart.enter(Order(codes, codes == self._last))
         self._last = codes
@@ -45,7 +48,7 @@ class LeaseGate:
             heart.leave()
             self.lost = True
             heart.say(Phase.YIELDED)
-            raise SafetyTrip(
+            raise LeaseLost(
                 f"the host stood still for {silent_ns * 1e-6:.0f} ms: this process has lost the outputs to the "
                 "guardian, which takes them to neutral",
                 device=self._name,
@@ -55,6 +58,15 @@ class LeaseGate:
     def leave(self) -> None:
         """The transfer is over, well or not."""
         self._heart.leave()
+
+    @property
+    def alone(self) -> bool:
+        """There is no guardian any more."""
+        return self._alone
+
+    def take_up(self) -> None:
+        """The guardian has given the outputs back: the lease begins anew."""
+        self.lost = False
 
     def regain(self) -> None:
         """There is no guardian any more: nobody else commands."""

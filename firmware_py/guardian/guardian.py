@@ -62,6 +62,7 @@ class Guardian:
         self.ended = False
         self.exclusive = True
         """Whether no command of the firmware can have come after the outputs were taken."""
+        self._last: dict[str, Any] | None = None
         self._end = end
         self._heart = heart
         self._output = output
@@ -86,18 +87,25 @@ class Guardian:
         self.state = State.DONE
 
     def report(self) -> dict[str, Any]:
-        """What happened, JSON values; times on the bench clock in ns, ``None``: did not happen."""
-        heart = self._heart
+        """What happened, JSON values; times on the bench clock in ns, ``None``: did not happen. Of several times that
+        the outputs were taken, the last one."""
+        taking = self._taking() if self._heart.taken_ns or self._last is None else self._last
         return {
             "format": 1,
-            "why": heart.why.name.lower(),
-            "last_beat_ns": heart.beat_ns or None,
-            "noticed_ns": heart.noticed_ns or None,
-            "taken_ns": heart.taken_ns or None,
-            "neutral_ns": heart.reached_ns or None,
+            **taking,
+            "noticed_ns": self._heart.noticed_ns or None,
             "firmware_ended": self.ended,
             "exclusive": self.exclusive,
             "problem": self.problem,
+        }
+
+    def _taking(self) -> dict[str, Any]:
+        heart = self._heart
+        return {
+            "why": heart.why.name.lower(),
+            "last_beat_ns": heart.beat_ns or None,
+            "taken_ns": heart.taken_ns or None,
+            "neutral_ns": heart.reached_ns or None,
         }
 
     def _watch(self, alive: bool) -> None:
@@ -166,6 +174,13 @@ class Guardian:
                 self._output.lose_position()
                 self.state = State.RAMPING
                 return
-        held_ns = self._clock.now_ns() - self._heart.reached_ns
-        if held_ns > HOLD_NS and (not alive or self._heart.phase is Phase.IDLE):
+        heart = self._heart
+        if self._clock.now_ns() - heart.reached_ns <= HOLD_NS:
+            return
+        wanted = heart.asked_ns > heart.taken_ns
+        if not alive or (heart.phase is Phase.IDLE and not wanted):
             self.state = State.DONE
+        elif heart.phase is Phase.IDLE and heart.inside is None:
+            self._last = self._taking()
+            self.state = State.WATCHING
+            heart.give_back()

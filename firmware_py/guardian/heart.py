@@ -7,8 +7,8 @@ import os
 from enum import IntEnum
 from typing import NamedTuple
 
-_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY, _INSIDE, _WATCHED = range(8)
-_BYTES = 64
+_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY, _INSIDE, _WATCHED, _ASKED = range(9)
+_BYTES = 9 * 8
 _SOMEBODY, _REPEATS = 1 << 48, 1 << 49
 
 
@@ -38,8 +38,8 @@ class Order(NamedTuple):
 
 
 class Heart:
-    """``phase``, ``beat`` and ``inside`` are the firmware's words, the others the guardian's. Times: bench clock, ns;
-    0: never.
+    """``phase``, ``beat``, ``inside`` and ``asked`` are the firmware's words, the others the guardian's. Times: bench
+    clock, ns; 0: never.
 
     Without ``fd`` in private memory, for a guardian in the same process.
     """
@@ -72,6 +72,10 @@ class Heart:
         """It has gone out, or will not."""
         self._words[_INSIDE] = 0
 
+    def ask_back(self, t_ns: int) -> None:
+        """The outputs are wanted back once the guardian has done with them; no command is going out."""
+        self._words[_ASKED] = t_ns
+
     # -- the guardian's side
 
     def watch(self, t_ns: int) -> None:
@@ -91,6 +95,12 @@ class Heart:
         """Neutral, read back."""
         self._words[_REACHED] = t_ns
 
+    def give_back(self) -> None:
+        """The outputs are the firmware's again; ``taken`` is cleared last, because it is what the firmware looks at."""
+        self._words[_WHY] = Why.NOTHING
+        self._words[_REACHED] = 0
+        self._words[_TAKEN] = 0
+
     # -- for both
 
     @property
@@ -108,6 +118,10 @@ class Heart:
         if not word:
             return None
         return Order((word >> 32 & 0xFFFF, word >> 16 & 0xFFFF, word & 0xFFFF), bool(word & _REPEATS))
+
+    @property
+    def asked_ns(self) -> int:
+        return self._words[_ASKED]
 
     @property
     def watched_ns(self) -> int:

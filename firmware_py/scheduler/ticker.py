@@ -89,6 +89,11 @@ class ScanTicker:
             if self._clock.now_ns() + _ROUNDING_NS >= silent_at_ns:
                 return self._host_tick(self._last_due_ns)
 
+    def tick_without_scan(self) -> Ticks:
+        """A host tick now: reading failed, and supervision goes on without waiting."""
+        now_ns = self._clock.now_ns()
+        return self._host_tick(now_ns - self._period_ns if self._last_due_ns is None else self._last_due_ns)
+
     def _scans(self, block: ScanBlock) -> Ticks:
         if self._seq_of_tick0 is None:
             self._seq_of_tick0 = block.seq0 - (self._last_k + 1)

@@ -84,6 +84,10 @@ class NidaqmxOutput:
     def commands_sent(self) -> int:
         return self.guard.writes
 
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
     def write(self, values_V: Float64Array) -> int:
         mask = self.guard.admit(values_V)
         self._send()

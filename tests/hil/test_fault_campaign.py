@@ -15,6 +15,7 @@ from tools.faults.trial import observe_running, observe_start
 NAMES = (
     "serial: silence",
     "daq: FIFO overflow",
+    "host: stalls for 50 ms",
     "sensor: stuck",
     "sensor: sign turned round",
     "output bus: DAC holds its outputs",

@@ -27,6 +27,8 @@ FRAME_S = 1 / 60
 STATUS_S = 0.1
 DISK_S = 2.0
 STALE_S = 0.25
+OPERATOR = "the operator"
+"""What a hold of the firmware waits for when only a person is missing (``firmware_py.control.holds``)."""
 DISK_LOW_BYTES = 2 << 30
 DISK_LOW_SHARE = 0.03
 
@@ -192,7 +194,17 @@ class Session:
             found.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
         if self.recorder.active and self.recorder.trouble():
             found.append(("error", f"Recording: {self.recorder.trouble()}"))
-        return [{"kind": kind, "text": text} for kind, text in found]
+        return [*self._hold_alert(), *({"kind": kind, "text": text} for kind, text in found)]
+
+    def _hold_alert(self) -> list[dict[str, str]]:
+        """Why the outputs rest at neutral; with ``order`` where a person may end that."""
+        hold = self.run.status.get("hold")
+        if self.run.phase != "running" or not hold:
+            return []
+        text = f"Hold, outputs at neutral: {hold['cause']}."
+        if hold["waits_for"] and hold["waits_for"] != hold["cause"]:
+            text += f" It waits for {hold['waits_for']}."
+        return [{"kind": "warn", "text": text, **({"order": "rearm"} if hold["waits_for"] == OPERATOR else {})}]
 
     def state(self) -> dict[str, Any]:
         """The status message of the page."""

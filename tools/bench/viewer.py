@@ -175,6 +175,8 @@ class Viewer:
             raise Nonsense("too many orders")
         elif order == "arm":
             self._armed = self._session.order("arm")
+        elif order == "rearm":
+            self._session.order("rearm")
         elif order == "disarm":
             self._armed = False
             self._session.order("disarm")

@@ -26,6 +26,8 @@ from tools.faults.points import POINTS, Point, write_bench
 from tools.faults.trial import observe_running, observe_start
 
 NUMBERS = re.compile(r"-?\d+\.\d+")
+DECIDED = ("safe state", "holds", "resumes")
+TOLD = (*DECIDED, "refused")
 WITHIN_MS = 20.0  # from the moment at which the tip has gone 5 um astray
 
 
@@ -44,7 +46,7 @@ class FaultRow:
 
     @property
     def detected(self) -> int:
-        """Runs in which the instrument tripped, noticed, or refused to start."""
+        """Runs in which the instrument tripped, held, noticed, or refused to start."""
         return sum(o.answer != "none" for o in self.observations)
 
     @property
@@ -55,8 +57,9 @@ class FaultRow:
 
     @property
     def as_expected(self) -> int:
-        quiet = self.fault.expected in ("harmless", "cannot be seen")
-        return sum(o.answer == self.fault.expected or (quiet and o.answer == "none") for o in self.observations)
+        # a fault that comes and goes may let the outputs resume until it comes again
+        also = {"harmless": "none", "cannot be seen": "none", "holds": "resumes"}.get(self.fault.expected)
+        return sum(o.answer in (self.fault.expected, also) for o in self.observations)
 
     @property
     def late(self) -> int:
@@ -69,8 +72,8 @@ class FaultRow:
 
     @property
     def wrong_messages(self) -> int:
-        """Trips and refusals whose message names none of the words that belong to the fault."""
-        told = [o for o in self.observations if o.answer in ("safe state", "refused")]
+        """Trips, holds and refusals whose message names none of the words that belong to the fault."""
+        told = [o for o in self.observations if o.answer in TOLD]
         return sum(not any(word.lower() in o.message.lower() for word in self.fault.names) for o in told)
 
     @property
@@ -95,7 +98,7 @@ class FaultRow:
             "detected": self.detected,
             "detect_ms": _spread([o.detect_ms for o in self.observations]),
             "answer": self.answer,
-            "answer_ms": _spread([o.neutral_ms for o in self.observations if o.answer == "safe state"]),
+            "answer_ms": _spread([o.neutral_ms for o in self.observations if o.answer in DECIDED]),
             "unsafe_outputs": self.unsafe,
             "uncounted_samples": sum(o.uncounted for o in self.observations),
             "tip_error_um_max": max(o.astray_um for o in self.observations),
@@ -104,7 +107,7 @@ class FaultRow:
             "as_expected": self.as_expected,
             "moved_unseen": self.late,
             "not_confirmed": sum(not o.confirmed for o in self.observations),
-            "message": next((o.message for o in self.observations if o.answer in ("safe state", "refused")), ""),
+            "message": next((o.message for o in self.observations if o.answer in TOLD), ""),
             "why": self.fault.why,
             "known_by": self.known_by,
             "isolated": self.isolated,

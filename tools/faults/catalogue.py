@@ -15,6 +15,8 @@ ONE_BYTE = (
     "and each wrong one is known: benches/micron-read-back.toml, below"
 )
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
+RESUMES_S = 0.7
+"""Watched for so long where outputs are expected to hold and to resume: the cause, 20 ms, 200 ms, a new alignment."""
 GUARDED = "the guardian notices after 8 ms, and takes the outputs to neutral after 40 ms without a command"
 
 
@@ -25,22 +27,24 @@ def faults() -> tuple[Fault, ...]:
 
 
 def serial_line() -> tuple[Fault, ...]:
-    def line(name: str, expected: str, *, names: tuple[str, ...] = DAQ, why: str = "", **plan: float) -> Fault:
-        return Fault(f"serial: {name}", OnBus("daq0", plan), expected, names, effect=1, why=why)  # type: ignore[arg-type]
+    def line(
+        name: str, expected: str, *, names: tuple[str, ...] = DAQ, why: str = "", watch_s: float = 0.15, **plan: float
+    ) -> Fault:
+        return Fault(f"serial: {name}", OnBus("daq0", plan), expected, names, watch_s, effect=1, why=why)  # type: ignore[arg-type]
 
     return (
-        line("one byte in a thousand lost", "safe state", loss=0.001),
-        line("a burst of lost bytes", "safe state", loss=0.3, for_s=0.004),
+        line("one byte in a thousand lost", "holds", loss=0.001),
+        line("a burst of lost bytes", "holds", loss=0.3, for_s=0.004),
         line("one bit in ten thousand bytes flipped", "cannot be seen", corruption=1e-4, why=NO_SUM),
         line("one bit in a hundred bytes flipped", "safe state", corruption=0.01),
-        line("bytes doubled", "safe state", duplication=0.001),
+        line("bytes doubled", "holds", duplication=0.001),
         line("neighbouring bytes exchanged", "safe state", reorder=0.05),
-        line("reads cut short", "safe state", truncation=0.02),
+        line("reads cut short", "holds", truncation=0.02),
         line("every tenth read 2 ms late", "noticed", delay=0.1, delay_s=0.002),
         line("a read 20 ms late now and then", "noticed", delay=0.02, delay_s=0.020, why=GUARDED),
         line("silence of 3 ms", "noticed", silent_after_s=0.0, silent_for_s=0.003),
-        line("silence of 50 ms", "safe state", silent_after_s=0.0, silent_for_s=0.05),
-        line("silence", "safe state", silent_after_s=0.0),
+        line("silence of 50 ms", "resumes", watch_s=RESUMES_S, silent_after_s=0.0, silent_for_s=0.05),
+        line("silence", "holds", silent_after_s=0.0),
         line("cable pulled", "safe state", disconnect_after_s=0.0),
         line("cable pulled for 100 ms", "safe state", disconnect_after_s=0.0, reconnect_after_s=0.1),
     )
@@ -51,9 +55,9 @@ def daq_device() -> tuple[Fault, ...]:
     small = "100 ppm of a sample period is 0.1 us a tick; the time line follows it"
     return (
         Fault("daq: unplugged", InWorld("unplug", "daq"), "safe state", ("daq",)),
-        Fault("daq: frozen", InWorld("freeze", "daq"), "safe state", ("daq",)),
+        Fault("daq: frozen", InWorld("freeze", "daq"), "holds", ("daq",)),
         Fault("daq: frozen for 3 ms", InWorld("freeze", "daq", "thaw", 0.003), "noticed", ("daq",)),
-        Fault("daq: FIFO overflow", InWorld("overflow", "daq"), "safe state", ("overflow",)),
+        Fault("daq: FIFO overflow", InWorld("overflow", "daq"), "resumes", ("overflow",), RESUMES_S),
         Fault("daq: crystal 100 ppm fast", InWorld("clock=100", "daq"), "harmless", why=small, redraws=True),
         Fault("daq: crystal 100 ppm slow", InWorld("clock=-100", "daq"), "harmless", why=small, redraws=True),
         Fault("daq: clock steps by 0.1 ms", InWorld("clock_step=100", "daq"), "cannot be seen", redraws=True, why=step),
@@ -117,16 +121,17 @@ def output_bus() -> tuple[Fault, ...]:
         how, own = OnBus("i2c0", plan, only=DAC), "write_corruption" in plan
         return Fault(f"output bus: {name}", how, expected, ("piezo",), watch_s, own_output=own, effect=4, why=why)  # type: ignore[arg-type]
 
+    deaf, stuck = InWorld("nack", "piezo", "ack", 0.002), InWorld("stuck", "i2c0", "free", 0.005)
     return (
         Fault("output bus: DAC refuses its address", InWorld("nack", "piezo"), "safe state", ("piezo",)),
         Fault("output bus: DAC refuses data", InWorld("nack_data", "piezo"), "safe state", ("piezo",)),
-        Fault("output bus: DAC deaf for 2 ms", InWorld("nack", "piezo", "ack", 0.002), "safe state", ("piezo",)),
+        Fault("output bus: DAC deaf for 2 ms", deaf, "resumes", ("piezo",), RESUMES_S),
         Fault("output bus: SDA stuck", InWorld("stuck", "i2c0"), "safe state", ("piezo", "i2c", "SDA")),
-        Fault("output bus: SDA stuck for 5 ms", InWorld("stuck", "i2c0", "free", 0.005), "safe state", ("SDA",)),
+        Fault("output bus: SDA stuck for 5 ms", stuck, "resumes", ("SDA",), RESUMES_S),
         Fault("output bus: DAC restarts", InWorld("brown_out", "piezo"), "safe state", ("piezo",), own_output=True),
         Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", ("piezo",)),
-        piezo("one transfer in a hundred refused", "safe state", watch_s=0.6, nack=0.01),
-        piezo("half of the transfers lost", "safe state", loss=0.5),
+        piezo("one transfer in a hundred refused", "holds", watch_s=0.6, nack=0.01),
+        piezo("half of the transfers lost", "holds", loss=0.5),
         piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0, why=ONE_BYTE),
         piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1, why=ONE_BYTE),
         piezo("a bit wrong in one transfer of a thousand", "cannot be seen", write_corruption=0.001, why=ONE_BYTE),
@@ -143,8 +148,8 @@ def magnetometer() -> tuple[Fault, ...]:
     coasts = "the heading coasts for 150 ms"
     waits = "the driver waits for the longest conversion of the data sheet and does not ask the bit"
     return (
-        Fault("magnetometer: ADC refuses its address", InWorld("nack", "mag_adc"), "safe state", ("mag", "0x48"), 0.3),
-        Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "safe state", ("mag",), 0.3),
+        Fault("magnetometer: ADC refuses its address", InWorld("nack", "mag_adc"), "holds", ("mag", "0x48"), 0.3),
+        Fault("magnetometer: ADC never ready", InWorld("freeze", "mag_adc"), "holds", ("mag",), 0.3),
         Fault("magnetometer: ADC always says ready", InWorld("always_ready", "mag_adc"), "harmless", why=waits),
         Fault("magnetometer: one transfer in ten refused", OnBus("i2c1", {"nack": 0.1}, ADC), "noticed", ("mag",)),
         Fault(
@@ -163,13 +168,13 @@ def can_bus() -> tuple[Fault, ...]:
     heard = "the button is heard often enough"
     return (
         Fault("can: stop button pressed", InWorld("press", ""), "safe state", ("stop button",), 0.3),
-        Fault("can: bus silent", InWorld("silence", "can0"), "safe state", ("stop button",), 1.8),
+        Fault("can: bus silent", InWorld("silence", "can0"), "holds", ("stop button",), 1.8),
         frames("one frame in five lost", "harmless", loss=0.2, why=heard),
         frames("bits of frames flipped", "harmless", corruption=0.2, why="counters and range checks; " + heard),
         frames("frames doubled", "harmless", duplication=0.5, why=heard),
         frames("frames out of order", "harmless", reorder=0.5, why=heard),
         frames("frames cut short", "harmless", truncation=0.2, why=heard),
-        frames("controller bus-off", "safe state", watch_s=1.8, bus_off_after_s=0.0),
+        frames("controller bus-off", "holds", watch_s=1.8, bus_off_after_s=0.0),
         frames("error frames", "harmless", error_frames_hz=500.0, why=heard),
         frames("a node babbles", "harmless", babble_hz=4000.0, why="a poll reads a bounded number of frames"),
         frames("adapter unplugged", "safe state", watch_s=1.8, disconnect_after_s=0.0),
@@ -194,8 +199,8 @@ def host() -> tuple[Fault, ...]:
     return (
         Fault("host: stalls for 3 ms", OnHost(3.0), "noticed", ("daq",), effect=0),
         Fault("host: stalls for 5 ms", OnHost(5.0), "noticed", ("daq",), effect=0),
-        Fault("host: stalls for 50 ms", OnHost(50.0), "safe state", ("guardian",), effect=0, why=GUARDED),
-        Fault("host: stalls for 500 ms", OnHost(500.0), "safe state", ("daq", "host"), effect=0, why=GUARDED),
+        Fault("host: stalls for 50 ms", OnHost(50.0), "resumes", ("guardian",), RESUMES_S, effect=0, why=GUARDED),
+        Fault("host: stalls for 500 ms", OnHost(500.0), "resumes", ("daq", "host"), 1.1, effect=0, why=GUARDED),
         Fault("host: 8 MB of memory left", OutOfMemory(8.0), "harmless", effect=0, why="a tick allocates nothing"),
         Fault("host: firmware killed (kill -9)", Kill("firmware"), "safe state", ("firmware died",), 0.3),
         Fault("host: guardian killed (kill -9)", Kill("guardian"), "noticed", ("guardian",), 0.3),

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-Expected = Literal["safe state", "noticed", "harmless", "refused", "cannot be seen"]
+Expected = Literal["safe state", "holds", "resumes", "noticed", "harmless", "refused", "cannot be seen"]
 LEFT_OUT = "the axis is left out once the others contradict it by seven deviations of their noise"
 
 

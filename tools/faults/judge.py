@@ -32,8 +32,10 @@ class Seen:
 class Observation:
     """Times in ms from the strike; ``None``: did not happen.
 
-    ``unsafe``: demands at the amplifier beyond its range, faster than the slew limit, or not neutral 20 ms after the
-    decision although the report says so. ``uncounted``: scans of the device that the firmware cannot account for.
+    ``held_ms``: the first hold began; ``resumed``: the last one ended and the outputs moved again.
+    ``unsafe``: demands at the amplifier beyond its range, faster than the slew limit, not neutral 20 ms after the
+    decision although the report says so, or anything but the ramp and neutral in a hold. ``uncounted``: scans of the
+    device that the firmware cannot account for.
     ``lost``: scans that the firmware reports as lost.
     ``astray_um``: largest distance of the tip from the same run without the fault, until the decision; ``moved_ms``:
     when it passed 5 um.
@@ -54,6 +56,8 @@ class Observation:
     astray_um: float
     moved_ms: float | None
     lost: int = 0
+    held_ms: float | None = None
+    resumed: bool = False
 
     @classmethod
     def refusal(cls, fault: str, point: str, seed: int, message: str) -> Observation:
@@ -67,19 +71,22 @@ class Observation:
             return "refused"
         if self.tripped_ms is not None:
             return "safe state"
+        if self.held_ms is not None:
+            return "resumes" if self.resumed else "holds"
         return "noticed" if self.noticed_ms is not None else "none"
 
     @property
     def known_by(self) -> str:
         """What was said first."""
-        if self.noticed_ms is not None and (self.tripped_ms is None or self.noticed_ms < self.tripped_ms):
+        decided = [t for t in (self.tripped_ms, self.held_ms) if t is not None]
+        if self.noticed_ms is not None and (not decided or self.noticed_ms < min(decided)):
             return self.noticed
-        return self.message if self.refused or self.tripped_ms is not None else ""
+        return self.message if self.refused or decided else ""
 
     @property
     def detect_ms(self) -> float | None:
         """When anything was known of the fault."""
-        times = [t for t in (self.tripped_ms, self.noticed_ms) if t is not None]
+        times = [t for t in (self.tripped_ms, self.held_ms, self.noticed_ms) if t is not None]
         return min(times) if times else None
 
 
@@ -96,7 +103,10 @@ def judge(
     outcome = seen.outcome
     safe = outcome["safe_state"]
     reason = str(safe["reason"])
-    decided_ns = int(outcome["safe_ns"])
+    tripped = not reason.startswith(ENDED_WELL)
+    ended_ns = int(outcome["safe_ns"])
+    holds = [hold for hold in outcome.get("holds", ()) if hold["t_ns"] >= seen.strike_ns]
+    decided_ns = holds[0]["t_ns"] if holds else ended_ns
     confirmed = bool(safe["reached"])
     noticed = {what: t_ns for what, t_ns in outcome["noticed"].items() if t_ns >= seen.strike_ns}
     first = min(noticed, key=noticed.__getitem__) if noticed else ""
@@ -106,7 +116,8 @@ def judge(
     t_ns = seen.t_ns[:n]
     before = (t_ns >= seen.strike_ns) & (t_ns <= decided_ns)
     moved = np.flatnonzero(before & (away_m > MOVED_M))
-    neutral = neutral_ms(seen.demands, decided_ns) if confirmed else None
+    first_end_ns = decided_ns + round(holds[0]["length_s"] * 1e9) if holds and holds[0]["resumed"] else None
+    neutral = neutral_ms(seen.demands, decided_ns, first_end_ns) if confirmed else None
     samples = outcome["samples"]
     counted = samples["received"] + samples["lost"] + samples["unread"] + 1  # and the one under way
     return Observation(
@@ -114,25 +125,43 @@ def judge(
         point=point,
         seed=seed,
         refused=outcome["armed_ns"] is None,
-        tripped_ms=None if reason.startswith(ENDED_WELL) else (decided_ns - seen.strike_ns) * 1e-6,
+        tripped_ms=(ended_ns - seen.strike_ns) * 1e-6 if tripped else None,
         noticed_ms=(noticed[first] - seen.strike_ns) * 1e-6 if noticed else None,
         noticed=first,
         neutral_ms=neutral,
-        message=reason,
+        message=reason if tripped or not holds else str(holds[0]["cause"]),
         confirmed=confirmed,
-        unsafe=rough_demands(seen.demands) + (confirmed and (neutral is None or neutral > RAMP_MS)),
+        unsafe=rough_demands(seen.demands)
+        + (confirmed and (neutral is None or neutral > RAMP_MS))
+        + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in holds),
         uncounted=max(0, seen.scans - counted),
         astray_um=1e6 * float(away_m[before].max(initial=0.0)),
         moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size else None,
         lost=int(samples["lost"]),
+        held_ms=(decided_ns - seen.strike_ns) * 1e-6 if holds else None,
+        resumed=bool(holds and holds[-1]["resumed"]),
     )
 
 
-def neutral_ms(demands: list[tuple[int, int, float]], decided_ns: int) -> float | None:
-    """From the decision until the last change of a demand; ``None`` when one is not neutral in the end."""
+def driven_in_hold(demands: list[tuple[int, int, float]], begin_ns: float, end_ns: float) -> int:
+    """Demands in a hold that are farther from neutral than the one before: neither its ramp nor neutral."""
+    count = 0
+    before_V: dict[int, float] = {}
+    for t_ns, channel, volts in demands:
+        if begin_ns < t_ns < end_ns and channel in before_V:
+            count += abs(volts - NEUTRAL_V) > abs(before_V[channel] - NEUTRAL_V) + 1e-9
+        before_V[channel] = volts
+    return count
+
+
+def neutral_ms(demands: list[tuple[int, int, float]], decided_ns: int, until_ns: int | None = None) -> float | None:
+    """From the decision until the last change of a demand before ``until_ns``; ``None`` when one is not neutral
+    then."""
     last_ns = decided_ns
     volts_of: dict[int, float] = {}
     for t_ns, channel, volts in demands:
+        if until_ns is not None and t_ns >= until_ns:
+            break
         if volts != volts_of.get(channel):
             last_ns = max(last_ns, t_ns)
         volts_of[channel] = volts

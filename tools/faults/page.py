@@ -23,14 +23,14 @@ random instant, or is there when the bench is opened ("at start").
 | messages that do not name the cause | 0 | {wrong_messages} |
 | answers as expected below | all | {as_expected} of {runs} |
 
-How it is measured. Known: the firmware tripped, or counted it under a name (`noticed` in the run's JSON), or refused
-to start; within 20 ms of the instant at which the tip is 5 um astray. The tip's error is its distance from the same
-run without the fault (same hand, same noise, bit for bit the same until the strike), until the decision. Faults that
-also shift when samples are taken would meet other noise: their tip is that of two more runs, both without noise from
-the strike on. Unsafe: a demand that arrives at the amplifier beyond 0..100 V or faster than 20 V/ms, or a channel that
-is not neutral 21 ms after the decision although the report says that it is; a report that says "neutral NOT confirmed"
-makes no such claim. Uncounted: scans that the device took and that are neither
-received, nor reported lost, nor unread at the end.
+How it is measured. Known: the firmware tripped, held, or counted it under a name (`noticed` in the run's JSON), or
+refused to start; within 20 ms of the instant at which the tip is 5 um astray. The tip's error is its distance from the
+same run without the fault (same hand, same noise, bit for bit the same until the strike), until the decision. Faults
+that also shift when samples are taken would meet other noise: their tip is that of two more runs, both without noise
+from the strike on. Unsafe: a demand that arrives at the amplifier beyond 0..100 V or faster than 20 V/ms; a channel
+that is not neutral 21 ms after the decision although the report says that it is (one that says "neutral NOT confirmed"
+makes no such claim); or anything but the ramp and neutral from the begin to the end of a hold. Uncounted: scans that
+the device took and that are neither received, nor reported lost, nor unread at the end.
 
 ## What is not seen, or too late
 
@@ -105,7 +105,8 @@ archives checked for paths outside and for size.
 
 Over all hands. "Names the part": runs in which what was said names the broken part (input, output, device), so that it
 is isolated and not only noticed. A safe state is latched: it ends the run, and a new one begins only when somebody
-starts it.
+starts it. A hold ends by itself when its cause has passed, or latches: [findings](findings.md) has the table. "Holds"
+in the answers: the run was watched no longer, or the fault would not pass.
 
 | fault | said first | names the part | then | scans lost, most |
 |---|---|---|---|---|
@@ -189,6 +190,8 @@ def _line(row: FaultRow) -> str:
 THEN = {
     "refused": "does not start: mend, start again",
     "safe state": "latched: mend, start again",
+    "holds": "holds at neutral until it passes; latches after 3 s",
+    "resumes": "holds at neutral, goes on by itself",
     "noticed": "goes on, counted",
     "none": "goes on",
 }

@@ -41,7 +41,7 @@ def strike_s(seed: int) -> float:
 
 
 @dataclass
-class _Bench:
+class FarBench:
     """The opened bench from the far side: its clock, world, ports, and every demand at the amplifier."""
 
     clock: VirtualClock = field(default_factory=VirtualClock)
@@ -114,7 +114,7 @@ class _Bench:
 
 def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observation:
     """A fault that is there before the devices are opened."""
-    far = _Bench()
+    far = FarBench()
 
     def open_hook(opened: OpenBench) -> None:
         far.attach(opened)
@@ -137,7 +137,7 @@ def observe_running(
     bench: Path, point: str, faults: Sequence[Fault], seed: int, done: Callable[[], None] = lambda: None
 ) -> list[Observation]:
     """Each of ``faults`` strikes the same run at the same instant; ``done`` is called after each."""
-    far = _Bench()
+    far = FarBench()
     at_ns = round(strike_s(seed) * 1e9)
     answers: list[Any] = []
     me = _Child()

@@ -37,7 +37,7 @@ class Magnetometer:
 @pytest.mark.parametrize("broken", [0, 6])
 def test_what_is_out_of_line_depends_on_the_time_between_readings(interval_ms: int, broken: int):
     noticed: list[str] = []
-    incidents: Any = SimpleNamespace(notice=noticed.append, bad_for=lambda *_: None)
+    incidents: Any = SimpleNamespace(notice=noticed.append, bad_for=lambda *_, **__: None)
     magnetometer: Any = Magnetometer(interval_ms * 1_000_000, broken)
     field = FieldInput(magnetometer, incidents, LoopCounts(), 150.0, OUTLIER_V)
     for k in range(10):

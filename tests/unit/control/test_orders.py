@@ -13,6 +13,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from firmware_py.control.findings import CauseClass, Finding
 from firmware_py.control.incidents import Incidents, LoopCounts
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
@@ -106,10 +107,10 @@ def test_the_safe_button_is_the_operators_end_of_the_run(desk: Desk):
     desk.incidents.tick = 7
     desk.say({"order": "safe", "t_ns": HOST_AHEAD_NS + 6_500_000})
     reason = "stopped by the operator (safe button of the bench page)"
-    assert desk.supervisor.trip_cause == Trip(reason, 7, 7 * MS, normal=True)
+    assert desk.supervisor.trip_cause == Trip(Finding.STOPPED_ON_PAGE, reason, 7, 7 * MS, CauseClass.OPERATOR)
     assert desk.orders.asked_safe_ns == 6_500_000
     assert desk.recorder.events == [{"t_ns": 7 * MS, "tick": 7, "event": "safe state", "reason": reason}]
-    desk.incidents.trip("later")
+    desk.incidents.report(Finding.BUTTON_PRESSED)
     assert desk.supervisor.trip_cause.reason == reason
     assert len(desk.recorder.events) == 1
 
@@ -172,18 +173,19 @@ def test_histograms_are_shown_in_turn(desk: Desk):
     assert desk.memory.distribution(1).n == 1
 
 
-def test_a_doubt_ends_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: Desk, looking: Desk):
+def test_a_doubt_holds_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: Desk, looking: Desk):
+    words = {"value": 3.0, "low": 4.5, "high": 5.5}
     for each in (desk, looking):
         for t_ms in (0, 20, 40):
-            each.incidents.bad_for("supply", True, t_ms * MS, 50.0, "supply 3 V")
-        each.incidents.bad_for("supply", False, 45 * MS, 50.0, "supply 3 V")
-        each.incidents.bad_for("supply", True, 46 * MS, 50.0, "supply 3 V")
-        each.incidents.bad_for("supply", True, 95 * MS, 50.0, "supply 3 V")
-        assert each.supervisor.trip_cause is None, "it was good in between"
+            each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, t_ms * MS, 50.0, **words)
+        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, False, 45 * MS, 50.0, **words)
+        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 46 * MS, 50.0, **words)
+        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 95 * MS, 50.0, **words)
+        assert not each.supervisor.holds, "it was good in between"
         assert not each.counts.noticed
-        each.incidents.bad_for("supply", True, 96 * MS, 50.0, "supply 3 V")
-    assert desk.supervisor.trip_cause is not None
-    assert desk.supervisor.trip_cause.reason == "supply 3 V"
+        each.incidents.bad_for(Finding.SUPPLY_OUTSIDE, True, 96 * MS, 50.0, **words)
+    assert [hold.reason for hold in desk.supervisor.holds] == ["supply 3.00 V is outside 4.5..5.5 V"]
+    assert desk.supervisor.state is State.HOLD_RAMP
     assert looking.supervisor.trip_cause is None
     assert looking.counts.noticed == {"supply: beyond its limit": 0}
 
@@ -193,9 +195,10 @@ def test_a_doubt_ends_a_run_that_moves_and_is_noticed_in_one_that_looks(desk: De
     [(HalTimeout("no answer", device="daq"), "daq: no answer"), (HalTimeout("no answer"), "daq: no answer")],
 )
 def test_a_trip_for_a_device_names_it_once(desk: Desk, error: HalTimeout, reason: str):
-    desk.incidents.trip_for("daq", error)
+    desk.incidents.report_error(Finding.DAQ_GONE, "daq", error)
     assert desk.supervisor.trip_cause is not None
     assert desk.supervisor.trip_cause.reason == reason
+    assert desk.incidents.error is error
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from firmware_py.control.safety import FINISHED, RAMP_TICKS, State, Supervisor, Trip
+from firmware_py.control.findings import CauseClass, Finding
+from firmware_py.control.safety import RAMP_TICKS, State, Supervisor, Trip
 from hal.contracts import Float64Array
 from hal.errors import I2cNack, SafetyTrip
 from hal.types import OutputLimit
@@ -70,8 +71,8 @@ def test_failed_self_test_leaves_everything_disarmed():
 
 def test_first_reason_wins_and_neutral_in_20_ticks():
     supervisor = running(FakeAmplifier())
-    supervisor.trip("stop button", tick=7, t_ns=7_000_000)
-    supervisor.trip("stale sample", tick=8, t_ns=8_000_000)
+    supervisor.trip(Finding.BUTTON_PRESSED, "stop button", tick=7, t_ns=7_000_000)
+    supervisor.trip(Finding.SCANS_MISSING, "stale sample", tick=8, t_ns=8_000_000)
     assert not supervisor.may_move
     steps = 1
     while not supervisor.step():
@@ -79,13 +80,13 @@ def test_first_reason_wins_and_neutral_in_20_ticks():
     assert steps == RAMP_TICKS
     assert supervisor.safe_reached
     assert supervisor.trip_cause is not None
-    assert supervisor.trip_cause == Trip("stop button", 7, 7_000_000, normal=False)
+    assert supervisor.trip_cause == Trip(Finding.BUTTON_PRESSED, "stop button", 7, 7_000_000, CauseClass.OPERATOR)
     assert supervisor.ramp_failure == ""
 
 
 def test_no_way_back():
     supervisor = running(FakeAmplifier(ticks=1))
-    supervisor.trip("NaN in the estimate", tick=1, t_ns=1)
+    supervisor.trip(Finding.NOT_A_NUMBER, "NaN in the estimate", tick=1, t_ns=1)
     assert supervisor.step()
     supervisor.begin_self_test()
     supervisor.arm()
@@ -94,7 +95,7 @@ def test_no_way_back():
 
 def test_a_refused_step_is_tried_again_within_its_tick():
     supervisor = running(FakeAmplifier(ticks=5, failing=4))
-    supervisor.trip("link lost", tick=1, t_ns=1)
+    supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)
     # three refusals take the first tick, the fourth costs the second one nothing
     assert [supervisor.step() for _ in range(6)] == [False] * 5 + [True]
     assert supervisor.safe_reached
@@ -102,7 +103,7 @@ def test_a_refused_step_is_tried_again_within_its_tick():
 
 def test_a_dead_bus_ends_in_a_report_not_in_a_loop():
     supervisor = running(FakeAmplifier(failing=10_000))
-    supervisor.trip("link lost", tick=1, t_ns=1)
+    supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)
     assert [supervisor.step() for _ in range(2 * RAMP_TICKS)] == [False] * (2 * RAMP_TICKS - 1) + [True]
     assert not supervisor.safe_reached
     assert "0x0c not acknowledged" in supervisor.ramp_failure
@@ -110,7 +111,7 @@ def test_a_dead_bus_ends_in_a_report_not_in_a_loop():
 
 def test_an_amplifier_that_never_says_neutral_is_given_up_and_told_of():
     supervisor = running(FakeAmplifier(ticks=10_000))
-    supervisor.trip("link lost", tick=1, t_ns=1)
+    supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)
     assert [supervisor.step() for _ in range(2 * RAMP_TICKS)] == [False] * (2 * RAMP_TICKS - 1) + [True]
     assert supervisor.safe_reached is False
     assert supervisor.ramp_failure == "the amplifier did not report neutral in time"
@@ -118,7 +119,7 @@ def test_an_amplifier_that_never_says_neutral_is_given_up_and_told_of():
 
 def test_neutral_after_a_refusal_leaves_no_failure_in_the_report():
     supervisor = running(FakeAmplifier(ticks=1, failing=2))
-    supervisor.trip("link lost", tick=1, t_ns=1)
+    supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)
     assert supervisor.step()
     assert supervisor.ramp_failure == ""
 
@@ -127,18 +128,19 @@ def test_no_ramp_before_a_trip_nor_after_neutral():
     amplifier = FakeAmplifier(ticks=1)
     supervisor = running(amplifier)
     assert not supervisor.step()
-    supervisor.trip(FINISHED, tick=1, t_ns=1, normal=True)
+    supervisor.trip(Finding.FINISHED, "run finished", tick=1, t_ns=1)
     assert supervisor.step()
     assert supervisor.step()
     assert amplifier.ticks == 0
-    assert supervisor.trip_cause == Trip(FINISHED, 1, 1, normal=True)
+    assert supervisor.trip_cause == Trip(Finding.FINISHED, "run finished", 1, 1, CauseClass.OPERATOR)
+    assert supervisor.trip_cause.normal
 
 
 def test_only_the_planned_end_waits_for_scans():
     asked, planned = running(FakeAmplifier()), running(FakeAmplifier())
     assert not asked.must_not_wait
-    asked.trip("stop button", tick=1, t_ns=1)
-    planned.trip(FINISHED, tick=1, t_ns=1, normal=True)
+    asked.trip(Finding.BUTTON_PRESSED, "stop button", tick=1, t_ns=1)
+    planned.trip(Finding.FINISHED, "run finished", tick=1, t_ns=1)
     assert asked.must_not_wait
     assert not planned.must_not_wait
 
@@ -164,3 +166,79 @@ def test_warnings_are_counted_and_end_nothing():
         supervisor.warn(what)
     assert supervisor.warnings == {"jerk": 1, "drift": 0, "field": 2}
     assert supervisor.may_move
+
+
+def held(amplifier: FakeAmplifier) -> Supervisor:
+    supervisor = running(amplifier)
+    supervisor.hold(Finding.SCANS_MISSING, "daq: silent", tick=5, t_ns=5)
+    return supervisor
+
+
+def test_a_hold_ramps_as_a_trip_does_and_can_resume():
+    amplifier = FakeAmplifier()
+    supervisor = held(amplifier)
+    assert supervisor.is_holding
+    assert not supervisor.may_move
+    assert not supervisor.must_not_wait
+    assert [supervisor.step() for _ in range(RAMP_TICKS)] == [False] * RAMP_TICKS
+    assert supervisor.state is State.HOLD
+    assert not supervisor.safe_reached
+    supervisor.resume()
+    assert supervisor.may_move
+    assert amplifier.armed
+
+
+def test_nothing_resumes_on_the_way_to_neutral_or_after_a_trip():
+    supervisor = held(FakeAmplifier())
+    supervisor.step()
+    supervisor.resume()
+    assert not supervisor.may_move
+    supervisor.trip(Finding.BUTTON_PRESSED, "stop button", tick=7, t_ns=7)
+    while not supervisor.step():
+        supervisor.resume()
+    supervisor.resume()
+    assert supervisor.state is State.SAFE
+    assert supervisor.holds[0].end_ns == 7
+
+
+def test_a_trip_within_the_ramp_of_a_hold_does_not_begin_its_time_anew():
+    supervisor = held(FakeAmplifier(failing=10_000))
+    for _ in range(RAMP_TICKS):
+        assert not supervisor.step()
+    supervisor.trip(Finding.BUTTON_PRESSED, "stop button", tick=7, t_ns=7)
+    assert [supervisor.step() for _ in range(RAMP_TICKS)] == [False] * (RAMP_TICKS - 1) + [True]
+    assert not supervisor.safe_reached
+
+
+def test_a_hold_that_does_not_reach_neutral_is_none():
+    supervisor = held(FakeAmplifier(failing=10_000))
+    assert [supervisor.step() for _ in range(2 * RAMP_TICKS)] == [False] * (2 * RAMP_TICKS - 1) + [True]
+    assert supervisor.state is State.SAFE
+    assert not supervisor.safe_reached
+    cause = supervisor.trip_cause
+    assert cause == Trip(Finding.NEUTRAL_NOT_REACHED, "daq: silent", 5, 5, CauseClass.LINK)
+    assert "0x0c not acknowledged" in supervisor.ramp_failure
+
+
+def test_only_what_runs_is_held():
+    supervisor = Supervisor(FakeAmplifier())
+    supervisor.begin_self_test()
+    supervisor.hold(Finding.SCANS_MISSING, "daq: silent", tick=5, t_ns=5)
+    assert supervisor.state is State.SELF_TEST
+    assert supervisor.holds == []
+
+
+def test_an_amplifier_that_cannot_be_armed_again_leaves_the_hold():
+    amplifier = FakeAmplifier(ticks=1)
+    supervisor = held(amplifier)
+    supervisor.step()
+    amplifier.self_test = False
+    with pytest.raises(SafetyTrip):
+        supervisor.resume()
+    assert supervisor.state is State.HOLD
+
+
+def test_states_have_words_for_people():
+    assert [state.words for state in (State.RUNNING, State.HOLD_RAMP, State.HOLD, State.SAFE_RAMP)] == [
+        "running", "hold", "hold", "safe ramp",
+    ]  # fmt: skip

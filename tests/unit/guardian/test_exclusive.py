@@ -78,10 +78,10 @@ class Stand:
 
     def run(self, ticks: int, wish_V: Callable[[int], np.ndarray] = lambda k: FAR_V) -> str:
         """Ticks of the firmware: commands, and after a refusal its way to the safe state. The refusal, or empty."""
-        refusal = ""
+        refusal, at_neutral = "", False
         for k in range(ticks):
             if refusal:
-                self.amplifier.safe_step()
+                at_neutral = at_neutral or self.amplifier.safe_step()
             else:
                 try:
                     self.amplifier.write(wish_V(k))
@@ -109,20 +109,85 @@ def test_nobody_moves_the_outputs_beside_the_guardian(stall_ms: float, phase_us:
     at_ns = (stand.clock.now_ns() // STEP_NS + 3) * STEP_NS + phase_us * 1000
     stand.clock.at(at_ns, lambda _: stand.clock.burn_ns(round(stall_ms * MS)))
     refusal = stand.run(130, alternating)
-    taken_ns = stand.heart.taken_ns
+    report = stand.guardian.report()
+    taken_ns = report["taken_ns"]
     if not taken_ns:  # too short: the firmware has gone on as if nothing had been
         assert not refusal
         assert stall_ms <= LEASE_MS
         return
     assert "lost the outputs to the guardian" in refusal
     assert max(stand.commands_of("firmware")) < taken_ns
-    assert stand.heart.why is Why.SILENT
+    assert report["why"] == "silent"
     assert stand.guardian.exclusive
     assert stand.volts() == pytest.approx([50.0] * 3)
     for channel in range(3):
         ramp = np.array([v for t_ns, c, v in stand.path if c == channel and t_ns > taken_ns])
         assert np.all(np.diff(np.abs(ramp - 50.0)) <= 1e-9)  # nothing but nearer and nearer
         assert np.abs(np.diff(ramp)).max() <= 20.0
+
+
+@pytest.mark.parametrize("phase_us", [0, 180, 371, 600, 990])
+@pytest.mark.parametrize("stall_ms", [40.4, 41.0, 45.0, 70.0, 500.0])
+def test_outputs_come_back_in_a_handshake_three_times(stall_ms: float, phase_us: int):
+    """Between the guardian's taking and the firmware's arming nobody but the guardian commands; then only the
+    firmware does."""
+    stand = Stand()
+    for _ in range(3):
+        stand.run(5, alternating)
+        began_ns = stand.clock.now_ns()
+        at_ns = (began_ns // STEP_NS + 3) * STEP_NS + phase_us * 1000
+        stand.clock.at(at_ns, lambda _: stand.clock.burn_ns(round(stall_ms * MS)))
+        assert "lost the outputs to the guardian" in stand.run(130, alternating)
+        assert not stand.heart.taken_ns, "it gives them back 50 ms after neutral"
+        report = stand.guardian.report()
+        stand.amplifier.arm()
+        armed_ns = stand.clock.now_ns()
+        assert all(not report["taken_ns"] <= t_ns < armed_ns - 3 * MS for t_ns in stand.commands_of("firmware"))
+        assert not stand.run(20, alternating)
+        assert max(stand.commands_of("guardian")) < armed_ns
+        assert stand.guardian.state is State.WATCHING
+        ramp = [v for t_ns, channel, v in stand.path if channel == 0 and report["taken_ns"] < t_ns <= armed_ns]
+        assert np.all(np.diff(np.abs(np.array(ramp) - 50.0)) <= 1e-9)
+
+
+def test_outputs_that_are_wanted_at_once_are_waited_for():
+    stand = Stand()
+    stand.run(5, alternating)
+    stand.clock.burn_ns(50 * MS)
+    assert stand.run(25, alternating)
+    report = stand.guardian.report()
+    assert stand.heart.taken_ns
+    stand.amplifier.arm()
+    assert stand.clock.now_ns() - report["neutral_ns"] > 50 * MS
+    assert not stand.run(5, alternating)
+
+
+def test_a_firmware_that_dies_after_it_got_its_outputs_back_is_brought_to_neutral():
+    stand = Stand()
+    stand.run(5, alternating)
+    stand.clock.burn_ns(50 * MS)
+    assert stand.run(130, alternating)
+    stand.amplifier.arm()
+    assert not stand.run(5, alternating)
+    stand.alive = False
+    for _ in range(30):
+        stand.tick()
+    assert stand.guardian.report()["why"] == "died"
+    assert stand.volts() == pytest.approx([50.0] * 3)
+
+
+def test_a_guardian_that_keeps_the_outputs_or_had_to_be_ended_ends_the_run():
+    stand = Stand(guardian_steps=False)
+    stand.run(5)
+    stand.heart.take(Why.SILENT, stand.clock.now_ns())
+    with pytest.raises(SafetyTrip, match="does not give the outputs back"):
+        stand.amplifier.arm()
+    stand = Stand(guardian_steps=False)
+    stand.run(5)
+    stand.clock.burn_ns(50 * MS)
+    assert stand.run(42)
+    with pytest.raises(SafetyTrip, match="had to be ended"):
+        stand.amplifier.arm()
 
 
 def test_a_command_that_stands_before_the_wire_ends_the_firmware_before_the_guardian_moves():

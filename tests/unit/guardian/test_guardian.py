@@ -107,6 +107,9 @@ def test_a_pause_is_noticed_and_a_long_one_taken_over_and_the_firmware_gives_in(
     assert stand.volts() == pytest.approx([50.0] * 3)
     for _ in range(60):
         stand.tick()
+    assert stand.guardian.state is State.WATCHING  # given back
+    assert stand.guardian.report()["why"] == "silent"
+    stand.tick(alive=False)
     assert stand.guardian.state is State.DONE
 
 
