@@ -144,7 +144,9 @@ def _effect(where: str, entry: Any) -> PlacedEffect:
     family = EFFECTS[entry["name"]]
     try:
         settings = {str(k): tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
-        forms = [(e, e.parts(settings)) for e in (family, *family.variants) if e.kind != "feedback"]
+        family_forms = [e for e in (family, *family.variants) if e.kind != "feedback"]
+        said = [e for e in family_forms if e.equation == entry.get("equation")]
+        forms = [(e, e.parts(settings)) for e in said or family_forms]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise BenchError(f"{where}: settings do not fit {family.name} ({error!r})") from error
     for effect, parts in forms:

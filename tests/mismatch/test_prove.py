@@ -11,11 +11,10 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from tools.mismatch.prove import draw, page, prove, real, seal
+from tools.mismatch.prove import draw, page, prove, seal
 from tools.mismatch.prove.nulls import clopper_pearson, document, kept, nulls
 from tools.mismatch.prove.score import coverage, score
 from tools.mismatch.prove.table import failures, show
-from tools.mismatch.recording_load import load
 
 QUIET = {"max_samples": 2500, "progress": lambda text: None}
 
@@ -182,22 +181,6 @@ def test_a_page_of_null_runs_keeps_what_it_said_of_earlier_states() -> None:
 def test_sealed_answers_come_back(tmp_path: Path) -> None:
     digest = seal.close({"r0": {"kind": "agrees"}}, tmp_path)
     assert seal.opened(tmp_path, digest) == {"r0": {"kind": "agrees"}}
-
-
-def test_real_sets_carry_their_official_split(tmp_path: Path) -> None:
-    """Joined descriptors load, the split points at the test part, and the page and rows are made."""
-    if not real.DATA.is_dir():
-        pytest.skip(f"{real.DATA}: measured recordings are not here")
-    piezo = next(s for s in real.SETS if s.name.startswith("piezo"))
-    rec = load(real.joined(piezo, real.DATA, tmp_path))
-    assert rec.n == 8027 + 14155
-    assert rec.split.fit == (0, 8027)
-    assert rec.split.test == (8027, 22182)
-    rows = real.run(only=["coupled"], diagnose=silent, say=lambda text: None)
-    assert [r.real.name for r in rows] == ["coupled_electric_drives low", "coupled_electric_drives high"]
-    body = real.rows_json(rows, 1.0)
-    assert {r["meets"] for r in body["rows"]} == {False}
-    assert "| coupled_electric_drives low | V |" in real.document(rows)
 
 
 @pytest.mark.slow

@@ -234,7 +234,7 @@ def real(
         Path | None, typer.Option(metavar="FOLDER", help="The measured recordings; default: beside the project.")
     ] = None,
     only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only sets whose name has this in it.")] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, hidden=True)] = None,
 ) -> None:
     """Measured recordings with published figures: what the naive twin lacks, and the error on the official split.
 
@@ -242,13 +242,14 @@ def real(
     """
     with _clear_errors():
         _check_targets(json_file, doc)
-        from tools.mismatch.prove.real import DATA, reproduce
+        from tools.reproduce.measured import table
 
-        try:
-            result = reproduce(data or DATA, only=only or (), jobs=jobs or os.cpu_count() or 1, doc=doc)
-        except FileNotFoundError as error:
-            raise InputError(str(error)) from error
-        console().print(f"page: {doc}")
+        if data is not None:
+            os.environ["MICRON_DATA"] = str(data)
+        done = table(tuple(only or ()))
+        write_text_atomic(doc, done.page)
+        console().print(f"page: {doc}; the same: micron reproduce measured --out {doc}")
+        result = done.as_dict()
         write_json(result, json_file)
 
 
@@ -279,7 +280,9 @@ def cut(
 def apply(
     recording: RecordingArgument,
     report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],
-    out: Annotated[Path, typer.Option("--out", metavar="TWIN.toml", help="The corrected twin.")],
+    out: Annotated[
+        Path, typer.Option("--out", metavar="FILE", help="The corrected twin: .toml, .py, .fmu, or .csv for columns.")
+    ],
     bench: Annotated[
         Path | None, typer.Option(metavar="BENCH.toml", help="Put a piezo_stack twin on this emulated bench, too.")
     ] = None,
@@ -289,12 +292,20 @@ def apply(
 ) -> None:
     """Write the corrected twin: base parameters re-fitted beside the effects, and the effects themselves.
 
-    A recording refers to it by file = "TWIN.toml" in its twin table, a bench by twin = "TWIN.toml" in emulation.
-    Example: micron mismatch apply rec rec.json --out twin.toml --bench benches/micron.toml
+    The ending says the form: .toml is taken by recordings (file = "TWIN.toml" in the twin table) and benches
+    (twin = "TWIN.toml" in emulation); .py needs numpy alone; .fmu is an FMI 2.0 co-simulation; .csv holds the
+    simulated columns. 'micron mismatch simulate' runs the first three again.
+
+    Example: micron mismatch apply rec rec.json --out twin.py
     """
     with _clear_errors():
         if bench_out is not None and bench is None:
             raise InputError("--bench-out names a copy of a bench; name the bench with --bench")
+        from tools.mismatch.export.write import check_format, write_twin
+
+        check_format(out)
+        if bench is not None and out.suffix.lower() != ".toml":
+            raise InputError(f"--bench takes a twin file; name one that ends in .toml with --out, not {out.name}")
         copy = bench_out or out.with_name("bench.toml")
         _check_targets(out, *([] if bench is None else [copy]))
         original = None
@@ -306,10 +317,11 @@ def apply(
                 raise InputError(f"{copy}: is the bench itself; name another file with --bench-out")
         from tools.mismatch.apply import corrected_twin
 
-        twin = corrected_twin(recording, _report(report))
+        body = _report(report)
+        twin = corrected_twin(recording, body)
         if original is not None and twin.kind != "piezo_stack":
             raise InputError(f"{bench}: an emulated bench runs twins of piezo_stack, this one is a {twin.kind}")
-        write_text_atomic(out, twin.text)
+        write_twin(twin, body, out)
         for note in twin.notes:
             console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
         carried = ", ".join(twin.effects) or "no effects"
@@ -319,6 +331,34 @@ def apply(
 
             with_twin(original, out, copy)
             console().print(f"{copy}: {original.path} with it; try: micron run --bench {copy}", soft_wrap=True)
+
+
+@app.command()
+def simulate(
+    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="What apply wrote: .toml, .py or .fmu.")],
+    recording: RecordingArgument,
+    out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Run a corrected twin freely over a whole recording and print how far it is from what was recorded.
+
+    Example: micron mismatch simulate twin.py rec --out simulated.csv
+    """
+    with _clear_errors():
+        _check_targets(out, json_file)
+        from tools.mismatch.export.run import Residual, residuals, simulate_file
+        from tools.mismatch.export.write import columns
+        from tools.mismatch.recording_load import load
+
+        loaded = load(recording)
+        found = simulate_file(twin, recording)
+        rows: list[Residual] = residuals(loaded, found)
+        if out is not None:
+            write_text_atomic(out, columns(loaded, found))
+        say = console() if json_file == "-" else data_console()
+        for row in rows:
+            say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}", highlight=False)
+        write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
 
 
 def _report(path: Path) -> dict[str, Any]:

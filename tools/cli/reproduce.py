@@ -20,12 +20,20 @@ def reproduce(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="sensing, real-sensors, ... or all.")],
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the tables as a page (Markdown).")] = None,
     json_file: JsonOption = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="NAME", help="Of measured: only sets with this in their name.")
+    ] = None,
+    rows: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Of measured: keeps each set that is done, goes on there.")
+    ] = None,
 ) -> None:
     """Compute published figures again and print them beside ours.
 
     Example: micron reproduce sensing --json out/sensing.json
 
     A page: micron reproduce sensing real-sensors --out docs/sensing-tables.md
+
+    Measured recordings, set by set: micron reproduce measured --set emps --rows out/measured.json
     """
     from tools.reproduce.names import check, expand, reproduce_table
     from tools.reproduce.page import markdown
@@ -75,12 +83,17 @@ def reproduce(
 
     with clear_errors():
         check_writable(json_file, out)
+        wanted = expand(names)
+        options = {"only": tuple(sets or ()), "rows_file": rows} if sets or rows else {}
+        if options and wanted != ["measured"]:
+            raise InputError("--set and --rows belong to 'micron reproduce measured' alone")
         tables: list[Table] = []
-        for name in ready(expand(names)):
-            tables.append(reproduce_table(name))
+        for name in ready(wanted):
+            tables.append(reproduce_table(name, **options))
             show(tables[-1])
         if out is not None:
             command = f"micron reproduce {' '.join(names)} --out {out}"
-            write_text_atomic(out, markdown(tables, command, revision_and_day()))
+            text = tables[0].page if len(tables) == 1 and tables[0].page else ""
+            write_text_atomic(out, text or markdown(tables, command, revision_and_day()))
         results = [table.as_dict() for table in tables]
         write_json(results[0] if len(results) == 1 else {"format": 1, "tables": results}, json_file)

@@ -26,12 +26,18 @@ EVENTS = ("spikes", "step_shift", "random_walk", "dropped_samples")
 
 @dataclass(frozen=True)
 class Corrected:
-    """``text`` of the twin file, its ``effects`` in order, ``notes`` on what was left out and why."""
+    """``text`` of the twin file, its ``effects`` in order, ``notes`` on what was left out and why.
+
+    ``recording`` with the corrected base, ``model`` with the effects placed in it and ``theta``, its parameters.
+    """
 
     kind: str
     text: str
     effects: tuple[str, ...]
     notes: tuple[str, ...]
+    recording: Recording
+    model: Model
+    theta: np.ndarray
 
 
 def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
@@ -62,6 +68,9 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
         f"{head}\nformat = 1\n\n{twin_toml(table)}",
         tuple(str(e["name"]) for e in table["effects"]),
         tuple(notes),
+        with_effects,
+        model,
+        theta,
     )
 
 
@@ -97,8 +106,8 @@ def _belongs(recording: Recording, report: Mapping[str, Any], found: Sequence[Ma
 
 
 def _entry(p: Mapping[str, Any]) -> dict[str, Any]:
-    keys = ("name", "site", "target", "stage", "outputs", "settings")
-    return {**{k: p[k] for k in keys}, "parameters": p["raw"]}
+    keys = ("name", "equation", "site", "target", "stage", "outputs", "settings")
+    return {**{k: p[k] for k in keys if k in p}, "parameters": p["raw"]}
 
 
 def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, theta: np.ndarray) -> np.ndarray:

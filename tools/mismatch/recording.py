@@ -60,6 +60,12 @@ class Recording:
     split: Split
     declared_step: Mapping[str, float] = field(default_factory=dict[str, float])
     warnings: tuple[str, ...] = ()
+    declared_unit: Mapping[str, str] = field(default_factory=dict[str, str])
+
+    @property
+    def file_unit(self) -> dict[str, str]:
+        """The unit of each signal in the data file."""
+        return {**self.unit, **self.declared_unit}
 
     @property
     def n(self) -> int:

@@ -120,6 +120,7 @@ def load(path: Path | str) -> Recording:
             if c.role == "output"
         },
         unit={c.signal: c.to for c in channels},
+        declared_unit={c.signal: c.unit for c in channels},
         column={c.signal: c.column for c in channels},
         twin=twin,
         split=_split(path, text.get("split"), n),
@@ -173,6 +174,14 @@ def _twin_table(path: Path, value: object) -> object:
     if not isinstance(table, Mapping):
         raise RecordingError(f"{other}: no [twin] table; write one with 'micron mismatch apply'")
     return table
+
+
+def load_twin(path: Path) -> TwinText:
+    """The ``[twin]`` table of a twin file. RecordingError says what is wrong with it."""
+    table = _toml(path).get("twin")
+    if not isinstance(table, Mapping):
+        raise RecordingError(f"{path}: no [twin] table; write one with 'micron mismatch apply'")
+    return _twin(str(path), table)[0]
 
 
 def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:

@@ -26,6 +26,7 @@ def describe(model: Model, theta: Array) -> dict[str, Any]:
         effects.append(
             {
                 "name": pl.effect.name,
+                "equation": pl.effect.equation,
                 "site": pl.site,
                 "target": pl.target,
                 "stage": pl.stage,
@@ -80,7 +81,7 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
         settings = {k: tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
     except (TypeError, ValueError):
         raise RecordingError(f"{where}: settings must be lists of numbers") from None
-    effect = _variant(where, effect, site, settings, given)
+    effect = _variant(where, effect, site, settings, given, entry.get("equation"))
     pl = Placed(effect, site, target, cast(Stage, stage), tuple(outputs), settings)
     names = [p.name for p in (*pl.parts.nonlinear, *pl.parts.weights)]
     missing = [n for n in names if not _finite(given.get(n))]
@@ -89,13 +90,18 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
     return pl, np.array([float(given[n]) for n in names])
 
 
-def _variant(where: str, effect: Effect, site: object, settings: Settings, given: Mapping[str, Any]) -> Effect:
-    """The form of an effect that sits at ``site`` and has these parameters."""
+def _variant(
+    where: str, effect: Effect, site: object, settings: Settings, given: Mapping[str, Any], equation: object
+) -> Effect:
+    """The form of an effect: the one with this ``equation``; in files that do not say it, the one at ``site`` that has
+    these parameters.
+    """
     if site not in ("input", "output", "feedback"):
         raise RecordingError(f"{where}: site must be input, output or feedback, got {site!r}")
     forms = [e for e in (effect, *effect.variants) if (e.kind == "feedback") == (site == "feedback")]
     if not forms:
         raise RecordingError(f"{where}: {effect.name} cannot sit at '{site}'")
+    forms = [e for e in forms if e.equation == equation] or forms
     try:
         parts = [e.parts(settings) for e in forms]
     except (KeyError, IndexError, ValueError) as error:

@@ -13,13 +13,16 @@ MODULES: dict[str, str] = {
     "endoscope": "tools.reproduce.endoscope",
     "tremor": "tools.reproduce.tremor",
     "actuation": "tools.reproduce.actuation",
+    "measured": "tools.reproduce.measured",
 }
+OLD_NAMES = {"mismatch-real": "measured"}
 
 
 def expand(names: list[str]) -> list[str]:
     """``all`` is every name, in order; ``InputError`` for one that is not there."""
     if "all" in names:
         return list(MODULES)
+    names = [OLD_NAMES.get(name, name) for name in names]
     for name in names:
         if name not in MODULES:
             raise InputError(f"'{name}' is no table; there are: {', '.join(MODULES)}, all")
@@ -33,6 +36,6 @@ def check(name: str) -> None:
         ready()
 
 
-def reproduce_table(name: str) -> Table:
-    """Compute one table: calls ``table()`` of its module."""
-    return import_module(MODULES[name]).table()
+def reproduce_table(name: str, **options: object) -> Table:
+    """Compute one table: calls ``table()`` of its module with the options that it alone has."""
+    return import_module(MODULES[name]).table(**options)

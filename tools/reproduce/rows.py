@@ -51,6 +51,8 @@ class Table:
     rows: tuple[Row, ...]
     seconds: float
     notes: tuple[str, ...] = field(default=())
+    page: str = ""
+    """A page of the table's own, where it has one."""
 
     def as_dict(self) -> dict[str, Any]:
         return {

@@ -8,10 +8,11 @@ import numpy as np
 from scipy.signal import bilinear, lfilter
 
 from sim_devices.physics.effect import Array, Human, Parameter
+from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 
-_NAMES = ("mass", "damping", "stiffness", "offset_force", "hold")
+_NAMES = names(PARAMETERS["mechanical_axis"])
 
 
 def axis_twin(recording: Recording) -> DynamicTwin:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.head import ScaledOutputs
@@ -112,7 +113,7 @@ def cluster_twin(recording: Recording) -> ClusterTwin:
     text = recording.twin.parameters
     where = f"{recording.path}: [twin.parameters]"
     for key in text:
-        if key not in ("positions_m", "bias", "scale"):
+        if key not in names(PARAMETERS["accelerometer_cluster"]):
             raise RecordingError(f"{where} '{key}' is not a parameter of accelerometer_cluster; known: positions_m")
     given = text.get("positions_m", {})
     if not isinstance(given, Mapping):

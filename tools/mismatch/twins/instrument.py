@@ -26,6 +26,7 @@ from sim_devices.config import EmulationConfig, emulation_config
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
+from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.units import convert, same_dimension
@@ -113,7 +114,7 @@ def _world(recording: Recording) -> tuple[bool, float]:
     """Whether the bench's own hand moves the instrument, and how long its world had run at the first sample."""
     given = recording.twin.parameters
     where = f"{recording.path}: [twin.parameters]"
-    unknown = [k for k in given if k not in ("bench", "hand", "start_s")]
+    unknown = [k for k in given if k not in names(PARAMETERS["instrument"])]
     if unknown:
         raise RecordingError(f"{where} '{unknown[0]}' is not a parameter of instrument; known: bench, hand, start_s")
     hand, start_s = given.get("hand", "rest"), given.get("start_s", 0.0)

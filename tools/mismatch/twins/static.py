@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from tools.mismatch.keys import PARAMETERS, names
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
@@ -115,16 +116,16 @@ def static_twin(recording: Recording) -> StaticTwin:
             )
         drives[o] = drive
     text = recording.twin.parameters
-    known = {offset, scale}
+    known = names(PARAMETERS[kind])
     if text.get("hold", "linear") not in ("zero", "linear"):
         raise RecordingError(
             f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {text['hold']!r}"
         )
     for key in text:
         # at the samples, where it is compared, a twin without memory is the same for either hold
-        if key not in known and key != "hold":
+        if key not in known:
             raise RecordingError(
-                f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {sorted(known)}"
+                f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {', '.join(known)}"
             )
     given = tuple(
         (_one(recording, text.get(offset), offset, o, i), _one(recording, text.get(scale), scale, o, i))

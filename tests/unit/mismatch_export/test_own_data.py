@@ -1,0 +1,97 @@
+"""``docs/own-data.md``: made by its command, and what it tells a stranger to do works in an empty folder."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from tools.cli.main import app
+from tools.mismatch import keys
+from tools.mismatch.export.write import FORMATS
+from tools.mismatch.own_data import page
+from tools.mismatch.recording_load import load
+from tools.mismatch.twins.vocabulary import KINDS
+
+PAGE = Path(__file__).parents[3] / "docs" / "own-data.md"
+
+
+def blocks(kind: str) -> list[str]:
+    return re.findall(rf"^``` {{ \.{kind}[^\n]*\n(.*?)^```", page(), flags=re.S | re.M)
+
+
+def test_the_page_is_current() -> None:
+    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tools.mismatch.own_data"
+
+
+def test_every_key_and_every_kind_is_on_the_page() -> None:
+    text = page()
+    for kind in KINDS:
+        assert f"### `{kind}`" in text
+        assert keys.of_kind(kind)
+    for table in (*(t for _, t in keys.tables()), *map(keys.of_kind, KINDS)):
+        for key in table:
+            assert f"| `{key.name}` |" in text
+            assert key.help
+    for ending in FORMATS:
+        assert f"- `{ending}`: " in text
+
+
+def test_a_stranger_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The blocks of the page in their order: data, recording.toml, the commands, the module elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    make, again, elsewhere = blocks("python")
+    (toml,) = blocks("toml")
+    (commands,) = blocks("bash")
+    exec(make, {})
+    Path("recording.toml").write_text(toml)
+    for line in commands.strip().splitlines():
+        words = shlex.split(line)
+        assert words[0] == "micron"
+        result = CliRunner().invoke(app, words[1:])
+        assert result.exit_code == 0, (line, result.output)
+    report = json.loads(Path("report.json").read_text())
+    assert [p["name"] for p in report["physics"]] == ["coulomb_friction"]
+    space: dict[str, np.ndarray] = {}
+    exec(again, space)
+    done = subprocess.run(
+        [sys.executable, "-c", f"{elsewhere}\nnp.save('elsewhere.npy', [position_mm, heavier])"],
+        capture_output=True,
+        text=True,
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    position, heavier = np.load("elsewhere.npy")
+    recorded = load(".").outputs["position"] * 1e3
+    base = report["fit"]["base_rms"]["position"] * 1e3
+    for found in (space["position_mm"], position):
+        assert np.std(recorded - found) < 0.2 * base
+    assert np.std(heavier - position) > 0.1 * base
+    table = np.genfromtxt("simulated.csv", delimiter=",", names=True)
+    assert table.dtype.names == ("t_s", "force_N", "x_mm", "x_mm_simulated")
+    np.testing.assert_allclose(table["x_mm_simulated"], position, atol=1e-9)
+
+
+def test_only_the_keys_of_the_tables_are_known(tmp_path: Path) -> None:
+    (tmp_path / "data.csv").write_text("u,z\n" + "\n".join(f"{k % 7},{k % 5}" for k in range(60)))
+    (tmp_path / "recording.toml").write_text(
+        'format = 1\ndata = "data.csv"\nrate_hz = 1.0\nplace = "lab"\n[twin]\nkind = "piezo_stack"\n'
+        '[[channels]]\ncolumn = "u"\nrole = "input"\nsignal = "command"\n'
+        '[[channels]]\ncolumn = "z"\nrole = "output"\nsignal = "displacement"\ncolour = "red"\n'
+    )
+    notes = load(tmp_path).warnings
+    assert "key 'place' is unknown and not used" in notes
+    assert "[[channels]] 2: key 'colour' is unknown and not used" in notes
+
+
+def test_a_key_that_nobody_described_is_listed() -> None:
+    """What a parser knows is on the page, whether or not somebody has written a line about it."""
+    found = keys.listed((keys.Key("a", "number", "the first"), keys.Key("gone", "number", "was dropped")), {"a", "new"})
+    assert [k.name for k in found] == ["a", "new"]

@@ -1,0 +1,489 @@
+"""Each effect of the vocabulary as lines of numpy: what an exported twin sets up once, and what it adds to a signal."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from itertools import groupby
+
+import numpy as np
+
+from sim_devices.physics import hysteresis, rate_hysteresis
+from sim_devices.physics.axes import vector_of
+from sim_devices.physics.effect import Array
+from tools.errors import InputError
+from tools.mismatch.placed import Placed
+
+PER_FORCE = {
+    "{out}/s^2": "{in}",
+    "1/s": "{in} s/{out}",
+    "1/s^2": "{in}/{out}",
+    "{out}/s^2/{out}": "{in}/{out}",
+    "1/({out} s^2)": "{in}/{out}^2",
+    "1/({out}^2 s^2)": "{in}/{out}^3",
+    "1/({out}^4 s^2)": "{in}/{out}^5",
+    "1/{out}": "{in} s^2/{out}^2",
+    "1/({out}^2 s)": "{in} s/{out}^3",
+}
+"""Units of a force's weights per unit of mass, and as a force."""
+
+
+@dataclass
+class Writer:
+    """The lines of an exported twin while they are collected. ``parameters``: value and unit under each key;
+    ``setup``: what is done once, ``run``: what is done with samples; ``used``: functions of ``parts``.
+    """
+
+    dt: float
+    samples: int
+    signals: Mapping[str, Array]
+    parameters: dict[str, tuple[object, str]] = field(default_factory=dict[str, tuple[object, str]])
+    setup: list[str] = field(default_factory=list[str])
+    run: list[str] = field(default_factory=list[str])
+    used: set[str] = field(default_factory=set[str])
+
+    def part(self, name: str, arguments: str, call: str) -> str:
+        """Set up function ``name`` of ``parts`` under a new local name; returns that name."""
+        self.used.add(name)
+        local = call
+        while any(line.startswith(f"{local} = ") for line in self.setup):
+            local += "_"
+        self.setup.append(f"{local} = {name}({arguments})")
+        return local
+
+
+@dataclass
+class Slot:
+    """One placed effect: ``at(name)`` is the code of a parameter, ``group(stem)`` that of a list of them."""
+
+    writer: Writer
+    placed: Placed
+    label: str
+    values: Mapping[str, float]
+    output: str
+
+    def __post_init__(self) -> None:
+        self.place: dict[str, str] = {}
+        units = {p.name: p.unit for p in (*self.placed.parts.nonlinear, *self.placed.parts.weights)}
+        numbered = re.compile(r"(.*?\D)_?(\d+)$")
+
+        def stem(name: str) -> str:
+            m = numbered.fullmatch(name)
+            return m[1].rstrip("_") if m else ""
+
+        for s, run in groupby(self.values, stem):
+            names = list(run)
+            if s and len(names) > 1:
+                self._put(s, [self.values[n] for n in names], units[names[0]])
+                self.place |= {n: f'p["{self.label}.{s}"][{i}]' for i, n in enumerate(names)}
+                continue
+            for n in names:
+                self._put(n, self.values[n], units[n])
+                self.place[n] = f'p["{self.label}.{n}"]'
+
+    def _put(self, name: str, value: object, unit: str) -> None:
+        self.writer.parameters[f"{self.label}.{name}"] = (value, unit)
+
+    def at(self, name: str) -> str:
+        """Code of one parameter."""
+        return self.place[name]
+
+    def group(self, *stems: str) -> str:
+        """Code of the weights of several lists, one after the other."""
+        every = [f'p["{self.label}.{s}"]' for s in stems]
+        return every[0] if len(every) == 1 else f"np.concatenate([{', '.join(every)}])"
+
+    def setting(self, name: str) -> float:
+        """First number of a setting."""
+        return self.placed.settings[name][0]
+
+    def part(self, name: str, arguments: str) -> str:
+        """See Writer: named after the effect."""
+        return self.writer.part(name, arguments, re.sub(r"\W", "_", self.label))
+
+
+def numbers(values: object) -> str:
+    """Code of numbers (any nesting), exact."""
+    a = np.asarray(values, np.float64)
+    if a.ndim == 0:
+        return repr(float(a))
+    return "[" + ", ".join(numbers(v) for v in a) + "]"
+
+
+Expression = Callable[[Slot, str, str], str]
+"""(slot, signal, driver) -> the changed signal, as code."""
+
+
+def _lag(s: Slot, x: str, d: str) -> str:
+    return f"{s.part('low_pass', s.at('time_constant_s') + ', dt')}({x})"
+
+
+def _ac(s: Slot, x: str, d: str) -> str:
+    if "period_by_2pi_s" in s.values:
+        period, damping = s.at("period_by_2pi_s"), s.at("damping_ratio")
+        slow = s.part("mode", f"1 / (2 * np.pi * {period}), {damping}, dt, settled={s.at('settled_share')}")
+        return f"{x} - np.array([1, 2 * {damping}]) @ {slow}({x})"
+    slow = s.part("low_pass", f"{s.at('time_constant_s')}, dt, settled={s.at('settled_share')}")
+    return f"{x} - {slow}({x})"
+
+
+def _resonance(s: Slot, x: str, d: str) -> str:
+    mode = s.part("mode", f"{s.at('frequency_Hz')}, {s.at('damping_ratio')}, dt")
+    weights = f"np.array([{s.at('share')}, {s.at('rate_share')}])"
+    return f"(1 - {s.at('share')}) * {x} + {weights} @ {mode}({x})"
+
+
+def _delay(s: Slot, x: str, d: str) -> str:
+    cubic = "delay_s" in s.values
+    late = s.at("delay_s" if cubic else "late_s")
+    return f"{s.part('resample', f'-{late} / dt, 1.0, 0.0, {cubic}')}({x})"
+
+
+def _skew(s: Slot, x: str, d: str) -> str:
+    if "skew_at_begin_ppm" in s.values:
+        bend = f"0.5e-6 * {s.at('skew_change_ppm')} / {s.writer.samples}"
+        begin = s.at("skew_at_begin_ppm")
+        return f"{s.part('resample', f'0.0, 1 + 1e-6 * {begin}, {bend}, True')}({x})"
+    cubic = "skew_ppm" in s.values
+    skew = s.at("skew_ppm" if cubic else "apart_ppm")
+    return f"{s.part('resample', f'0.0, 1 + 1e-6 * {skew}, 0.0, {cubic}')}({x})"
+
+
+def _slew(s: Slot, x: str, d: str) -> str:
+    if "asymptotic_rate" in s.values:
+        rate = s.at("asymptotic_rate")
+        lag = s.at("small_signal_s")
+        return f"{s.part('slew', f'{rate}, {rate}, {lag}, dt, rounded=True')}({x})"
+    up, down = ("rate", "rate") if "rate" in s.values else ("rate_up", "rate_down")
+    arguments = ", ".join(s.at(n) for n in (up, down, "time_constant_s"))
+    return f"{s.part('slew', arguments + ', dt')}({x})"
+
+
+def _saturation(s: Slot, x: str, d: str) -> str:
+    s.writer.used.add("limit")
+    lo, hi = sorted(("lower_limit", "upper_limit"), key=lambda n: s.values[n])
+    return f"limit({x}, {s.at(lo)}, {s.at(hi)}, {s.at('corner')})"
+
+
+def _quantization(s: Slot, x: str, d: str) -> str:
+    if s.setting("step") <= 0:
+        return x
+    s.writer.used.add("rounded")
+    return f"rounded({x}, {numbers(s.setting('step'))}, {numbers(s.setting('origin'))}, {s.at('dither_rms')})"
+
+
+def _elements(s: Slot, d: str) -> str:
+    """Code of the columns of a hysteresis, (n, elements)."""
+    settings = s.placed.settings
+    lo, hi = settings["range"]
+    half, rest = 0.5 * (hi - lo), numbers(settings["rest"][0])
+    form = hysteresis.FORMS[int(settings.get("form", (0.0,))[0])]
+    wide = settings.get("wide", (0.0,))[0] > 0
+    radii = [*hysteresis.thresholds(half, hysteresis.N_PLAYS), *(f * half for f in hysteresis.WIDE if wide)]
+    smooth = half * np.geomspace(0.05, 4.0, hysteresis.N_DAHL)
+    before = hysteresis.way_before(settings)
+
+    def element(name: str, arguments: str) -> str:
+        local = s.part(name, arguments)
+        if before is not None:
+            s.writer.setup.append(f"{local}(np.array([{rest}, {numbers(before)}]))  # the way before the record")
+        return f"{local}({d})"
+
+    def plain() -> str:
+        return element("stops", f"{numbers(radii)}, {rest}")
+
+    def soft(radii: Array, skew: Array) -> str:
+        return element("dahl", f"np.array({numbers(radii)}), {numbers(skew)}, {rest}")
+
+    n = hysteresis.N_DAHL
+    match form:
+        case "stops":
+            return plain()
+        case "dahl":
+            return soft(smooth, np.zeros(n))
+        case "dahl_stops":
+            return f"np.hstack([{soft(smooth, np.zeros(n))}, {plain()}])"
+        case "dahl_skewed":
+            return soft(np.tile(smooth, 3), np.repeat([-0.6, 0.0, 0.6], n))
+        case "stops_bent":
+            z = f"np.clip(({d} - {numbers(0.5 * (lo + hi))}) / {numbers(half)}, -1.1, 1.1)[:, None]"
+            s.writer.used.add("bent")
+            return f"bent({plain()}, {z})"
+        case _:
+            return element("relays", f"{numbers(lo)}, {numbers(hi)}, {hysteresis.N_GRID}")
+
+
+def _hysteresis(s: Slot, x: str, d: str) -> str:
+    return f"{x} + {_elements(s, d)} @ {s.group('w')}"
+
+
+def _rate_hysteresis(s: Slot, x: str, d: str) -> str:
+    settings = s.placed.settings
+    lo, hi = settings["range"]
+    half, rest = 0.5 * (hi - lo), numbers(settings["rest"][0])
+    radii = hysteresis.thresholds(half, rate_hysteresis.N_PLAYS)
+    wide = half * np.geomspace(0.1, 3.0, rate_hysteresis.N_DAHL)
+    plays = s.part("stops", f"{numbers(radii)}, {rest}")
+    soft = s.part("dahl", f"np.array({numbers(wide)}), {numbers(np.zeros(wide.size))}, {rest}")
+    before = hysteresis.way_before(settings)
+    if before is not None:
+        way = f"np.array([{rest}, {numbers(before)}])"
+        s.writer.setup += [f"{plays}({way})  # the way before the record", f"{soft}({way})"]
+    lag = f"{s.at('time_constant_s')}, dt"
+    late, late_x, speed = s.part("low_pass", lag), s.part("low_pass", lag), s.part("slope", "dt")
+    s.writer.used.add("loop_with_speed")
+    usual = numbers(settings["usual_slope"][0])
+    columns = f"loop_with_speed({d}, np.hstack([{plays}({d}), {soft}({d})]), {speed}({d}) / {usual}, {late}, {late_x})"
+    keys = ", ".join(f'p["{s.label}.{n}"]' for n in ("w", "v", "l", "lag"))
+    weights = f"np.r_[{keys}]"
+    return f"{x} + {columns} @ {weights}"
+
+
+def _creep(s: Slot, x: str, d: str) -> str:
+    taus = numbers(s.placed.settings["time_constants_s"])
+    # every mode is a low-pass of its own that begins at rest
+    modes = s.part("low_pass", f"np.array({taus}), dt, rest={s.at('rest')}")
+    return f"{x} + {modes}({d}) @ {s.group('c')}"
+
+
+def _backlash(s: Slot, x: str, d: str) -> str:
+    play = s.part("stops", f"[{s.at('half_gap')}], {numbers(s.setting('rest'))}")
+    return f"{x} - {s.at('missing_slope')} * {play}({d})[:, 0]"
+
+
+def _dead_zone(s: Slot, x: str, d: str) -> str:
+    width = s.at("half_width")
+    return f"{x} - {s.at('missing_slope')} * np.clip({d} - {s.at('centre')}, -{width}, {width})"
+
+
+def _curve(s: Slot, x: str, d: str) -> str:
+    lo, hi = s.placed.settings["range"]
+    shape = int(s.placed.settings.get("shape", (3.0,))[0])
+    middle, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
+    z = f"({d} - {numbers(middle)}) / {numbers(half)}"
+    straight = f" + {s.at('slope')} * {z}" if "slope" in s.values else ""
+    if shape == 1:
+        return f"{x} + {s.at('sign_lost')} * (np.abs({d}) - {d}){straight}"
+    if shape > 1:
+        s.writer.used.add("legendre")
+        weights = s.group("legendre") if shape > 2 else f"[{s.at('legendre2')}]"
+        return f"{x} + legendre({d}, {numbers(lo)}, {numbers(hi)}, {shape}) @ {weights}{straight}"
+    knots = np.linspace(-1, 1, len([n for n in s.values if n.startswith("hinge")]) + 2)[1:-1]
+    if lo < 0 < hi:
+        knots[int(np.argmin(np.abs(knots + middle / half)))] = -middle / half
+    kinks = f"np.abs({d}[:, None] - np.array({numbers(middle + half * knots)})) / {numbers(half)}"
+    return f"{x} + {kinks} @ {s.group('hinge')}{straight}"
+
+
+def _warm_up(s: Slot, x: str, d: str) -> str:
+    if "rise" in s.values:
+        return f"{x} + {s.at('rise')} / (1 + np.exp(-(t - {s.at('middle_s')}) / {s.at('width_s')}))"
+    tau = s.at("time_constant_s")
+    fast = f" + {s.at('fast')} * np.exp(-t / ({tau} * {s.at('ratio')}))" if "fast" in s.values else ""
+    return f"{x} + {s.at('slow')} * np.exp(-t / {tau}){fast}"
+
+
+def _line(s: Slot, x: str, d: str) -> str:
+    knots = s.placed.settings.get("knots_s", (0.0,))
+    terms: list[str] = []
+    for order in s.placed.settings.get("orders", (1.0,)):
+        for wave in ("sin", "cos"):
+            name = f"{wave}{int(order)}"
+            size = s.at(name) if len(knots) == 1 else f"np.interp(t, {numbers(knots)}, {s.group(name)})"
+            terms.append(f"{size} * np.{wave}({2 * int(order)} * np.pi * {s.at('frequency_Hz')} * t)")
+    return " + ".join([x, *terms])
+
+
+def _condition(signal: str, lag: str, name: str) -> Expression:
+    def expression(s: Slot, x: str, d: str) -> str:
+        change = f'u["{signal}"] - {numbers(s.setting("reference"))}'
+        if s.values[lag] > 0.1 * s.writer.dt:
+            change = f"{s.part('low_pass', f'{s.at(lag)}, dt')}({change})"
+        s.writer.run.append(f"{name} = {change}")
+        first, second, *gain = [n for n in s.values if n != lag]
+        scale = f" + {s.at(gain[0])} * ({d} - {numbers(s.setting('centre'))})" if gain else ""
+        return f"{x} + ({s.at(first)} + {s.at(second)} * {name}{scale}) * {name}"
+
+    return expression
+
+
+def _current(s: Slot, x: str, d: str) -> str:
+    name = next(n for n in ("actuator_current", "current") if n in s.writer.signals)
+    return f'{x} + {s.at("per_A")} * u["{name}"] + {s.at("per_A2")} * u["{name}"] ** 2'
+
+
+def _axes(s: Slot) -> dict[str, str]:
+    """Axis letter -> code of the input vector's component."""
+    return {a: f'u["{name}"]' for a, name in vector_of(s.writer.signals).items()}
+
+
+def _misalignment(s: Slot, x: str, d: str) -> str:
+    here = _here(s)
+    if "rotation_x" in s.values:
+        i = "xyz".index(s.output[-1])
+        j, k = "xyz"[(i + 1) % 3], "xyz"[(i + 2) % 3]
+        terms = [f" - {s.at(f'rotation_{j}')} * {here[k]}"] if k in here else []
+        terms += [f" + {s.at(f'rotation_{k}')} * {here[j]}"] if j in here else []
+        return x + "".join(terms)
+    return x + "".join(f" + {s.at(n)} * {here[n[-1]]}" for n in s.values)
+
+
+def _here(s: Slot) -> dict[str, str]:
+    """Axis letter -> code of the vector where the sensor sits."""
+    from tools.mismatch.twins.cluster import location
+
+    vector = _axes(s)
+    if not s.output.startswith("accel_"):
+        return vector
+    place = f'R["{location(s.output)}"]'
+    whole = f"(np.cross(alpha, {place}) + np.cross(omega, np.cross(omega, {place})))"
+    return {a: f"({v} + {whole}[:, {'xyz'.index(a)}])" for a, v in vector.items()}
+
+
+def _cross_axis(s: Slot, x: str, d: str) -> str:
+    vector = _axes(s)
+    return x + "".join(f" + {s.at(n)} * {vector[n[-2]]} * {vector[n[-1]]}" for n in s.values)
+
+
+def _scale_variation(s: Slot, x: str, d: str) -> str:
+    here, own = _here(s), _axes(s)[s.output[-1]]
+    terms: list[str] = []
+    for a in dict.fromkeys(n[2] for n in s.values):
+        terms.append(f"{s.at(f'k_{a}1')} * {here[a]} + {s.at(f'k_{a}2')} * {here[a]} ** 2")
+    return f"{x} + {own} * ({' + '.join(terms)})"
+
+
+def _soft_iron(s: Slot, x: str, d: str) -> str:
+    own = s.output[-1]
+    return x + "".join(f" + {s.at(own + a)} * {v}" for a, v in _axes(s).items() if a != own)
+
+
+def _centripetal(s: Slot, x: str, d: str) -> str:
+    from tools.mismatch.twins.cluster import location
+
+    place, axis = f'R["{location(s.output)}"]', "xyz".index(s.output[-1])
+    return f"{x} + {s.at('share')} * np.cross(omega, np.cross(omega, {place}))[:, {axis}]"
+
+
+def _elsewhere(s: Slot, x: str, d: str) -> str:
+    axis, shift = "xyz".index(s.output[-1]), f"[{s.at('dx')}, {s.at('dy')}, {s.at('dz')}]"
+    turned = f" + np.cross(omega, np.cross(omega, {shift}))" if s.placed.settings["centripetal"][0] else ""
+    return f"{x} + (np.cross(alpha, {shift}){turned})[:, {axis}]"
+
+
+EXPRESSIONS: Mapping[str, Expression] = {
+    "hysteresis": _hysteresis,
+    "rate_dependent_hysteresis": _rate_hysteresis,
+    "creep": _creep,
+    "backlash": _backlash,
+    "dead_zone": _dead_zone,
+    "saturation": _saturation,
+    "static_nonlinearity": _curve,
+    "slew_limit": _slew,
+    "first_order_lag": _lag,
+    "ac_coupling": _ac,
+    "resonance": _resonance,
+    "dead_time": _delay,
+    "misalignment": _misalignment,
+    "cross_axis_nonlinearity": _cross_axis,
+    "scale_factor_variation": _scale_variation,
+    "thermal_drift": _warm_up,
+    "temperature_sensitivity": _condition("temperature", "thermal_lag_s", "dT"),
+    "supply_sensitivity": _condition("supply", "supply_lag_s", "dV"),
+    "current_coupling": _current,
+    "soft_iron": _soft_iron,
+    "mains_interference": _line,
+    "vibration": _line,
+    "clock_skew": _skew,
+    "quantization": _quantization,
+    "centripetal_acceleration": _centripetal,
+    "sensor_position_error": _elsewhere,
+    "channel_delay": _delay,
+}
+"""How each effect of a signal path is written. Forces inside an equation of motion: ``FORCES``."""
+
+
+@dataclass(frozen=True)
+class ForceCode:
+    """What one force adds: ``smooth`` (code in position x and velocity v), ``limit`` of dry friction (code in v and
+    sign), ``stiff`` bristles, elastic elements that yield at ``radii`` with ``springs``.
+    """
+
+    smooth: str = ""
+    limit: str = ""
+    stiff: str = ""
+    radii: str = ""
+    springs: str = ""
+
+
+def _friction(s: Slot) -> ForceCode:
+    has = s.values.__contains__
+    level = s.at("level")
+    if has("full_speed"):
+        return ForceCode(limit=f"{level} * (1 - np.exp(-((v / {s.at('full_speed')}) ** 2)))")
+    limit = level + (f" + sign * {s.at('asymmetry')}" if has("asymmetry") else "")
+    if has("extra"):
+        limit += f" + {s.at('extra')} * np.exp(-((v / {s.at('stribeck_speed')}) ** 2))"
+    smooth = f" - {s.at('viscous_asymmetry')} * abs(v)" if has("viscous_asymmetry") else ""
+    bent = next((n for n in ("presliding", "yield_distance") if has(n)), "")
+    return ForceCode(smooth, limit, f"{level} / {s.at(bent)}" if bent else "")
+
+
+def _spring(s: Slot) -> ForceCode:
+    powers = {"linear": "x", "quadratic": "x**2", "cubic": "x**3", "quintic": "x**5"}
+    return ForceCode("".join(f" - {s.at(n)} * {powers[n]}" for n in s.values))
+
+
+def _drag(s: Slot) -> ForceCode:
+    return ForceCode(f" - {s.at('drag')} * abs(v) * v")
+
+
+def _amplitude_damping(s: Slot) -> ForceCode:
+    return ForceCode(f" - {s.at('growth')} * x**2 * v")
+
+
+def _clearance(s: Slot) -> ForceCode:
+    inside = f"np.clip(x - {s.at('centre')}, -{s.at('half_gap')}, {s.at('half_gap')})"
+    return ForceCode(f" - {s.at('stiffness')} * (x - {s.at('centre')} - {inside})")
+
+
+def _cogging(s: Slot) -> ForceCode:
+    waves = [(f"{w}{h}", f"np.{w}({2 * h} * np.pi * x / {s.at('period')})") for h in (1, 2) for w in ("sin", "cos")]
+    return ForceCode("".join(f" + {s.at(n)} * {wave}" for n, wave in waves))
+
+
+def _force_memory(s: Slot) -> ForceCode:
+    if "yield_distance" in s.values:
+        return _friction(s)
+    return ForceCode(radii=numbers(s.placed.settings["thresholds"]), springs=s.group("k"))
+
+
+FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
+    "hysteresis": _force_memory,
+    "coulomb_friction": _friction,
+    "stribeck_friction": _friction,
+    "cubic_stiffness": _spring,
+    "cogging": _cogging,
+    "quadratic_drag": _drag,
+    "amplitude_dependent_damping": _amplitude_damping,
+    "clearance": _clearance,
+}
+
+
+def written(slot: Slot, x: str, driver: str) -> str:
+    """The code of a signal ``x`` behind a placed effect; InputError for an effect of a package of the user's."""
+    name = slot.placed.effect.name
+    if name not in EXPRESSIONS:
+        raise InputError(
+            f"{name}: has no numpy form to write; use --out FILE.toml with 'micron mismatch simulate', or FILE.csv"
+        )
+    return EXPRESSIONS[name](slot, x, driver)
+
+
+def force(slot: Slot) -> ForceCode:
+    """The code of a force; as ``written``."""
+    name = slot.placed.effect.name
+    if name not in FORCES:
+        raise InputError(f"{name}: has no numpy form to write as a force; use --out FILE.toml or FILE.csv")
+    return FORCES[name](slot)

@@ -1,0 +1,131 @@
+"""A corrected twin of any kind of file, loaded and run again by one call: ``simulate_file(twin, recording)``."""
+
+from __future__ import annotations
+
+import importlib.util
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim_devices.physics.effect import Array
+from tools.mismatch import units
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording_load import load, load_twin
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.fmu import FmuRun
+from tools.mismatch.twins.make import make
+
+KINDS = (".toml", ".py", ".fmu")
+
+
+@dataclass(frozen=True)
+class Residual:
+    """Rms of recorded minus simulated, of one output in the unit of the file; ``where`` says over which samples."""
+
+    output: str
+    unit: str
+    rms: float
+    where: str
+
+    def as_dict(self) -> dict[str, object]:
+        """The row of the command's JSON."""
+        return asdict(self)
+
+
+def residuals(recording: Recording, found: Mapping[str, Array]) -> list[Residual]:
+    """The residual of each output over the whole recording, and over its test range where ``[split]`` gives one."""
+    rows: list[Residual] = []
+    parts = {"": (0, recording.n)}
+    test = recording.split.test
+    if isinstance(test, tuple):
+        parts[f" on samples {test[0]} to {test[1]}"] = test
+    for o, y in found.items():
+        away = units.convert(recording.outputs[o], recording.unit[o], recording.file_unit[o]) - y
+        rows += [
+            Residual(o, recording.file_unit[o], float(np.sqrt(np.mean(away[a:b] ** 2))), where)
+            for where, (a, b) in parts.items()
+        ]
+    return rows
+
+
+def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
+    """The outputs (n,) of a twin over a whole recording, by signal, in the units of the recording's file.
+
+    ``twin``: what ``micron mismatch apply`` wrote (.toml, .py or .fmu). It runs freely: measured outputs set the state
+    at the first samples of a .toml twin with states, and nothing else; a .py twin begins as it was written.
+    RecordingError says what is wrong with either file.
+    """
+    path, rec = Path(twin), load(recording)
+    if not path.is_file():
+        raise RecordingError(f"{path}: no such twin; give a file that 'micron mismatch apply' wrote")
+    match path.suffix.lower():
+        case ".toml":
+            other = replace(rec, twin=load_twin(path))
+            if other.twin.kind != rec.twin.kind:
+                raise RecordingError(f"{path}: is a {other.twin.kind}, {rec.path} is recorded for a {rec.twin.kind}")
+            found = free_run(other)
+            return {o: units.convert(y, rec.unit[o], rec.file_unit[o]) for o, y in found.items()}
+        case ".py":
+            return _of(path, rec, _simulate_of(path)(in_file_units(rec), dt=rec.dt))
+        case ".fmu":
+            return _run_fmu(path, rec)
+        case suffix:
+            raise RecordingError(f"{path}: a twin ends in {', '.join(KINDS)}, not '{suffix}'")
+
+
+def free_run(recording: Recording) -> dict[str, Array]:
+    """The outputs (n,) of the twin that a recording names, in its own units: one free run over the whole recording."""
+    twin = make(recording)
+    return whole_run(recording, Model(twin), twin.start(recording))
+
+
+def whole_run(recording: Recording, model: Model, theta: Array) -> dict[str, Array]:
+    """The outputs (n,) of a model in one free run; the first samples that a diagnosis would use set its state."""
+    from tools.mismatch.engine.diagnose import free_run as course
+
+    init = recording.split.initialization or course(recording, model.twin)[1]
+    return model.simulate(View(recording, ((0, recording.n),), init), theta)
+
+
+def in_file_units(recording: Recording) -> dict[str, Array]:
+    """Inputs and context signals (n,) in the units of the data file."""
+    return {s: units.convert(x, recording.unit[s], recording.file_unit[s]) for s, x in recording.signals.items()}
+
+
+def _simulate_of(path: Path) -> Any:
+    spec = importlib.util.spec_from_file_location(f"twin_{path.stem}", path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise RecordingError(f"{path}: cannot be imported ({error!r})") from error
+    if not callable(getattr(module, "simulate", None)):
+        raise RecordingError(f"{path}: has no simulate(inputs, parameters, dt); write one with 'micron mismatch apply'")
+    return module.simulate
+
+
+def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
+    """The outputs (n,) of an FMU in the units of the recording's file; those of an FMU are the recording's own."""
+    fmu = FmuRun(path, tuple(recording.inputs), tuple(recording.outputs), recording.dt)
+    known = fmu.names()
+    signals = {s: x for s, x in recording.signals.items() if s in known}
+    lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
+    if lost:
+        raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
+    fmu.inputs = tuple(signals)
+    found = fmu({**signals, "t": recording.t}, {})
+    return {o: units.convert(np.asarray(y), recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
+
+
+def _of(path: Path, recording: Recording, found: Mapping[str, Any]) -> dict[str, Array]:
+    """The outputs of the recording among those that a twin returned."""
+    lost = [o for o in recording.outputs if o not in found]
+    if lost:
+        raise RecordingError(f"{path}: returned no output {', '.join(lost)}; it gives {', '.join(found) or 'none'}")
+    return {o: np.asarray(found[o], np.float64) for o in recording.outputs}

@@ -1,0 +1,153 @@
+"""What every key of ``recording.toml`` and of each twin's parameters means.
+
+Which keys there are is asked of the code that parses them; one that nobody has described here is listed all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from types import MappingProxyType
+
+
+@dataclass(frozen=True)
+class Key:
+    """``value``: what may stand there; ``default``: what holds where it is left out ("" if it may not be)."""
+
+    name: str
+    value: str
+    help: str
+    default: str = ""
+
+
+TOP = (
+    Key("format", "1", "version of this format"),
+    Key("title", "text", "heading of the report", "the file's name"),
+    Key("data", "file name", "the data: .csv with one header row, .npz with one array per column, or .mcap"),
+    Key("rate_hz", "number > 0", "uniform sampling rate", "from time_column"),
+    Key("time_column", "column name", "time stamps in seconds, for recordings without rate_hz", "none"),
+    Key("twin", "table", "the simulation that the recording is compared with"),
+    Key("channels", "list of tables", "one per column that is used"),
+    Key("split", "table", "which samples may be fitted and which are the test", "the tool splits by itself"),
+)
+CHANNEL = (
+    Key("column", "text", "name in the data file"),
+    Key("role", "input, output, context", "drives the twin, is compared with it, or was recorded beside"),
+    Key("signal", "text", "the twin's own name for it (below)"),
+    Key("unit", "text", "SI or another unit of the same dimension (mV, um, deg/s, G, mg, ...)", "the twin's"),
+    Key("noise_rms", "number > 0", "of an output: rms noise of the instrument, in unit", "estimated"),
+    Key("resolution", "number > 0", "of an output: smallest step of the readings, in unit", "found in the data"),
+    Key("tolerance", "number > 0", "of an output: smaller differences do not matter to you, in unit", "none"),
+)
+SPLIT = (
+    Key("fit", "[start, stop] or file name", "samples (stop excluded) or the recording that may be fitted", "the rest"),
+    Key("test", "[start, stop] or file name", "samples or the recording that no fit may see", "the rest"),
+    Key("initialization", "number of samples", "at the start of a test: may set the state, are not scored", "0"),
+)
+TWIN = (
+    Key("kind", "text", "one of the kinds below"),
+    Key("parameters", "table", "what you believe of the twin; below, per kind", "estimated where possible"),
+    Key("effects", "list of tables", "effects of a corrected twin; written by 'micron mismatch apply'", "none"),
+    Key("file", "file name", "a twin file instead of all the keys above, relative to the recording", "none"),
+)
+HOLD = Key("hold", "linear, zero", "between samples the input runs straight, or is held", "linear")
+_PER_OUTPUT = "number, list or table by output"
+_AXES = "number, list or table by output (x, y, z)"
+
+PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
+    {
+        "piezo_stack": (
+            Key("gain_um_per_V", _PER_OUTPUT, "displacement per volt", "least squares"),
+            Key("offset_um", _PER_OUTPUT, "displacement at 0 V", "least squares"),
+            HOLD,
+        ),
+        "accelerometer": (
+            Key("bias_V", _AXES, "output at 0 g", "least squares"),
+            Key("scale_V_per_g", _AXES, "volts per g", "least squares"),
+            HOLD,
+        ),
+        "magnetometer": (
+            Key("bias_V", _AXES, "output in no field", "least squares"),
+            Key("scale_V_per_uT", _AXES, "volts per microtesla", "least squares"),
+            HOLD,
+        ),
+        "accelerometer_cluster": (
+            Key("positions_m", 'table { "1" = [x, y, z] }', "place of each sensor from the body origin", "the origin"),
+            Key("bias", "table by output", "m/s^2; written by apply", "0"),
+            Key("scale", "table by output", "written by apply", "1"),
+        ),
+        "mechanical_axis": (
+            Key("mass", "number > 0", "kg, or kg m^2 of a rotation", "regression"),
+            Key("damping", "number", "N s/m, or N m s/rad", "regression"),
+            Key("stiffness", "number", "N/m, or N m/rad; an axis without the key has no spring", "0"),
+            Key("offset_force", "number", "added to the force", "0"),
+            HOLD,
+        ),
+        "state_space": (
+            Key("A", "rows of numbers", "x' = A x + B u, or x[k+1] where discrete"),
+            Key("B", "rows of numbers", "one column per input, in the order of the channels"),
+            Key("C", "rows of numbers", "one row per output, in the order of the channels"),
+            Key("D", "rows of numbers", "y = C x + D u + y0", "0"),
+            Key("x0", "list of numbers", "state at the first sample", "set by the first samples"),
+            Key("y0", "list of numbers", "offset of each output", "0"),
+            HOLD,
+            Key("discrete", "true, false", "A and B are those of the difference equation", "false"),
+        ),
+        "instrument": (
+            Key("bench", "file name", "bench description of the emulated instrument, relative to the recording"),
+            Key("hand", "rest, bench", "where no motion was recorded: at rest, or moved by the bench's hand", "rest"),
+            Key("start_s", "0 to 3600", "how long that world had run at the first sample", "0"),
+        ),
+        "ode": (
+            Key("states", "table by state", "unit, start and limits of each state"),
+            Key(
+                "equations", "table of texts", "the derivative of each state in terms of states, inputs and parameters"
+            ),
+            Key("outputs", "table of texts", "each output in the same terms", "the state of that name"),
+            Key("function", "file.py:name", "derivatives(t, states, inputs, parameters) in place of equations", "none"),
+            Key("units", "table by parameter", "unit of each parameter", "none"),
+            Key("fixed", "list of names", "parameters that are not re-fitted", "none"),
+            HOLD,
+            Key("any other name", "number", "a parameter of the equations; may be re-fitted"),
+        ),
+        "fmu": (
+            Key("path", "file name", "the FMI 2 or 3 FMU, relative to the recording"),
+            Key("any parameter of the FMU", "number", "your value; may be re-fitted", "the FMU's"),
+        ),
+    }
+)
+"""Keys of ``[twin.parameters]`` per kind. Kinds of installed packages have their own."""
+
+
+def names(keys: Sequence[Key]) -> tuple[str, ...]:
+    """The names of keys, in order."""
+    return tuple(key.name for key in keys)
+
+
+def tables() -> Iterator[tuple[str, Sequence[Key]]]:
+    """(heading, keys) of every table of ``recording.toml`` but the twins' parameters."""
+    from tools.mismatch import recording_load
+
+    yield "Top of the file", listed(TOP, recording_load._TOP)
+    yield "`[[channels]]`", listed(CHANNEL, recording_load._CHANNEL)
+    yield "`[split]`", SPLIT
+    yield "`[twin]`", TWIN
+
+
+def of_kind(kind: str) -> Sequence[Key]:
+    """Keys of ``[twin.parameters]`` of one kind of twin, as its own module knows them."""
+    described = PARAMETERS.get(kind, ())
+    module = {"state_space": "state_space", "mechanical_axis": "axis", "ode": "ode_text"}.get(kind)
+    if module is None:
+        return described
+    code = import_module(f"tools.mismatch.twins.{module}")
+    return listed(described, getattr(code, "TABLES" if kind == "ode" else "_NAMES"))
+
+
+def listed(described: Sequence[Key], known: Iterable[str]) -> list[Key]:
+    """The keys that a parser knows, with what is said of them; the others of them at the end."""
+    known = list(known)
+    rest = sorted(set(known) - set(names(described)))
+    free = [k for k in described if not k.name.isidentifier()]
+    return [*(k for k in described if k.name in known), *(Key(n, "", "not described yet", " ") for n in rest), *free]

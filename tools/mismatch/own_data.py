@@ -1,0 +1,170 @@
+"""``docs/own-data.md``: from a csv to a diagnosis, then every key and every twin, from the tables that the loader uses.
+
+``python -m tools.mismatch.own_data`` writes the page; a test compares.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from tools.mismatch import keys
+from tools.mismatch.keys import Key
+from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
+
+PAGE = Path("docs/own-data.md")
+
+_GUIDE = """# Your own data
+
+Made by `python -m tools.mismatch.own_data`; do not edit. The first part is run by the tests as it stands.
+
+A recording is a folder: your data file and a `recording.toml` that says what its columns are and which simulation it is
+to be compared with. Here, a motor axis: force in, position out, `data.csv` with a header row.
+
+``` { .python title="what stands for your measurement here" }
+import numpy as np
+
+t = np.arange(3000) / 200.0
+force = 8 * np.sin(2 * np.pi * 0.7 * t) + 5 * np.sin(2 * np.pi * 0.23 * t + 1) + 3 * np.sin(2 * np.pi * 1.9 * t)
+x = v = 0.0
+rows = []
+for k in range(t.size):
+    rows.append((t[k], force[k], 1e3 * x))
+    for _ in range(50):
+        net = force[k] - 6.0 * v - 120.0 * x
+        friction = 2.0 if abs(net) > 2.0 or abs(v) > 1e-4 else abs(net)
+        before, v = v, v + (net - friction * np.sign(v if abs(v) > 1e-4 else net)) / 2.0 / 200 / 50
+        v = 0.0 if before * v < 0 and abs(net) < 2.0 else v
+        x += v / 200 / 50
+table = np.array(rows)
+table[:, 2] += np.random.default_rng(1).normal(0, 0.02, t.size)
+np.savetxt("data.csv", table, delimiter=",", header="t_s,force_N,x_mm", comments="")
+```
+
+## 1. Say what the columns are
+
+``` { .toml title="recording.toml" }
+format = 1
+data = "data.csv"
+time_column = "t_s"
+
+[twin]
+kind = "mechanical_axis"
+[twin.parameters] # what you believe today
+mass = 2.1
+damping = 5.0
+stiffness = 120.0
+
+[[channels]]
+column = "force_N"
+role = "input"
+signal = "force"
+unit = "N"
+
+[[channels]]
+column = "x_mm"
+role = "output"
+signal = "position"
+unit = "mm"
+noise_rms = 0.02 # of your instrument, if you know it: a wrong noise floor is the usual cause of a wrong verdict
+```
+
+## 2. Diagnose, correct, run again
+
+``` { .bash }
+micron mismatch diagnose . --html report.html --json report.json
+micron mismatch apply . report.json --out twin.toml
+micron mismatch apply . report.json --out twin.py
+micron mismatch simulate twin.py . --out simulated.csv
+```
+
+The report says where the two differ and which physics is missing ([how to read it](mismatch.md#reading-a-report)).
+`apply` writes the corrected twin in the form that the ending asks for:
+
+{formats}
+
+A `.toml`, a `.py` and an `.fmu` are run again by `micron mismatch simulate`, or in Python by one call, in the units of
+the data file:
+
+``` { .python title="run again" }
+from tools.mismatch.export.run import simulate_file
+
+position_mm = simulate_file("twin.toml", ".")["position"]
+```
+
+`twin.py` needs numpy alone and none of this package:
+
+``` { .python title="elsewhere" }
+import numpy as np
+from twin import PARAMETERS, simulate
+
+data = np.genfromtxt("data.csv", delimiter=",", names=True)
+position_mm = simulate({"force": data["force_N"]})["position"]
+heavier = simulate({"force": data["force_N"]}, parameters={"mass": 3.0})["position"]
+```
+
+`start` among its parameters is the state at the first sample of this recording; another recording begins elsewhere. An
+FMU holds its inputs over a communication step: it sees them one step later than the columns have them.
+
+## 3. Does it hold on the next recording?
+
+Put `file = "twin.toml"` in place of the `[twin]` table of another recording and diagnose that. What is still missing is
+what the first one did not excite.
+"""
+
+
+def page() -> str:
+    """The text of the page."""
+    from tools.mismatch.export.write import FORMATS
+
+    formats = "\n".join(f"- `{ending}`: {what}" for ending, what in FORMATS.items())
+    lines = [_GUIDE.replace("{formats}", formats), "## Every key of `recording.toml`", ""]
+    for heading, table in keys.tables():
+        lines += [f"### {heading}", "", *_rows(table), ""]
+    lines += ["## Every kind of twin", ""]
+    for kind, words in KINDS.items():
+        lines += [f"### `{kind}`", ""]
+        for role, patterns in (("inputs", words.inputs), ("outputs", words.outputs)):
+            said = ", ".join(f"`{_signals(p)}` ({' or '.join(units) or 'any unit'})" for p, units in patterns)
+            lines.append(f"- {role}: {said or 'any names, any units'}")
+        lines += ["", *_rows(keys.of_kind(kind)), ""]
+    lines += [
+        "Packages may add kinds ([a twin of your own](adding/twin.md)).",
+        "",
+        "## Context signals with a fixed unit",
+        "",
+        ", ".join(f"`{s}` ({' or '.join(u)})" for s, u in CONTEXT_UNITS.items())
+        + ". Any other name may be recorded beside, in any unit.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _rows(table: Sequence[Key]) -> Iterator[str]:
+    if not table:
+        yield "No keys are listed for this kind."
+        return
+    yield "| key | value | meaning | if left out |"
+    yield "|---|---|---|---|"
+    for k in table:
+        yield f"| `{k.name}` | {_cell(k.value)} | {_cell(k.help)} | {_cell(k.default) or '**needed**'} |"
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|")
+
+
+def _signals(pattern: str) -> str:
+    """A pattern of signal names as a person would write it."""
+    return pattern.replace(r"\w*", "PLACE")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="write docs/own-data.md")
+    parser.add_argument("--out", type=Path, default=PAGE)
+    parser.parse_args().out.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
