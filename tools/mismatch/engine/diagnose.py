@@ -15,6 +15,7 @@ from tools.mismatch.engine.assemble import assemble
 from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.evidence import weigh_evidence
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
+from tools.mismatch.engine.forward import Work, forward
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
@@ -310,9 +311,10 @@ def nominated(
     for part, allowed in parts:
         problem, _, base = prepared(part, held_out, seed, False)
         stride = max(1, problem.fit_rows.size // 12000)
-        found = search(problem, base, allowed, rule=rule, stride=stride, jobs=jobs, progress=progress)
-        names |= {t.name for t in found.steps}
-        names |= {t.name for rivals in found.rivals for t in rivals[:1]}
+        # second thoughts are for the whole: here one way forward is enough
+        way = forward(problem, base, base, (), Work(allowed, rule, stride, jobs, progress))
+        names |= {t.name for t in way.steps}
+        names |= {t.name for rivals in way.rivals for t in rivals[:2]}
     return tuple(e for e in catalogue if e.name in names)
 
 

@@ -324,7 +324,10 @@ def _roots(mode: Mode, discrete: bool, dt: float) -> Complex:
 def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Array]:
     """Companion form (s, s) and its input (s,) of these roots of s or z - 1, states scaled by powers of ``omega``."""
     s = roots.size
-    den = np.real(np.poly(roots))
+    if s == 2:
+        den = np.array([1.0, -float(np.sum(roots).real), float(np.prod(roots).real)])
+    else:
+        den = np.real(np.poly(roots))
     a = np.zeros((s, s))
     a[:-1, 1:] = omega * np.eye(s - 1)
     a[-1, :] = -den[:0:-1] / (omega ** np.arange(s - 1, -1, -1.0))
