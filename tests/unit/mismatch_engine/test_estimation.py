@@ -9,13 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.unit.mismatch_engine.cases import recording, wave
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording, stack, wave
 from tools.mismatch.engine.diagnose import prepared
-from tools.mismatch.engine.fit import fit_base
+from tools.mismatch.engine.exported import raw_values, without_events
+from tools.mismatch.engine.fit import fit, fit_base
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.reduce import fitted_part
 from tools.mismatch.engine.score import fit_rms, held_rms
+from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
 from tools.mismatch.twins.opaque import opaque_twin
 
 Array = np.ndarray
@@ -88,3 +93,28 @@ def test_a_refit_that_loses_on_held_out_data_is_not_used() -> None:
     problem, raw, base = prepared(rec, 0.3, 0, False)
     assert held_rms(problem, base) == held_rms(problem, raw)
     np.testing.assert_array_equal(base.theta, raw.theta)
+
+
+def test_offsets_are_solved_again_when_the_events_are_left_out_of_a_twin() -> None:
+    problem, _, base = prepared(stack(np.random.default_rng(1), "step_shift", 30.0), 0.3, 0, False)
+    place = places(problem, (EFFECTS["step_shift"],), ())[0]
+    candidate = one_step(problem, base, place, bend(problem, base))
+    fitted = fit(problem, Model(problem.twin, (candidate.placed,)), candidate.starts)
+    written = without_events(problem, fitted)
+    assert written.model.placed == ()
+    assert raw_values(written) == {}
+    names = [p.name for p in written.model.parameters]
+    offset = names.index("offset_um")
+    # beside the step the offset is the level before it; a run without the step lies between both levels
+    assert written.theta[offset] == pytest.approx(fit_base(problem).theta[offset], rel=0.05)
+    assert abs(fitted.theta[offset] - written.theta[offset]) > 5 * problem.floors["displacement"].rms
+    assert without_events(problem, base) is base
+
+
+def test_a_search_on_parts_sees_nothing_of_an_official_test() -> None:
+    rec = two_tanks()
+    assert fitted_part(rec).n == N
+    assert fitted_part(replace(rec, split=replace(rec.split, test=(1000, 1200)))).n == 1000
+    part = fitted_part(replace(rec, split=replace(rec.split, fit=(100, 900), test=(1000, 1200))))
+    np.testing.assert_array_equal(part.outputs["level"], rec.outputs["level"][100:900])
+    assert part.split.test is None
