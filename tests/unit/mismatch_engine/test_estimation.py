@@ -105,8 +105,9 @@ def test_offsets_are_solved_again_when_the_events_are_left_out_of_a_twin() -> No
     assert raw_values(written) == {}
     names = [p.name for p in written.model.parameters]
     offset = names.index("offset_um")
-    # beside the step the offset is the level before it; a run without the step lies between both levels
-    assert written.theta[offset] == pytest.approx(fit_base(problem).theta[offset], rel=0.05)
+    # beside the step the offset is the level before it; without it, what leaves no mean
+    left = written.residual["displacement"][problem.fit_rows]
+    assert abs(float(np.mean(left))) < 1e-6 * float(np.std(left))
     assert abs(fitted.theta[offset] - written.theta[offset]) > 5 * problem.floors["displacement"].rms
     assert without_events(problem, base) is base
 
