@@ -11,16 +11,18 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, stack, wave
-from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.diagnose import nominated, prepared
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import fit, fit_base
+from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.reduce import fitted_part
+from tools.mismatch.engine.reduce import fitted_part, is_long
 from tools.mismatch.engine.score import fit_rms, held_rms
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
+from tools.mismatch.twins.make import make
 from tools.mismatch.twins.opaque import opaque_twin
 
 Array = np.ndarray
@@ -119,3 +121,16 @@ def test_a_search_on_parts_sees_nothing_of_an_official_test() -> None:
     part = fitted_part(replace(rec, split=replace(rec.split, fit=(100, 900), test=(1000, 1200))))
     np.testing.assert_array_equal(part.outputs["level"], rec.outputs["level"][100:900])
     assert part.split.test is None
+
+
+def test_parts_of_a_long_record_nominate_what_the_whole_decides_on() -> None:
+    rng = np.random.default_rng(2)
+    n = 90_000
+    u = 50 + 40 * np.concatenate([wave(rng, 6000) for _ in range(15)])
+    z = 0.12 * np.minimum(u, 75.0) + 0.02 * rng.standard_normal(n)
+    rec = recording("piezo_stack", {"command": u}, {"displacement": z}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
+    assert is_long(rec, make(rec))
+    tried = tuple(EFFECTS[e] for e in ("saturation", "mains_interference", "creep", "spikes"))
+    names = [e.name for e in nominated(rec, 0.3, 0, 1, None, tried, Rule())]
+    assert "saturation" in names
+    assert "mains_interference" not in names
