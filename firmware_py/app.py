@@ -213,6 +213,7 @@ def make_outcome(
         "recorder": {
             "ticks": recording.ticks if recording is not None else 0,
             "dropped": recording.dropped if recording is not None else 0,
+            "problem": recording.problem if recording is not None else "",
         },
     }
 

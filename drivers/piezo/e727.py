@@ -83,9 +83,9 @@ class E727:
         on = int(self._servo)
         self._link.command(f"SVO 1 {on} 2 {on} 3 {on}")
         if self._servo:
-            low, high = self._link.values("TMN?"), self._link.values("TMX?")
+            low, high = self._link.values("TMN?", CHANNELS), self._link.values("TMX?", CHANNELS)
             limit = self.limits[0]
-            if max(low[:CHANNELS]) > limit.lo_V * self._per_V or min(high[:CHANNELS]) < limit.hi_V * self._per_V:
+            if max(low) > limit.lo_V * self._per_V or min(high) < limit.hi_V * self._per_V:
                 raise BenchError(f"the stage travels {low} .. {high} um, less than commanded", device=self.name)
         return identity
 
@@ -98,7 +98,7 @@ class E727:
             wait_s(self._clock, TICK_S)
         self._link.settle()
         self._link.command(f"{self._verb} {self._values()}")
-        told = [v / self._per_V for v in self._link.values(f"{self._verb}?")[:CHANNELS]]
+        told = [v / self._per_V for v in self._link.values(f"{self._verb}?", CHANNELS)]
         neutral = [limit.safe_V for limit in self.limits]
         good = all(abs(a - b) < 0.01 for a, b in zip(told, neutral, strict=True))
         self.guard.require(good, f"neutral is {neutral} V, the controller answers {told}")
@@ -131,7 +131,7 @@ class E727:
     def safe_step(self) -> bool:
         """One tick of the ramp; steps between two command times are not sent, the last one always is."""
         if not self._position_known:
-            self.guard.start_from([v / self._per_V for v in self._link.values(f"{self._verb}?")[:CHANNELS]])
+            self.guard.start_from([v / self._per_V for v in self._link.values(f"{self._verb}?", CHANNELS)])
             self._position_known = True
         done = self.guard.ramp()
         now_ns = self._clock.now_ns()
@@ -145,7 +145,7 @@ class E727:
     def readback_V(self) -> Float64Array:
         """Piezo voltages of output channels 1 to 3, measured by the controller (``VOL?``)."""
         self._link.settle()
-        return np.array(self._link.values("VOL? 1 2 3")[:CHANNELS])
+        return np.array(self._link.values("VOL? 1 2 3", CHANNELS))
 
     def close(self) -> None:
         """Ramp to neutral unless there, then close the port."""

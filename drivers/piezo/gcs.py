@@ -62,16 +62,19 @@ class GcsLink:
             reply += bytes(self._buf[:n])
         return [line.strip() for line in reply.decode("latin-1").splitlines()]
 
-    def values(self, text: str) -> list[float]:
-        """Query of the form ``1=value`` per line. Raises ``ProtocolError`` for anything else."""
+    def values(self, text: str, n: int) -> list[float]:
+        """The first ``n`` values of an answer with ``1=value`` per line. Raises ``ProtocolError`` for anything else,
+        fewer values included."""
         lines = self.query(text)
         try:
             values = [float(line.split("=", 1)[1]) for line in lines]
             if not all(math.isfinite(value) for value in values):
                 raise ValueError("not finite")
-            return values
+            if len(values) < n:
+                raise ValueError("too few")
+            return values[:n]
         except (IndexError, ValueError):
-            raise ProtocolError(f"answer to {text!r} was {lines!r}", device=self.name) from None
+            raise ProtocolError(f"answer to {text!r} was {lines!r}, not {n} finite values", device=self.name) from None
 
     def command(self, text: str) -> None:
         """Send a set command and ask for its error at once. Raises ``ProtocolError`` with the error's meaning."""

@@ -147,7 +147,7 @@ def make_outcome(
         "experiment": experiment(loop.game),
         "safe_state": {"reached": True, "reason": loop.reason, "normal": loop.normal},
         "recording": str(recording.path) if recording is not None else None,
-        "recorder": {"ticks": recording.ticks, "dropped": recording.dropped}
+        "recorder": {"ticks": recording.ticks, "dropped": recording.dropped, "problem": recording.problem}
         if recording
-        else {"ticks": 0, "dropped": 0},
+        else {"ticks": 0, "dropped": 0, "problem": ""},
     }

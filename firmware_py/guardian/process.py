@@ -118,7 +118,7 @@ def main(arguments: list[str]) -> int:
         signal.signal(number, signal.SIG_IGN)  # it ends with the firmware, not with its terminal
     clock = MonotonicClock()
     try:
-        bus = open_i2c(order["uri"], speed_hz=order["speed_hz"])
+        bus = open_i2c(order["uri"], speed_hz=order["speed_hz"], exclusive=False)
         amplifier = DacAmplifier(bus, clock, **order["options"])
         amplifier.readback_V()
     except HalError as error:

@@ -2,7 +2,8 @@
 
 A block is closed after 100 rows, at a gap in the row numbers, or 0.12 s after its first row; so when the recorder
 itself is killed, less than 0.2 s of rows are lost. When the firmware dies, what it pushed is still in the rings and
-is written. ``fdatasync`` once per second bounds what a power failure takes.
+is written. ``fdatasync`` once per second bounds what a power failure takes; with it the recorder looks whether its file
+is still there and as long as what it wrote, and ends with a clear word when another program has changed it.
 
 Standard input: one JSON line with the path, columns and metadata, later one with ``stop``; its end without ``stop``
 means that the firmware is gone. Standard output: one JSON line when ready, one at the end.
@@ -27,8 +28,9 @@ import numpy as np
 from firmware_py.exit_codes import Exit
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.reader import Recording
 from firmware_py.recording.ring import EventRing, RowRing
-from firmware_py.recording.writer import RecordingWriter
+from firmware_py.recording.writer import FileDisturbed, RecordingWriter
 
 POLL_S = 0.02
 OPEN_BLOCK_S = 0.12
@@ -45,6 +47,7 @@ class RecorderState(IntEnum):
     DISK_FULL = 2
     FAILED = 3
     DONE = 4
+    DISTURBED = 5
 
 
 class _Control:
@@ -177,14 +180,25 @@ def main(arguments: list[str]) -> int:
     _say({"ready": True})
     drain = Drain(rows, events, writer)
     reserve = _Reserve(path.parent)
+    kept: int | None = None
     try:
         ended, statistics = _run(control, drain, writer)
+        writer.check()
         drain.drain()
         if statistics is not None:
             writer.write_metadata(fmt.STATISTICS_METADATA, statistics)
         totals = drain.totals(ended)
         size = writer.finish(totals)
         state, problem = RecorderState.DONE, ""
+        if writer.moved:
+            problem = f"{path}: the file was moved while it was recorded; it is whole under its new name"
+    except FileDisturbed as error:
+        writer.abandon()
+        kept = 0 if error.lost else _rows_in(path)
+        problem = f"{path}: {error}; {f'{kept} ticks are left in it' if kept else 'nothing of it is left'}"
+        totals = drain.totals(f"the file was {error.what}")
+        size = 0 if error.lost else path.stat().st_size
+        state = RecorderState.DISTURBED
     except OSError as error:
         full = error.errno in _FULL
         problem = f"{path}: {'the disk is full' if full else error.strerror}; recorded up to row {writer.rows}"
@@ -194,10 +208,18 @@ def main(arguments: list[str]) -> int:
         size = writer.give_up((events.pushed, event), totals)
         state = RecorderState.DISK_FULL if full else RecorderState.FAILED
     reserve.release()
-    rows.report(writer.rows, state)
+    rows.report(writer.rows if kept is None else kept, state)
     _say({**totals, "bytes": size, "problem": problem})
-    lost = problem or totals["rows_dropped"] or totals["events_dropped"]
+    lost = state is not RecorderState.DONE or totals["rows_dropped"] or totals["events_dropped"]
     return Exit.DATA_LOST if lost else Exit.DONE
+
+
+def _rows_in(path: Path) -> int:
+    """How many rows a reader finds in a file that another program has changed."""
+    try:
+        return Recording(path).n_rows
+    except RecordingError:
+        return 0
 
 
 def _run(control: _Control, drain: Drain, writer: RecordingWriter) -> tuple[str, Any]:
@@ -214,6 +236,7 @@ def _run(control: _Control, drain: Drain, writer: RecordingWriter) -> tuple[str,
             return "the recorder was terminated", None
         if time.monotonic() - synced_s >= SYNC_S:
             writer.sync()
+            writer.check()
             synced_s = time.monotonic()
 
 

@@ -49,6 +49,7 @@ class Health:
     events: int
     missing_events: int
     damage: tuple[Damage, ...]
+    being_recorded: bool = False
 
     @property
     def lost(self) -> bool:
@@ -70,10 +71,11 @@ class Health:
                 "the file is complete, but without the recorder's last words: another program has copied it without "
                 "its metadata; whether ticks are missing at its end is not known"
             )
+        elif self.being_recorded:
+            lines.append("it is being recorded now: up to 0.2 s after the last tick are not in the file yet")
         elif self.expected_rows is None:
             lines.append(
-                "the recorder was killed or is still writing: it left no last words; "
-                "up to 0.2 s after the last tick may be missing"
+                "the recorder was killed: it left no last words; up to 0.2 s after the last tick may be missing"
             )
         elif not self.finished:
             lines.append("the index at the end of the file is missing")
@@ -112,5 +114,6 @@ class Health:
             "missing_ticks": self.missing_ticks,
             "events": self.events,
             "missing_events": self.missing_events,
+            "being_recorded": self.being_recorded,
             "damage": [{"offset": d.offset, "length": d.length, "reason": d.reason} for d in self.damage],
         }

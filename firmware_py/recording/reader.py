@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.files import is_being_recorded
 from firmware_py.recording.format import Block, ColumnInfo, Float64Array
 from firmware_py.recording.health import Health, RowGap, TickGap
 from firmware_py.recording.scan import (
@@ -306,6 +307,7 @@ class Recording:
             events=len(self.events),
             missing_events=expected_events - len(self.events),
             damage=self._damage.listed(),
+            being_recorded=is_being_recorded(self.path),
         )
 
 

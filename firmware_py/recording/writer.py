@@ -16,7 +16,17 @@ from mcap.writer import CompressionType, Writer
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
+from firmware_py.recording.files import lock, refuse_existing
 from firmware_py.recording.format import Float64Array
+
+
+class FileDisturbed(RecordingError):
+    """Another program has changed the file under the recorder; ``what`` it did, ``lost``: nothing of it is left."""
+
+    def __init__(self, what: str, *, lost: bool = False) -> None:
+        super().__init__(f"the file was {what} while it was recorded")
+        self.what = what
+        self.lost = lost
 
 
 class _Output:
@@ -26,15 +36,23 @@ class _Output:
     """
 
     def __init__(self, path: Path, overwrite: bool) -> None:
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (os.O_TRUNC if overwrite else os.O_EXCL)
+        refuse_existing(path, overwrite=overwrite)
+        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | (0 if overwrite else os.O_EXCL)
         try:
             self._fd = os.open(path, flags, 0o644)
         except FileExistsError as error:
             raise RecordingError(f"{path} exists already: choose another name or remove it") from error
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written ({error.strerror}); choose another place") from error
+        self._path = path
         self._position = 0
         self.good_end = 0
+        try:
+            lock(self._fd, path)
+            os.ftruncate(self._fd, 0)  # not when it was opened: it might have been somebody's recording
+        except BaseException:
+            os.close(self._fd)
+            raise
 
     def write(self, data: bytes) -> int:
         left = memoryview(data)
@@ -49,6 +67,30 @@ class _Output:
 
     def flush(self) -> None:
         """Nothing is held back."""
+
+    def check(self) -> None:
+        """Raise ``FileDisturbed`` when another program has deleted, replaced, cut or written the file."""
+        ours = os.fstat(self._fd)
+        try:
+            there = os.stat(self._path)
+        except OSError:
+            there = None
+        if ours.st_nlink == 0:
+            raise FileDisturbed("deleted" if there is None else "replaced by another file", lost=True)
+        if ours.st_size < self._position:
+            raise FileDisturbed(f"cut to {ours.st_size} of {self._position} bytes")
+        if ours.st_size > self._position:
+            raise FileDisturbed("written by another program as well")
+
+    @property
+    def moved(self) -> bool:
+        """Whether the file is whole, but no longer under its name."""
+        try:
+            there = os.stat(self._path)
+        except OSError:
+            return True
+        ours = os.fstat(self._fd)
+        return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def keep(self) -> None:
         """What has been written so far is whole."""
@@ -88,6 +130,8 @@ class RecordingWriter:
         self._time_column = names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in names else None
         self._now_ns = 0
         self.rows = self.blocks = self.events = 0
+        self.moved = False
+        """Known after ``finish``: the file is whole, but another program has given it another name."""
         self._output = _Output(path, overwrite)
         self._mcap = Writer(
             self._output,  # type: ignore[arg-type]  # it uses write, tell and flush only
@@ -140,17 +184,28 @@ class RecordingWriter:
         """Wait until it is on the disk."""
         self._output.sync()
 
+    def check(self) -> None:
+        """Raise ``FileDisturbed`` when others have deleted, replaced, cut or written the file."""
+        self._output.check()
+
     def finish(self, end: Mapping[str, Any]) -> int:
         """Write ``end`` (what the recording should hold, why it ended) and the index, and close.
 
-        Returns the size of the file in bytes.
+        Returns the size of the file in bytes. Raises ``FileDisturbed`` as ``check`` does; then call ``abandon``.
         """
+        self._output.check()  # before anything is written into what others have made
         self.write_metadata(fmt.END_METADATA, self._last_words(end))
         self._mcap.finish()
         self._output.keep()
         self._output.sync()
+        self._output.check()
+        self.moved = self._output.moved
         self._output.close()
         return self._output.good_end
+
+    def abandon(self) -> None:
+        """Close a disturbed file without touching it any more."""
+        self._output.close()
 
     def give_up(self, event: tuple[int, Mapping[str, Any]], end: Mapping[str, Any]) -> int:
         """After an ``OSError``: cut off what was not finished, add a last event and ``end`` if they fit, close.

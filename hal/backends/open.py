@@ -35,15 +35,19 @@ def open_serial(uri: str, baud: int = 115200) -> SerialPort:
     return PyserialPort(path, baud)
 
 
-def open_i2c(uri: str, speed_hz: int = 400_000) -> I2cBus:
-    """Open an I2C bus. A Linux bus has the speed its device tree says; ``speed_hz`` is then for reports."""
+def open_i2c(uri: str, speed_hz: int = 400_000, *, exclusive: bool = True) -> I2cBus:
+    """Open an I2C bus. A Linux bus has the speed its device tree says; ``speed_hz`` is then for reports.
+
+    A Linux bus is locked against other programs of ours; ``exclusive`` off is for the guardian, which stands by on the
+    firmware's bus.
+    """
     scheme, host, path, options = _split(uri, I2C_FORMS)
     _no_more(options, uri)
     if scheme == "linux-i2c":
         _need(bool(host) != bool(path), uri, I2C_FORMS)
         from hal.backends.smbus2_i2c import Smbus2I2c
 
-        return Smbus2I2c(_integer(host, "bus number", uri) if host else path, speed_hz)
+        return Smbus2I2c(_integer(host, "bus number", uri) if host else path, speed_hz, exclusive=exclusive)
     if scheme == "unix-i2c":
         _need(not host and path, uri, I2C_FORMS)
         from hal.backends.unix_i2c import UnixI2c

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import importlib
 from collections.abc import Sequence
 from typing import Any
@@ -18,9 +19,14 @@ from hal.types import I2cOp, I2cWrite, PortInfo
 
 
 class Smbus2I2c:
-    """``/dev/i2c-N`` (``bus`` is the number) or any path. The kernel's device tree sets the bus speed."""
+    """``/dev/i2c-N`` (``bus`` is the number) or any path. The kernel's device tree sets the bus speed.
 
-    def __init__(self, bus: int | str, speed_hz: int = 400_000) -> None:
+    ``exclusive`` takes the lock of the bus (``flock``), as a serial port is opened exclusively: two programs that
+    command one amplifier would undo each other's outputs. The lock ends with the process. Programs of others that do
+    not ask for it (i2c-tools) are not kept away.
+    """
+
+    def __init__(self, bus: int | str, speed_hz: int = 400_000, *, exclusive: bool = True) -> None:
         smbus2: Any = importlib.import_module("smbus2")
         self._message: Any = smbus2.i2c_msg
         self._device = f"/dev/i2c-{bus}" if isinstance(bus, int) else bus
@@ -34,6 +40,17 @@ class Smbus2I2c:
                 errno.EACCES: "no permission: add yourself to the group that owns it (usually i2c)",
             }.get(error.errno or 0, str(error))
             raise DeviceNotFound(hint, device=self._device) from error
+        try:
+            if exclusive:
+                fcntl.flock(self._bus.fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            self.close()
+            raise DeviceNotFound(
+                "the bus is in use by another program of ours, or twice in the bench file; end the other one first",
+                device=self._device,
+            ) from error
+        except OSError:
+            pass  # no locks here: better an unlocked bus than none
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         check_address(address, self._device)

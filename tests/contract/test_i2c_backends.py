@@ -177,6 +177,23 @@ class TestSmbus2(I2cContract):
         assert isinstance(caught.value.__cause__, OSError)
 
 
+def test_a_linux_bus_belongs_to_one_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """A second program of ours would undo the outputs of the first one, every millisecond."""
+    monkeypatch.setattr(smbus2.smbus2, "ioctl", KernelBus().ioctl)
+    path = tmp_path / "i2c-1"
+    path.touch()
+    first = open_i2c(f"linux-i2c://{path}")
+    with pytest.raises(DeviceNotFound, match="in use by another program of ours, or twice in the bench file") as caught:
+        open_i2c(f"linux-i2c://{path}")
+    assert caught.value.device == str(path)
+    first.transfer(MEMORY, [I2cWrite(b"\x00")])
+    beside = open_i2c(f"linux-i2c://{path}", exclusive=False)  # the guardian's
+    beside.transfer(MEMORY, [I2cWrite(b"\x00")])
+    beside.close()
+    first.close()
+    open_i2c(f"linux-i2c://{path}").close()
+
+
 def test_no_i2c_on_this_machine_says_what_to_do():
     with pytest.raises(DeviceNotFound, match="enable I2C"):
         open_i2c("linux-i2c://97")

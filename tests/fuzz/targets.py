@@ -206,7 +206,7 @@ def motion_card_lines(data: bytes) -> None:
 def gcs_replies(data: bytes) -> None:
     clock = VirtualClock()
     with suppress(HalError):
-        assert all(math.isfinite(v) for v in GcsLink(BytesPort(data, clock), clock, "e727").values("VOL?"))
+        assert all(math.isfinite(v) for v in GcsLink(BytesPort(data, clock), clock, "e727").values("VOL?", 3))
     link = GcsLink(BytesPort(data, clock), clock, "e727")
     with suppress(HalError):
         link.ask_error()

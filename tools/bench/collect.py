@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
+from firmware_py.recording.files import is_being_recorded
 from firmware_py.recording.format import TIME_COLUMN
 from firmware_py.recording.reader import Recording
 from tools.bench.jobs import Jobs
@@ -151,6 +152,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         path = existing(request)
         if recorder.active and path == recorder.path(recorder.name):
             raise InputError("this recording is running; stop it first")
+        if is_being_recorded(path):
+            raise InputError(f"{path.stem!r} is being recorded by another process; stop it first")
         path.unlink()
         path.with_suffix(".json").unlink(missing_ok=True)
         session.note("info", f"deleted {path.stem}")

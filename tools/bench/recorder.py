@@ -105,6 +105,8 @@ class RunRecorder:
         stats = self._recorder.stats()
         if stats.state is RecorderState.DISK_FULL:
             return "the disk is full, nothing more is written"
+        if stats.state is RecorderState.DISTURBED:
+            return "another program has deleted, replaced or cut the file; nothing more is recorded"
         if not stats.alive:
             return "the recorder process has died; stop, then run 'micron recover' on the file"
         lost = stats.dropped + self._missed

@@ -159,6 +159,8 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
     lines.append(host_line(result))
     if result["recording"]:
         lines.append(f"recording: {result['recording']}")
+        if problem := result["recorder"].get("problem"):
+            lines.append(f"NOT RECORDED AS ASKED: {problem}")
     return lines
 
 

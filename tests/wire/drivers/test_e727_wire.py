@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -55,6 +57,33 @@ def test_probe_reads_identity_axes_and_sets_the_servo():
     device, port, _ = make(*PROBE)
     assert "E-727.3SDA" in device.probe()
     port.done()
+
+
+FEW = b"1=5.000000000e+01 \n2=5.000000000e+01\n"
+
+
+@pytest.mark.parametrize(
+    ("script", "act"),
+    [
+        ([*PROBE, ("w", b"SVA?\n"), ("r", FEW)], lambda device: device.arm()),
+        ([*ARM[:-2], ("w", b"SVA?\n"), ("r", FEW)], lambda device: device.arm()),
+        ([("w", b"SVA?\n"), ("r", b"1=5.0e+01\n")], lambda device: device.safe_step()),
+        ([("w", b"VOL? 1 2 3\n"), ("r", FEW)], lambda device: device.readback_V()),
+    ],
+)
+def test_an_answer_with_too_few_values_is_an_error_of_the_device(script: Script, act: Callable[[E727], object]) -> None:
+    """It was a bare ValueError, which nobody above the HAL catches."""
+    device, _, _ = make(*script)
+    with pytest.raises(ProtocolError, match=r"answer to '(SVA|VOL)\?.*not 3 finite values") as caught:
+        act(device)
+    assert caught.value.device == "piezo"
+
+
+def test_the_range_of_a_servo_stage_needs_three_values() -> None:
+    servo = [("w", b"SVO 1 1 2 1 3 1\n") if step == ("w", b"SVO 1 0 2 0 3 0\n") else step for step in PROBE]
+    device, _, _ = make(*servo, ("w", b"TMN?\n"), ("r", b"1=0 \n2=0\n"), mode="servo")
+    with pytest.raises(ProtocolError, match=r"answer to 'TMN\?'"):
+        device.probe()
 
 
 def test_probe_refuses_another_controller():

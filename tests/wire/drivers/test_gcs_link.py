@@ -49,10 +49,10 @@ def test_a_reply_ends_with_the_line_that_has_no_space():
 
 
 def test_values_are_finite_numbers_after_an_equals_sign():
-    assert scripted(("w", b"POS?\n"), ("r", b"1=1.5 \n2=-2e1\n")).values("POS?") == [1.5, -20.0]
-    for reply in (b"1.5\n", b"1=fast\n", b"1=nan\n", b"1=2=3\n"):
+    assert scripted(("w", b"POS?\n"), ("r", b"1=1.5 \n2=-2e1\n")).values("POS?", 2) == [1.5, -20.0]
+    for reply in (b"1.5\n", b"1=fast\n", b"1=nan\n", b"1=2=3\n", b"1=1.5\n", b"\n"):
         with pytest.raises(ProtocolError, match=r"answer to 'POS\?'") as caught:
-            scripted(("w", b"POS?\n"), ("r", reply)).values("POS?")
+            scripted(("w", b"POS?\n"), ("r", reply)).values("POS?", 2)
         assert caught.value.device == "piezo"
 
 
