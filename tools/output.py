@@ -1,19 +1,23 @@
-"""Results as files: JSON or text that is there whole or not at all, and a folder that is checked before the work."""
+"""Results as files: each is there whole or not at all, none costs another one, and names are checked beforehand."""
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 import math
 import os
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import BaseModel
 
-from tools.errors import InputError
+from tools.errors import InputError, OutputError
 
 
 def to_jsonable(value: Any) -> Any:
@@ -36,19 +40,50 @@ def to_jsonable(value: Any) -> Any:
 
 
 def write_text_atomic(path: Path, text: str) -> None:
-    """All of the file or nothing of it."""
+    """All of the file or nothing of it. ``OutputError`` when it cannot be written."""
+    write_bytes_atomic(path, text.encode())
+
+
+def write_bytes_atomic(path: Path, data: bytes) -> None:
+    """Write a temporary file beside ``path`` and rename it; a device or a pipe is written as it is.
+
+    A link is followed. ``OutputError`` when it cannot be written; ``path`` is then what it was before.
+    """
+    target = path.resolve()
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        if target.exists() and not target.is_file():
+            target.write_bytes(data)  # /dev/stdout, /dev/null, a named pipe: renaming would put a file in their place
+            return
+        handle, temporary = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:200]}.")
     except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror}); name a folder that exists") from error
+        raise OutputError(_cannot(path, error)) from error
     try:
-        with os.fdopen(handle, "w", encoding="utf-8") as file:
-            file.write(text)
+        with os.fdopen(handle, "wb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(handle)  # a quota or a full disk may show itself only here
         os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-    except BaseException:
+        os.replace(temporary, target)
+    except OSError as error:
+        raise OutputError(_cannot(path, error)) from error
+    finally:
         Path(temporary).unlink(missing_ok=True)
-        raise
+
+
+def save_figure(figure: Any, path: Path, **options: Any) -> None:
+    """Draw a matplotlib figure and write it whole, in the format that the name says; its folder is made."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format=path.suffix.removeprefix(".") or "png", **options)
+    make_folder_of(path)
+    write_bytes_atomic(path, buffer.getvalue())
+
+
+def make_folder_of(path: Path) -> None:
+    """``OutputError`` when the folder of ``path`` is not there and cannot be made."""
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(_cannot(path, error)) from error
 
 
 def write_json(result: Any, destination: str | None) -> None:
@@ -57,18 +92,69 @@ def write_json(result: Any, destination: str | None) -> None:
         return
     text = json.dumps(to_jsonable(result), indent=2) + "\n"
     if destination == "-":
-        sys.stdout.write(text)
+        try:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            raise OutputError(_cannot("standard output", error)) from error
     else:
         write_text_atomic(Path(destination), text)
 
 
+class Outputs:
+    """Results that do not depend on one another: each is tried, and ``finish`` says which failed.
+
+    A run of an hour must not be lost because the disk was too full for its picture.
+    """
+
+    def __init__(self) -> None:
+        self.failed: list[str] = []
+
+    @contextmanager
+    def part(self, name: str) -> Iterator[None]:
+        """One result. What goes wrong in it is remembered."""
+        try:
+            yield
+        except OutputError as error:
+            self.failed.append(f"{name}: {error}")
+        except Exception as error:
+            self.failed.append(f"{name}: {type(error).__name__}: {error}")
+
+    def finish(self) -> None:
+        """``OutputError`` with everything that failed."""
+        if self.failed:
+            raise OutputError("not all results could be written; the others are there\n  " + "\n  ".join(self.failed))
+
+
 def check_writable(*destinations: str | Path | None, folders: bool = False) -> None:
-    """Refuse a result file in a folder that is not there, or that is a folder (unless ``folders``), before any work."""
+    """Refuse, before any work, a result file that cannot be written: ``InputError``.
+
+    The folder must be there and take a file, and the name must not be a folder's (unless ``folders``). That the disk
+    becomes full during the work is not seen here.
+    """
     for destination in destinations:
         if destination is None or str(destination) == "-":
             continue
-        if not folders and Path(destination).is_dir():
+        path = Path(destination)
+        if not folders and path.is_dir():
             raise InputError(f"{destination}: this is a folder; name a file in it")
-        parent = Path(destination).absolute().parent
+        target = path.resolve()
+        parent = target.parent
         if not parent.is_dir():
             raise InputError(f"{destination}: the folder {parent} does not exist; create it first")
+        if target.exists() and not target.is_file():
+            if not target.is_dir() and not os.access(target, os.W_OK):
+                raise InputError(f"{destination}: no permission to write there; name another file")
+            continue
+        try:
+            with tempfile.TemporaryFile(dir=parent, prefix=f".{target.name[:200]}."):
+                pass
+        except OSError as error:
+            raise InputError(_cannot(destination, error)) from error
+
+
+def _cannot(path: object, error: OSError) -> str:
+    advice = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "name a folder that you may write to"
+    return f"{path}: cannot be written ({error.strerror or error}); {advice}"

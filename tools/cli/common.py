@@ -18,7 +18,7 @@ from rich.table import Table
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
-from tools.errors import InputError
+from tools.errors import InputError, OutputError
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON; '-' is standard output.")
@@ -58,6 +58,8 @@ def clear_errors() -> Iterator[None]:
         yield
     except typer.Exit:
         raise
+    except OutputError as error:
+        _fail(error, Exit.FAILED)
     except InputError as error:
         _fail(error, Exit.BAD_INPUT)
     except HalError as error:

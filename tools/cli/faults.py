@@ -17,7 +17,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
 
 if TYPE_CHECKING:
@@ -82,18 +82,23 @@ def faults(
             besides = [Beside(f"{f}", text, more) for (f, text), more in zip(others, others_rows, strict=True)]
             bounds = drift_bounds(path, rows) if out is not None else []
         total = totals(rows)
+        outputs = Outputs()
         if out is not None:
             asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
             command = f"micron faults --seeds {seeds}{asked} --out {out}"
-            write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
+            with outputs.part("page"):
+                write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
         if json_file != "-":
-            _print(rows, total)
+            with outputs.part("table"):
+                _print(rows, total)
         more = [
             {"bench": b.bench, "only": b.chosen, "rows": [r.as_dict() for r in b.rows], "totals": totals(b.rows)}
             for b in besides
         ]
         result = {"format": 1, "rows": [row.as_dict() for row in rows], "totals": total}
-        write_json({**result, "beside": more} if more else result, json_file)
+        with outputs.part("JSON"):
+            write_json({**result, "beside": more} if more else result, json_file)
+        outputs.finish()
     for figures in (total, *(totals(b.rows) for b in besides)):
         if figures["unsafe_outputs"] or figures["uncounted_samples"] or figures["wrong_messages"]:
             raise typer.Exit(1)

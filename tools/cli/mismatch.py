@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_writable, write_json, write_text_atomic
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -130,19 +130,23 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
     from tools.mismatch.report.terminal import print_report
 
-    # with '--json -' standard output belongs to the JSON
-    print_report(report, console() if json_file == "-" else data_console())
-    write_json(report.to_json(), json_file)
-    if html is None and out is None:
-        return
-    from tools.mismatch.batch import write_reports
-    from tools.mismatch.report.page import html_page
+    outputs = Outputs()
+    with outputs.part("table"):
+        # with '--json -' standard output belongs to the JSON
+        print_report(report, console() if json_file == "-" else data_console())
+    with outputs.part("JSON"):
+        write_json(report.to_json(), json_file)
+    if html is not None or out is not None:
+        from tools.mismatch.batch import write_reports
+        from tools.mismatch.report.page import html_page
 
-    page = html_page(report)
-    if out is not None:
-        write_reports(report, out, page)
-    if html is not None:
-        write_text_atomic(html, page)
+        with outputs.part("page"):
+            page = html_page(report)
+            if html is not None:
+                write_text_atomic(html, page)
+            if out is not None:
+                write_reports(report, out, page)
+    outputs.finish()
 
 
 def _diagnose_folder(

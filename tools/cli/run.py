@@ -29,7 +29,6 @@ from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
 from tools.errors import InputError
 from tools.output import check_writable, write_json
-from tools.output import write_text_atomic as write_text
 from tools.prepare import prepare
 
 if TYPE_CHECKING:
@@ -126,22 +125,11 @@ def run(
             finish_endoscope_run(outcome, truth, json_file)
             return
         # only now: the firmware did not wait for what draws
-        from tools.reports.run_report import html_page, next_steps, picture, print_report, save_picture
+        from tools.reports.run_report import next_steps, write_report
 
         result = complete_result(outcome, truth)
-        if truth is not None and result["tremor"]["reduction_percent"] is not None:
-            png = picture(truth, result)
-            save_picture(png, image)
-        else:
-            png = None
-        if html is not None:
-            write_text(html, html_page(result, png))
-        print_report(result, console())
-        if png is not None:
-            console().print(f"picture: {image}")
-        for line in next_steps(result):
-            console().print(escape(line), soft_wrap=True)
-        write_json(result, json_file)
+        steps = next_steps(result)
+        write_report(result, truth, console(), json_file=json_file, html=html, image=image, more=steps)
         if not result["safe_state"]["normal"]:
             raise typer.Exit(Exit.FAILED)
         if result["samples"]["lost"] or result["recorder"]["dropped"]:

@@ -14,7 +14,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.cli.run import complete_result
 from tools.errors import InputError
-from tools.output import check_writable, write_json
+from tools.output import Outputs, check_writable, write_json
 
 if TYPE_CHECKING:
     from tools.closed_loop.simulate import SimulatedRun
@@ -63,13 +63,17 @@ def simulate_command(
             )  # fmt: skip
         took_s = time.process_time() - started_s
         result = complete_result(_outcome(run, file, seconds, delay_s), run.truth)
+        outputs, people = Outputs(), console()
+        with outputs.part("table"):
+            people.print(tremor_table(result))
+            people.print(f"commands clipped: {run.clipped}; {seconds / took_s:.0f} x real time on one core")
+            people.print(headline(result), style="bold")
+        with outputs.part("JSON"):
+            write_json(result, json_file)
         if image is not None:
-            save_picture(picture(run.truth, result), image)
-        people = console()
-        people.print(tremor_table(result))
-        people.print(f"commands clipped: {run.clipped}; {seconds / took_s:.0f} x real time on one core")
-        people.print(f"[bold]{headline(result)}[/]")
-        write_json(result, json_file)
+            with outputs.part("picture"):
+                save_picture(picture(run.truth, result), image)
+        outputs.finish()
 
 
 def _outcome(run: SimulatedRun, bench: Path, seconds: float, delay_s: float) -> dict[str, object]:

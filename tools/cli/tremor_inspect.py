@@ -11,7 +11,7 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_writable, write_bytes_atomic, write_json, write_text_atomic
 
 
 def inspect(
@@ -80,16 +80,21 @@ def inspect(
             console().print(f"note: {note}", soft_wrap=True)
         if json_file != "-":
             print_whole(table(found, whole=True), table(found, whole=False))
+        outputs = Outputs()
+        with outputs.part("JSON"):
+            write_json({"format": 1, "source": recording, "signals": [one.as_dict() for one in found]}, json_file)
         if png is not None or html is not None:
             from tools.tremor.inspect_picture import inspection_figure, page, png_bytes
 
             if png is not None:
-                png.write_bytes(png_bytes(inspection_figure(found[0])))
-                console().print(f"picture: {png}")
+                with outputs.part("picture"):
+                    write_bytes_atomic(png, png_bytes(inspection_figure(found[0])))
+                    console().print(f"picture: {png}")
             if html is not None:
-                write_text_atomic(html, page(found))
-                console().print(f"page: {html}")
-        write_json({"format": 1, "source": recording, "signals": [one.as_dict() for one in found]}, json_file)
+                with outputs.part("page"):
+                    write_text_atomic(html, page(found))
+                    console().print(f"page: {html}")
+        outputs.finish()
 
 
 def _readable(unit: str, size: float) -> tuple[float, str]:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tools.imu.series import AXES, Array, Series
+from tools.output import save_figure
 
 POINTS = 4000
 COLOURS = ("#0072b2", "#d55e00", "#009e73")
@@ -39,8 +40,7 @@ def save_imu_picture(series: Series, path: Path) -> None:
         if warm is not None:
             axes[row, 1].set(xlabel="temperature of the chip (degC)", ylabel=label)
     figure.suptitle(f"{series.name}, {series.rate_hz:g} Hz", fontsize="medium")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)
 
 
 def _envelope(value: Array, rate_hz: float) -> tuple[Array, Array, Array]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from firmware_py.actuation.config import ActuationConfig
 from tools.manipulator.workspace import Workspace, border_faces
+from tools.output import save_figure
 
 TREMOR_UM = 50.0
 
@@ -51,5 +52,4 @@ def save_workspace_picture(config: ActuationConfig, workspace: Workspace, path: 
     flat.set_ylabel("z (um)")
     flat.set_title("seen along y, to scale", fontsize=10, loc="right")
     flat.legend(loc="upper center", bbox_to_anchor=(0.5, -0.9), fontsize=9)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=110)
+    save_figure(figure, path, dpi=110)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from tools.noise.allan import AllanCurve, NoiseModel
+from tools.output import save_figure
 
 
 def save_allan_picture(curves: Mapping[str, tuple[AllanCurve, NoiseModel]], path: Path) -> None:
@@ -25,5 +26,4 @@ def save_allan_picture(curves: Mapping[str, tuple[AllanCurve, NoiseModel]], path
     axes.set(xscale="log", yscale="log", xlabel="averaging time (s)", ylabel="Allan deviation (unit)")
     axes.grid(visible=True, which="both", lw=0.3)
     axes.legend(fontsize="small")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)

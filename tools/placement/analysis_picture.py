@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from tools.output import save_figure
 from tools.placement.analysis import BAND_HZ, Analysis
 
 
@@ -34,5 +35,4 @@ def save_analysis_picture(found: Sequence[Analysis], path: Path) -> None:
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize="x-small", ncols=min(4, len(found)), loc="outside lower center")
     figure.suptitle("rms error by body axis, from the sensors' noise alone", fontsize="medium")
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)

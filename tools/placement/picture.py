@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from tools.output import save_figure
 from tools.placement.configurations import Placement
 from tools.placement.space import Space
 
@@ -39,5 +40,4 @@ def save_placement_picture(placement: Placement, space: Space, path: Path) -> No
         axes.set(xlabel=labels[0], ylabel=labels[1])
         axes.set_aspect("equal", adjustable="datalim")
     side.legend(fontsize="x-small", ncols=3)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path)
+    save_figure(figure, path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from rich.console import Console, Group
 from rich.markup import escape
 from rich.table import Table
 
+from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
 from tools.reports.tremor_figures import AXES, TREMOR_BAND_HZ, band_pass
 
 Array = NDArray[np.float64]
@@ -236,5 +237,39 @@ def html_page(result: Mapping[str, Any], image: bytes | None) -> str:
 
 def save_picture(image: bytes, path: Path) -> None:
     """Write the PNG, making its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(image)
+    make_folder_of(path)
+    write_bytes_atomic(path, image)
+
+
+def write_report(
+    result: Mapping[str, Any],
+    truth: Mapping[str, Array] | None,
+    console: Console,
+    *,
+    json_file: str | None,
+    html: Path | None,
+    image: Path,
+    more: Sequence[str] = (),
+) -> None:
+    """Table, JSON, picture and page of a run, none of which depends on another one; then the lines ``more``.
+
+    Raises ``OutputError`` at the end, with everything that could not be written.
+    """
+    outputs = Outputs()
+    with outputs.part("table"):
+        print_report(result, console)
+    with outputs.part("JSON"):
+        write_json(result, json_file)
+    png: bytes | None = None
+    if truth is not None and result["tremor"]["reduction_percent"] is not None:
+        with outputs.part("picture"):
+            png = picture(truth, result)
+            save_picture(png, image)
+            console.print(f"picture: {image}")
+    if html is not None:
+        with outputs.part("page"):
+            write_text_atomic(html, html_page(result, png))
+    with outputs.part("what to do next"):
+        for line in more:
+            console.print(line, soft_wrap=True, markup=False)
+    outputs.finish()

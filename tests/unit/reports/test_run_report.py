@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import io
+import json
+import os
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from rich.console import Console
 
@@ -13,7 +18,9 @@ from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 from tools.cli.run import complete_result
-from tools.reports.run_report import headline, summary_lines, task_table
+from tools.errors import OutputError
+from tools.reports import run_report
+from tools.reports.run_report import headline, summary_lines, task_table, write_report
 
 
 @pytest.fixture(scope="module")
@@ -51,3 +58,55 @@ def test_no_figure_of_a_task_is_cut_on_eighty_columns():
     for figure in ("1800000", "520", "1234", "12345", "34567"):
         assert figure in words
     assert words.count("34567") == 2
+
+
+class FullConsole(Console):
+    def print(self, *_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+@pytest.mark.parametrize("lost", [(), ("table",), ("JSON",), ("picture",), ("page",), ("drawing",), ("JSON", "page")])
+def test_the_four_results_of_a_run_do_not_depend_on_one_another(
+    sensed: dict[str, Any],
+    tmp_path: Path,
+    full_disk: Callable[[str], None],
+    monkeypatch: pytest.MonkeyPatch,
+    lost: tuple[str, ...],
+) -> None:
+    files = {"JSON": tmp_path / "r.json", "picture": tmp_path / "new" / "r.png", "page": tmp_path / "r.html"}
+    for name in set(lost) & set(files):
+        full_disk(files[name].name)
+
+    def draw(*_: object) -> bytes:
+        if "drawing" in lost:
+            raise ValueError("a drawing that fails")
+        return b"PNG"
+
+    monkeypatch.setattr(run_report, "picture", draw)
+    monkeypatch.setattr(run_report, "tremor_table", lambda _: "a table")
+    monkeypatch.setattr(run_report, "headline", lambda _: "a headline")
+    result = {**sensed, "tremor": {**sensed["tremor"], "reduction_percent": 80.0}}
+    said = io.StringIO()
+    console = FullConsole() if "table" in lost else Console(file=said, width=80)
+
+    def write() -> None:
+        write_report(
+            result, {"t_ns": np.zeros(1)}, console, json_file=str(files["JSON"]), html=files["page"],
+            image=files["picture"],
+        )  # fmt: skip
+
+    if lost:
+        with pytest.raises(OutputError) as caught:
+            write()
+        for name in lost:
+            assert f"\n  {'picture' if name == 'drawing' else name}: " in str(caught.value)
+    else:
+        write()
+    expected = {name for name in files if name not in lost and not (name == "picture" and "drawing" in lost)}
+    assert {name for name, path in files.items() if path.exists()} == expected
+    if "table" not in lost:
+        assert "a headline" in said.getvalue()
+    if "JSON" in expected:
+        assert json.loads(files["JSON"].read_text())["tremor"]["reduction_percent"] == 80.0
+    leftovers = list(tmp_path.rglob(".*"))
+    assert leftovers == []
