@@ -12,9 +12,8 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from tools.bench.started import started
+from tools.terminal import plain_console
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 SETTLE_MS = {"scope": 9000, "tremor": 8000}
@@ -40,7 +39,7 @@ def report(folder: Path) -> Path:
 
 
 def main(arguments: list[str]) -> int:
-    people = Console(stderr=True)
+    people = plain_console(stderr=True)
     chromium = shutil.which("chromium")
     try:
         from playwright.sync_api import sync_playwright

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import clear_errors, console
@@ -49,7 +50,8 @@ def bench(
 
         def announce(address: str) -> None:
             console().print(
-                f"bench page: [bold]{address}[/]  (the token is shown only here; Ctrl-C ends)", soft_wrap=True
+                Text.assemble("bench page: ", (address, "bold"), "  (the token is shown only here; Ctrl-C ends)"),
+                soft_wrap=True,
             )
 
         choice = Choice(bench_path(bench).absolute(), hand, None, seed, stale_ms)

@@ -144,7 +144,7 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforw
         if not fit.warnings:
             data_console().print(f"stack {i + 1}: nothing is missing in the excitation")
         for name, left, kept in fit.parts:
-            console().print(f"[dim]stack {i + 1}: {name}: {left:.4f} um{'' if kept else ' (not kept)'}[/]")
+            console().print(f"stack {i + 1}: {name}: {left:.4f} um{'' if kept else ' (not kept)'}", style="dim")
 
 
 def manipulator(

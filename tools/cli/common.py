@@ -12,13 +12,14 @@ from typing import Annotated
 
 import typer
 from rich.console import Console
-from rich.markup import escape
 from rich.measure import Measurement
 from rich.table import Table
+from rich.text import Text
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
 from tools.errors import InputError, OutputError
+from tools.terminal import plain_console
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON; '-' is standard output.")
@@ -27,12 +28,12 @@ JsonOption = Annotated[
 
 def console() -> Console:
     """For people: standard error."""
-    return Console(stderr=True, highlight=False, emoji=False)
+    return plain_console(stderr=True)
 
 
 def data_console() -> Console:
     """For data: standard output."""
-    return Console(highlight=False)
+    return plain_console()
 
 
 def print_whole(full: Table, narrow: Table | None = None) -> None:
@@ -43,12 +44,22 @@ def print_whole(full: Table, narrow: Table | None = None) -> None:
     out = data_console()
     needed = Measurement.get(out, out.options.update(max_width=1000), full).maximum
     if not out.is_terminal:
-        out = Console(highlight=False, width=max(needed, out.width))
+        out = plain_console(width=max(needed, out.width))
     elif narrow is not None and needed > out.width:
         out.print(narrow)
         console().print(f"{needed} columns show more than these {out.width}; so does --json FILE", soft_wrap=True)
         return
     out.print(full)
+
+
+def print_error(message: str) -> None:
+    """``micron: message`` on standard error."""
+    console().print(Text.assemble(("micron:", "bold red"), " ", message), soft_wrap=True)
+
+
+def print_note(message: str) -> None:
+    """``note: message`` on standard error."""
+    console().print(Text.assemble(("note:", "yellow"), " ", message), soft_wrap=True)
 
 
 @contextmanager
@@ -67,5 +78,5 @@ def clear_errors() -> Iterator[None]:
 
 
 def _fail(error: Exception, code: Exit) -> None:
-    console().print(f"[bold red]micron:[/] {escape(str(error))}", soft_wrap=True)
+    print_error(str(error))
     raise typer.Exit(code)

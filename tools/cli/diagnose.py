@@ -9,13 +9,12 @@ from typing import Annotated
 
 import typer
 from rich.live import Live
-from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 
@@ -70,7 +69,8 @@ def scan(
         for heading in ("bus", "address", "declared", "answers"):
             table.add_column(heading)
         for a in result.i2c:
-            table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", "yes" if a.answered else "[bold red]no[/]")
+            answered = Text("yes") if a.answered else Text("no", "bold red")
+            table.add_row(a.bus, f"0x{a.address:02X}", a.declared or "-", answered)
         out.print(table)
         traffic = Table(title=f"CAN, {seconds:g} s", title_justify="left")
         for heading in ("bus", "id", "message", "frames", "rate (Hz)"):
@@ -207,7 +207,7 @@ def ramp(
                 str(step.channel + 1),
                 f"{step.wanted_V:.2f}",
                 f"{step.read_V:.3f}",
-                f"[red]{error}[/]" if bad else error,
+                Text(error, "red") if bad else error,
             )
 
         with opened_bench(path, pace=pace_of(virtual)) as opened:
@@ -316,7 +316,7 @@ def golden_diff(
         for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
             table.add_column(heading)
         for d in report.differences:
-            table.add_row(d.bus, d.side, str(d.entry), d.kind, escape(d.recorded), escape(d.found))
+            table.add_row(d.bus, d.side, str(d.entry), d.kind, d.recorded, d.found)
         if report.differences:
             data_console().print(table)
         console().print(f"{report.protocol} differences of protocol, {report.data} of data")
@@ -352,7 +352,7 @@ def log_follow(
                     typer.echo(f"{line['when']} {line['level']:<5} {line['text']}")
                     sys.stdout.flush()
         except ConnectionError as error:
-            console().print(f"[bold red]micron:[/] {escape(str(error))}", soft_wrap=True)
+            print_error(str(error))
             raise typer.Exit(Exit.DEVICE_MISSING) from error
         except KeyboardInterrupt:
             pass

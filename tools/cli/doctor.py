@@ -14,6 +14,7 @@ from typing import Literal
 
 import typer
 from rich.table import Table
+from rich.text import Text
 
 from drivers.bus_use import bus_shares, bus_uses
 from drivers.polling import polling_of
@@ -183,7 +184,7 @@ def doctor(
             colours = {"ok": "green", "limited": "yellow", "missing": "red"}
             for finding in findings:
                 colour = colours[finding.verdict]
-                table.add_row(finding.part, f"[{colour}]{finding.verdict}[/]", finding.detail, finding.remedy)
+                table.add_row(finding.part, Text(finding.verdict, colour), finding.detail, finding.remedy)
             data_console().print(table)
         write_json({"format": 1, "findings": [asdict(f) for f in findings], "missing": len(missing)}, json_file)
         if missing:

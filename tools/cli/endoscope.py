@@ -88,7 +88,7 @@ def play_command(
         if not done["done"]:
             ended = result.get("safe_state", {"normal": True})
             why = f"gave up after {limit:g} s (--limit)" if ended["normal"] else f"ended: {ended['reason']}"
-            console().print(f"[yellow]{why}[/]", soft_wrap=True)
+            console().print(why, style="yellow", soft_wrap=True)
             raise typer.Exit(Exit.FAILED)
         if not healthy:
             raise typer.Exit(Exit.DATA_LOST)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.recording.revision import git_revision
@@ -19,6 +19,7 @@ from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
+from tools.terminal import task_name
 
 if TYPE_CHECKING:
     from tools.faults.fault import Fault
@@ -63,9 +64,7 @@ def faults(
         benches = [(path, _chosen("--only", only)), *((file, _chosen("--beside", text)) for file, text in others)]
         for file, chosen in benches:
             _emulated(file, chosen)
-        with Progress(
-            TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), console=console(), transient=True
-        ) as progress:
+        with Progress(task_name(), BarColumn(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting", total=len(POINTS) * seeds * len(benches))
             rows, *others_rows = (
                 run_campaign(

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
@@ -14,6 +14,7 @@ from tools.cli.common import JsonOption, clear_errors, console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
+from tools.terminal import task_name
 
 
 def hands(
@@ -37,9 +38,7 @@ def hands(
             raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
         file = load_bench(bench_path(bench))
         rows: list[HandRow] = []
-        with Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(), transient=True
-        ) as progress:
+        with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
             rows.extend(run_hands(file, data, seconds, lambda text: progress.update(task, description=text)))
         page = markdown(rows, seconds, revision_and_day())

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
 from tools.cli.bench_option import pace_of
@@ -15,6 +15,7 @@ from tools.cli.common import Exit, JsonOption, clear_errors, console, data_conso
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
+from tools.terminal import task_name
 
 imu = typer.Typer(help="Inertial sensors: offsets, stability, drift, noise, temperature.")
 
@@ -100,7 +101,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
     found: list[dict[str, Any]] = []
     described = load_bench(bench)
     check_devices(described.description, str(described.path))
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
+    columns = (task_name(), BarColumn(), TimeRemainingColumn())
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
         open_bench(described, pace=pace_of(virtual), runtime_dir=Path(folder)) as opened,
@@ -175,7 +176,7 @@ def _show(found: dict[str, Any]) -> None:
             table.add_row(name, *(f"{v:.3g}" for v in figures), axis["unit"], axis["verdict"])
         data_console().print(table)
     for warning in found["warnings"]:
-        console().print(f"[yellow]{found['sensor']}: {warning}[/]", soft_wrap=True)
+        console().print(f"{found['sensor']}: {warning}", style="yellow", soft_wrap=True)
 
 
 def _show_others(result: dict[str, Any]) -> None:
@@ -194,4 +195,6 @@ def _show_others(result: dict[str, Any]) -> None:
                 data_console().print(f"{turned['sensor']}: offset {x:.1f}, {y:.1f}, {z:.1f} mg by {what}")
         if turned["poles_missing"]:
             missing = ", ".join(turned["poles_missing"])
-            console().print(f"[yellow]never pointed up: {missing}; the manual offsets of these axes mean nothing[/]")
+            console().print(
+                f"never pointed up: {missing}; the manual offsets of these axes mean nothing", style="yellow"
+            )

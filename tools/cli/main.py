@@ -102,7 +102,20 @@ def load(name: str) -> Any:
         around.add_typer(found, name=name, cls=Helpful)
     else:
         around.command(name)(found)
-    return typer.main.get_group(around).commands[name]
+    return _with_brackets(typer.main.get_group(around).commands[name])
+
+
+def _with_brackets(command: Any) -> Any:
+    """``command`` with its help escaped: typer reads help as rich markup and leaves ``[firmware]`` out."""
+    from rich.markup import escape
+
+    command.help = escape(command.help) if command.help else command.help
+    for parameter in command.params:
+        if getattr(parameter, "help", None):
+            parameter.help = escape(parameter.help)
+    for inner in getattr(command, "commands", {}).values():
+        _with_brackets(inner)
+    return command
 
 
 class Helpful(TyperGroup):

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
 
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_json, write_text_atomic
+from tools.terminal import task_name
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
@@ -113,9 +113,9 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
 
     loaded = load(path)
     for note in loaded.warnings:
-        console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
+        print_note(note)
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
+        task_name(), BarColumn(), TextColumn("{task.completed}/{task.total}"), TimeElapsedColumn(),
         console=console(), transient=True,
     ) as progress:  # fmt: skip
         bar = progress.add_task("noise and base parameters", total=None)
@@ -152,7 +152,7 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 def _diagnose_folder(
     folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None
 ) -> None:
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from tools.mismatch import batch
     from tools.mismatch.report.terminal import batch_report
@@ -161,7 +161,7 @@ def _diagnose_folder(
     stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
     rows: list[batch.Row] = []
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        task_name(), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
         console=console(), transient=True,
     ) as progress:  # fmt: skip
         bar = progress.add_task("recordings", total=len(work))
@@ -173,7 +173,7 @@ def _diagnose_folder(
     write_json(batch.to_json(folder, rows), json_file)
     bad = [row for row in rows if row.error]
     if bad:
-        console().print(f"[bold red]micron:[/] {len(bad)} of {len(rows)} recordings have no report")
+        print_error(f"{len(bad)} of {len(rows)} recordings have no report")
         raise typer.Exit(Exit.BAD_INPUT if all(row.bad_input for row in bad) else Exit.FAILED)
 
 
@@ -327,7 +327,7 @@ def apply(
             raise InputError(f"{bench}: an emulated bench runs twins of piezo_stack, this one is a {twin.kind}")
         write_twin(twin, body, out)
         for note in twin.notes:
-            console().print(f"[yellow]note:[/] {escape(note)}", soft_wrap=True)
+            print_note(note)
         carried = ", ".join(twin.effects) or "no effects"
         console().print(f"{out}: {twin.kind} with {carried}")
         if original is not None:

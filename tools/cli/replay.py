@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.text import Text
 
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.output import check_writable, write_json
@@ -38,8 +39,10 @@ def replay(
             say.print(f"{report.rows} ticks replayed: every estimate and command is the recorded one, bit for bit")
         else:
             say.print(
-                f"[bold red]{report.mismatching_rows} of {report.rows} ticks differ[/]; the first: {report.first}. "
-                "Was the recording made by another revision of the firmware?"
+                Text.assemble(
+                    (f"{report.mismatching_rows} of {report.rows} ticks differ", "bold red"),
+                    f"; the first: {report.first}. Was the recording made by another revision of the firmware?",
+                )
             )
         say.print(f"{recorded_s:.1f} s in {took_s:.2f} s: {recorded_s / took_s:.0f} x real time")
         write_json(

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 from rich.table import Table as RichTable
+from rich.text import Text
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
@@ -53,15 +53,15 @@ def reproduce(
         for row in table.rows:
             if row.source != source:
                 source = row.source
-                grid.add_row(f"[bold]{escape(source)}[/]")
+                grid.add_row(Text(source, "bold"))
             sign = {"equal": "=", "lower": "<=", "higher": ">="}[row.better]
-            why = f"\n[dim]{escape(row.why)}[/]" if row.why else ""
+            why = ("\n" + row.why, "dim") if row.why else ""
             grid.add_row(
-                f"  {escape(row.quantity)} ({escape(row.condition)}; {row.kind}){why}",
+                Text.assemble(f"  {row.quantity} ({row.condition}; {row.kind})", why),
                 f"{sign} {row.published:.4g}",
                 f"{row.ours:.4g}" if math.isfinite(row.ours) else "-",
                 row.unit,
-                "yes" if row.meets else "[red]no[/]",
+                "yes" if row.meets else Text("no", "red"),
             )
         data_console().print(grid)
         for note in table.notes:

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.console import RenderableType
 from rich.live import Live
-from rich.markup import escape
 from rich.spinner import Spinner
 from rich.text import Text
 
@@ -118,7 +117,7 @@ def run(
             from tools.reports.run_live import opening_lines
 
             for line in opening_lines(file, seconds, pace, hand, seed):
-                console().print(escape(line))
+                console().print(line)
             prepare(file, request.method, console())
         outcome, truth = _run_real(request) if pace == "realtime" else _run_emulated(request)
         if outcome.get("instrument") == "endoscope":

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.endoscope.wiring import is_endoscope
@@ -15,6 +15,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.terminal import task_name
 
 
 def budget(
@@ -58,7 +59,7 @@ def budget(
 
 
 def _progress() -> Progress:
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn())
+    columns = (SpinnerColumn(), task_name(), TimeElapsedColumn())
     return Progress(*columns, console=console(), transient=True)
 
 

@@ -6,13 +6,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.tremor.config import METHODS, Method, all_methods
 from tools.cli.common import JsonOption, clear_errors, console, data_console, print_whole
 from tools.errors import InputError
 from tools.output import check_writable, write_json
+from tools.terminal import task_name
 
 
 def evaluate(
@@ -73,9 +74,7 @@ def evaluate(
         cases = [c for source in recordings for c in cases_from(source, not as_recorded, not as_recorded)]
         for note in dict.fromkeys(f"{c.name}: {note}" for c in cases for note in c.notes):
             console().print(f"note: {note}", soft_wrap=True)
-        with Progress(
-            SpinnerColumn(), TextColumn("{task.description}"), TimeElapsedColumn(), console=console(), transient=True
-        ) as progress:
+        with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
             results = evaluate_cases(
                 cases, methods, horizons, progress=lambda text: progress.update(task, description=text)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from rich import box
 from rich.console import Console, Group
-from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
 from tools.reports.tremor_figures import AXES, TREMOR_BAND_HZ, band_pass
@@ -178,10 +178,10 @@ def next_steps(result: Mapping[str, Any]) -> list[str]:
 
 def print_report(result: Mapping[str, Any], console: Console) -> None:
     """The whole report for a terminal: the result in one sentence, the tables, what to do next."""
-    parts: list[Any] = ["", f"[bold]{headline(result)}[/]", ""]
+    parts: list[Any] = ["", Text(headline(result), "bold"), ""]
     if result["tremor"]["reduction_percent"] is not None:
         parts.append(tremor_table(result))
-    parts += [task_table(result), f"[dim]{task_legend(result)}[/]", "", *map(escape, summary_lines(result)), ""]
+    parts += [task_table(result), Text(task_legend(result), "dim"), "", *summary_lines(result), ""]
     console.print(Group(*parts))
 
 
@@ -271,5 +271,5 @@ def write_report(
             write_text_atomic(html, html_page(result, png))
     with outputs.part("what to do next"):
         for line in more:
-            console.print(line, soft_wrap=True, markup=False)
+            console.print(line, soft_wrap=True)
     outputs.finish()

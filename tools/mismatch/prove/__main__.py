@@ -32,11 +32,10 @@ def main() -> int:
     p.add_argument("--generate-only", action="store_true", help="write recordings and answers, diagnose nothing")
     args = p.parse_args()
 
-    from rich.console import Console
-
     from tools.mismatch.prove import plans, seal
     from tools.mismatch.prove.proof import generate, prove
     from tools.mismatch.prove.table import show
+    from tools.terminal import plain_console
 
     if args.generate_only:
         if args.keep is None or args.seed is None:
@@ -46,7 +45,7 @@ def main() -> int:
         print(f"{len(answers)} recordings, sha256 {seal.close(answers, args.keep / 'sealed')}")
         return 0
     result = prove(args.cases, args.seed, args.jobs, args.keep, only=args.only, max_samples=args.max_samples)
-    show(result, Console(file=sys.stdout if args.json is None else sys.stderr, width=150))
+    show(result, plain_console(file=sys.stdout if args.json is None else sys.stderr, width=150))
     if args.json is not None:
         args.json.write_text(json.dumps(result.to_json(), indent=1))
     return 0

@@ -7,6 +7,7 @@ from typing import Any
 
 from rich.console import Console, Group, RenderableType
 from rich.table import Table
+from rich.text import Text
 
 from tools.mismatch.prove.proof import ProofResult
 
@@ -37,9 +38,10 @@ def _totals(s: dict[str, Any]) -> Table:
     for key, text, goal, more in LINES:
         got, of = s[key]
         share = got / of if of else None
-        verdict = ""
+        verdict = Text()
         if goal is not None and share is not None:
-            verdict = "[green]met" if (share >= goal if more else share <= goal) else "[red]missed"
+            met = share >= goal if more else share <= goal
+            verdict = Text("met", "green") if met else Text("missed", "red")
         target = "" if goal is None else f"{'>=' if more else '<='} {100 * goal:.0f} %"
         t.add_row(text, f"{got}/{of}", "" if share is None else f"{100 * share:.0f} %", target, verdict)
     return t

@@ -145,7 +145,7 @@ def render(report: Report) -> RenderableType:
     parts: list[RenderableType] = [
         Panel(
             Text(report.summary),
-            title=f"[bold {colour}]{wording.VERDICTS[report.verdict]}",
+            title=Text(wording.VERDICTS[report.verdict], f"bold {colour}"),
             title_align="left",
             border_style=colour,
         )

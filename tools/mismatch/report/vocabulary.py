@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from rich.console import Console
-from rich.markup import escape
 from rich.padding import Padding
 from rich.table import Table
 from rich.text import Text
@@ -110,7 +109,7 @@ def to_json(found: Sequence[Entry]) -> dict[str, Any]:
 def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
     """For a terminal."""
     for e in found:
-        console.print(f"[bold yellow]{e.name}[/]  {escape(e.summary)}")
+        console.print(Text.assemble((e.name, "bold yellow"), "  ", e.summary))
         t = Table.grid(padding=(0, 2, 0, 0))
         t.add_column(style="dim", no_wrap=True)
         t.add_column(overflow="fold")
@@ -128,4 +127,4 @@ def print_vocabulary(found: Sequence[Entry], console: Console) -> None:
         for name, value in rows:
             t.add_row(name, Text(value))
         console.print(Padding(t, (0, 0, 1, 2)))
-    console.print(f"[dim]{UNITS}[/]", markup=True)
+    console.print(Text(UNITS, "dim"))
