@@ -7,9 +7,11 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 # compiled modules are kept: without them every process of the tests compiles its imports anew
 unexport PYTHONDONTWRITEBYTECODE
+# versions and hashes of everything, of what builds the package as well
+INSTALL = VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -b constraints.txt
 COVERED = hal drivers firmware_py
 
-.PHONY: run test unit realtime speed test-all lint audit fuzz bench docs pictures wheel coverage mutation quality setup clean
+.PHONY: run test unit realtime speed test-all lint audit fuzz bench docs pictures wheel coverage mutation quality constraints setup clean
 
 run: setup
 	$(BIN)/micron run
@@ -35,26 +37,39 @@ lint: setup
 	$(BIN)/pyright
 	$(BIN)/lint-imports
 
-# fails on a known vulnerability that has a repair; says so and goes on where the database cannot be reached
+# of everything that is installed and of all extras: fails on a known vulnerability that has a repair; says so and goes on
+# where the database cannot be reached
 audit: setup
 	$(BIN)/python -m tools.supply.audit
+
+# pins and hashes of the project and all extras again; make constraints UPGRADE="numpy uv" takes newer ones of these
+UPGRADE ?=
+LOCK = $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --generate-hashes --no-header --no-annotate \
+  $(addprefix --upgrade-package ,$(UPGRADE))
+constraints: setup
+	grep '^#' constraints.txt > constraints.new && grep '^#' uv-pin.txt > uv-pin.new
+	cp constraints.txt constraints.out && cp uv-pin.txt uv-pin.out
+	printf 'hatchling\neditables\n' | $(LOCK) pyproject.toml - --all-extras -o constraints.out
+	echo uv | $(LOCK) - -o uv-pin.out
+	cat constraints.out >> constraints.new && mv constraints.new constraints.txt && rm constraints.out
+	cat uv-pin.out >> uv-pin.new && mv uv-pin.new uv-pin.txt && rm uv-pin.out
 
 # coverage guided, 60 s per parser, one parser per core: make fuzz SECONDS=600 TARGET=own_recording
 SECONDS ?= 60
 SEED    ?= 0
 TARGET  ?= all
 fuzz: setup
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[fuzz]'
+	$(INSTALL) -e '.[fuzz]'
 	$(BIN)/python -m tests.fuzz.run $(TARGET) --seconds $(SECONDS) --seed $(SEED)
 
 # installs the peers that it compares with; make bench ONLY="step world" for some of it
 bench: setup
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[bench]'
+	$(INSTALL) -e '.[bench]'
 	$(BIN)/python -m benchmarks $(ONLY)
 
 # the site in out/site; strict: a broken link or an undocumented name in the reference fails
 docs: setup
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[docs]'
+	$(INSTALL) -e '.[docs]'
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet
 
 # the pictures of the documents, of a running page; needs Chromium
@@ -64,9 +79,9 @@ pictures: setup
 # the built package in an empty environment, away from the sources
 wheel: setup
 	rm -rf out/wheel
-	$(BIN)/uv build --quiet --wheel --out-dir out/wheel
+	$(BIN)/uv build --quiet -b constraints.txt --wheel --out-dir out/wheel
 	$(BIN)/uv venv --quiet --python $(BIN)/python out/wheel/venv
-	VIRTUAL_ENV=out/wheel/venv $(BIN)/uv pip install --quiet -c constraints.txt out/wheel/*.whl
+	VIRTUAL_ENV=out/wheel/venv $(BIN)/uv pip install --quiet -c constraints.txt -b constraints.txt out/wheel/*.whl
 	$(BIN)/python -m zipfile -l out/wheel/*.whl > out/wheel/files.txt
 	for file in hal/py.typed drivers/dbc/micron.dbc benches/calibration/piezo.toml tools/bench/static/index.html; do \
 	  grep -q "^$$file " out/wheel/files.txt || { echo "the wheel lacks $$file"; exit 1; }; done
@@ -83,16 +98,16 @@ mutation: setup quality
 	$(BIN)/python -m tests.mutation.run $(ONLY)
 
 quality: setup
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[quality]'
+	$(INSTALL) -e '.[quality]'
 
 setup: $(VENV)/.ready
 
 # the stamp is touched only when every step has worked, so that a half-made environment is made again
-$(VENV)/.ready: pyproject.toml constraints.txt
+$(VENV)/.ready: pyproject.toml constraints.txt uv-pin.txt
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed, this is " + sys.version)'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check uv
-	VIRTUAL_ENV=$(VENV) $(BIN)/uv pip install --quiet -c constraints.txt -e '.[dev]'
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes -r uv-pin.txt
+	$(INSTALL) -e '.[dev]'
 	touch $@
 
 clean:

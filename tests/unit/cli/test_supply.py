@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from email.message import Message
 from types import SimpleNamespace
 from typing import Any, cast
 
-from tools.supply.audit import findings, verdict
+from tools.supply.audit import CONSTRAINTS, audited, findings, verdict
 from tools.supply.licences import PYPROJECT, declared, page, parts
 
 
@@ -62,3 +63,33 @@ def test_only_a_vulnerability_with_a_repair_fails_the_audit():
     assert verdict(found) == 1
     assert verdict(found[1:]) == 0
     assert verdict([]) == 0
+
+
+def test_what_the_database_does_not_know_is_not_audited():
+    assert audited(REPORT) == 3
+
+
+def pins(text: str) -> dict[str, list[str]]:
+    """Hashes by package; a line that is no exact pin fails."""
+    found: dict[str, list[str]] = {}
+    for entry in text.replace("\\\n", " ").splitlines():
+        if entry.strip() and not entry.startswith("#"):
+            match = re.fullmatch(r"([a-z0-9-]+)==[^ ;]+( ; [^-]+?)?((?: +--hash=sha256:[0-9a-f]{64})+) *", entry)
+            assert match, entry[:100]
+            found[match[1]] = match[3].split()
+    return found
+
+
+def test_every_package_of_every_extra_is_pinned_with_hashes():
+    pinned = pins(CONSTRAINTS.read_text())
+    assert {name.lower().replace("_", "-") for name in declared(PYPROJECT)} <= set(pinned)
+    assert {"hatchling", "editables"} <= set(pinned)  # what builds the package
+    assert len(pins((CONSTRAINTS.parent / "uv-pin.txt").read_text())["uv"]) > 10
+
+
+def test_nothing_is_installed_without_its_hash():
+    """The one thing before uv is uv."""
+    makefile = (CONSTRAINTS.parent / "Makefile").read_text()
+    for line in makefile.splitlines():
+        if "pip install" in line:
+            assert "--require-hashes" in line or "-c constraints.txt -b constraints.txt" in line, line
