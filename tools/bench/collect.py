@@ -13,8 +13,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
+from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import is_being_recorded
-from firmware_py.recording.format import TIME_COLUMN
+from firmware_py.recording.format import TIME_COLUMN, load_json
 from firmware_py.recording.reader import Recording
 from tools.bench.jobs import Jobs
 from tools.bench.recorder import SUFFIX, check_name, is_own_file
@@ -26,6 +27,7 @@ FORMATS = ("csv", "npz", "parquet")
 MAX_LISTED = 500
 LOOK_PIXELS = 900
 LOOK_CHANNELS = 8
+MOST_NOTES_BYTES = 1 << 20
 
 
 def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
@@ -38,10 +40,7 @@ def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
         sidecar = path.with_suffix(".json")
         table: dict[str, Any] = {}
         if is_own_file(sidecar):
-            try:
-                table = json.loads(sidecar.read_text(encoding="utf-8"))
-            except ValueError:
-                table = {"notes": ["(its notes cannot be read)"]}
+            table = _notes(sidecar)
         status = path.stat()
         found.append(
             {
@@ -56,6 +55,20 @@ def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
             }
         )
     return found
+
+
+def _notes(sidecar: Path) -> dict[str, Any]:
+    """What was noted beside a recording; a stranger's file may hold anything."""
+    try:
+        if sidecar.stat().st_size > MOST_NOTES_BYTES:
+            raise ValueError("too long")
+        table = load_json(sidecar.read_bytes())
+        if not isinstance(table, dict) or not isinstance(table.get("notes", []), list):
+            raise ValueError("not the notes of a recording")
+        json.dumps(table, allow_nan=False)  # a NaN would cost the whole list
+        return table
+    except (ValueError, OSError, RecordingError):
+        return {"notes": ["(its notes cannot be read)"]}
 
 
 @lru_cache(maxsize=2)

@@ -85,8 +85,11 @@ Half an hour on all buses and eight hours without wires, by eighths: [long runs]
 `tests/fuzz` damages sound inputs of every parser (bench files, recordings, csv, npz, mcap, descriptors, hands, FMU
 archives, DI-4108 streams, motion card lines, GCS replies, CAN frames, page orders, WebSocket messages, reports) in the
 default tests, and replays the corpus in `tests/fuzz/corpus`, which coverage-guided runs have collected; CI goes on from
-it with atheris (`make fuzz`, 60 s per parser). npz files are read without pickle and sized before allocation, FMU
-archives checked for paths outside and for size.
+it with atheris (`make fuzz`, 60 s per parser). Recordings are also changed behind their CRCs (taken apart, changed, put
+together with right lengths and CRCs), in both. No declared size is believed: what is unpacked, searched and listed of a
+recording is bounded ([the bounds](recording-format.md)) and linear in the size of the file. npz files are read without
+pickle, sized before allocation, and unpack to 64 MiB and 200 times their size at most; FMU archives are checked for
+paths outside and for size.
 
 ## Where else
 
@@ -96,6 +99,9 @@ archives checked for paths outside and for size.
 | kill -9 of the emulated world | `tests/hil/test_real_time.py` |
 | kill -9 of the recorder | `tests/unit/recording/test_recorder_process.py` |
 | slow disk, full disk under a running instrument | `tests/hil/test_disk_faults.py`, `tests/unit/recording` |
+| full disk under the results of a run | `tests/unit/reports/test_run_report.py`, `tests/unit/cli/test_output.py` |
+| a recording deleted, replaced, cut or moved under the recorder | `tests/unit/recording/test_disturbed.py` |
+| recordings copied by other programs, or made to hurt | `tests/unit/recording/test_copies.py`, `test_hostile.py` |
 | clocks and counters that wrap: 2^31, 2^32, 2^53 ns | `tests/hil/test_time_marks.py`, [long runs](long-runs.md) |
 | bit flips in frames with a checksum | `tests/wire/drivers/test_can_drivers_wire.py`, `test_e727_wire.py` |
 | real benches: `micron run --inject`, refused without `--max-effect` | `tests/unit/faults/test_inject.py` |

@@ -46,7 +46,7 @@ from tests.fuzz.mcap_parts import (
     schema,
 )
 from tests.unit.recording.samples import same_bits
-from tools.bench.collect import collect_routes, quick_look
+from tools.bench.collect import collect_routes, listing, quick_look
 from tools.errors import InputError
 from tools.mismatch.recording import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
@@ -378,6 +378,16 @@ class TestQuickLook:
         writer.finish({})
         with pytest.raises(InputError, match=r"r\.mcap holds no ticks with a time"):
             quick_look(path, ["tick"])
+
+    @pytest.mark.parametrize(
+        "notes", [b"[1]", b"[" * 5000, b'{"notes": 3}', b'{"ticks": NaN}', b"\xff", b'"x"', b" " * (1 << 21)]
+    )
+    def test_notes_of_strangers_do_not_cost_the_list(self, tmp_path: Path, notes: bytes) -> None:
+        (tmp_path / "r.mcap").write_bytes(b"")
+        (tmp_path / "r.json").write_bytes(notes)
+        (row,) = listing(tmp_path, "")
+        assert row["notes"] == ["(its notes cannot be read)"]
+        json.dumps(row, allow_nan=False)
 
     def test_over_http_hostile_files_are_one_line(self, tmp_path: Path) -> None:
         class Recorder:
