@@ -92,7 +92,7 @@ def test_a_disk_that_stands_still_for_a_second_costs_nothing(
         (2000, lambda pid: os.kill(pid, signal.SIGCONT)),
     )
     np.testing.assert_array_equal(truth["tip_m"], undisturbed[1]["tip_m"])
-    assert outcome["recorder"] == {"ticks": outcome["ticks"]["run"], "dropped": 0}
+    assert outcome["recorder"] == {"ticks": outcome["ticks"]["run"], "dropped": 0, "problem": ""}
     recording = Recording(path)
     assert recording.column("tick").tolist() == list(range(outcome["ticks"]["run"]))
     assert not recording.health.lost

@@ -128,7 +128,7 @@ def test_a_silent_card_holds_the_view_and_ends_the_run(tmp_path: Path) -> None:
 def test_it_records(tmp_path: Path) -> None:
     file = tmp_path / "run.mcap"
     outcome, _ = run_in_process(RunRequest(bench(tmp_path), 1.0, pace="virtual", record=file))
-    assert outcome["recorder"] == {"ticks": outcome["sensors"]["card"]["received"], "dropped": 0}
+    assert outcome["recorder"] == {"ticks": outcome["sensors"]["card"]["received"], "dropped": 0, "problem": ""}
     recording = Recording(file)
     assert recording.column("view_x")[-1] == pytest.approx(outcome["view"]["x"], abs=1.0)
     assert set(np.unique(recording.column("status"))) == {0.0, 1.0}

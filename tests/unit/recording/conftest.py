@@ -30,6 +30,8 @@ def write_file(tmp_path: Path) -> Callable[..., tuple[Path, np.ndarray]]:
             writer.write_metadata("statistics", {"ticks": n})
             end = {"ended": "stopped", "rows_pushed": n, "rows_dropped": 0}
             writer.finish({**end, "events_pushed": events, "events_dropped": 0})
+        else:
+            writer.abandon()  # as if it had been killed
         return path, rows
 
     return write
