@@ -90,7 +90,7 @@ def test_brackets_in_everything_that_is_printed(capsys: pytest.CaptureFixture[st
 
 
 def test_brackets_in_what_is_shown_meanwhile() -> None:
-    """The title of ``micron run`` names the state in brackets: ``[running]``."""
+    """The title of a status table names the state in brackets: ``[running]``."""
     out = io.StringIO()
     shown = plain_console(file=out, width=200, force_terminal=True, color_system=None)
     table = Table("a column" * 8, title="micron run  1.0 of 10 s  [running]")
@@ -101,18 +101,6 @@ def test_brackets_in_what_is_shown_meanwhile() -> None:
         progress.add_task("[daq0] lost [ni]")
         progress.refresh()
     assert "[daq0] lost [ni]" in out.getvalue()
-
-
-def test_the_status_of_a_run_names_its_state() -> None:
-    from tools.cli.run import _status_table
-
-    status = {
-        "t_s": 1.0, "state": "running", "amplitude_um": [1.0] * 3, "frequency_hz": [9.0] * 3, "command_V": [50.0] * 3,
-        "latency_us": [1.0] * 2, "lost": 0, "skipped": 0,
-    }  # fmt: skip
-    out = io.StringIO()
-    plain_console(file=out, width=80).print(_status_table(status, 10.0))
-    assert "[running]" in out.getvalue()
 
 
 def test_styles_are_given_by_objects_and_consoles_made_in_one_place() -> None:
