@@ -14,6 +14,7 @@ from tests.unit.mismatch_engine.cases import recording, stack, wave
 from tools.mismatch.engine.diagnose import nominated, prepared
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import fit, fit_base
+from tools.mismatch.engine.intervals import covariance
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import fitted_part, is_long
@@ -76,13 +77,18 @@ def test_a_parameter_that_no_output_depends_on_stays_as_given(gear: float) -> No
     given: dict[str, object] = {"k1": 2.0, "k2": 0.5, "offset": 0.1, "gear": gear}
     rec = recording("own", {"u": u}, {"y": 1.7 * u + 0.3 + 0.01 * rng.standard_normal(N)}, given)
     problem = own_problem(rec, geared)
-    found = dict(zip(given, fit_base(problem).theta.tolist(), strict=True))
+    fitted = fit_base(problem)
+    found = dict(zip(given, fitted.theta.tolist(), strict=True))
     assert found["gear"] == pytest.approx(gear, rel=1e-3)
     assert found["k1"] * found["k2"] == pytest.approx(1.7, rel=0.01)
     # the product says nothing about its factors: each stays near what was believed
     assert 0.5 < found["k1"] / 2.0 < 2.0
     assert 0.5 < found["k2"] / 0.5 < 2.0
     assert found["offset"] == pytest.approx(0.3, abs=0.01)
+    # nor does the interval of the gear claim that it is known
+    half = 1.96 * np.sqrt(np.diag(covariance(problem, fitted)))
+    assert half[list(given).index("gear")] > abs(gear)
+    assert half[list(given).index("offset")] < 0.01
 
 
 def test_a_refit_that_loses_on_held_out_data_is_not_used() -> None:

@@ -13,6 +13,7 @@ from tools.mismatch.engine.colour import fit_whitener
 from tools.mismatch.engine.fit import Fit, moved_a_little
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import HUBER, robust_scale
+from tools.mismatch.engine.trust import TIMES_GIVEN, TIMES_SCALE
 from tools.mismatch.simulate import Model
 
 Array = NDArray[np.float64]
@@ -129,7 +130,10 @@ def _beyond_fit(problem: Problem, fitted: Fit) -> float:
 
 
 def _ranges(fitted: Fit) -> Array:
-    """Widths of the bounds (parameters,); of an unbounded parameter its scale."""
-    wide = np.array([p.hi - p.lo for p in fitted.model.parameters])
-    scale = np.array([abs(p.scale) for p in fitted.model.parameters])
+    """Widths of the bounds (parameters,); of an unbounded one that of its prior, or its scale where it has none."""
+    model = fitted.model
+    wide = np.array([p.hi - p.lo for p in model.parameters])
+    scale = np.array([abs(p.scale) for p in model.parameters])
+    base = slice(0, model.n_base)
+    scale[base] = np.maximum(TIMES_GIVEN * np.abs(fitted.theta[base]), TIMES_SCALE * scale[base])
     return np.where(np.isfinite(wide), wide, scale)
