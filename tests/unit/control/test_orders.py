@@ -212,3 +212,15 @@ def test_a_trip_for_a_device_names_it_once(desk: Desk, error: HalTimeout, reason
 )
 def test_exit_codes_of_errors(error: BenchError, code: Exit):
     assert exit_code_of(error) is code
+
+
+def test_the_page_ends_a_hold_only_when_its_cause_has_passed(desk: Desk):
+    desk.incidents.report(Finding.SCANS_MISSING, device="daq", limit_ms=5.0)
+    desk.say({"order": "rearm"})
+    events = [event["event"] for event in desk.recorder.events]
+    assert events == ["hold begins", "rearm refused"]
+    desk.supervisor.state = State.HOLD
+    desk.clock.burn_ns(200 * MS)
+    assert desk.incidents.holds.may_end(desk.clock.now_ns())
+    desk.say({"order": "rearm"})
+    assert len(desk.recorder.events) == 2
