@@ -11,16 +11,19 @@ from sim_devices.physics.backlash import BACKLASH
 from sim_devices.physics.clock_skew import CLOCK_SKEW
 from sim_devices.physics.creep import CREEP
 from sim_devices.physics.curve import STATIC_NONLINEARITY
+from sim_devices.physics.damping import AMPLITUDE_DAMPING, QUADRATIC_DRAG
 from sim_devices.physics.dead_zone import DEAD_ZONE
 from sim_devices.physics.delay import CHANNEL_DELAY, DEAD_TIME
 from sim_devices.physics.drift import RANDOM_WALK
 from sim_devices.physics.dropped_samples import DROPPED_SAMPLES
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
+from sim_devices.physics.flows import OVERFLOW, SQUARE_ROOT_OUTFLOW
 from sim_devices.physics.friction import COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
+from sim_devices.physics.parameter import PARAMETER_VARIATION
 from sim_devices.physics.quantization import QUANTIZATION
 from sim_devices.physics.rate_hysteresis import RATE_DEPENDENT_HYSTERESIS
 from sim_devices.physics.resonance import RESONANCE
@@ -28,7 +31,7 @@ from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_
 from sim_devices.physics.saturation import SATURATION
 from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
-from sim_devices.physics.spring import COGGING_FORCE, CUBIC_STIFFNESS
+from sim_devices.physics.spring import CLEARANCE, COGGING_FORCE, CUBIC_STIFFNESS
 from sim_devices.physics.step_shift import STEP_SHIFT
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
@@ -69,6 +72,12 @@ _ALL = (
     CENTRIPETAL_ACCELERATION,
     SENSOR_POSITION_ERROR,
     CHANNEL_DELAY,
+    QUADRATIC_DRAG,
+    AMPLITUDE_DAMPING,
+    CLEARANCE,
+    SQUARE_ROOT_OUTFLOW,
+    OVERFLOW,
+    PARAMETER_VARIATION,
 )
 
 

@@ -197,6 +197,9 @@ class Effect:
     sites: tuple[Site, ...] = ("input", "output")
     needs: tuple[str, ...] = ()
     shared: bool = False
+    acts_on: tuple[Literal["motion", "storage", "storages", "parameter"], ...] = ("motion",)
+    """Feedback only: at a velocity, at any other state (a level, a current, a temperature), at all such at once, or on
+    a parameter of differential equations."""
     twins: tuple[str, ...] = ()
     """Twin kinds that can have it; empty: all."""
     available: Callable[[Mapping[str, Array], str], str] | None = None

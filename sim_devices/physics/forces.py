@@ -12,9 +12,11 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context
 
 FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness
-SPRING = 4  # cubic, quadratic, linear, quintic
+SPRING = 9  # cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
 COGGING = 5  # period, sin1, cos1, sin2, cos2
+FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
+ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
 
 
 @kernel
@@ -49,14 +51,31 @@ def bristle_after(z, v, step_s, row):
 
 @kernel
 def smooth_force(p, v, spring, cogging, friction):
-    """Forces that are continuous in position p and velocity v: spring curvature, cogging, unequal viscosity."""
+    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, viscosity."""
     q = p * p
     f = -(spring[0] + spring[3] * q) * q * p - spring[1] * q - spring[2] * p - friction[4] * abs(v)
+    f -= (spring[4] * abs(v) + spring[5] * q) * v
+    if spring[6] != 0.0:
+        d = p - spring[8]
+        f -= spring[6] * (d - min(max(d, -spring[7]), spring[7]))
     if cogging[0] > 0.0:
         a = 2.0 * np.pi * p / cogging[0]
         f += cogging[1] * np.sin(a) + cogging[2] * np.cos(a)
         f += cogging[3] * np.sin(2.0 * a) + cogging[4] * np.cos(2.0 * a)
     return f
+
+
+@kernel
+def flow_of(x, row):
+    """A flow that depends on one state x: its root or what stands above a level, its square, or the state itself."""
+    law, over = row[0], x - row[4]
+    if law == 0.0:
+        return row[3] * np.sqrt(over) if over > 0.0 else 0.0
+    if law == 1.0:
+        return row[3] * over if over > 0.0 else 0.0
+    if law == 2.0:
+        return row[3] * over * abs(over)
+    return row[3] * over
 
 
 def base_moves(x: Array, ctx: Context) -> list[Array]:

@@ -183,3 +183,60 @@ COGGING_FORCE = Effect(
     vanishes_with=(("amplitude_*",),),
     essential=("period",),
 )
+
+
+def _gap_parts(settings: Settings) -> Parts:
+    size, travel = settings.get("size", (1.0,))[0], settings.get("travel", (1.0,))[0]
+    gap = Parameter("half_gap", "{out}", 1e-3 * travel, 0.5 * travel, log=True, scale=0.02 * travel)
+    centre = Parameter("centre", "{out}", -size, size, scale=0.02 * travel)
+    return Parts((gap, centre), (Parameter("stiffness", "1/s^2", 0.0),))
+
+
+def _gap_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    d = x - q[1]
+    return -(d - np.clip(d, -q[0], q[0]))[:, None]
+
+
+def _gap_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(SPRING)
+    row[6], row[7], row[8] = w[0], q[0], q[1]
+    return {"spring": row}
+
+
+def _gap_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    k = thin(ctx.keep, 8000)
+    line = np.stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))], axis=1)
+    travel, middle = settings["travel"][0], 0.5 * float(np.max(x[ctx.keep]) + np.min(x[ctx.keep]))
+    tried: list[tuple[float, float, float]] = []
+    for centre in dict.fromkeys((0.0, middle)):
+        for gap in travel * np.array([0.03, 0.1, 0.2, 0.3, 0.4]):
+            column = ctx.to_output(np.ascontiguousarray(_gap_basis(x, ctx, np.array([gap, centre]), settings)[:, 0]))[k]
+            tried.append((least_squares(np.column_stack([line, column]), residual[k])[1], float(gap), centre))
+    size = settings["size"][0]
+    return tuple((gap, float(np.clip(centre, -size, size))) for _, gap, centre in sorted(tried)[:2])
+
+
+def _gap_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("gap", 2 * float(p[0]), "{out}"),
+        Human("centre", float(p[1]), "{out}"),
+        Human("contact_stiffness", float(p[2]) / (scale or 1.0), "{in}/{out}"),
+    )
+
+
+CLEARANCE = Effect(
+    name="clearance",
+    summary="play at a joint: a spring that takes hold beyond a gap",
+    kind="feedback",
+    stages=("mechanics", "mounting"),
+    parts=_gap_parts,
+    equation=r"m\ddot x + c\dot x + k x = F - k_c\,(d - \max(-g, \min(g, d))),\; d = x - x_0",
+    source="M. Nordin, P.-O. Gutman, Automatica 38 (2002) 1633, eq. 4 (dead-zone model of a gap in a shaft)",
+    excitation="amplitudes within the gap and beyond it",
+    confusable_with=("cubic_stiffness", "backlash", "saturation"),
+    prepare=_travel,
+    guess=_gap_guess,
+    basis=_gap_basis,
+    fill=_gap_fill,
+    report=_gap_report,
+)

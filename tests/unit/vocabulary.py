@@ -38,4 +38,11 @@ NAMES = (
     "centripetal_acceleration",
     "sensor_position_error",
     "channel_delay",
+    # beyond the contract's table, which may be extended
+    "quadratic_drag",
+    "amplitude_dependent_damping",
+    "clearance",
+    "square_root_outflow",
+    "overflow",
+    "parameter_variation",
 )

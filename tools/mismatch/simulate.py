@@ -25,6 +25,7 @@ from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
+from tools.mismatch.twins.ode import inside_of, weight_scale
 
 
 @dataclass(frozen=True)
@@ -63,8 +64,16 @@ class Model:
             u_tgt = twin.units.get(pl.target, "")
             if pl.site == "input":
                 u_in = u_tgt
+            inside = inside_of(twin) if pl.site == "feedback" else None
+            if inside is not None:
+                u_in, u_out = inside.place_units(pl.target)
             for p in (*parts.nonlinear, *parts.weights):
                 free.append(free_entry(p, u_in, u_out, pl.label + ".", k))
+            if inside is not None and inside.place(pl.target).kind == "motion":
+                free[c - len(parts.weights) :] = [
+                    replace(f, scale=weight_scale(p.unit, *inside.force_scale(pl.target)))
+                    for f, p in zip(free[c - len(parts.weights) :], parts.weights, strict=True)
+                ]
             self._slices.append((slice(a, b), slice(b, c)))
         self.order = sorted(range(len(self.placed)), key=lambda k: STAGES.index(self.placed[k].stage))
         self._free = tuple(free)
@@ -138,6 +147,9 @@ class Model:
             g = self.twin.sensitivity(pl.outputs[0], theta[: self.n_base])
             if pl.site == "output" and not self.twin.static:
                 g = 1.0  # driven by the output itself
+            inside = inside_of(self.twin) if pl.site == "feedback" else None
+            if inside is not None:
+                g = inside.force_gain(pl.target, theta[: self.n_base])[0]
             if pl.effect.report is not None:
                 out[pl.label] = list(pl.effect.report(p, pl.settings, g))
             else:
@@ -280,7 +292,7 @@ class Model:
     def _force(self, k: int, theta: Array) -> Force:
         pl = self.placed[k]
         a, b = self._slices[k]
-        return Force(pl.effect, pl.settings, theta[a], theta[b], b.start)
+        return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)
 
     def _pass(
         self,

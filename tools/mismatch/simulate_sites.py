@@ -9,8 +9,10 @@ from sim_devices.physics.effect import Effect, Stage
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.ode import Place
 
 SAME = "input or output"
+AXIS = Place("", "motion", 0, 1, 1, "")
 _WHOLE_RECORD = ("dead_time", "clock_skew", "dropped_samples")  # one clock for all outputs
 _ALIKE = ("first_order_lag",)  # equal channels of one instrument, or one filter in front of them
 _DRIVES: tuple[Stage, ...] = ("amplifier", "actuator")  # stages before the base physics
@@ -40,6 +42,8 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return f"no {' or '.join(effect.stages)} in the chain of this twin"
     if effect.kind == "feedback" and not twin.feedback_on:
         return "the twin has no equation of motion"
+    if effect.kind == "feedback" and not {p.kind for p in places_of(twin)} & set(effect.acts_on):
+        return "no state that it could act on"
     missing = [s for s in effect.needs if s not in recording.signals]
     if missing:
         return f"{', '.join(missing)} not recorded"
@@ -49,6 +53,13 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
     if effect.shared and len(twin.outputs) < 2 and effect.name == "misalignment":
         return "one output only"
     return "" if "" in reasons else reasons[0]
+
+
+def places_of(twin: Twin) -> tuple[Place, ...]:
+    """Where forces and flows may act inside: at each state of differential equations, or on the one equation of motion
+    that the other dynamic twins have.
+    """
+    return getattr(twin, "places", (AXIS,) if twin.feedback_on else ())
 
 
 def _here(effect: Effect, recording: Recording, output: str) -> str:
@@ -66,6 +77,9 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     stage = _stage(twin, effect)
     if effect.kind == "feedback":
         # a force moves every output of its equation of motion
+        places = places_of(twin)
+        if places != (AXIS,):
+            return [Placed(effect, "feedback", p.name, stage, twin.outputs) for p in places if p.kind in effect.acts_on]
         others = tuple(o for o in twin.outputs if o != twin.feedback_on)
         return [Placed(effect, "feedback", twin.feedback_on, stage, (twin.feedback_on, *others))]
     usable = tuple(o for o in twin.outputs if not _here(effect, recording, o))

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING
 from tools.mismatch.twins.feedback import run_feedback
 
-NO_SPRING, NONE5, NONE6 = np.zeros(4), np.zeros(5), np.zeros(6)
+NO_SPRING, NONE5, NONE6 = np.zeros(SPRING), np.zeros(COGGING), np.zeros(FRICTION)
 
 
 def free_mass(u: np.ndarray, dt: float, x0: tuple[float, float], radius: float, stiffness: float) -> np.ndarray:

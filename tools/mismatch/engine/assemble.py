@@ -18,6 +18,7 @@ from tools.mismatch.engine.intervals import covariance
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.reach import not_tried, out_of_reach, tempered
 from tools.mismatch.engine.report import (
     BaseShift,
     Checks,
@@ -80,6 +81,8 @@ def assemble(
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
+    if out_of_reach(physics, twin, {o: f.rms for o, f in problem.floors.items()}):
+        verdict, physics = "unexplained", tempered(physics)
     looked = fitted if verdict == "unexplained" else base
     if verdict == "missing_physics":
         touched = [o for o in twin.outputs if any(o in f.outputs for f in physics)]
@@ -190,6 +193,7 @@ def assemble(
             {s: x[problem.index] for s, x in rec.signals.items()},
             rec.unit,
         ),
+        not_tried=not_tried(twin),
     )
 
 

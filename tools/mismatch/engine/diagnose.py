@@ -35,6 +35,7 @@ from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.corrected import CorrectedTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make
+from tools.mismatch.twins.ode import OdeTwin
 
 Progress = Callable[[str, int, int], None]
 
@@ -105,7 +106,7 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
 
 def restarting(twin: Twin, restart: bool) -> Twin:
     """A dynamic twin, plain or corrected, that starts every range afresh or does not."""
-    assert isinstance(twin, DynamicTwin | CorrectedTwin)
+    assert isinstance(twin, DynamicTwin | CorrectedTwin | OdeTwin)
     return replace(twin, restart=restart)
 
 

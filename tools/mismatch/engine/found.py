@@ -19,6 +19,7 @@ from tools.mismatch.engine.score import compare, misfits, paired_t
 from tools.mismatch.engine.select import Selection
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.placed import Placed
+from tools.mismatch.twins.ode import inside_of
 
 Array = NDArray[np.float64]
 
@@ -60,6 +61,10 @@ def _rms(r: Array) -> float:
 
 
 def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: Placed) -> str:
+    inside = inside_of(problem.twin) if placed.site == "feedback" else None
+    if inside is not None:
+        u_in, u_out = inside.place_units(placed.target)
+        return trial_unit.replace("{in}", u_in).replace("{out}", u_out)
     units = problem.twin.units
     drive = problem.twin.drive(output) or target
     # a force inside the equation of motion has the unit of what drives it, and what is added to a static twin's
@@ -99,7 +104,7 @@ def physics_found(
         c = compare(problem, small, fitted)
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         if placed.site == "feedback":
-            worst = placed.target  # whose unit its parameters have
+            worst = placed.target if placed.target in small.residual else worst  # whose unit its parameters have
         step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
         sure = float(norm.cdf(min(c.z, 8.0)))
         if step is not None:

@@ -178,6 +178,8 @@ class Report:
     """Effects that were tried and are not named, with the reason."""
     corrected_parameters: tuple[float, ...] = ()
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
+    not_tried: str = ""
+    """What this kind of twin does not allow to be tried, and which kind would."""
 
     def to_json(self) -> dict[str, Any]:
         """The JSON of the contract, with optional keys beside; numbers finite or null."""

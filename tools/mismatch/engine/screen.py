@@ -40,10 +40,17 @@ def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, .
     out: list[Placed] = []
     for effect in effects:
         for place in sites(problem.twin, problem.recording, effect, present):
-            taken = any(p.effect.name == effect.name and set(p.outputs) & set(place.outputs) for p in present)
+            taken = any(p.effect.name == effect.name and _same_place(p, place) for p in present)
             if not taken:
                 out.append(place)
     return out
+
+
+def _same_place(present: Placed, place: Placed) -> bool:
+    """Whether two places move the same outputs, but for forces and flows at different states."""
+    if present.site == place.site == "feedback":
+        return bool(set(present.target.split("+")) & set(place.target.split("+")))
+    return bool(set(present.outputs) & set(place.outputs))
 
 
 @dataclass(frozen=True)

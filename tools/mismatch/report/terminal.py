@@ -150,6 +150,8 @@ def render(report: Report) -> RenderableType:
             border_style=colour,
         )
     ]
+    if report.not_tried:
+        parts.append(Padding(Text(report.not_tried, "italic"), (1, 0, 0, 2)))
     if report.location.outputs:
         parts.append(_section("Where", _where(report)))
     if report.physics:

@@ -49,6 +49,8 @@ class Force:
     weights: Array
     first_weight: int
     """Index of its first weight in theta."""
+    target: str = ""
+    """Where it acts, of a twin that has several places."""
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,12 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.axis import axis_twin
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cluster import cluster_twin
+from tools.mismatch.twins.columns import columns_twin
 from tools.mismatch.twins.fmu import fmu_twin
+from tools.mismatch.twins.ode_matrices import physical_twin
+from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.opaque import user_twin
-from tools.mismatch.twins.state_space import state_space_twin
+from tools.mismatch.twins.state_space import read_matrices, state_space_twin
 from tools.mismatch.twins.static import static_twin
 from tools.mismatch.twins.vocabulary import user_kinds
 
@@ -25,7 +28,13 @@ def core(recording: Recording) -> Twin:
         case "mechanical_axis":
             return axis_twin(recording)
         case "state_space":
+            if "states" in recording.twin.parameters:
+                return physical_twin(recording, read_matrices(recording))
             return state_space_twin(recording)
+        case "columns":
+            return columns_twin(recording)
+        case "ode":
+            return ode_twin(recording)
         case "fmu":
             return fmu_twin(recording)
         case "instrument":

@@ -19,7 +19,7 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
 
-_NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete")
+_NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states")
 MAX_ORDER = 64
 """Modes of a plant at most."""
 
@@ -43,7 +43,7 @@ class Matrices:
 
 def state_space_twin(recording: Recording) -> DynamicTwin:
     """theta = pole parameters, numerator coefficients (in units of the given scale), y0 of every output."""
-    m = without_constant(_matrices(recording), recording.dt)
+    m = without_constant(read_matrices(recording), recording.dt)
     inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
     dt = recording.dt
     poles = felt_poles(m)
@@ -199,7 +199,7 @@ def _matrix(recording: Recording, key: str, shape: tuple[int | None, int | None]
     return a
 
 
-def _matrices(recording: Recording) -> Matrices:
+def read_matrices(recording: Recording) -> Matrices:
     text = recording.twin.parameters
     for key in text:
         if key not in _NAMES:

@@ -127,8 +127,25 @@ def static_twin(recording: Recording) -> StaticTwin:
             raise RecordingError(
                 f"{recording.path}: [twin.parameters] '{key}' is not a parameter of {kind}; known: {', '.join(known)}"
             )
+    return gain_and_offset(recording, (offset, scale), drives, chain)
+
+
+def gain_and_offset(
+    recording: Recording,
+    names: tuple[str, str],
+    drives: Mapping[str, str],
+    chain: tuple[Stage, ...],
+    missing: tuple[float, float] = (np.nan, np.nan),
+) -> StaticTwin:
+    """The twin whose outputs are each an offset plus a scaled input. ``missing``: offset and scale that are not given
+    (NaN: estimated)."""
+    (offset, scale), text = names, recording.twin.parameters
+    inputs, outputs = tuple(recording.inputs), tuple(recording.outputs)
     given = tuple(
-        (_one(recording, text.get(offset), offset, o, i), _one(recording, text.get(scale), scale, o, i))
+        (
+            _one(recording, text.get(offset, missing[0]), offset, o, i),
+            _one(recording, text.get(scale, missing[1]), scale, o, i),
+        )
         for i, o in enumerate(outputs)
     )
     many = len(outputs) > 1
@@ -140,7 +157,9 @@ def static_twin(recording: Recording) -> StaticTwin:
             if unit and np.isfinite(b) and b:
                 typical = b
             parameters.append(Parameter(f"{name}[{o}]" if many else name, u, scale=abs(typical)))
-    return StaticTwin(kind, inputs, outputs, recording.unit, chain, tuple(parameters), drives, (offset, scale), given)
+    return StaticTwin(
+        recording.twin.kind, inputs, outputs, recording.unit, chain, tuple(parameters), drives, names, given
+    )
 
 
 def _one(recording: Recording, value: object, name: str, output: str, i: int) -> float:
@@ -155,7 +174,7 @@ def _one(recording: Recording, value: object, name: str, output: str, i: int) ->
                 f" expected one or {len(recording.outputs)}"
             )
         value = value[i]
-    if value is None:
+    if value is None or value is np.nan:
         return float("nan")
     if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
         raise RecordingError(f"{recording.path}: [twin.parameters] {name} must be a finite number, got {value!r}")

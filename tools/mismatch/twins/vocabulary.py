@@ -64,6 +64,8 @@ KINDS = MappingProxyType(
         "state_space": Vocabulary(open_ended=True),
         "instrument": Vocabulary(open_ended=True),
         "fmu": Vocabulary(open_ended=True),
+        "ode": Vocabulary(open_ended=True),
+        "columns": Vocabulary(open_ended=True),
     }
 )
 

@@ -1,0 +1,55 @@
+"""A parameter of differential equations that is no constant: it follows a recorded signal."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.flows import PAIRS
+
+
+def _settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    spread = float(np.std(x[k])) or 1.0
+    return {"centre": (float(np.mean(x[k])),), "spread": (spread,), PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0))}
+
+
+def _parts(settings: Settings) -> Parts:
+    spread = settings.get("spread", (1.0,))[0]
+    return Parts((), (Parameter("per_unit", "1/{out}", scale=0.1 / spread),))
+
+
+def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return (x - settings["centre"][0])[:, None]
+
+
+def _fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    parameter, signal = settings[PAIRS]
+    return {"sway": np.array([parameter, signal, w[0], settings["centre"][0]])}
+
+
+def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("relative_change", float(p[0]), "1/{out}"),
+        Human("change_over_spread", float(p[0]) * 2 * settings["spread"][0], "1"),
+    )
+
+
+PARAMETER_VARIATION = Effect(
+    name="parameter_variation",
+    summary="a parameter of the equations follows a recorded signal (a resistance its temperature)",
+    kind="feedback",
+    stages=("mechanics", "actuator", "environment"),
+    parts=_parts,
+    equation=r"p = p_0 (1 + a (s - \bar s))",
+    source="IEC 60751:2022, section 5.2, to first order (platinum resistance); the same form for any other parameter",
+    excitation="a signal that changes while the input keeps moving",
+    confusable_with=("thermal_drift", "temperature_sensitivity"),
+    prepare=_settings,
+    basis=_basis,
+    fill=_fill,
+    report=_report,
+    acts_on=("parameter",),
+)

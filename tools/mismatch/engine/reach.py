@@ -1,0 +1,45 @@
+"""What a twin does not allow to be tried, and how sure a name can be that had no rival inside."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+from tools.mismatch.engine.report import PhysicsFound
+from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.opaque import OpaqueTwin
+
+MUCH_LEFT = 3.0
+"""Residual over noise floor above which what was named is not the whole account."""
+NO_RIVAL = 0.5
+"""Most that a name is sure where much is left and the forces that could explain it could not be tried."""
+_INSIDE = "friction, springs, play, flows and limits inside its equations could not be tried"
+
+
+def not_tried(twin: Twin) -> str:
+    """What could not be tried on this kind of twin and which kind would allow it, in a sentence; "" if all could."""
+    core = getattr(twin, "core", twin)
+    if core.kind == "columns":
+        return (
+            "This twin is columns of simulated output: only effects at outputs and late outputs were tried, and"
+            f" {_INSIDE}. A twin of kind 'ode' (the equations as text) allows it."
+        )
+    if not isinstance(core, OpaqueTwin):
+        return ""
+    what = {
+        "fmu": "An FMU for co-simulation shows its inputs and outputs alone",
+        "instrument": "The emulated bench shows its inputs and outputs alone",
+    }.get(core.kind, "A twin in Python shows its inputs and outputs alone")
+    return f"{what}: {_INSIDE}. A twin of kind 'ode' (the equations as text or a function of derivatives) allows it."
+
+
+def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[str, float]) -> bool:
+    """Whether the named effects leave much that may sit where this kind of twin lets nothing be tried."""
+    return bool(not_tried(twin)) and any(
+        p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics
+    )
+
+
+def tempered(physics: Sequence[PhysicsFound]) -> list[PhysicsFound]:
+    """The same effects, none surer than ``NO_RIVAL``: what could explain the rest had no chance against them."""
+    return [replace(p, confidence=min(p.confidence, NO_RIVAL)) for p in physics]

@@ -1,0 +1,496 @@
+"""Differential equations as a twin: named states, so that forces and flows can be added to the derivative of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.physics.effect import Array, Human
+from sim_devices.physics.forces import FLOW, UNCENTRED
+from tools.mismatch import units
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.feedback import Rows, pack
+from tools.mismatch.twins.head import Head
+from tools.mismatch.twins.linear import discretise, run_output, start_state
+from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
+from tools.mismatch.twins.program import Program
+
+MOST_SUBSTEPS = 200
+LEAST_WINDOW = 20
+ROUNDS = 3  # Gauss-Newton steps to a start state
+LEAST_SHOWN = 3e-4  # of the best determined combination of start states: what shows less keeps its guess
+FORGOTTEN = 20.0  # time constants in a record: a slower state is set afresh in every stretch
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a force or flow may act. ``position``, ``velocity``, ``target``: indices of states; of a storage (a level,
+    a current, a temperature) all three are that state. ``name``: the state whose derivative the force is added to.
+    """
+
+    name: str
+    kind: Literal["motion", "storage", "storages", "parameter"]
+    position: int
+    velocity: int
+    target: int
+    unit: str
+    """Of the position, or of what is stored."""
+    pairs: tuple[float, ...] = ()
+    """Of a storage: see ``flows.PAIRS``. Of a parameter: its register and that of the signal which it may follow."""
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Forces and flows of one run, packed for the compiled loop (``ode_run.run_equations``)."""
+
+    place: NDArray[np.int64]
+    rows: tuple[Rows, ...]
+    flows: Array
+    sway: Array
+
+    @cached_property
+    def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:
+        """friction, spring, cogging, counts, thresholds, memory."""
+        rows = self.rows
+
+        def stack(parts: list[Array]) -> Array:
+            return np.stack(parts) if parts else np.zeros((0, 0))
+
+        def join(parts: list[Array]) -> Array:
+            return np.concatenate(parts) if parts else np.zeros(0)
+
+        return (
+            stack([r.friction for r in rows]),
+            stack([r.spring for r in rows]),
+            stack([r.cogging for r in rows]),
+            np.array([r.thresholds.size for r in rows], np.int64),
+            join([r.thresholds for r in rows]),
+            join([r.memory for r in rows]),
+        )
+
+
+NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)))
+
+
+class Equations(Protocol):
+    """Derivatives and outputs of a model, however they are worked out."""
+
+    def states(
+        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
+        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
+    ) -> Array:  # fmt: skip
+        """States (n, s) in free run; ``times`` (n,): seconds; ``values``: parameters."""
+        ...
+
+    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """Outputs (n, q)."""
+        ...
+
+    def rates(self, x: Array, u: Array, values: Array) -> Array:
+        """Derivatives (s,) at one instant, at time zero, without forces."""
+        ...
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Equations that are data (``program.py``), compiled once for all."""
+
+    rates_program: Program
+    outputs: Program
+    at: int
+    """Register of the first parameter."""
+
+    def states(
+        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
+        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
+    ) -> Array:  # fmt: skip
+        """See Equations."""
+        p = self.rates_program
+        friction, spring, cogging, counts, thresholds, memory = inside.arrays
+        return run_equations(
+            p.operations, self._set(p, values), p.results, inside.sway, x0, starts, stop, u, held, times, step_s,
+            sub, inside.place, friction, spring, cogging, counts, thresholds, memory, inside.flows, *limits,
+        )  # fmt: skip
+
+    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """See Equations."""
+        return run_readings(self.outputs.operations, self._set(self.outputs, values), self.outputs.results, x, u, t)
+
+    def rates(self, x: Array, u: Array, values: Array) -> Array:
+        """See Equations."""
+        p, dx = self.rates_program, np.empty(x.size)
+        rates_of(p.operations, self._set(p, values), np.zeros(1), p.results, np.zeros((0, SWAY)), x, u, 0.0, dx)
+        return dx
+
+    def _set(self, program: Program, values: Array) -> Array:
+        registers = program.registers.copy()
+        registers[self.at : self.at + values.size] = values
+        return registers
+
+
+@dataclass(frozen=True)
+class State:
+    """A state: unit, where it starts (a guess that the recording improves), and what it cannot leave."""
+
+    name: str
+    unit: str
+    start: float = 0.0
+    lowest: float = -np.inf
+    highest: float = np.inf
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
+
+    a: Array
+    b: Array
+    c: Array
+
+
+@dataclass(frozen=True)
+class OdeTwin(Head):
+    """``signals``: what the equations see, inputs first, then context. ``given``: the ``[twin.parameters]`` table,
+    ``names`` its numbers in the order of the equations, ``free`` which of them may be re-fitted.
+    """
+
+    equations: Equations
+    state_list: tuple[State, ...]
+    signals: tuple[str, ...]
+    names: tuple[str, ...]
+    free: tuple[int, ...]
+    given: Mapping[str, Any]
+    held: bool
+    text_of: Callable[[Mapping[str, float]], dict[str, object]] = field(repr=False)
+    parameter_units: Mapping[str, str]
+    typical: Array
+    """Size of each state in a run as given, (s,)."""
+    middle: tuple[Array, Array]
+    """Mean states (s,) and signals (m,) of that run."""
+    places: tuple[Place, ...]
+    fastest_per_s: float
+    restart: bool
+    feedback_on: str
+    static: bool = False
+    apart: bool = False
+    counted: Counted = ""
+
+    def start(self, recording: Recording) -> Array:
+        """See Twin."""
+        return np.array([float(self.given[self.names[i]]) for i in self.free])
+
+    def values(self, theta: Array) -> Array:
+        """All numbers of the equations for base parameters ``theta`` (further entries are ignored)."""
+        out = np.array([float(self.given[n]) for n in self.names])
+        out[list(self.free)] = theta[: len(self.free)]
+        return out
+
+    def drive(self, output: str) -> str:
+        """See Twin."""
+        return self.inputs[0] if len(self.inputs) == 1 else ""
+
+    def facts(self, output: str) -> Mapping[str, tuple[float, ...]]:
+        """See Twin."""
+        a = self.linearised(self.start_values).a
+        free = any(p.kind == "motion" and a[p.target, p.position] == 0.0 for p in self.places)
+        return {UNCENTRED: (1.0,)} if free else {}
+
+    @cached_property
+    def start_values(self) -> Array:
+        """The engineer's own numbers."""
+        return np.array([float(self.given[n]) for n in self.names])
+
+    def sensitivity(self, output: str, theta: Array) -> float:
+        """See Twin: what effects at an input carry is in input units."""
+        return 1.0
+
+    def input_gain(self, signal: str, theta: Array) -> float:
+        """See Twin."""
+        return 1.0
+
+    def human(self, theta: Array) -> Sequence[Human]:
+        """See Twin."""
+        return [
+            Human(self.names[i], float(v), self.parameter_units.get(self.names[i], ""))
+            for i, v in zip(self.free, theta, strict=False)
+        ]
+
+    def to_text(self, theta: Array) -> dict[str, object]:
+        """See Twin."""
+        return self.text_of({self.names[i]: float(v) for i, v in zip(self.free, theta, strict=False)})
+
+    # -- places ---------------------------------------------------------------------------------------
+
+    def place(self, name: str) -> Place:
+        """The place of that name. Raises RecordingError: a twin file may name any."""
+        for p in self.places:
+            if p.name == name:
+                return p
+        known = ", ".join(p.name for p in self.places) or "none"
+        raise RecordingError(f"no state '{name}' that a force or flow can act on; there are: {known}")
+
+    def force_gain(self, target: str, theta: Array) -> tuple[float, str]:
+        """What one unit of the input that drives a place does to its derivative there, and that input ("" : none)."""
+        if self.place(target).kind == "parameter":
+            return 1.0, ""
+        row = self.linearised(self.values(theta)).b[self.place(target).target]
+        for i, s in enumerate(self.inputs):
+            if row[i] != 0.0:
+                return float(row[i]), s
+        return 1.0, ""
+
+    def place_units(self, target: str) -> tuple[str, str]:
+        """Units of a force at a place (that of the input which drives it, where one does) and of its position."""
+        place = self.place(target)
+        _, source = self.force_gain(target, self.start_values[list(self.free)])
+        per = "s^2" if place.kind == "motion" else "s"
+        return (self.units[source] if source else f"{place.unit}/{per}"), place.unit
+
+    def force_scale(self, target: str) -> tuple[float, float, float]:
+        """Typical derivative, position and velocity at a place: what the size of a weight is measured by."""
+        place = self.place(target)
+        size, speed = self.typical[place.position], self.typical[place.velocity]
+        if place.kind == "storage":
+            speed = size * self.fastest_per_s
+            return speed, size, speed
+        return speed * max(self.fastest_per_s, speed / size), size, speed
+
+    def course(self, run: Run, theta: Array, target: str) -> tuple[Array, Array]:
+        """Position and velocity (n,) at a place: as recorded where an output reads them, else as simulated."""
+        place = self.place(target)
+        if place.kind == "parameter":
+            signal = run.signals[self.signals[place.position]]
+            return signal, np.gradient(signal, run.dt)
+        x = self._simulated(run, {s: run.signals[s] for s in self.signals}, theta, ())
+        c = self.linearised(self.values(theta)).c
+        found: list[Array] = []
+        for i in (place.position, place.velocity):
+            y = x[:, i]
+            for k, o in enumerate(self.outputs):
+                alone = c[k, i] != 0.0 and np.count_nonzero(c[k]) == 1
+                if alone and np.allclose(self.readings(x, run, theta)[:, k], c[k, i] * y, rtol=1e-9, atol=1e-12):
+                    y = run.measured[o] / c[k, i]
+                    break
+            found.append(np.ascontiguousarray(y))
+        return found[0], found[1]
+
+    # -- simulation -----------------------------------------------------------------------------------
+
+    def respond(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force], join: bool
+    ) -> dict[str, Signal]:
+        """See Twin. Nothing stays linear behind the equations."""
+        used = {s: fold(x, theta) for s, x in inputs.items()}
+        key: tuple[object, ...] = ("ode", theta[: len(self.free)].tobytes(), run.starts, run.window)
+        key = (*key, *(x.token for x in used.values()))
+        key = (*key, *((f.effect.form, f.target, f.q.tobytes(), f.weights.tobytes(), _settings(f)) for f in forces))
+
+        def make() -> Array:
+            # a made-up stretch that only asks which parameters are linear has no context
+            none = np.zeros(run.t.size)
+            signals = {s: used[s].value if s in used else run.signals.get(s, none) for s in self.signals}
+            x = self._simulated(run, signals, theta, forces)
+            u = np.column_stack([signals[s] for s in self.signals])
+            return np.ascontiguousarray(self.equations.readings(x, u, run.t, self.values(theta)).T)
+
+        with np.errstate(all="ignore"):
+            stacked = remember(run.memo, key, make)
+        return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
+
+    def readings(self, x: Array, run: Run, theta: Array) -> Array:
+        """Outputs (n, q) for states (n, s) of a run."""
+        u = np.column_stack([run.signals[s] for s in self.signals])
+        return self.equations.readings(x, u, run.t, self.values(theta))
+
+    def _inside(self, forces: Sequence[Force]) -> Inside:
+        by: dict[str, list[Force]] = {}
+        for f in forces:
+            by.setdefault(f.target, []).append(f)
+        place: list[tuple[int, int, int, int]] = []
+        sway: list[Array] = []
+        rows: list[Rows] = []
+        flows: list[Array] = []
+        for name, here in by.items():
+            filled = [f.effect.fill(f.q, f.weights, f.settings) for f in here if f.effect.fill is not None]
+            flows += [r["flows"].reshape(-1, FLOW) for r in filled if "flows" in r]
+            sway += [r["sway"] for r in filled if "sway" in r]
+            solid = [f for f, r in zip(here, filled, strict=True) if not {"flows", "sway"} & set(r)]
+            if solid:
+                p, row = self.place(name), pack(solid)
+                smooth = bool(np.any(row.spring) or np.any(row.cogging) or row.friction[4])
+                place.append((p.position, p.velocity, p.target, int(smooth)))
+                rows.append(row)
+        return Inside(
+            np.array(place, np.int64).reshape(-1, 4),
+            tuple(rows),
+            np.concatenate(flows) if flows else np.zeros((0, FLOW)),
+            np.array(sway, np.float64).reshape(-1, SWAY),
+        )
+
+    def _substeps(self, run: Run, inside: Inside) -> int:
+        """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (a power of two, so
+        that it seldom changes while a fit moves), two at least where dry friction may stick, six to a period of
+        cogging.
+        """
+        sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
+        for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
+            springs = float(np.sum(np.abs(rows.memory))) + max(float(rows.friction[5]), 0.0)
+            stiff = run.dt * np.sqrt(springs) / 0.5
+            if stiff > sub:
+                sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
+            if np.any(rows.friction[:3] != 0.0):
+                sub = max(sub, 2)
+            if rows.cogging[0] > 0.0 and position != velocity:
+                sub = max(sub, int(np.ceil(6 * self.typical[velocity] * run.dt / rows.cogging[0])))
+        return int(np.clip(sub, 1, MOST_SUBSTEPS))
+
+    def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
+        """States (n, s) in free run from start states that the first measured samples of each stretch set."""
+        values = self.values(theta)
+        inside = self._inside(forces)
+        sub = self._substeps(run, inside)
+        u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
+        limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))
+        starts = np.array(run.starts, np.int64)
+        ends = np.array((*run.starts[1:], run.t.size), np.int64)
+
+        def go(
+            x0: Array, first: NDArray[np.int64], stop: NDArray[np.int64], u: Array, t: Array,
+            sub: int = sub, values: Array = values, inside: Inside = inside,
+        ) -> Array:  # fmt: skip
+            held = np.full(len(self.signals), self.held)
+            return self.equations.states(x0, first, stop, u, held, t, run.dt, sub, values, inside, limits)
+
+        given = np.array([[x.start for x in self.state_list]])
+        if run.window == 0 and run.starts == (0,):
+            return go(given, starts, ends, u, run.t)
+        # what sets the state is simulated alone, one window after the other
+        window = max(run.window, min(LEAST_WINDOW, run.t.size))
+        stop = np.asarray(np.minimum(starts + window, ends), np.int64)
+        seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
+        after = np.cumsum(stop - starts)
+        before = after - (stop - starts)
+        rows = np.repeat(np.arange(starts.size), stop - starts)
+        weight = np.array([1.0 / (float(np.std(run.measured[o])) or 1.0) for o in self.outputs])
+        y = np.column_stack([run.measured[o][seen] for o in self.outputs])
+        part, t = np.ascontiguousarray(u[seen]), run.t[seen]
+
+        def misses(x0: Array) -> Array:
+            x = go(x0, before, after, part, t)
+            return (y - self.equations.readings(x, part, t, values)) * weight
+
+        def plain() -> Array:
+            # the engineer's own model, run through from its own start: where later stretches begin to be sought
+            end, sub = np.array([run.t.size], np.int64), self._substeps(run, NOTHING)
+            return go(given, starts[:1], end, u, run.t, sub, self.start_values, NOTHING)[starts]
+
+        x0 = remember(run.memo, ("about", run.starts), plain)
+        x0 = np.where(np.isfinite(x0), x0, given)
+        return go(self._met(x0, misses, rows, limits), starts, ends, u, run.t)
+
+    def _met(
+        self, x0: Array, misses: Callable[[Array], Array], rows: NDArray[np.int64], limits: tuple[Array, Array]
+    ) -> Array:
+        """Start states (starts, s) that leave least of ``misses`` (rows, q); ``rows``: the stretch of each row.
+
+        Gauss-Newton; what the window does not show stays at the guess.
+        """
+        s, step = x0.shape[1], 1e-4
+        best = misses(x0)
+        energy = lambda e: np.bincount(rows, np.sum(e * e, axis=1))  # noqa: E731
+        for _ in range(ROUNDS):
+            slopes = np.stack(
+                [(best - misses(x0 + step * self.typical * np.eye(s)[i])) / step for i in range(s)], axis=-1
+            )
+            moved = x0.copy()
+            for k in range(x0.shape[0]):
+                a, b = slopes[rows == k].reshape(-1, s), best[rows == k].ravel()
+                if np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
+                    moved[k] += self.typical * np.linalg.lstsq(a, b, rcond=LEAST_SHOWN)[0]
+            moved = np.clip(moved, *limits)
+            after = misses(moved)
+            was, now = energy(best), energy(after)
+            better = now < was
+            x0 = np.where(better[:, None], moved, x0)
+            best = np.where(better[rows][:, None], after, best)
+            if not np.any(now < 0.999 * was):
+                break
+        return x0
+
+    # -- linearised -----------------------------------------------------------------------------------
+
+    def linearised(self, values: Array) -> Linearised:
+        """About the mean of a run as given, for these numbers."""
+        return linearise(self.equations, *self.middle, self.typical, values)
+
+    def through(self, run: Run, signal: str, theta: Array, output: str) -> Callable[[Array], Array]:
+        """See Twin; ``signal`` is an input or the name of a place."""
+        lin = self.linearised(self.values(theta))
+        if signal in self.signals:
+            b = lin.b[:, self.signals.index(signal)]
+        else:
+            b = np.zeros(len(self.state_list))
+            b[self.place(signal).target] = 1.0
+        d = discretise(lin.a, b, run.dt, "zero" if self.held else "linear")
+        c = dict(zip(self.outputs, lin.c, strict=True))
+        window = max(run.window, min(LEAST_WINDOW, run.t.size))
+        ss = start_state(d.ad, c, run.measured, run.starts, run.t.size, window, run.memo)
+        at = np.array(run.starts, np.int64)
+
+        def carry(change: Array) -> Array:
+            y = {o: run_output(d.ad, d.g0, d.g1, np.ascontiguousarray(c[o]), change, at) for o in self.outputs}
+            free = ss.response(ss.states({o: -v for o, v in y.items()}), output, change.size)
+            return y[output] + free
+
+        return carry
+
+
+def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: Array) -> Linearised:
+    """Derivatives of the right-hand side and of the outputs, by central differences about ``x`` (s,) and ``u`` (m,)."""
+    step = 1e-5 * typical
+    width = 1e-5 * np.maximum(np.abs(u), 1e-3)
+    move = np.concatenate([step, width])
+    around = np.concatenate([x, u])
+    at = np.concatenate([around + np.diag(move), around - np.diag(move)])
+    s = x.size
+    f = rates_at(equations, at[:, :s], at[:, s:], values)
+    y = equations.readings(np.ascontiguousarray(at[:, :s]), np.ascontiguousarray(at[:, s:]), np.zeros(len(at)), values)
+    half = move.size
+    slope = (f[:half] - f[half:]).T / (2 * move)
+    # what is left of digits that cancel
+    slope[np.abs(slope) < 1e-9 * np.max(np.abs(f), axis=0)[:, None] / move] = 0.0
+    reading = (y[:half] - y[half:]).T / (2 * move)
+    return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]))
+
+
+def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
+    """Derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
+    return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
+
+
+def _settings(force: Force) -> tuple[object, ...]:
+    return tuple(sorted(force.settings.items()))
+
+
+def inside_of(twin: object) -> OdeTwin | None:
+    """The equations behind a twin, plain or corrected; None for a twin of another kind."""
+    core = getattr(twin, "core", twin)
+    return core if isinstance(core, OdeTwin) else None
+
+
+def weight_scale(unit: str, push: float, size: float, speed: float) -> float:
+    """Typical size of a weight: the derivative ``push`` over what the weight multiplies, whose size follows from the
+    ``unit`` of the weight (with ``{out}`` for that of the position) and from typical position and velocity.
+    """
+    try:
+        d = units.parse(unit.replace("{out}", "m")).dimension
+    except units.UnitError:
+        return push
+    # weight times column is m/s^2
+    return push / (size ** (1 - d[0]) * (size / speed) ** (d[2] + 2))

@@ -1,0 +1,317 @@
+"""From a ``[twin]`` table with equations, or the name of a Python function, to a twin of differential equations."""
+
+from __future__ import annotations
+
+import importlib.util
+import keyword
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sim_devices.physics.effect import Array, Parameter
+from tools.mismatch import units
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.twins.ode import FORGOTTEN, NOTHING, Equations, OdeTwin, Place, Programs, State, linearise, rates_at
+from tools.mismatch.twins.program import Builder, EquationError, parse, trace
+
+TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")
+"""Keys of an ode twin that are no numbers; beside ``parameters`` in ``[twin]``, or inside it."""
+PROBES = 5
+
+
+def ode_twin(recording: Recording) -> OdeTwin:
+    """The twin that a recording's table describes. Raises RecordingError that names the key and what to do."""
+    table = recording.twin.parameters
+    where = f"{recording.path}: [twin]"
+    unknown = [k for k, v in table.items() if k not in TABLES and not _number(v)]
+    if unknown:
+        raise RecordingError(
+            f"{where} {unknown[0]} = {table[unknown[0]]!r} is neither a finite number nor one of {', '.join(TABLES)}"
+        )
+    names = tuple(k for k in table if k not in TABLES)
+    states = _states(where, table.get("states"))
+    signals = (*recording.inputs, *recording.context)
+    for name in (*(s.name for s in states), *signals, *names):
+        if not re.fullmatch(r"[A-Za-z_]\w*", name) or keyword.iskeyword(name) or name in ("t", "pi"):
+            raise RecordingError(f"{where} '{name}' cannot be used in an equation; give it another name")
+    every = ["t", *(s.name for s in states), *signals, *names]
+    twice = {n for n in every if every.count(n) > 1}
+    if twice:
+        raise RecordingError(f"{where} '{twice.pop()}' names two things among states, signals and parameters")
+    try:
+        equations = _programs(recording, table, states, signals, names, tuple(every))
+    except EquationError as error:
+        raise RecordingError(f"{where} {error}") from None
+    return assembled(recording, equations, states, signals, names)
+
+
+def assembled(
+    recording: Recording,
+    equations: Equations,
+    states: tuple[State, ...],
+    signals: tuple[str, ...],
+    names: Sequence[str],
+) -> OdeTwin:
+    """The twin around equations of whatever origin, with what a run as given tells of it."""
+    table, where = recording.twin.parameters, f"{recording.path}: [twin]"
+    hold = table.get("hold", "linear")
+    if hold not in ("zero", "linear"):
+        raise RecordingError(f"{where} hold must be 'zero' or 'linear', got {hold!r}")
+    fixed = table.get("fixed", [])
+    if not isinstance(fixed, Sequence) or isinstance(fixed, str) or any(f not in names for f in fixed):
+        raise RecordingError(f"{where} fixed must list parameters that stay as given, got {fixed!r}")
+    own_units = table.get("units", {})
+    if not isinstance(own_units, Mapping) or not all(isinstance(u, str) for u in own_units.values()):
+        raise RecordingError(f"{where} units must give the unit of each parameter as text")
+    free = tuple(i for i, n in enumerate(names) if n not in fixed)
+    values = np.array([float(table[n]) for n in names])
+    u = np.column_stack([recording.signals[s] for s in signals])
+    x = _as_given(recording, equations, states, u, values, hold == "zero")
+    typical = _typical(x, states)
+    middle = (np.asarray(x.mean(axis=0), np.float64), np.asarray(u.mean(axis=0), np.float64))
+    rates: list[complex] = []
+    for k in np.linspace(0, recording.n - 1, 7).astype(int):
+        a = linearise(equations, x[k], u[k], typical, values).a
+        rates += np.linalg.eigvals(a).tolist() if np.all(np.isfinite(a)) else []
+    if not rates:
+        raise RecordingError(f"{where} the derivatives are not finite where the states start; check 'start' of each")
+    about = np.linalg.eigvals(linearise(equations, *middle, typical, values).a)
+    places = _places(equations, states, x, u, values, linearise(equations, *middle, typical, values).a)
+    places = (*places, *_parameters(recording, states, signals, names, free))
+
+    def text_of(found: Mapping[str, float]) -> dict[str, object]:
+        return {k: found.get(k, v) for k, v in table.items()}
+
+    return OdeTwin(
+        kind=recording.twin.kind,
+        inputs=tuple(recording.inputs),
+        outputs=tuple(recording.outputs),
+        units=recording.unit,
+        chain=("amplifier", "actuator", "mechanics", "environment", "sensor", "acquisition"),
+        parameters=tuple(
+            Parameter(names[i], str(own_units.get(names[i], "")), scale=0.01 * abs(values[i]) or 1e-3) for i in free
+        ),
+        equations=equations,
+        state_list=states,
+        signals=signals,
+        names=tuple(names),
+        free=free,
+        given=dict(table),
+        held=hold == "zero",
+        text_of=text_of,
+        parameter_units=dict(own_units),
+        typical=typical,
+        middle=middle,
+        places=places,
+        fastest_per_s=float(np.max(np.abs(rates))),
+        restart=bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN),
+        feedback_on=next(iter(recording.outputs)) if places else "",
+    )
+
+
+def _as_given(
+    recording: Recording, equations: Equations, states: tuple[State, ...], u: Array, values: Array, held: bool
+) -> Array:
+    """States (n, s) of one free run with the engineer's numbers from the engineer's start."""
+    n = u.shape[0]
+    x0 = np.array([[state.start for state in states]])
+    limits = (np.array([state.lowest for state in states]), np.array([state.highest for state in states]))
+    typical = np.maximum(np.abs(x0[0]), 1.0)
+    with np.errstate(all="ignore"):
+        a = linearise(equations, x0[0], u[0], typical, values).a
+        fastest = float(np.max(np.abs(np.linalg.eigvals(a)))) if np.all(np.isfinite(a)) else 1.0 / recording.dt
+        sub = int(np.clip(np.ceil(recording.dt * fastest / 0.25), 1, 200))
+        x = equations.states(
+            x0, np.zeros(1, np.int64), np.array([n], np.int64), np.ascontiguousarray(u), np.full(u.shape[1], held),
+            recording.t, recording.dt, sub, values, NOTHING, limits,
+        )  # fmt: skip
+    if not np.all(np.isfinite(x)):
+        k = int(np.argmax(~np.isfinite(x).all(axis=1)))
+        name = states[int(np.argmax(~np.isfinite(x[k])))].name
+        raise RecordingError(
+            f"{recording.path}: [twin] state '{name}' is {x[k][~np.isfinite(x[k])][0]} at sample {k} of a run with your"
+            " own parameters; check the equations, their units and 'start' of each state"
+        )
+    return x
+
+
+def _typical(x: Array, states: tuple[State, ...]) -> Array:
+    """Size of each state in a run: its spread, or its value where it stays."""
+    size = np.std(x, axis=0)
+    return np.where(size > 0.0, size, np.maximum(np.max(np.abs(x), axis=0), 1e-6))
+
+
+def _places(
+    equations: Equations, states: tuple[State, ...], x: Array, u: Array, values: Array, slopes: Array
+) -> tuple[Place, ...]:
+    """A state whose derivative is another state is a position, the other its velocity; every other state is a storage.
+
+    Whether the derivative of one is the other is tried at points of a run that are shaken at random.
+    """
+    rng = np.random.default_rng(0)
+    s = x.shape[1]
+    at = x[rng.integers(0, x.shape[0], PROBES)] + np.std(x, axis=0) * rng.standard_normal((PROBES, s))
+    beside = u[rng.integers(0, u.shape[0], PROBES)] + np.std(u, axis=0) * rng.standard_normal((PROBES, u.shape[1]))
+    f = rates_at(equations, at, beside, values)
+    out: list[Place] = []
+    positions: dict[int, int] = {}
+    for i in range(s):
+        for j in range(s):
+            ratio = f[:, i] / np.where(at[:, j] == 0.0, np.nan, at[:, j])
+            if i != j and np.all(np.isfinite(ratio)) and ratio[0] != 0.0 and np.ptp(ratio) < 1e-9 * abs(ratio[0]):
+                positions.setdefault(j, i)
+    for j, state in enumerate(states):
+        if j in positions:
+            out.append(Place(state.name, "motion", positions[j], j, j, states[positions[j]].unit))
+        elif _is_velocity(state.unit):
+            out.append(Place(state.name, "motion", j, j, j, state.unit.removesuffix("/s")))
+        elif j not in positions.values():
+            out.append(Place(state.name, "storage", j, j, j, state.unit))
+    stores = [p.target for p in out if p.kind == "storage"]
+    into = {i: [i, *(j for j in stores if j != i and slopes[j, i] != 0.0)] for i in stores}
+    out = [replace(p, pairs=_flat({p.target: into[p.target]})) if p.kind == "storage" else p for p in out]
+    if len(stores) > 1:
+        first = stores[0]
+        name = "+".join(states[i].name for i in stores)
+        out.append(Place(name, "storages", first, first, first, states[first].unit, _flat(into)))
+    return tuple(out)
+
+
+def _parameters(
+    recording: Recording,
+    states: tuple[State, ...],
+    signals: tuple[str, ...],
+    names: Sequence[str],
+    free: Sequence[int],
+) -> list[Place]:
+    """Each parameter that may be re-fitted beside each recorded signal which is no input of the twin."""
+    first = 1.0 + len(states)
+    return [
+        Place(
+            f"{names[i]} by {s}", "parameter", k, k, 0, recording.unit[s], (float(first + len(signals) + i), first + k)
+        )
+        for k, s in enumerate(signals)
+        if s in recording.context
+        for i in free
+    ]
+
+
+def _flat(into: Mapping[int, Sequence[int]]) -> tuple[float, ...]:
+    return tuple(float(v) for i, others in into.items() for j in others for v in (i, j))
+
+
+def _is_velocity(unit: str) -> bool:
+    try:
+        dimension = units.parse(unit).dimension
+    except units.UnitError:
+        return False
+    return dimension in (units.parse("m/s").dimension, units.parse("rad/s").dimension)
+
+
+def _states(where: str, table: object) -> tuple[State, ...]:
+    if not isinstance(table, Mapping) or not table:
+        raise RecordingError(f"{where} states must name each state with its unit, as in states = {{ v = 'm/s' }}")
+    out: list[State] = []
+    for name, entry in table.items():
+        if isinstance(entry, str):
+            entry = {"unit": entry}
+        known = {"unit", "start", "min", "max"}
+        if not isinstance(entry, Mapping) or set(entry) - known or not isinstance(entry.get("unit", "1"), str):
+            raise RecordingError(f"{where} states.{name} must be a unit, or a table with {', '.join(sorted(known))}")
+        for key in ("start", "min", "max"):
+            if key in entry and not _number(entry[key]):
+                raise RecordingError(f"{where} states.{name} {key} must be a finite number, got {entry[key]!r}")
+        low, high = float(entry.get("min", -np.inf)), float(entry.get("max", np.inf))
+        start = float(entry.get("start", min(max(0.0, low), high)))
+        if not low <= start <= high or low == high:
+            raise RecordingError(f"{where} states.{name}: start {start} does not lie between min {low} and max {high}")
+        try:
+            units.parse(entry.get("unit", "1"))
+        except units.UnitError as error:
+            raise RecordingError(f"{where} states.{name}: {error}") from None
+        out.append(State(str(name), entry.get("unit", "1"), start, low, high))
+    return tuple(out)
+
+
+def _programs(
+    recording: Recording,
+    table: Mapping[str, Any],
+    states: tuple[State, ...],
+    signals: tuple[str, ...],
+    names: tuple[str, ...],
+    every: tuple[str, ...],
+) -> Programs:
+    """Equations from text, or by tracing the Python function that is named. Raises EquationError."""
+    texts, function = table.get("equations"), table.get("function")
+    if (texts is None) == (function is None):
+        raise EquationError("needs either equations, or function = 'file.py:name'")
+    own = [s.name for s in states]
+    builder = Builder(every)
+    if texts is not None:
+        texts = _texts("equations", texts)
+        missing = [s for s in own if s not in texts]
+        if missing:
+            raise EquationError(f"no equation for the derivative of state '{missing[0]}'")
+        # the name of a state means its value in an equation, and its derivative as the name of one
+        renamed = {f"derivative of {k}" if k in own else k: v for k, v in texts.items()}
+        clash = [k for k in texts if k in every and k not in own]
+        if clash:
+            raise EquationError(f"'{clash[0]}' is a signal or a parameter and cannot have an equation")
+        results = parse(builder, renamed, [f"derivative of {s}" for s in own])
+        beside = {k: v for k, v in texts.items() if k not in own}
+    else:
+        found = trace(builder, _function(recording, function), {"states": own, "inputs": signals, "parameters": names})
+        missing = [s for s in own if s not in found]
+        if missing:
+            raise EquationError(f"derivatives returned {', '.join(found) or 'nothing'}, and no '{missing[0]}'")
+        results = [found[s] for s in own]
+        beside = {}
+    outputs = _texts("outputs", table.get("outputs", {}))
+    reader = Builder(every)
+    for o in recording.outputs:
+        if o not in outputs and o not in own:
+            raise EquationError(f"output '{o}' is no state; say under outputs how it is read, such as {o} = '{own[0]}'")
+    read = parse(reader, {**beside, **{f"output {o}": e for o, e in outputs.items()}},
+                 [f"output {o}" if o in outputs else o for o in recording.outputs])  # fmt: skip
+    return Programs(builder.program(results), reader.program(read), 1 + len(own) + len(signals))
+
+
+def _texts(key: str, table: object) -> dict[str, str]:
+    if not isinstance(table, Mapping):
+        raise EquationError(f"{key} must be a table of equations")
+    out: dict[str, str] = {}
+    for name, text in table.items():
+        if not isinstance(text, str | int | float) or isinstance(text, bool):
+            raise EquationError(f"{key}.{name} must be text, got {text!r}")
+        out[str(name)] = str(text)
+    return out
+
+
+def _function(recording: Recording, name: object) -> Callable[..., object]:
+    """``file.py:name`` beside the recording. Raises EquationError."""
+    if not isinstance(name, str) or ":" not in name:
+        raise EquationError(f"function must be 'file.py:name' with a file beside the recording, got {name!r}")
+    file, _, attribute = name.rpartition(":")
+    path = (recording.path.parent / file).resolve()
+    if not path.is_file():
+        raise EquationError(f"function: {path} does not exist")
+    spec = importlib.util.spec_from_file_location(Path(file).stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    try:
+        spec.loader.exec_module(module)
+    except Exception as error:
+        raise EquationError(f"function: {path} cannot be loaded ({error!r})") from error
+    found = getattr(module, attribute, None)
+    if not callable(found):
+        raise EquationError(f"function: {path} has no function '{attribute}'")
+    return found
+
+
+def _number(value: object) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
