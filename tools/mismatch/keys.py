@@ -93,6 +93,11 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("y0", "list of numbers", "offset of each output", "0"),
             HOLD,
             Key("discrete", "true, false", "A and B are those of the difference equation", "false"),
+            Key("states", "table by state", "name and unit of each row of A: forces are then tried inside", "none"),
+        ),
+        "columns": (
+            Key("offset", _PER_OUTPUT, "added to the column of simulated output", "0"),
+            Key("scale", _PER_OUTPUT, "times the column", "1"),
         ),
         "instrument": (
             Key("bench", "file name", "bench description of the emulated instrument, relative to the recording"),
