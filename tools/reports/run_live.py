@@ -63,6 +63,8 @@ class TipWatch:
 
         def look(t_ns: int) -> None:
             row = world.world.plant.truth_row()
+            if "tip_rigid_m" not in row:  # an endoscope has no tip that trembles
+                return
             self.add(np.concatenate([row["tip_rigid_m"], row["tip_m"]]))
             clock.at(t_ns + LOOK_NS, look)
 
