@@ -9,11 +9,14 @@ from numpy.typing import NDArray
 from scipy.stats import t as student
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parts, Settings, Signature
+from sim_devices.physics.periods import locked_p_value, period_of
 from sim_devices.physics.statistics import after_jumps, robust_rms, smooth, whiten
 
 MOST_SHARE = 0.05  # of all samples; more is not "short and isolated"
 THRESHOLD = 6.0
 LEAST_OF_TOP = 0.25  # of the third largest burst
+LEAST_LOCKED = 4  # bursts from which their phase says anything
+LOCKED = 1e-3  # p-value of Rayleigh's test below which bursts belong to the phase of an input
 
 
 def find_bursts(residual: Array, keep: NDArray[np.bool_]) -> list[tuple[int, int, float]]:
@@ -65,12 +68,20 @@ def _where(ctx: Context, residual: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def not_driven(bursts: list[tuple[int, int, float]], ctx: Context) -> list[tuple[int, int, float]]:
-    """Bursts less those that begin at a jump of a signal, when more do so than chance has it: a response."""
+    """Bursts less those that begin at a jump of a signal, when more do so than chance has it: a response. None where
+    they keep to the phase of an input that repeats: the misfit of a loop comes back in every period.
+    """
     lively = after_jumps(ctx.signals.values(), ctx.t.size, 0.1)
     at = np.array([lively[min(a + 2, lively.size - 1)] for a, _, _ in bursts], np.bool_)
-    if at.sum() <= max(1.0, 3.0 * float(lively.mean()) * len(bursts)):
-        return bursts
-    return [b for b, driven in zip(bursts, at, strict=True) if not driven]
+    if at.sum() > max(1.0, 3.0 * float(lively.mean()) * len(bursts)):
+        bursts = [b for b, driven in zip(bursts, at, strict=True) if not driven]
+    middle = np.array([0.5 * (a + b) for a, b, _ in bursts])
+    if middle.size >= LEAST_LOCKED:
+        for x in ctx.signals.values():
+            period = period_of(x)
+            if period is not None and locked_p_value(middle, period.samples) < LOCKED:
+                return []
+    return bursts
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:

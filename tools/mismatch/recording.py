@@ -44,6 +44,7 @@ class Recording:
 
     ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
+    ``tolerance``: differences of an output that do not matter to the user, in its contract unit.
     """
 
     path: Path
@@ -59,6 +60,7 @@ class Recording:
     twin: TwinText
     split: Split
     declared_step: Mapping[str, float] = field(default_factory=dict[str, float])
+    tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     warnings: tuple[str, ...] = ()
     declared_unit: Mapping[str, str] = field(default_factory=dict[str, str])
 

@@ -23,7 +23,7 @@ MOST_MISSING = 0.02  # of the time
 CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch without gaps"
 MOST_SIZE = 1e100  # of any value: squares must stay finite
 _TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
-_CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution"}
+_CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance"}
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,7 @@ class _Channel:
     to: str
     noise: float | None
     step: float | None
+    tolerance: float | None = None
 
 
 def load(path: Path | str) -> Recording:
@@ -126,6 +127,9 @@ def load(path: Path | str) -> Recording:
         split=_split(path, text.get("split"), n),
         declared_step={
             c.signal: units.convert_difference(c.step, c.unit, c.to) for c in channels if c.step is not None
+        },
+        tolerance={
+            c.signal: units.convert_difference(c.tolerance, c.unit, c.to) for c in channels if c.tolerance is not None
         },
         warnings=tuple(notes),
     )
@@ -238,7 +242,11 @@ def _channels(where: str, value: object, words: Vocabulary, kind: str, notes: li
         step = _positive(at, "resolution", entry.get("resolution"))
         if noise is not None and role != "output":
             notes.append(f"[[channels]] {i + 1}: noise_rms of a channel that is no output is not used")
-        out.append(_Channel(column, role, signal, unit, to, noise, step))
+        tolerance = _positive(at, "tolerance", entry.get("tolerance"))
+        if tolerance is not None and role != "output":
+            notes.append(f"[[channels]] {i + 1}: tolerance of a channel that is no output is not used")
+            tolerance = None
+        out.append(_Channel(column, role, signal, unit, to, noise, step, tolerance))
     if not any(c.role == "output" for c in out):
         raise RecordingError(f"{where}: no channel with role = 'output': there is nothing to compare the twin with")
     if not any(c.role == "input" for c in out):

@@ -28,7 +28,6 @@ from tools.mismatch.engine.report import (
     PhysicsFound,
     Pictures,
     Report,
-    Verdict,
     Window,
     Withheld,
 )
@@ -36,7 +35,7 @@ from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.select import Selection
 from tools.mismatch.engine.unexplained import Leftover, about
-from tools.mismatch.engine.verdict import OF_THE_CLOCK, compare_ratio, decide
+from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio, judge, within_tolerance
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
@@ -73,7 +72,8 @@ def assemble(
     """
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
-    verdict, p = decide(problem, raw, base, selection, left, rule)
+    decision = judge(problem, raw, base, selection, left, rule)
+    verdict, p = decision.verdict, decision.p_value
     cov = covariance(problem, fitted)
     runners, groups, alike = alternatives(problem, selection, rule)
     physics = physics_found(problem, selection, cov, alike)
@@ -114,7 +114,7 @@ def assemble(
     if verdict == "missing_physics":
         depends.sort(key=lambda d: -d.strength)
         depends = led_by_physics(problem, base, fitted, depends)
-    span = windows(problem, looked, guilty) if guilty else []
+    span = windows(problem, looked, guilty, {o: hi for o, (_, hi) in decision.floors.items()}) if guilty else []
     stage = ""
     if physics and verdict == "missing_physics":
         stage = physics[0].stage
@@ -133,7 +133,7 @@ def assemble(
         recording=str(rec.path),
         twin=twin.kind,
         verdict=verdict,
-        summary=summary(verdict, physics, guilty, depends, problem, base, fitted),
+        summary=summary(decision, physics, guilty, depends, problem, base, fitted),
         location=Location(
             tuple(guilty),
             stage,
@@ -157,6 +157,8 @@ def assemble(
             problem.split.fit,
             problem.split.held_out,
             tuple(base_shifts(raw, base, fitted, cov)),
+            decision.floors,
+            dict(rec.tolerance),
         ),
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),
@@ -183,6 +185,9 @@ def assemble(
             for t in selection.first
         ),
         withheld=tuple(withheld),
+        meaning=decision.meaning,
+        trouble=decision.trouble,
+        doubtful=decision.doubtful,
         pictures=Pictures(
             rec.t[problem.index],
             held,
@@ -236,7 +241,7 @@ def guess_stage(chain: Sequence[str], depends: Sequence[DependsOn]) -> str:
 
 
 def summary(
-    verdict: Verdict,
+    decision: Decision,
     physics: Sequence[PhysicsFound],
     guilty: Sequence[str],
     depends: Sequence[DependsOn],
@@ -244,10 +249,12 @@ def summary(
     base: Fit,
     fitted: Fit,
 ) -> str:
-    """One sentence a bench engineer would say."""
-    outputs = ", ".join(guilty)
+    """One sentence a bench engineer would say, and one about what is left where that is much."""
+    verdict, outputs = decision.verdict, ", ".join(guilty)
     a, b = held_rms(problem, base), held_rms(problem, fitted)
     if verdict == "agrees":
+        if problem.recording.tolerance and all(within_tolerance(problem, base).values()):
+            return "The recording is within the declared tolerance of the simulation as given."
         return "The recording is within its noise of the simulation as given."
     if verdict == "recalibrate":
         return "New base parameters explain the recording; no physics is missing."
@@ -255,9 +262,21 @@ def summary(
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
         factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o])
-        return (
+        said = (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
             f" from {number(factor * a[o])} to {number(factor * b[o])} {unit}."
         )
+        times = b[o] / max(decision.floors[o][1], 1e-300)
+        if times > MUCH_LEFT and b[o] > problem.recording.tolerance.get(o, 0.0):
+            said += f" That is still {number(times)} times the noise: it is not the whole account."
+        return said
     what = f" and follows {depends[0].signal} ({depends[0].feature})" if depends else ""
+    if decision.meaning == "floor_doubtful":
+        return f"Something may be left in {outputs}{what}; whether it is noise this recording does not say."
+    if decision.meaning == "fit_failed":
+        return f"Something is left in {outputs}{what}, but the fit failed: {decision.trouble[0]}."
     return f"Something is left in {outputs} that no known effect explains{what}."
+
+
+MUCH_LEFT = 2.0
+"""Times the upper end of the noise floor above which the summary says what is left."""

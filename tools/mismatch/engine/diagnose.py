@@ -123,13 +123,20 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
     """Noise floors from the recalibrated residual."""
     rec = problem.recording
     inputs = np.column_stack([*rec.inputs.values()]) if rec.inputs else np.empty((rec.n, 0))
+    whole: dict[str, np.ndarray] = {}
+    if not problem.twin.restart:
+        with np.errstate(all="ignore"):
+            simulated = base.model.simulate(View.whole(rec, problem.init), base.theta)
+        whole = {o: rec.outputs[o] - y for o, y in simulated.items() if np.all(np.isfinite(y))}
     floors = {}
     for o in problem.twin.outputs:
-        y = rec.outputs[o]
         longest = max(problem.fit_spans + problem.held_spans, key=lambda s: s[1] - s[0])
         full = base.residual[o]
         r = full if full.size == rec.n else full[longest[0] : longest[1]]
-        floors[o] = noise_floor(y, r, 1 / rec.dt, declared=rec.noise.get(o), inputs=inputs)
+        floors[o] = noise_floor(
+            rec.outputs[o], r, 1 / rec.dt, declared=rec.noise.get(o), inputs=inputs, whole=whole.get(o),
+            resolution=rec.declared_step.get(o, 0.0),
+        )  # fmt: skip
     return problem.with_floors(floors)
 
 

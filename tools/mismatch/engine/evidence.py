@@ -78,8 +78,16 @@ def weigh_evidence(
         doubts: list[tuple[float, Doubt, Fit]] = []
         for k, placed in enumerate(fitted.model.placed):
             doubt = doubt_of(placed, k, values.get(placed.label, {}), fitted.at_bound)
+            limits = [problem.recording.tolerance.get(o, 0.0) for o in placed.outputs]
+            if doubt is None and not all(limits):
+                continue
+            without = reduced(problem, fitted, k)
+            if doubt is None and all(
+                float(np.std((without.residual[o] - fitted.residual[o])[problem.held_rows])) < most
+                for o, most in zip(placed.outputs, limits, strict=True)
+            ):
+                doubt = Doubt(k, "below_tolerance", ())
             if doubt is not None:
-                without = reduced(problem, fitted, k)
                 doubts.append((sum(misfits(problem, without).values()), doubt, without))
         if not doubts:
             break

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,12 +118,17 @@ def regime(problem: Problem, fitted: Fit, output: str) -> str:
     return f"worst at {best[1]}" if best[0] > np.log(1.25) else "everywhere alike"
 
 
-def windows(problem: Problem, fitted: Fit, outputs: list[str]) -> list[tuple[float, float]]:
-    """Time windows in which any of ``outputs`` stands above its noise, seconds of the recording."""
+def windows(
+    problem: Problem, fitted: Fit, outputs: list[str], loudest: Mapping[str, float] | None = None
+) -> list[tuple[float, float]]:
+    """Time windows in which any of ``outputs`` stands above its noise (``loudest``: the most that this may be), seconds
+    of the recording. Where nearly all of the record does, those that hold most of what stands above it.
+    """
+    noise = {o: max((loudest or {}).get(o, 0.0), problem.sigma(o)) for o in outputs}
     t = problem.recording.t[problem.index] - problem.recording.t[0]
     found: list[tuple[float, float]] = []
     for o in outputs:
-        for a, b in bad_windows(fitted.residual[o], problem.sigma(o), 1.0):
+        for a, b in bad_windows(fitted.residual[o], noise[o], 1.0):
             i, j = min(int(a), t.size - 1), min(int(b), t.size) - 1
             found.append((float(t[i]), float(t[j]) + problem.recording.dt))
     found.sort()

@@ -1,8 +1,11 @@
-"""How loud the instrument itself is: the noise floor of an output.
+"""How loud the instrument itself is: the noise floor of an output, and the interval that it lies in.
 
-Four witnesses: what the recording declares; repetitions of the excitation; the flat upper part of the residual's
-spectrum (median over frequency, so that lines do not count, after clipping, so that spikes do not count); the
-lattice of a quantised output.
+Five witnesses: what the recording declares; periods of the excitation, whose misfit is the same in each; stretches in
+which every input rests; the flat upper part of the residual's spectrum (median over frequency, so that lines do not
+count, after clipping, so that spikes do not count); the lattice of a quantised output or its declared resolution.
+
+A spectrum bounds the noise from below only: a sensor behind a low-pass has little of its noise in the upper part. How
+far up the floor may lie is then said by what the residual follows (``floor_interval``).
 """
 
 from __future__ import annotations
@@ -14,7 +17,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.signal import welch
 
-from tools.mismatch.engine.colour import autocovariance
+from sim_devices.physics.periods import ALIKE, period_of
+from sim_devices.physics.statistics import runs
 
 Array = NDArray[np.float64]
 
@@ -25,7 +29,8 @@ class NoiseFloor:
 
     ``rms`` the whole noise; ``standard_error`` of it; ``white_rms`` the flat part (equal to ``rms`` unless the noise
     is coloured); ``step`` the quantisation step that the samples sit on, 0 when none shows; ``method`` one of
-    declared, repeats, spectrum; ``coloured`` says that the spectrum keeps falling to its end.
+    declared, repeats, rest, spectrum; ``coloured`` says that the spectrum keeps falling to its end. ``most``: the
+    noise is no louder than this, by periods or stretches at rest (infinite: there were none).
     """
 
     rms: float
@@ -34,6 +39,7 @@ class NoiseFloor:
     step: float
     method: str
     coloured: bool
+    most: float = np.inf
 
     @property
     def declared(self) -> bool:
@@ -123,35 +129,85 @@ def _level_of(e: Array, rate_hz: float) -> tuple[float, float, bool]:
     return rms, error, falling
 
 
-def repeat_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
-    """Noise from exact repetitions of the excitation: (rms, standard error); None when nothing repeats.
+HIGH_PASS = 20
+"""Running means over this share of a record are taken off differences between periods: what warms up is no noise."""
 
-    ``inputs`` (n, k). Slow drift is taken off the differences (a running mean over a twentieth of them),
-    so that warm-up is not booked as noise.
+
+SLOW = 1.5
+"""Factor by which the variance of differences grows with a high-pass of three times the width, from which they are slow:
+a walk (three times), or noise that the high-pass cuts. What it lets through says nothing then."""
+
+
+def repeat_floor(y: Array, inputs: Array) -> tuple[float, float, bool] | None:
+    """Noise from periods of the excitation: (rms, standard error, is it too slow to tell); None when nothing repeats.
+
+    ``y`` (n,) an output, or the residual of a simulation (then what an input does differently in each period is taken
+    off as well); ``inputs`` (n, k). The first of three and more periods is left out: it starts from another state. Slow
+    drift is taken off the differences, and so are lines and bursts.
     """
     n = y.size
     if inputs.size == 0 or n < 200:
         return None
     x = inputs[:, int(np.argmax(np.std(inputs, axis=0)))]
-    if np.std(x) == 0:
+    period = period_of(x)
+    if period is None:
         return None
-    rho = autocovariance(x, n // 2)
-    rho = rho / rho[0] / (1 - np.arange(rho.size) / n)
-    below = np.nonzero(rho < 0.5)[0]
-    if below.size == 0:
+    lag = period.lag
+    begin = round(period.samples) if n - lag - period.samples >= max(100, n // 4) else 0
+    if n - lag - begin < 100 or any(not _repeats(inputs[:, i], lag) for i in range(inputs.shape[1])):
         return None
-    start = int(below[0])
-    lag = start + int(np.argmax(rho[start:]))
-    for candidate in (lag, 2 * lag, 5 * lag):
-        if candidate <= 0 or n - candidate < max(100, n // 3):
-            break
-        change = inputs[candidate:] - inputs[:-candidate]
-        if float(np.max(np.abs(change))) <= 1e-6 * float(np.max(np.abs(inputs))):
-            d = y[candidate:] - y[:-candidate]
-            d = clip_spikes(d - uniform_filter1d(d, max(51, d.size // 20), mode="nearest"))
-            rms = float(np.std(d)) / np.sqrt(2)
-            return rms, rms / np.sqrt(max(d.size / 4, 2))
-    return None
+    d = y[begin + lag :] - y[begin : n - lag]
+    window = max(51, d.size // HIGH_PASS)
+    narrow, wide = (_variance_without_lines(d, w) for w in (window, 3 * window))
+    rms = float(np.sqrt(narrow / 2))
+    return rms, rms / float(np.sqrt(max(d.size / 4, 2))), wide > SLOW * narrow
+
+
+def _repeats(x: Array, lag: int) -> bool:
+    spread = float(np.std(x))
+    return spread == 0.0 or float(np.sqrt(np.mean((x[lag:] - x[:-lag]) ** 2) / 2)) <= ALIKE * spread
+
+
+def _variance_without_lines(d: Array, window: int) -> float:
+    """Variance of ``d`` (n,) less its running mean over ``window`` samples, without lines and bursts."""
+    d = clip_spikes(d - uniform_filter1d(d, min(window, d.size), mode="nearest"))
+    segment = int(min(d.size, max(128, 1 << int(np.log2(max(d.size // 8, 128))))))
+    frequency, density = welch(d, 1.0, nperseg=segment, detrend="constant")
+    usual = median_filter(density, min(15, density.size), mode="nearest")
+    return float(np.sum(np.where(density > 6.0 * usual, usual, density)[1:])) * float(frequency[1])
+
+
+REST = 1e-3  # of an input's range: an input that moves by less over a stretch rests
+LEAST_REST = 64  # samples of a stretch at rest, whose first half is left to settle
+
+
+def rest_floor(y: Array, inputs: Array) -> tuple[float, float] | None:
+    """Noise of ``y`` (n,) where every input (n, k) rests and the output has settled: (rms, standard error); None when
+    no stretch is long enough or none is settled.
+    """
+    n = y.size
+    if inputs.size == 0 or n < LEAST_REST:
+        return None
+    size = np.maximum(np.ptp(inputs, axis=0), 1e-300)
+    if np.all(np.ptp(inputs, axis=0) == 0.0):
+        return None
+    level = np.round(inputs / (REST * size))
+    still = np.concatenate([[False], np.all(np.abs(np.diff(level, axis=0)) <= 1, axis=1)])
+    power = count = 0.0
+    for a, b in runs(still):
+        if b - a < LEAST_REST or np.any(np.ptp(inputs[a:b], axis=0) > 2 * REST * size):
+            continue
+        half = y[(a + b) // 2 : b]
+        t = np.linspace(-1.0, 1.0, half.size)
+        e = half - np.polynomial.Polynomial.fit(t, half, 2)(t)
+        early, late = float(np.std(e[: e.size // 2])), float(np.std(e[e.size // 2 :]))
+        if early <= 2.0 * late:
+            power += float(e @ e)
+            count += e.size - 3
+    if count < LEAST_REST / 2 or power <= 0.0:
+        return None
+    rms = float(np.sqrt(power / count))
+    return rms, rms / float(np.sqrt(max(count / 4, 2)))
 
 
 def noise_floor(
@@ -161,21 +217,58 @@ def noise_floor(
     *,
     declared: float | None = None,
     inputs: Array | None = None,
+    whole: Array | None = None,
+    resolution: float = 0.0,
 ) -> NoiseFloor:
     """Noise floor of one output.
 
-    ``y`` (n,) as recorded, ``residual`` (n,) after the base parameters were fitted, ``inputs`` (n, k).
-    A declared figure wins; otherwise repetitions, otherwise the quiet end of the spectrum.
+    ``y`` (n,) as recorded, ``residual`` (m,) after the base parameters were fitted, ``inputs`` (n, k), ``whole`` (n,)
+    the residual of one run through the whole record. A declared figure wins; otherwise periods, otherwise stretches at
+    rest, otherwise the quiet end of the spectrum; never below the quantisation.
     """
-    step = lattice_step(y)
+    step = max(lattice_step(y), resolution)
     white, error, falling = spectral_floor(residual, rate_hz)
     if declared is not None and declared > 0:
         white = min(white, declared) if white > 0 else declared
-        return NoiseFloor(declared, 0.02 * declared, white, step, "declared", falling)
-    repeated = repeat_floor(y, inputs) if inputs is not None else None
-    if repeated is not None and 0 < repeated[0] < 1.5 * white:
-        rms, spread = repeated
-        return NoiseFloor(rms, spread, min(white, rms), step, "repeats", falling)
+        return NoiseFloor(declared, 0.02 * declared, white, step, "declared", falling, declared)
     least = step / np.sqrt(12.0)
     rms = max(white, least)
-    return NoiseFloor(rms, max(error, 0.01 * rms), rms, step, "spectrum", falling)
+    most = np.inf
+    if inputs is not None:
+        both = [repeat_floor(e, inputs) for e in (y, whole) if e is not None]
+        repeated = min((r for r in both if r is not None), default=None)
+        rest = rest_floor(y, inputs)
+        if repeated is not None and 0 < repeated[0] < 1.5 * white:
+            value, spread, _ = repeated
+            value = max(value, least)
+            return NoiseFloor(value, spread, min(white, value), step, "repeats", falling, value + 2 * spread)
+        if repeated is not None and repeated[0] > 0 and not repeated[2]:
+            # what is fast is the instrument's own; what is slow may be a walk, and is left to be found
+            most = max(repeated[0] + 2 * repeated[1], rms)
+            return NoiseFloor(max(repeated[0], least), repeated[1], rms, step, "repeats", falling, most)
+        if rest is not None:
+            most = min(most, max(rest[0] + 2 * rest[1], rms))
+            if rest[0] > 1.5 * white:
+                return NoiseFloor(max(rest[0], least), rest[1], rms, step, "rest", falling, most)
+    return NoiseFloor(rms, max(error, 0.01 * rms), rms, step, "spectrum", falling, most)
+
+
+KNOWN_WITHIN = 1.25
+"""Factor within which a floor from periods, rest or a flat spectrum is taken as known, either way."""
+
+
+def floor_interval(floor: NoiseFloor, left: Array, follows: float, rate_hz: float) -> tuple[float, float]:
+    """The interval that the noise rms lies in.
+
+    ``left`` (m,) what the final model leaves, ``follows`` the share of its variance that goes with recorded signals:
+    the rest is the loudest that the noise can be.
+    """
+    if floor.declared:
+        return floor.rms, floor.rms
+    if floor.method != "spectrum":
+        return floor.rms / KNOWN_WITHIN, max(floor.rms * KNOWN_WITHIN, min(floor.most, 2 * floor.rms))
+    _, _, falling = spectral_floor(left, rate_hz)
+    if not falling:
+        return floor.rms, KNOWN_WITHIN * floor.rms
+    unpredicted = float(np.sqrt(np.mean(left**2) * max(1.0 - follows, 0.0)))
+    return floor.rms, max(min(unpredicted, floor.most), floor.rms)

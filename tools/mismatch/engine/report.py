@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
+Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
+"""What an ``unexplained`` means; "" for the other verdicts."""
 WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance"]
 
 
@@ -125,6 +127,8 @@ class FitSummary:
     fit_spans: tuple[tuple[int, int], ...]
     held_out_spans: tuple[tuple[int, int], ...]
     base_parameters: tuple[BaseShift, ...]
+    noise_floor_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, "tuple[float, float]"])
+    tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
 @dataclass(frozen=True)
@@ -177,6 +181,12 @@ class Report:
     withheld: tuple[Withheld, ...] = ()
     """Effects that were tried and are not named, with the reason."""
     corrected_parameters: tuple[float, ...] = ()
+    meaning: Meaning = ""
+    """What the verdict ``unexplained`` means."""
+    trouble: tuple[str, ...] = ()
+    """What went wrong in the fit, in words."""
+    doubtful: tuple[str, ...] = ()
+    """Outputs whose verdict would be another at the lower end of the noise floor's interval."""
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
     not_tried: str = ""
     """What this kind of twin does not allow to be tried, and which kind would."""

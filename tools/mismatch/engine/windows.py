@@ -39,24 +39,48 @@ def change_points(x: Array, penalty: float | None = None) -> list[int]:
     return edges[::-1]
 
 
+EVERYWHERE = 0.8
+"""Share of the record above the noise from which a location that names all of it says nothing."""
+MOST_ENERGY = 0.8
+"""Share of the energy above the noise that the windows named then hold."""
+
+
 def bad_windows(e: Array, noise_rms: float, dt: float, *, blocks: int = 96) -> list[tuple[float, float]]:
     """Windows (start_s, stop_s) in which the residual ``e`` (n,) stands above its noise.
 
-    Neighbouring windows above are joined; the whole record is one window when nearly all of it is above.
+    Neighbouring windows above are joined. Where more than ``EVERYWHERE`` of the record is above, the loudest segments
+    that hold ``MOST_ENERGY`` of the excess; the whole record is one window only when it is as loud throughout.
     """
     n = e.size
     blocks = max(4, min(blocks, n // 16))
     edges = np.linspace(0, n, blocks + 1).astype(int)
-    energy = np.array([np.mean(e[a:b] ** 2) for a, b in itertools.pairwise(edges)])
+    energy = np.array([float(np.mean(e[a:b] ** 2)) for a, b in itertools.pairwise(edges)])
     level = np.log(np.maximum(energy, (0.05 * noise_rms) ** 2 + 1e-300))
-    segments = change_points(level)
+    segments = list(itertools.pairwise(change_points(level)))
     threshold = np.log(1.3 * noise_rms**2) if noise_rms > 0 else float(np.median(level))
+    above = [s for s in segments if float(np.log(np.mean(np.exp(level[s[0] : s[1]])))) > threshold]
+    if sum(b - a for a, b in above) > EVERYWHERE * blocks:
+        loud = _loudest(energy, noise_rms)
+        if sum(b - a for a, b in loud) <= EVERYWHERE * blocks:
+            above = loud
     out: list[tuple[float, float]] = []
-    for a, b in itertools.pairwise(segments):
-        if float(np.log(np.mean(np.exp(level[a:b])))) > threshold:
-            start, stop = float(edges[a] * dt), float(edges[b] * dt)
-            if out and abs(out[-1][1] - start) < 1e-9:
-                out[-1] = (out[-1][0], stop)
-            else:
-                out.append((start, stop))
+    for a, b in above:
+        start, stop = float(edges[a] * dt), float(edges[b] * dt)
+        if out and abs(out[-1][1] - start) < 1e-9:
+            out[-1] = (out[-1][0], stop)
+        else:
+            out.append((start, stop))
     return out
+
+
+def _loudest(energy: Array, noise_rms: float) -> list[tuple[int, int]]:
+    """Runs of blocks [start, stop), as few blocks as hold ``MOST_ENERGY`` of what stands above the noise; a single
+    quieter block between two of them is taken along."""
+    excess = np.maximum(energy - noise_rms**2, 0.0)
+    order = np.argsort(-excess, kind="stable")
+    needed = int(np.searchsorted(np.cumsum(excess[order]), MOST_ENERGY * excess.sum())) + 1
+    chosen = np.zeros(energy.size, bool)
+    chosen[order[:needed]] = True
+    chosen[1:-1] |= chosen[:-2] & chosen[2:]
+    ends = np.flatnonzero(np.diff(np.concatenate([[0], chosen.astype(np.int8), [0]])))
+    return [(int(a), int(b)) for a, b in zip(ends[::2], ends[1::2], strict=True)]

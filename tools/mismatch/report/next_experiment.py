@@ -41,7 +41,7 @@ def next_experiments(report: Report) -> list[Experiment]:
     if report.verdict == "unexplained":
         found += _unexplained(report)
     found += _poorly_known(report)
-    estimated = [o for o, m in report.fit.noise_method.items() if m != "declared"]
+    estimated = [o for o, m in report.fit.noise_method.items() if m == "spectrum"]
     if estimated:
         found.append(
             Experiment(

@@ -57,6 +57,7 @@ def html_page(report: Report) -> str:
         words=words,
         scaled=wording.scaled,
         why_withheld=wording.why_withheld,
+        meaning=wording.meaning(report),
     )
 
 

@@ -80,7 +80,7 @@ def _fit(report: Report) -> Table:
     for o, unit in f.unit.items():
         factor, shown = wording.scaled(f.recalibrated_rms[o], unit)
         figures = (f.base_rms[o] * factor, f.recalibrated_rms[o] * factor, f.fitted_rms[o] * factor)
-        floor = f"{number(f.noise_floor_rms[o] * factor)} ({f.noise_method.get(o, '')})"
+        floor = f"{wording.floor_of(f, o, factor)} ({f.noise_method.get(o, '')})"
         t.add_row(Text(f"{o} ({shown})"), *map(number, figures), floor, percent(wording.explained(f, o)))
     return t
 
@@ -152,6 +152,8 @@ def render(report: Report) -> RenderableType:
     ]
     if report.not_tried:
         parts.append(Padding(Text(report.not_tried, "italic"), (1, 0, 0, 2)))
+    if report.meaning:
+        parts.append(_section("What 'unexplained' means here", Text(wording.meaning(report))))
     if report.location.outputs:
         parts.append(_section("Where", _where(report)))
     if report.physics:

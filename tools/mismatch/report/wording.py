@@ -13,6 +13,17 @@ VERDICTS: Mapping[str, str] = {
     "missing_physics": "Missing physics",
     "unexplained": "Unexplained",
 }
+MEANINGS: Mapping[str, str] = {
+    "floor_doubtful": "the noise floor is in doubt: at its upper end nothing is left. Record ten seconds with the input"
+    " at rest, repeat the input, or declare noise_rms or tolerance",
+    "fit_failed": "the fit failed, so this says nothing about physics yet. Look at the parameters as given, the units"
+    " and the start of the record",
+    "place_not_reachable": "this kind of twin can be changed at its inputs and outputs only, and what is left may sit"
+    " between them. A twin with its equations (mechanical_axis, or state_space with one input) can be tried inside",
+    "unknown": "the noise floor is known well enough, the fit holds and every place of this twin was tried: no effect"
+    " of the vocabulary does this",
+}
+"""What an ``unexplained`` means, and what to do about it."""
 WELL_KNOWN = 0.3  # half an interval over its value: above this a parameter is poorly known
 MUCH = 1.5  # residual over noise floor that deserves a word whatever the verdict
 SHOWABLE = 1.05  # residual over noise floor below which nothing is left to be explained
@@ -129,9 +140,29 @@ def cautions(report: Report) -> list[str]:
     if report.verdict != "unexplained":
         f = report.fit
         for o, noise in f.noise_floor_rms.items():
-            if noise > 0 and f.fitted_rms[o] > MUCH * noise:
-                out.append(f"what is left in {o} is {number(f.fitted_rms[o] / noise)} times the noise floor")
+            most = max(noise, f.noise_floor_interval.get(o, (noise, noise))[1])
+            if noise > 0 and f.fitted_rms[o] > max(MUCH * most, f.tolerance.get(o, 0.0)):
+                out.append(f"what is left in {o} is {number(f.fitted_rms[o] / most)} times the noise floor")
+    for o in report.doubtful:
+        factor, unit = scaled(report.fit.noise_floor_interval[o][1], report.fit.unit.get(o, ""))
+        out.append(
+            f"the noise of {o} may be {floor_of(report.fit, o, factor)} {unit}: the verdict is that of the upper end"
+        )
     return out
+
+
+def floor_of(fit: FitSummary, output: str, factor: float) -> str:
+    """The noise floor of an output: one figure, or the two ends of its interval where these differ by half or more."""
+    lo, hi = fit.noise_floor_interval.get(output, (math.nan, math.nan))
+    if math.isfinite(lo) and math.isfinite(hi) and hi > 1.5 * lo:
+        return f"{number(lo * factor)} to {number(hi * factor)}"
+    return number(fit.noise_floor_rms[output] * factor)
+
+
+def meaning(report: Report) -> str:
+    """What the verdict ``unexplained`` means on this recording, as one sentence; "" for the other verdicts."""
+    said = MEANINGS.get(report.meaning, "")
+    return f"{said}: {'; '.join(report.trouble)}" if report.trouble and said else said
 
 
 def spans(of: Sequence[tuple[int, int]], dt_s: float) -> str:
