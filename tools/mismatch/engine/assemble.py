@@ -16,6 +16,7 @@ from tools.mismatch.engine.found import alternatives, physics_found
 from tools.mismatch.engine.identifiability import detection
 from tools.mismatch.engine.intervals import covariance
 from tools.mismatch.engine.locate import follow, regime, windows
+from tools.mismatch.engine.one_way import one_way
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reach import not_tried, out_of_reach, tempered
@@ -24,6 +25,7 @@ from tools.mismatch.engine.report import (
     Checks,
     DependsOn,
     FitSummary,
+    Hold,
     Location,
     PhysicsFound,
     Pictures,
@@ -66,15 +68,18 @@ def assemble(
     official: Problem | None = None,
     jobs: int = 1,
     withheld: Sequence[Withheld] = (),
+    hold: Hold | None = None,
 ) -> Report:
     """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
-    free run, when the decisions were made on shorter stretches; ``withheld``: effects that are not named.
+    free run, when the decisions were made on shorter stretches; ``withheld``: effects that are not named;
+    ``hold``: what the inputs do between their samples.
     """
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
     decision = judge(problem, raw, base, selection, left, rule)
     verdict, p = decision.verdict, decision.p_value
     cov = covariance(problem, fitted)
+    shifts = base_shifts(raw, base, fitted, cov)
     runners, groups, alike = alternatives(problem, selection, rule)
     physics = physics_found(problem, selection, cov, alike)
     exported = without_events(problem, fitted)
@@ -156,7 +161,7 @@ def assemble(
             {o: problem.floors[o].method for o in twin.outputs},
             problem.split.fit,
             problem.split.held_out,
-            tuple(base_shifts(raw, base, fitted, cov)),
+            tuple(shifts),
             decision.floors,
             dict(rec.tolerance),
         ),
@@ -188,6 +193,8 @@ def assemble(
         meaning=decision.meaning,
         trouble=decision.trouble,
         doubtful=decision.doubtful,
+        hold=dict.fromkeys(twin.inputs, hold) if hold is not None else {},
+        one_way=one_way(problem, fitted, shifts),
         pictures=Pictures(
             rec.t[problem.index],
             held,

@@ -16,12 +16,13 @@ from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.evidence import weigh_evidence
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
 from tools.mismatch.engine.forward import Work, forward
+from tools.mismatch.engine.hold import delay_is_hold, held, holdable, infer_hold, said_hold
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
-from tools.mismatch.engine.report import Report
+from tools.mismatch.engine.report import Hold, Report
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.select import search
@@ -176,6 +177,14 @@ def _diagnose(
     if is_long(recording, make(recording)):
         catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
+    hold = None
+    if holdable(problem):
+        hold = infer_hold(problem, base)
+        if hold.kind == "zero":
+            recording = held(recording)
+            problem, raw, base = prepared(recording, held_out, seed, was_joined)
+    elif said_hold(recording) in ("zero", "linear") and hasattr(problem.twin, "hold"):
+        hold = Hold("zero" if said_hold(recording) == "zero" else "linear", "declared")
     twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
@@ -191,6 +200,12 @@ def _diagnose(
         if strange is not None:
             # the effects only imitated it: nothing is named
             selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
+    if hold is not None and hold.how == "assumed":
+        without_delay = delay_is_hold(problem, selection)
+        if without_delay is not None:
+            selection, hold = without_delay, Hold("zero", "instead_of_delay")
+            problem, base = selection.problem, selection.base
+            recording, twin = problem.recording, problem.twin
     selection, withheld = weigh_evidence(problem, selection, catalogue)
     fitted = selection.fitted
     outputs = twin.outputs
@@ -211,7 +226,7 @@ def _diagnose(
         official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
         base = over_the_whole(problem, official, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, official, selection.fitted))
-    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld)
+    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld, hold)
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:

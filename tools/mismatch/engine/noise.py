@@ -134,8 +134,8 @@ HIGH_PASS = 20
 
 
 SLOW = 1.5
-"""Factor by which the variance of differences grows with a high-pass of three times the width, from which they are slow:
-a walk (three times), or noise that the high-pass cuts. What it lets through says nothing then."""
+"""Factor by which the variance of differences grows with a high-pass of three times the width, from which they are
+slow: a walk (three times), or noise that the high-pass cuts. What it lets through says nothing then."""
 
 
 def repeat_floor(y: Array, inputs: Array) -> tuple[float, float, bool] | None:

@@ -90,6 +90,32 @@ class Withheld:
 
 
 @dataclass(frozen=True)
+class Hold:
+    """What the inputs do between their samples: ``kind`` zero (held) or linear; ``how``: declared, inferred, assumed
+    (the data do not tell) or instead_of_delay (a named delay of half a sample was the hold). ``share``: 0 is linear, 1
+    held.
+    """
+
+    kind: Literal["zero", "linear"]
+    how: Literal["declared", "inferred", "assumed", "instead_of_delay"]
+    share: float | None = None
+    ci95: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True)
+class OneWay:
+    """A load that moved one way only (``direction`` 1 or -1): friction shows as ``offset`` of the force (re-fitted less
+    given; None where the twin has no such parameter). ``reversal``: travel, in ``unit``, that would tell.
+    """
+
+    output: str
+    direction: int
+    offset: ParameterValue | None
+    reversal: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class Alternative:
     name: str
     output: str
@@ -187,6 +213,10 @@ class Report:
     """What went wrong in the fit, in words."""
     doubtful: tuple[str, ...] = ()
     """Outputs whose verdict would be another at the lower end of the noise floor's interval."""
+    hold: Mapping[str, Hold] = field(default_factory=dict[str, Hold])
+    """Per input of a twin with memory: what it does between its samples."""
+    one_way: OneWay | None = None
+    """A load that moved one way only, so that its friction shows as an offset."""
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
     not_tried: str = ""
     """What this kind of twin does not allow to be tried, and which kind would."""

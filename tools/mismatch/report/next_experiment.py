@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.report import DependsOn, Report
-from tools.mismatch.report.wording import label, percent, poorly_known, words
+from tools.mismatch.report.wording import label, number, percent, poorly_known, words
 
 
 @dataclass(frozen=True)
@@ -38,6 +38,14 @@ def next_experiments(report: Report) -> list[Experiment]:
         Experiment(words(e.tell_apart_by), f"tells apart {', '.join(words(n) for n in e.names)}")
         for e in report.equivalent
     ]
+    if report.one_way is not None:
+        way = report.one_way
+        found.append(
+            Experiment(
+                f"a reversal of {number(way.reversal)} {way.unit} or more of {way.output}",
+                "it only ever moved one way, so friction and an offset of the force are the same",
+            )
+        )
     if report.verdict == "unexplained":
         found += _unexplained(report)
     found += _poorly_known(report)

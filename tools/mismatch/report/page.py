@@ -58,6 +58,7 @@ def html_page(report: Report) -> str:
         scaled=wording.scaled,
         why_withheld=wording.why_withheld,
         meaning=wording.meaning(report),
+        hold=wording.hold(report),
     )
 
 

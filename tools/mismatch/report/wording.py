@@ -5,7 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from tools.mismatch.engine.report import BaseShift, FitSummary, Location, ParameterValue, PhysicsFound, Report, Withheld
+from tools.mismatch.engine.report import (
+    BaseShift,
+    FitSummary,
+    Location,
+    OneWay,
+    ParameterValue,
+    PhysicsFound,
+    Report,
+    Withheld,
+)
 
 VERDICTS: Mapping[str, str] = {
     "agrees": "Agrees",
@@ -137,6 +146,16 @@ def guilty_stages(report: Report) -> tuple[str, ...]:
 def cautions(report: Report) -> list[str]:
     """What to look at before believing the verdict: the checks' messages, and a residual that no verdict covers."""
     out = list(report.checks.messages)
+    if report.one_way is not None:
+        out.append(one_way(report.one_way))
+    step = step_s(report)
+    for p in report.physics:
+        delay = p.parameters.get("delay_s")
+        if step and delay is not None and abs(delay.value - 0.5 * step) < 0.1 * step:
+            out.append(
+                f"{words(p.name)} of {p.output} is half a sample: an input that is held where the twin takes it as"
+                " linear, or the other way round, looks the same"
+            )
     if report.verdict != "unexplained":
         f = report.fit
         for o, noise in f.noise_floor_rms.items():
@@ -157,6 +176,36 @@ def floor_of(fit: FitSummary, output: str, factor: float) -> str:
     if math.isfinite(lo) and math.isfinite(hi) and hi > 1.5 * lo:
         return f"{number(lo * factor)} to {number(hi * factor)}"
     return number(fit.noise_floor_rms[output] * factor)
+
+
+def one_way(found: OneWay) -> str:
+    """What a load that moved one way only leaves open, and the reversal that would tell."""
+    way = "forwards" if found.direction > 0 else "backwards"
+    said = f"{found.output} only ever moved {way}: dry friction would show as an offset of the force"
+    if found.offset is not None:
+        value, lo, hi = interval(found.offset)
+        p = found.offset
+        said += f", which moved by {value} ({lo} .. {hi}) {p.unit} when re-fitted"
+        against = p.value * found.direction < 0 and not p.ci95[0] <= 0.0 <= p.ci95[1]
+        said += ": that may be friction of this size" if against else ""
+    return f"{said}; record a reversal of {number(found.reversal)} {found.unit} or more"
+
+
+_HOLDS = {
+    "declared": "as declared",
+    "inferred": "read off the data",
+    "assumed": "assumed: the data do not tell",
+    "instead_of_delay": "a delay of half a sample was this and no dead time",
+}
+
+
+def hold(report: Report) -> str:
+    """What the inputs do between their samples, in one line; "" for a twin without memory."""
+    by: dict[str, list[str]] = {}
+    for s, h in report.hold.items():
+        kind = "held" if h.kind == "zero" else "linear"
+        by.setdefault(f"{kind} between samples ({_HOLDS[h.how]})", []).append(s)
+    return "; ".join(f"{', '.join(of)} {said}" for said, of in by.items())
 
 
 def meaning(report: Report) -> str:

@@ -1,0 +1,114 @@
+"""What inputs do between their samples, and loads that only move one way: integrated here in small steps."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import RATE, recording, wave
+from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.hold import delay_is_hold, held, holdable, infer_hold
+from tools.mismatch.engine.one_way import direction, one_way
+from tools.mismatch.engine.report import BaseShift
+from tools.mismatch.engine.revise import added
+from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.select import Selection
+from tools.mismatch.recording import Recording
+from tools.mismatch.report import wording
+
+N = 3000
+
+
+def axis(seed: int, *, zero: bool, late: float = 0.0) -> Recording:
+    """A sprung mass under a force that is held or linear between its samples, thirty Euler steps to a sample."""
+    rng = np.random.default_rng(seed)
+    sub = 30
+    force = 3.0 * wave(rng, N, low=1.0, high=60.0)
+    at = np.arange(N * sub) / sub - late
+    fine = force[np.clip(np.floor(at + 1e-9).astype(int), 0, N - 1)] if zero else np.interp(at, np.arange(N), force)
+    h, x, v = 1 / (RATE * sub), 0.0, 0.0
+    position = np.empty(N)
+    for i in range(N):
+        position[i] = x
+        for f in fine[i * sub : (i + 1) * sub]:
+            v += h * (f - 6.0 * v - 20000.0 * x) / 0.5
+            x += h * v
+    believed: dict[str, object] = {"mass": 0.5, "damping": 6.0, "stiffness": 20000.0, "offset_force": 0.0}
+    measured = position + rng.normal(0, 5e-7, N)
+    return recording("mechanical_axis", {"force": force}, {"position": measured}, believed)
+
+
+@pytest.mark.parametrize("zero", [True, False])
+@pytest.mark.parametrize("seed", range(2))
+def test_the_hold_of_an_input_is_read_off_the_data(seed: int, zero: bool) -> None:
+    problem, _, base = prepared(axis(seed, zero=zero), 0.3, 0, False)
+    assert holdable(problem)
+    found = infer_hold(problem, base)
+    assert (found.kind, found.how) == ("zero" if zero else "linear", "inferred")
+    assert found.share == pytest.approx(1.0 if zero else 0.0, abs=0.2)
+
+
+def test_a_true_delay_of_three_samples_is_no_hold() -> None:
+    problem, _, base = prepared(axis(3, zero=False, late=3.0), 0.3, 0, False)
+    assert infer_hold(problem, base).kind == "linear"
+
+
+def test_a_declared_hold_is_not_questioned() -> None:
+    problem, _, _ = prepared(held(axis(4, zero=True)), 0.3, 0, False)
+    assert not holdable(problem)
+    assert problem.twin.to_text(problem.twin.start(problem.recording))["hold"] == "zero"
+
+
+def test_a_named_delay_of_half_a_sample_is_the_hold() -> None:
+    problem, _, base = prepared(axis(5, zero=True), 0.3, 0, False)
+    place = places(problem, [EFFECTS["dead_time"]], ())[0]
+    with np.errstate(all="ignore"):
+        fitted = added(problem, base, place)
+    found = delay_is_hold(problem, Selection(problem, base, fitted, (), ()))
+    assert found is not None
+    assert found.fitted.model.placed == ()
+    late, _, base = prepared(axis(5, zero=False, late=3.0), 0.3, 0, False)
+    with np.errstate(all="ignore"):
+        fitted = added(late, base, place)
+    assert delay_is_hold(late, Selection(late, base, fitted, (), ())) is None
+
+
+def test_which_way_a_load_moved() -> None:
+    rng = np.random.default_rng(6)
+    t = np.arange(N) / N
+    noise = 0.02 * rng.standard_normal(N)
+    assert direction(t**2 + noise, 0.02, is_rate=False) == 1
+    assert direction(-t + noise, 0.02, is_rate=False) == -1
+    assert direction(np.sin(7 * t) + noise, 0.02, is_rate=False) == 0
+    assert direction(0.5 + 0.3 * np.sin(9 * t) + noise, 0.02, is_rate=True) == 1
+    assert direction(noise, 0.02, is_rate=True) == 0
+
+
+def test_friction_of_a_load_that_moves_one_way_is_said_to_show_as_an_offset() -> None:
+    rng = np.random.default_rng(7)
+    sub, friction, mass, damping = 20, 1.2, 2.0, 8.0
+    force = 6.0 + 2.0 * wave(rng, N, low=0.3, high=5.0)  # always more than the friction
+    h, x, v = 1 / (RATE * sub), 0.0, 0.0
+    position = np.empty(N)
+    for i in range(N):
+        position[i] = x
+        for _ in range(sub):
+            v = max(v + h * (force[i] - damping * v - friction) / mass, 0.0)
+            x += h * v
+    believed: dict[str, object] = {"mass": mass, "damping": damping, "stiffness": 0.0, "offset_force": 0.0}
+    made = recording("mechanical_axis", {"force": force}, {"position": position + rng.normal(0, 1e-5, N)}, believed)
+    problem, raw, base = prepared(made, 0.3, 0, False)
+    shifts = [
+        BaseShift(p.name, p.unit, float(raw.theta[i]), float(base.theta[i]), float(base.theta[i]), (0.0, 0.0))
+        for i, p in enumerate(base.model.parameters)
+    ]
+    found = one_way(problem, base, shifts)
+    assert found is not None
+    assert (found.output, found.direction) == ("position", 1)
+    assert found.offset is not None
+    assert found.offset.value == pytest.approx(-friction, rel=0.1)
+    assert found.reversal == pytest.approx(0.1 * float(np.ptp(position)), rel=0.01)
+    said = wording.one_way(found)
+    assert "friction" in said
+    assert "reversal" in said

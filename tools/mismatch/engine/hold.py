@@ -1,0 +1,139 @@
+"""Whether an input was held between its samples or ran linearly, where the recording does not say.
+
+To first order the two differ by half a sample of delay, so a twin that runs the wrong one lacks a "dead time" that no
+machine has. The difference of both simulations is regressed on the whitened residual beside everything that the base
+parameters can do (Frisch and Waugh, Econometrica 1, 1933): a share of 0 is linear, of 1 held.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tools.mismatch.engine.colour import fit_whitener, whiten
+from tools.mismatch.engine.fit import Fit, fit, fit_base
+from tools.mismatch.engine.found import human_values
+from tools.mismatch.engine.intervals import covariance, jacobian
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import Hold
+from tools.mismatch.engine.score import misfits
+from tools.mismatch.engine.select import Selection
+from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
+from tools.mismatch.twins.make import make
+
+NEAR = 0.3
+"""Distance of the share from 0 or 1 within which it says which of the two it is."""
+CLEAR = 6.0
+"""Standard errors between the share and the other of the two."""
+
+
+def said_hold(recording: Recording) -> str:
+    """The hold that the recording declares: "zero", "linear", or "" where it says nothing or it does not matter."""
+    p = recording.twin.parameters
+    return str(p["hold"]) if "hold" in p else ""
+
+
+def holdable(problem: Problem) -> bool:
+    """Whether the twin's answer depends on what its inputs do between the samples."""
+    return getattr(problem.twin, "hold", "") == "linear" and not said_hold(problem.recording)
+
+
+def held(recording: Recording) -> Recording:
+    """The same recording with its inputs held between the samples."""
+    return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": "zero"}))
+
+
+def as_held(problem: Problem) -> Problem:
+    """The same problem with inputs held between the samples."""
+    recording = held(problem.recording)
+    twin = make(recording)
+    if hasattr(twin, "restart") and twin.restart != problem.twin.restart:
+        twin = replace(twin, restart=problem.twin.restart)  # type: ignore[type-var]
+    return replace(problem, recording=recording, twin=twin)
+
+
+def infer_hold(problem: Problem, base: Fit) -> Hold:
+    """Which hold the data show. ``base``: the twin with its parameters re-fitted, inputs linear."""
+    other = as_held(problem)
+    with np.errstate(all="ignore"):
+        there = Model(other.twin).simulate(other.view, base.theta)
+        here = Model(problem.twin).simulate(problem.view, base.theta)
+    rows, spans = problem.fit_rows, problem.fit_spans
+    slopes = jacobian(problem, base)
+    residual: list[np.ndarray] = []
+    columns: list[np.ndarray] = []
+    for k, o in enumerate(problem.twin.outputs):
+        filters = fit_whitener(base.residual[o], stretches=spans)
+        usable = [s for s in spans if s[1] - s[0] > filters.warm_up + 4]
+        change = there[o] - here[o]
+        if not usable or not np.all(np.isfinite(change)) or not np.any(change):
+            continue
+        scale = 1.0 / problem.sigma(o)
+        full = np.zeros((problem.index.size, slopes.shape[1]))
+        full[rows] = slopes[k * rows.size : (k + 1) * rows.size]
+        both = [change * scale, *full.T]
+        columns.append(np.column_stack([whiten(filters, np.ascontiguousarray(c), usable) for c in both]))
+        residual.append(whiten(filters, base.residual[o] * scale, usable))
+    if not columns:
+        return Hold("linear", "assumed")
+    x, e = np.concatenate(columns), np.concatenate(residual)
+    size = np.maximum(np.linalg.norm(x, axis=0), 1e-300)
+    share, spread = _first_coefficient(x / size, e)
+    share, spread = share / size[0], spread / size[0]
+    ci = (share - 1.96 * spread, share + 1.96 * spread)
+    if not np.isfinite(share) or not np.isfinite(spread):
+        return Hold("linear", "assumed")
+    if abs(share - 1.0) < NEAR and share > CLEAR * spread:
+        return Hold("zero", "inferred", share, ci)
+    if abs(share) < NEAR and 1.0 - share > CLEAR * spread:
+        return Hold("linear", "inferred", share, ci)
+    return Hold("linear", "assumed", share, ci)
+
+
+def _first_coefficient(x: np.ndarray, e: np.ndarray) -> tuple[float, float]:
+    """Least-squares coefficient of the first column of ``x`` (n, k) beside the others, and its standard error."""
+    first, others = x[:, 0], x[:, 1:]
+    own = first - others @ np.linalg.lstsq(others, first, rcond=1e-10)[0] if others.shape[1] else first
+    rest = e - others @ np.linalg.lstsq(others, e, rcond=1e-10)[0] if others.shape[1] else e
+    power = float(own @ own)
+    if power <= 1e-12 * float(first @ first):
+        return 0.0, np.inf
+    share = float(own @ rest) / power
+    left = rest - share * own
+    return share, float(np.sqrt(float(left @ left) / max(left.size - x.shape[1], 1) / power))
+
+
+DELAYS = ("dead_time", "channel_delay")
+NO_WORSE = 1.02
+
+
+def delay_is_hold(problem: Problem, selection: Selection) -> Selection | None:
+    """The selection with held inputs in place of a delay of half a sample; None where there is no such delay, or where
+    held inputs do not explain the held-out part as well.
+    """
+    fitted = selection.fitted
+    half = 0.5 * problem.recording.dt
+    values = human_values(problem, fitted, covariance(problem, fitted))
+    for k, placed in enumerate(fitted.model.placed):
+        delay = values.get(placed.label, {}).get("delay_s") if placed.effect.name in DELAYS else None
+        if delay is None or not abs(delay.value - half) < max(delay.ci95[1] - delay.value, 0.2 * half):
+            continue
+        other = as_held(problem)
+        rest = [p for j, p in enumerate(fitted.model.placed) if j != k]
+        model = Model(other.twin, rest)
+        theta = model.carry(fitted.model, fitted.theta, other.recording)
+        again = fit(other, model, [theta], iterations=25)
+        before, after = misfits(problem, fitted), misfits(other, again)
+        if again.ok and all(after[o] <= NO_WORSE * before[o] + 0.02 for o in before):
+            keep = [i for i, s in enumerate(selection.steps) if s.label != placed.label]
+            return replace(
+                selection,
+                problem=other,
+                base=fit_base(other),
+                fitted=again,
+                steps=tuple(selection.steps[i] for i in keep),
+                rivals=tuple(selection.rivals[i] for i in keep),
+            )
+    return None

@@ -1,0 +1,70 @@
+"""A load that only ever moved one way: its dry friction is a constant force, and shows as an offset.
+
+Nothing in such a record tells friction from an offset of the force, so the report says how large the offset is and
+which reversal would tell.
+"""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import Array, BaseShift, OneWay, ParameterValue
+
+BLOCKS = 200
+BACKWARDS = 0.01
+"""Share of the travel that may run backwards (noise, ringing) in a record of one direction."""
+REVERSAL = 0.1
+"""Share of the travel that a reversal should have, to be seen clear of play and bristles."""
+
+
+def direction(y: Array, noise_rms: float, *, is_rate: bool) -> int:
+    """1 or -1 when ``y`` (n,), a position or its rate, only ever moved that way; 0 when it turned, or stood still.
+
+    Means over blocks are compared, four standard errors of the noise apart.
+    """
+    blocks = int(np.clip(y.size // 20, 4, BLOCKS))
+    edges = np.linspace(0, y.size, blocks + 1).astype(int)
+    mean = np.array([float(np.mean(y[a:b])) for a, b in itertools.pairwise(edges)])
+    error = 4.0 * noise_rms / np.sqrt(y.size / blocks)
+    moved = mean if is_rate else np.diff(mean)
+    moved = np.where(np.abs(moved) > (error if is_rate else np.sqrt(2.0) * error), moved, 0.0)
+    forward, back = float(np.sum(np.maximum(moved, 0.0))), float(-np.sum(np.minimum(moved, 0.0)))
+    if max(forward, back) <= 0.0 or min(forward, back) > BACKWARDS * max(forward, back):
+        return 0
+    return 1 if forward > back else -1
+
+
+def one_way(problem: Problem, fitted: Fit, shifts: list[BaseShift]) -> OneWay | None:
+    """What a mechanical twin's record of one direction leaves open; None where it turned, or friction has no place.
+
+    ``shifts``: the base parameters as given and re-fitted; the offset is read off them where the twin has one.
+    """
+    twin = problem.twin
+    o = twin.feedback_on
+    if not o or o not in problem.recording.outputs:
+        return None
+    is_rate = bool(twin.counted) or o == "velocity"
+    y = problem.recording.outputs[o]
+    sign = direction(y, problem.sigma(o), is_rate=is_rate)
+    if sign == 0:
+        return None
+    travel = float(np.sum(np.abs(y)) * problem.recording.dt) if is_rate else float(np.ptp(y))
+    unit = twin.units[o].removesuffix("/s") if is_rate else twin.units[o]
+    return OneWay(o, sign, _offset(problem, shifts), REVERSAL * travel, unit)
+
+
+def _offset(problem: Problem, shifts: list[BaseShift]) -> ParameterValue | None:
+    """How far the re-fitted offset of the force is from the one given, in the unit of the force."""
+    by_name = {b.name: b for b in shifts}
+    if "offset_per_mass" not in by_name or "inverse_mass" not in by_name:
+        return None
+    per, inverse = by_name["offset_per_mass"], by_name["inverse_mass"]
+    if inverse.with_effects == 0.0 or inverse.given == 0.0:
+        return None
+    value = per.with_effects / inverse.with_effects - per.given / inverse.given
+    half = abs((per.ci95[1] - per.ci95[0]) / 2 / inverse.with_effects)
+    return ParameterValue(value, problem.twin.units[problem.twin.inputs[0]], (value - half, value + half))
