@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +32,7 @@ def filtered_noise(rng: np.random.Generator, n: int) -> Array:
     """Unit noise of a sensor with a second-order low-pass at a fortieth of the rate: smooth from sample to sample."""
     e = rng.standard_normal(n + 500)
     for _ in range(2):
-        e = lfilter([0.15], [1.0, -0.85], e)
+        e = np.asarray(lfilter([0.15], [1.0, -0.85], e))
     return e[500:] / e.std()
 
 
@@ -82,7 +83,7 @@ def test_a_walk_between_periods_is_not_booked_as_noise() -> None:
 def test_stretches_at_rest_see_it_too(seed: int) -> None:
     rng = np.random.default_rng([seed, 4])
     u = np.repeat(rng.uniform(10, 90, 10), 400)
-    y = 0.12 * lfilter([0.05], [1.0, -0.95], u) + NOISE_UM * filtered_noise(rng, u.size)
+    y = 0.12 * np.asarray(lfilter([0.05], [1.0, -0.95], u)) + NOISE_UM * filtered_noise(rng, u.size)
     found = rest_floor(y, u[:, None])
     assert found is not None
     assert found[0] == pytest.approx(NOISE_UM, rel=0.25)
@@ -136,7 +137,8 @@ def test_a_law_inside_an_opaque_twin_is_out_of_reach_and_the_report_says_so() ->
     left = {"displacement": Leftover("displacement", 9.0, follows, 1.0, True)}
     assert meaning_of(problem, left, ()) == "unknown"
     assert meaning_of(problem, left, ("worse",)) == "fit_failed"
-    outside = replace(problem, twin=replace(problem.twin, static=False))
+    twin: Any = problem.twin
+    outside = replace(problem, twin=replace(twin, static=False))
     assert meaning_of(outside, left, ()) == "place_not_reachable"
 
 

@@ -17,6 +17,8 @@ from tools.mismatch.engine.report import Array, BaseShift, OneWay, ParameterValu
 BLOCKS = 200
 BACKWARDS = 0.01
 """Share of the travel that may run backwards (noise, ringing) in a record of one direction."""
+MOST = 0.8
+"""Share of the motion between blocks that must stand out of the noise before its direction counts."""
 REVERSAL = 0.1
 """Share of the travel that a reversal should have, to be seen clear of play and bristles."""
 
@@ -24,18 +26,22 @@ REVERSAL = 0.1
 def direction(y: Array, noise_rms: float, *, is_rate: bool) -> int:
     """1 or -1 when ``y`` (n,), a position or its rate, only ever moved that way; 0 when it turned, or stood still.
 
-    Means over blocks are compared, four standard errors of the noise apart.
+    Means over blocks are compared, four standard errors of the noise apart: over the shortest blocks between which most
+    of the motion stands out.
     """
     blocks = int(np.clip(y.size // 20, 4, BLOCKS))
-    edges = np.linspace(0, y.size, blocks + 1).astype(int)
-    mean = np.array([float(np.mean(y[a:b])) for a, b in itertools.pairwise(edges)])
-    error = 4.0 * noise_rms / np.sqrt(y.size / blocks)
-    moved = mean if is_rate else np.diff(mean)
-    moved = np.where(np.abs(moved) > (error if is_rate else np.sqrt(2.0) * error), moved, 0.0)
-    forward, back = float(np.sum(np.maximum(moved, 0.0))), float(-np.sum(np.minimum(moved, 0.0)))
-    if max(forward, back) <= 0.0 or min(forward, back) > BACKWARDS * max(forward, back):
-        return 0
-    return 1 if forward > back else -1
+    while blocks >= 4:
+        edges = np.linspace(0, y.size, blocks + 1).astype(int)
+        mean = np.array([float(np.mean(y[a:b])) for a, b in itertools.pairwise(edges)])
+        error = 4.0 * noise_rms / np.sqrt(y.size / blocks)
+        moved = mean if is_rate else np.diff(mean)
+        clear = np.where(np.abs(moved) > (error if is_rate else np.sqrt(2.0) * error), moved, 0.0)
+        if float(np.sum(np.abs(clear))) > MOST * float(np.sum(np.abs(moved))):
+            forward, back = float(np.sum(np.maximum(clear, 0.0))), float(-np.sum(np.minimum(clear, 0.0)))
+            turned = min(forward, back) > BACKWARDS * max(forward, back)
+            return 0 if turned else 1 if forward > back else -1
+        blocks //= 2
+    return 0
 
 
 def one_way(problem: Problem, fitted: Fit, shifts: list[BaseShift]) -> OneWay | None:
