@@ -86,8 +86,9 @@ def assemble(
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
-    if out_of_reach(physics, twin, {o: f.rms for o, f in problem.floors.items()}):
+    if out_of_reach(physics, twin, {o: hi for o, (_, hi) in decision.floors.items()}):
         verdict, physics = "unexplained", tempered(physics)
+        decision = replace(decision, verdict=verdict, meaning=decision.meaning or "place_not_reachable")
     looked = fitted if verdict == "unexplained" else base
     if verdict == "missing_physics":
         touched = [o for o in twin.outputs if any(o in f.outputs for f in physics)]

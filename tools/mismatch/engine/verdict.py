@@ -13,6 +13,7 @@ from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.engine.report import Meaning, Verdict
 from tools.mismatch.engine.score import compare, fit_rms, held_rms
 from tools.mismatch.engine.select import Selection
@@ -156,7 +157,7 @@ def meaning_of(problem: Problem, left: dict[str, Leftover], trouble: Sequence[st
         return "fit_failed"
     twin = problem.twin
     follows = any(v.follows for v in left.values())
-    if not twin.static and not twin.feedback_on and follows:
+    if follows and not twin.static and (not_tried(twin) or not twin.feedback_on):
         return "place_not_reachable"
     return "unknown"
 

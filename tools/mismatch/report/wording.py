@@ -28,7 +28,7 @@ MEANINGS: Mapping[str, str] = {
     "fit_failed": "the fit failed, so this says nothing about physics yet. Look at the parameters as given, the units"
     " and the start of the record",
     "place_not_reachable": "this kind of twin can be changed at its inputs and outputs only, and what is left may sit"
-    " between them. A twin with its equations (mechanical_axis, or state_space with one input) can be tried inside",
+    " between them. A twin with its equations (ode, mechanical_axis, state_space with one input) can be tried inside",
     "unknown": "the noise floor is known well enough, the fit holds and every place of this twin was tried: no effect"
     " of the vocabulary does this",
 }
