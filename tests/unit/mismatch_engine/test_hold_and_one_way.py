@@ -46,6 +46,7 @@ def test_the_hold_of_an_input_is_read_off_the_data(seed: int, zero: bool) -> Non
     assert holdable(problem)
     found = infer_hold(problem, base)
     assert (found.kind, found.how) == ("zero" if zero else "linear", "inferred")
+    assert found.share == pytest.approx(1.0 if zero else 0.0, abs=0.2)
 
 
 def test_a_true_delay_of_three_samples_is_no_hold() -> None:
