@@ -95,6 +95,7 @@ def run_in_process(
             on_status=with_fallbacks(on_status, stages),
             live=live,
             sense_only=request.sense_only,
+            others_stalled_ms=opened.world.stalled_ms if opened.world is not None else None,
         )
         if on_status is not None and live is not None:
             on_status(
@@ -197,6 +198,8 @@ def make_outcome(
         "safe_state": {
             "reached": supervisor.safe_reached,
             "reason": reason,
+            "finding": trip.finding.name.lower() if trip is not None else None,
+            "class": trip.cause.value if trip is not None else None,
             "normal": trip is not None and trip.normal and supervisor.safe_reached,
             "tick": trip.tick if trip is not None else -1,
             "asked_ns": loop.asked_safe_ns,
@@ -207,7 +210,7 @@ def make_outcome(
             "method": loop.stages.configs.sensing.kinematics_method,
             "fallbacks": loop.stages.sensing.fallbacks,
         },
-        "host": describe_host(opened.clock),
+        "host": describe_host(opened, loop.host_gaps),
         "realtime": describe_scheduling(report, opened.virtual),
         "recording": str(recording.path) if recording is not None else None,
         "recorder": {

@@ -15,6 +15,8 @@ class Exit(IntEnum):
     BAD_INPUT = 2
     DATA_LOST = 3
     DEVICE_MISSING = 4
+    HOST_UNFIT = 5
+    INTERRUPTED = 130
 
 
 def exit_code_of(error: HalError) -> Exit:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.specs import check_devices
+from firmware_py.control.host_gaps import HostGaps
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.bench import BenchFile, OpenBench, Port, open_bench
 from hal.clock import Pace, PacedClock, VirtualClock
@@ -117,8 +118,16 @@ def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
     return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
 
 
-def describe_host(clock: Clock) -> dict[str, Any]:
-    """How the host kept up with the run, as JSON values: the pace, and the pauses of the host."""
-    if not isinstance(clock, PacedClock):
-        return {"pace": "virtual" if isinstance(clock, VirtualClock) else "realtime"}
-    return {"pace": "paced", **asdict(clock.report())}
+def describe_host(opened: OpenBench, gaps: HostGaps | None = None) -> dict[str, Any]:
+    """How the host kept up with the run, as JSON values: the pace, and how often and how long the host stood still.
+
+    In real time these are the stalls of the loop (``gaps``) and of the emulated world, whichever is worse.
+    """
+    clock = opened.clock
+    if isinstance(clock, PacedClock):
+        return {"pace": "paced", **asdict(clock.report())}
+    if isinstance(clock, VirtualClock):
+        return {"pace": "virtual", "stalls": 0, "longest_stall_ms": 0.0}
+    others = opened.world.stalls() if opened.world is not None else (0, 0.0)
+    own = (gaps.stalls, gaps.longest_ms) if gaps is not None else (0, 0.0)
+    return {"pace": "realtime", "stalls": max(own[0], others[0]), "longest_stall_ms": max(own[1], others[1])}

@@ -183,6 +183,16 @@ class EmulatedWorld(Protocol):
 
     def alive(self) -> bool: ...
     def stop(self) -> None: ...
+
+    def stalled_ms(self, now_ns: int, within_ms: float) -> float:
+        """How long the emulation stands still at bench time ``now_ns``, or stood still up to ``within_ms`` ago, because
+        its host did; 0 if it did not. What it says late is no fault of a device."""
+        ...
+
+    def stalls(self) -> tuple[int, float]:
+        """How often the emulation stood still, and for how many ms at the longest."""
+        ...
+
     def truth(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]: ...
 
 

@@ -53,6 +53,14 @@ class LockstepWorld:
     def alive(self) -> bool:
         return self._truth is None
 
+    def stalled_ms(self, now_ns: int, within_ms: float) -> float:
+        """A world in emulated time is never late."""
+        return 0.0
+
+    def stalls(self) -> tuple[int, float]:
+        """No stalls, of no length."""
+        return 0, 0.0
+
     def stop(self) -> None:
         """Freeze the truth at the present. Idempotent."""
         if self._truth is None:

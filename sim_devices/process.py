@@ -32,6 +32,7 @@ import numpy as np
 from hal.clock import MonotonicClock
 from hal.errors import HalError
 from sim_devices.faults import UnknownFault, inject
+from sim_devices.lateness import Lateness
 from sim_devices.transports.can_multicast import CanMulticast, free_udp_port
 from sim_devices.transports.i2c_socket import I2cSocketServer
 from sim_devices.transports.pty_carrier import PtyCarrier
@@ -81,6 +82,7 @@ class WorldProcess:
         self._stop = False
         self._ends_ns: int | None = None
         self._worst_late_ns = 0
+        self._lateness = Lateness(self._runtime_dir)
         self._turns = 0
         self.count_down_ns = 0
         """The end of a transfer, and what a device will say on a serial line, is waited for in a loop from so long
@@ -163,6 +165,7 @@ class WorldProcess:
     def _turn(self) -> None:
         """Bring world and transports to the present."""
         self._turns += 1
+        self._lateness.turn(self._clock.now_ns())
         while True:
             for pty in self._all_ptys:
                 pty.refresh()

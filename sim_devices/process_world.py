@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hal.errors import BenchError, DeviceNotFound, Disconnected, HalTimeout
+from sim_devices.lateness import LatenessView
 
 if TYPE_CHECKING:  # the physics and its kernels are the other process's
     from sim_devices.world import Truth
@@ -62,6 +63,7 @@ class ProcessWorld:
                 cwd=Path(__file__).resolve().parents[1],
             )
         self._endpoints = self._await_endpoints()
+        self._lateness = LatenessView(self._dir)
 
     @property
     def pid(self) -> int:
@@ -93,6 +95,14 @@ class ProcessWorld:
             raise Disconnected(f"the emulated world was killed and left no truth; its log: {self._tail()}")
         with np.load(path) as data:
             return {name: data[name] for name in data.files}
+
+    def stalled_ms(self, now_ns: int, within_ms: float) -> float:
+        """How long the world's process stands still now, or stood still up to ``within_ms`` ago; 0 for a dead one."""
+        return self._lateness.stalled_ms(now_ns, within_ms) if self.alive() else 0.0
+
+    def stalls(self) -> tuple[int, float]:
+        """How often the world's process stood still, and for how many ms at the longest."""
+        return self._lateness.stalls, self._lateness.longest_ms
 
     def statistics(self) -> dict[str, float]:
         """After ``stop``: ``worst_late_us`` (how late the world ran at worst), ``turns`` of its loop, ``cpu_s``."""

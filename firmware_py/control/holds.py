@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from firmware_py.control.findings import Finding
 from firmware_py.control.safety import Hold, SafetyLimits, State, Supervisor
 
 MINUTE_NS = 60_000_000_000
@@ -61,6 +62,14 @@ class Holds:
         """The operator wants the outputs to move again. False: there is nothing to end yet, and it is not kept."""
         self._asked = self._is_ready and self._supervisor.state is State.HOLD
         return self._asked
+
+    def wait_out_host(self, now_ns: int, reason: str) -> None:
+        """The host stands still within a hold: that time is not the cause's, and a hold that the host began tells how
+        long it was in all."""
+        self._last_ready_ns = now_ns
+        hold = self.current
+        if hold is not None and hold.finding is Finding.HOST_OVERSLEPT:
+            hold.reason = reason
 
     def is_too_long(self, now_ns: int) -> bool:
         """The hold has not become good within its limit."""

@@ -113,6 +113,8 @@ class Incidents:
         elif supervisor.is_holding or supervisor.state is State.SELF_TEST:
             self.holds.interrupt(now_ns, reason)
             self.notice(finding.value.title)
+            if finding is Finding.HOST_OVERSLEPT:
+                self.holds.wait_out_host(now_ns, reason)
         elif supervisor.state is not State.RUNNING or self._limits.holds_per_minute == 0:
             self._trip(finding, reason)
         elif (count := self.holds.within_a_minute(now_ns) + 1) > self._limits.holds_per_minute:

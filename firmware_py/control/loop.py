@@ -52,7 +52,8 @@ LATE_PART = 0.9  # of a period: the prediction bridges a known delay, not this o
 
 class InstrumentLoop:
     """Runs the opened devices. ``on_status`` gets a small dict now and then and must not block. ``sense_only``: nothing
-    is armed, and a reading that would end a run is only noticed."""
+    is armed, and a reading that would end a run is only noticed. ``others_stalled_ms(now_ns, within_ms)`` tells how
+    long another process of this host, which answers for devices, stands or stood still."""
 
     def __init__(
         self,
@@ -66,9 +67,11 @@ class InstrumentLoop:
         on_status: Callable[[dict[str, object]], None] | None = None,
         live: LiveLink | None = None,
         sense_only: bool = False,
+        others_stalled_ms: Callable[[int, float], float] | None = None,
     ) -> None:
         self._live = live
         self._sense_only = sense_only
+        self._others_stalled_ms = others_stalled_ms
         self._devices = devices
         self.stages = stages
         self._frame = stages.frame
@@ -258,8 +261,10 @@ class InstrumentLoop:
                 self.incidents.report(Finding.SCANS_MISSING, device=name, limit_ms=limits.stale_ms)
 
     def _host_stalled_ms(self) -> float:
-        """How long this host has stood still just now, 0 if it has not."""
-        return self.host_gaps.recent_ms(self._clock.now_ns(), 2.0 * self._config.safety.stale_ms)
+        """How long this host has stood still just now, 0 if it has not, by this loop and by others that it runs."""
+        now_ns, within_ms = self._clock.now_ns(), 2.0 * self._config.safety.stale_ms
+        others_ms = self._others_stalled_ms(now_ns, within_ms) if self._others_stalled_ms is not None else 0.0
+        return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
 
     def _self_test_passed(self) -> bool:
         if self._scan_failed:

@@ -78,7 +78,7 @@ def run_endoscope(
     outcome = make_outcome(request, opened, loop, sensors.identities, summary)
     return loop, {
         **outcome,
-        "host": describe_host(opened.clock),
+        "host": describe_host(opened),
         "realtime": describe_scheduling(report, opened.virtual),
     }
 

@@ -1,7 +1,7 @@
 """What all commands share: exit codes, ``--json``, consoles, and errors that become one clear line.
 
 Exit codes (contracts/commands.md): 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost,
-4 a declared device is missing.
+4 a declared device is missing, 5 the host was not fit for real time, 130 stopped by Ctrl-C.
 """
 
 from __future__ import annotations

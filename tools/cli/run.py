@@ -129,10 +129,17 @@ def run(
         result = complete_result(outcome, truth)
         steps = next_steps(result)
         write_report(result, truth, console(), json_file=json_file, html=html, image=image, more=steps)
-        if not result["safe_state"]["normal"]:
-            raise typer.Exit(Exit.FAILED)
-        if result["samples"]["lost"] or result["recorder"]["dropped"]:
-            raise typer.Exit(Exit.DATA_LOST)
+        raise typer.Exit(exit_status(result))
+
+
+def exit_status(result: Mapping[str, Any]) -> Exit:
+    """What the command ends with (contracts/commands.md)."""
+    safe = result["safe_state"]
+    if safe.get("finding") == "stopped" and "SIGINT" in safe["reason"]:
+        return Exit.INTERRUPTED
+    if not safe["normal"]:
+        return Exit.HOST_UNFIT if safe.get("class") == "host" and safe["reached"] else Exit.FAILED
+    return Exit.DATA_LOST if result["samples"]["lost"] or result["recorder"]["dropped"] else Exit.DONE
 
 
 def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) -> dict[str, Any]:

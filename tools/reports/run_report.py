@@ -111,7 +111,13 @@ def host_line(result: Mapping[str, Any]) -> str:
     """How the host kept up; a pause of the host is no fault in emulated time."""
     host = result.get("host", {})
     if host.get("pace") != "paced":
-        return f"scheduling: {result['realtime']}"
+        line = f"scheduling: {result['realtime']}"
+        if host.get("stalls"):
+            line += (
+                f"\nthis host stood still {host['stalls']} times, longest {host['longest_stall_ms']:.1f} ms: not fit "
+                "for a 1 kHz loop;\nsee docs/lab-machine.md, or run without --realtime"
+            )
+        return line
     emulated_s, wall_s = host["emulated_s"], host["wall_s"]
     line = f"pace: {emulated_s:.1f} s of emulated time took {wall_s:.1f} s"
     if wall_s > 1.05 * emulated_s:
