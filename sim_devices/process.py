@@ -31,7 +31,7 @@ import numpy as np
 
 from hal.clock import MonotonicClock
 from hal.errors import HalError
-from sim_devices.faults import UnknownFault, inject
+from sim_devices.faults import answer_order, inject
 from sim_devices.lateness import Lateness
 from sim_devices.transports.can_multicast import CanMulticast, free_udp_port
 from sim_devices.transports.i2c_socket import I2cSocketServer
@@ -204,16 +204,13 @@ class WorldProcess:
 
     def _obey(self) -> None:
         message, sender = self._control.recvfrom(4096)
-        try:
-            order = json.loads(message)
-            ptys = self._ptys | self._slcan
-            unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in ptys.items()}
-            inject(self.world, str(order["fault"]), str(order.get("target", "")), unplug, self._bus_of, self._now_ns)
-            answer = {"ok": True}
-        except (ValueError, KeyError, TypeError, UnknownFault) as error:
-            answer = {"ok": False, "error": str(error)}
+        ptys = self._ptys | self._slcan
+        unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in ptys.items()}
+        answer = answer_order(
+            message, lambda fault, target: inject(self.world, fault, target, unplug, self._bus_of, self._now_ns)
+        )
         if sender:
-            self._control.sendto(json.dumps(answer).encode(), sender)
+            self._control.sendto(answer, sender)
 
     def _finish(self) -> None:
         truth = self.world.truth(max(self._now_ns, self.world.epoch_ns))

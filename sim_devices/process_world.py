@@ -9,7 +9,6 @@ import shutil
 import signal
 import socket
 import subprocess
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -17,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hal.children import child_command, child_environment
 from hal.errors import BenchError, DeviceNotFound, Disconnected, HalTimeout
 from sim_devices.lateness import LatenessView
 
@@ -56,11 +56,11 @@ class ProcessWorld:
         self._log = self._dir / "world.log"
         with self._log.open("wb") as log:
             self._process = subprocess.Popen(
-                [sys.executable, "-m", "sim_devices.process", str(job_path)],
+                child_command("sim_devices.process", str(job_path)),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
-                cwd=Path(__file__).resolve().parents[1],
+                env=child_environment(),
             )
         self._endpoints = self._await_endpoints()
         self._lateness = LatenessView(self._dir)

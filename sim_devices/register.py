@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hal.clock import VirtualClock
+from hal.clock import PacedClock, VirtualClock
 from sim_devices.config import emulation_config
 
 if TYPE_CHECKING:
@@ -38,7 +38,10 @@ def provider(
     if clock is not None:
         from sim_devices.lockstep_world import LockstepWorld
 
-        return LockstepWorld(description, clock, file, hand_scale, plant)
+        world = LockstepWorld(description, clock, file, hand_scale, plant)
+        if isinstance(clock, PacedClock):  # somebody may be watching, and want to break something
+            world.obey(Path(runtime_dir))
+        return world
     from sim_devices.process_world import ProcessWorld
 
     return ProcessWorld(description, Path(runtime_dir), file, hand_scale, plant)

@@ -22,6 +22,7 @@ from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Why
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from hal.backends import open_i2c
+from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
 from hal.errors import HalError, OpenFailed
 
@@ -55,11 +56,11 @@ class GuardianProcess:
         ourselves = os.pidfd_open(os.getpid()) if may_end_us else -1
         order = {**order, "heart": heart.fd, "pipe": theirs, "report": str(report), "firmware": ourselves}
         process = subprocess.Popen(
-            [sys.executable, "-m", "firmware_py.guardian.process", json.dumps(order)],
+            child_command("firmware_py.guardian.process", json.dumps(order)),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             pass_fds=(heart.fd, theirs, *((ourselves,) if may_end_us else ())),
-            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), os.environ.get("PYTHONPATH", "")])},
+            env=child_environment(),
             start_new_session=True,  # Ctrl-C is for the firmware
         )
         os.close(theirs)

@@ -21,6 +21,7 @@ from firmware_py.recording import format as fmt
 from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.errors import RecorderFailed, RecordingError
 from firmware_py.recording.ring import EventRing, RowRing
+from hal.children import child_command
 
 _ROOT = Path(__file__).resolve().parents[2]
 _PAUSE_S = 0.0005
@@ -101,7 +102,7 @@ class RecorderProcess:
         events = EventRing.create(capacity_event_bytes)
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), *_inherited_path()])}
         process = subprocess.Popen(
-            [sys.executable, "-m", "firmware_py.recording.recorder", str(rows.fd), str(events.fd)],
+            child_command("firmware_py.recording.recorder", str(rows.fd), str(events.fd)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=(rows.fd, events.fd),

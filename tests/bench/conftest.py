@@ -1,4 +1,4 @@
-"""A bench server of its own for the real-time tests, and a browser to look at it.
+"""A bench server of its own for the tests of the page, and a browser to look at it.
 
 Chromium is Debian's; it is installed here where that is possible, else the browser tests are skipped and say why.
 """
@@ -25,7 +25,7 @@ from typing import Any
 
 import pytest
 
-from tests.conftest import DEFAULT_BENCH, PATIENT, copy_of_default_bench
+from tests.conftest import DEFAULT_BENCH, copy_of_default_bench
 
 START_S = 220.0
 ARTEFACTS = Path(__file__).parents[2] / "out" / "browser"
@@ -94,11 +94,10 @@ class Server:
         )
 
     def inject(self, fault: str, target: str) -> None:
-        """A fault in the emulated world that the firmware process has started."""
-        jobs = sorted(self.folder.glob("micron-bench-*/world-*/job.json"), key=lambda p: p.stat().st_mtime)
-        sockets = json.loads(jobs[-1].read_text())["socket_dir"]
+        """A fault in the emulated world of the firmware's process."""
+        sockets = sorted(self.folder.glob("micron-bench-*/control.sock"), key=lambda p: p.stat().st_mtime)
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
-            sock.connect(f"{sockets}/control.sock")
+            sock.connect(str(sockets[-1]))
             sock.send(json.dumps({"fault": fault, "target": target}).encode())
 
     def memory_bytes(self) -> int:
@@ -109,13 +108,13 @@ class Server:
 
 @contextmanager
 def bench_server(more_toml: str) -> Iterator[Server]:
-    """``micron bench`` on the default bench, patient, and ``more_toml``.
+    """``micron bench`` on the default bench and ``more_toml``, in paced emulated time.
 
     Its files are in a short path, for Unix sockets.
     """
     folder = Path(tempfile.mkdtemp(prefix="mb", dir="/tmp"))
     recordings = folder / "recordings"
-    bench = copy_of_default_bench(folder, PATIENT + more_toml)
+    bench = copy_of_default_bench(folder, more_toml)
     shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)  # has the motion card
     command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0"]
     command += ["--bench", str(bench)]

@@ -10,7 +10,7 @@ import pytest
 
 from tests.bench.conftest import Server, go
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.timeout(400)
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
 

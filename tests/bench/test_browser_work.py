@@ -16,7 +16,7 @@ from tests.bench.conftest import Server, bench_server, go, opened_page
 from tests.conftest import DEFAULT_BENCH
 from tests.recording_text import stack_channels
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.timeout(400)
 
 RECORDING = """
 format = 1

@@ -11,7 +11,7 @@ from tests.bench.conftest import Server
 from tests.unit.cli.test_worked_examples import WITH_A_PAGE, example
 from tools.cli.main import app
 
-pytestmark = pytest.mark.realtime
+pytestmark = pytest.mark.timeout(300)
 
 
 def test_this_server_was_started_as_the_help_of_bench_says(server: Server) -> None:

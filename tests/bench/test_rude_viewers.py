@@ -13,7 +13,7 @@ from websockets.sync.client import connect
 
 from tests.bench.conftest import Server
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(400)]
+pytestmark = pytest.mark.timeout(400)
 
 GROWTH_BYTES = 64 << 20
 ALL = {"type": "subscribe", "id": 1, "channels": [f"volts_{i}" for i in range(8)], "rows": 600_000, "pixels": 4000}

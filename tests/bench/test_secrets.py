@@ -16,7 +16,7 @@ import pytest
 from tests.bench.conftest import Server
 from tests.conftest import DEFAULT_BENCH
 
-pytestmark = [pytest.mark.realtime, pytest.mark.timeout(300)]
+pytestmark = pytest.mark.timeout(300)
 
 
 def descendants(pid: int) -> list[int]:

@@ -53,12 +53,9 @@ def run_with_stall(
         opened.clock.at(round(STRIKE_S * 1e9) + phase_ns, strike)  # type: ignore[attr-defined]
 
     monkeypatch.setattr(LockstepWorld, "stalled_ms", world_stalled_ms)
-    outcome, _ = run_in_process(
-        RunRequest(bench, 3.0 + 1e-3 * max(firmware_ms, world_ms), pace="virtual", seed=5),
-        on_open=prepare,
-        wrap=far.wrap,
-    )
-    return outcome
+    seconds = 3.0 + 1e-3 * max(firmware_ms, world_ms)
+    request = RunRequest(bench, seconds, pace="virtual", seed=5)
+    return run_in_process(request, on_open=prepare, wrap=far.wrap)[0]
 
 
 @pytest.mark.parametrize("ms", [1, 5, 16, 100, 1000, 5000])

@@ -7,7 +7,6 @@ import contextlib
 import json
 import signal
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,6 +17,8 @@ from typing import Any
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
 from firmware_py.run_request import RunRequest
+from hal.children import child_command, child_environment
+from hal.clock import Pace
 
 FOREVER_S = 30 * 86_400.0
 TRUTH_S = 5.0
@@ -34,6 +35,7 @@ class Choice:
     seed: int | None = None
     stale_ms: float | None = None
     sense_only: bool = False
+    pace: Pace | None = None
 
 
 class Firmware:
@@ -67,20 +69,19 @@ class Firmware:
             seed=choice.seed,
             stale_ms=choice.stale_ms,
             sense_only=choice.sense_only,
+            pace=choice.pace,
             live_fds=fds,
             truth_s=TRUTH_S,
         )
         request_file = self.runtime_dir / "request.json"
         request_file.write_text(request.to_json(self.runtime_dir), encoding="utf-8")
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "firmware_py.app",
-            str(request_file),
+            *child_command("firmware_py.app", str(request_file)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
             pass_fds=fds,
+            env=child_environment(),
         )
         self._their_control.close()
         self._reader = asyncio.create_task(self._read(on_line, on_end))

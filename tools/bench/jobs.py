@@ -8,13 +8,13 @@ import os
 import re
 import shutil
 import signal
-import sys
 import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from hal.children import child_command, child_environment
 from tools.errors import InputError
 
 MAX_LINES = 200
@@ -56,14 +56,12 @@ class Job:
 
     async def _one(self, arguments: Sequence[str]) -> int:
         self._process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            *arguments,
+            *child_command(*arguments),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
             start_new_session=True,
-            env={**os.environ, "COLUMNS": "110", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
+            env={**child_environment(), "COLUMNS": "110", "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"},
             preexec_fn=lambda: os.nice(10),
         )
         if self.state != "running":  # cancelled while it was being started

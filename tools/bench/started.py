@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-import os
 import signal
 import subprocess
-import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+from hal.children import child_command, child_environment
 
 
 @contextmanager
 def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     """Process of ``micron bench`` with ``options``, and the address that it printed, token included."""
     server = subprocess.Popen(
-        [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0", "--stale-ms", "1000", *options],
+        child_command("tools.cli.main", "bench", "--port", "0", *options),
         stderr=subprocess.PIPE,
         text=True,
-        env={**os.environ, "COLUMNS": "400"},  # the address in one line
+        env={**child_environment(), "COLUMNS": "400"},  # the address in one line
     )
     try:
         assert server.stderr is not None

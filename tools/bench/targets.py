@@ -7,7 +7,6 @@ import asyncio
 import contextlib
 import json
 import math
-import sys
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
@@ -18,6 +17,7 @@ from firmware_py.endoscope.control import ControlConfig
 from firmware_py.endoscope.report import experiment, report_csv
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
 from hal.bench import load_bench
+from hal.children import child_command, child_environment
 from tools.bench.recorder import check_name
 from tools.errors import InputError
 from tools.output import write_text_atomic
@@ -91,13 +91,11 @@ class CardReader:
         if not load_bench(bench).description.devices_with("motion_card"):
             raise InputError(f"{bench} has no motion_card; choose a bench like endoscope.toml")
         process = await asyncio.create_subprocess_exec(
-            sys.executable,
-            "-m",
-            "tools.bench.card",
-            str(bench),
+            *child_command("tools.bench.card", str(bench)),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.PIPE,
+            env=child_environment(),
         )
         return cls(process, on_sample)
 

@@ -8,9 +8,11 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import clear_errors, console
 from tools.errors import InputError
+from tools.prepare import prepare
 
 
 def bench(
@@ -31,6 +33,9 @@ def bench(
         typer.Option(min=1.0, max=1000.0, help="Missing scans end the run after this; for machines that do more."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world.")] = None,
+    realtime: Annotated[
+        bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
+    ] = False,
 ) -> None:
     """Run the instrument and serve the bench page for it, until Ctrl-C.
 
@@ -42,6 +47,8 @@ def bench(
     with clear_errors():
         if host_name and listen is None:
             raise InputError("--host-name belongs to --listen; give both or neither")
+        file = bench_path(bench).absolute()
+        prepare(load_bench(file), None, console())
         sock = bind(listen or LOOPBACK, port)
         try:
             recordings.mkdir(parents=True, exist_ok=True)
@@ -54,5 +61,5 @@ def bench(
                 soft_wrap=True,
             )
 
-        choice = Choice(bench_path(bench).absolute(), hand, None, seed, stale_ms)
+        choice = Choice(file, hand, None, seed, stale_ms, pace="realtime" if realtime else None)
         serve(choice, recordings.absolute(), sock, announce, names=tuple(host_name or ()))

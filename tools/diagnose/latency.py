@@ -22,6 +22,7 @@ from firmware_py.live.memory import LiveMemory
 from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
+from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
 from hal.errors import HalError
 
@@ -130,8 +131,10 @@ def firmware_loop(bench: Path, seconds: float, policy: Policy) -> Lateness:
             )
             request_file = Path(folder) / "request.json"
             request_file.write_text(request.to_json(Path(folder)), encoding="utf-8")
-            command = [sys.executable, "-m", "firmware_py.app", str(request_file)]
-            done = subprocess.run(command, capture_output=True, text=True, check=False, pass_fds=fds)
+            command = child_command("firmware_py.app", str(request_file))
+            done = subprocess.run(
+                command, capture_output=True, text=True, check=False, pass_fds=fds, env=child_environment()
+            )
             outcome_file = Path(folder) / "outcome.json"
             if done.returncode != 0 or not outcome_file.exists():
                 raise HalError((done.stderr.strip().splitlines() or ["the firmware did not run"])[-1])
