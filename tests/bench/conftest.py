@@ -126,7 +126,7 @@ def bench_server(more_toml: str) -> Iterator[Server]:
         env={**os.environ, "TMPDIR": str(folder), "COLUMNS": "400"},
     )
     assert process.stderr is not None
-    line = process.stderr.readline()
+    line = next(line for line in process.stderr if "http" in line)
     rest = threading.Thread(target=process.stderr.read, daemon=True)
     rest.start()
     address = next(word for word in line.split() if word.startswith("http"))

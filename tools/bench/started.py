@@ -22,7 +22,7 @@ def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
     )
     try:
         assert server.stderr is not None
-        address = next(word for word in server.stderr.readline().split() if word.startswith("http"))
+        address = next(word for line in server.stderr for word in line.split() if word.startswith("http"))
         threading.Thread(target=server.stderr.read, daemon=True).start()
         yield server, address
     finally:

@@ -225,7 +225,7 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     from tools.reports.run_live import TipWatch
 
     watch = TipWatch()
-    starting = "starting the emulated world and the firmware; the first run on a machine compiles, one to three minutes"
+    starting = "starting the emulated world and the firmware"
     with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
             live.update(_shown(json.loads(line), seconds, watch))
@@ -238,10 +238,7 @@ def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | Non
     result = complete_run(outcome, truth)
     print_run(result, console())
     write_json(result, json_file)
-    if not result["safe_state"]["normal"]:
-        raise typer.Exit(Exit.FAILED)
-    if result["samples"]["lost"] or result["recorder"]["dropped"]:
-        raise typer.Exit(Exit.DATA_LOST)
+    raise typer.Exit(exit_status(result))
 
 
 def _shown(status: dict[str, Any], seconds: float, watch: TipWatch) -> RenderableType:
