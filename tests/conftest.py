@@ -6,17 +6,6 @@ import pytest
 
 DEFAULT_BENCH = Path(__file__).parents[1] / "benches" / "micron.toml"
 
-PATIENT = """
-[emulation.daq]
-fifo_samples = 65536
-[firmware.safety]
-stale_ms = 5000.0
-stalled_ms = 5000.0
-magnetometer_ms = 5000.0
-monitor_ms = 5000.0
-"""
-"""For tests in real time: a shared machine takes the processor away for hundreds of ms, which is not what they test."""
-
 
 def copy_of_default_bench(folder: Path, more_toml: str) -> Path:
     """The default bench with ``more_toml`` at its end, in ``folder``."""
