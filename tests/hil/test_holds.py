@@ -24,6 +24,7 @@ from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, Port
 from hal.contracts import Clock
 from hal.errors import BenchError
+from hal.middleware.faults import FaultPlan
 from hal.types import I2cOp, I2cRead
 from tests.conftest import DEFAULT_BENCH
 from tools.faults.fault import InWorld, OnBus, OnHost
@@ -85,7 +86,7 @@ SCENES = (
     Scene(Finding.OUTPUT_TAKEN, ("stall in read-back",), 90.0),
     Scene(Finding.LEASE_LOST, stall(60.0), 61.0),
     Scene(Finding.MONITOR_DEAF, (InWorld("nack", "monitor_adc", "ack", 0.13),), 120.0, 0.8),
-    Scene(Finding.BUTTON_BUS, (OnBus("can0", {"bus_off_after_s": 0.0, "for_s": 0.03}),), 20.0),
+    Scene(Finding.BUTTON_BUS, ("bus-off for 30 ms",), 20.0),
     Scene(Finding.BUTTON_SILENT, (InWorld("silence", "can0", "speak", 1.52),), 1600.0, 2.8),
 )  # fmt: skip
 
@@ -133,8 +134,12 @@ def run_scene(
     def strike(t_ns: int) -> None:
         struck.append(t_ns)
         for how in scene.strikes:
-            if isinstance(how, str):
+            if how == "stall in read-back":
                 stalls[0].due = True
+            elif how == "bus-off for 30 ms":
+                can: Any = far.ports["can0"]
+                can.arm(FaultPlan(bus_off_after_s=0.0))
+                far.clock.at(t_ns + 30_000_000, lambda _, can=can: can.arm(FaultPlan()))
             else:
                 far.strike(how, seed=5)
 
