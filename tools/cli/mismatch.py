@@ -229,35 +229,6 @@ def prove(
 
 
 @app.command()
-def real(
-    json_file: JsonOption = None,
-    doc: Annotated[Path, typer.Option(metavar="FILE", help="The page to write.")] = Path(
-        "docs/mismatch-on-real-data.md"
-    ),
-    data: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="The measured recordings; default: beside the project.")
-    ] = None,
-    only: Annotated[list[str] | None, typer.Option(metavar="NAME", help="Only sets whose name has this in it.")] = None,
-    jobs: Annotated[int | None, typer.Option(min=1, hidden=True)] = None,
-) -> None:
-    """Measured recordings with published figures: what the naive twin lacks, and the error on the official split.
-
-    Example: micron mismatch real --only emps --doc emps.md
-    """
-    with _clear_errors():
-        _check_targets(json_file, doc)
-        from tools.reproduce.measured import table
-
-        if data is not None:
-            os.environ["MICRON_DATA"] = str(data)
-        done = table(tuple(only or ()))
-        write_text_atomic(doc, done.page)
-        console().print(f"page: {doc}; the same: micron reproduce measured --out {doc}")
-        result = done.as_dict()
-        write_json(result, json_file)
-
-
-@app.command()
 def cut(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml).")],
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],

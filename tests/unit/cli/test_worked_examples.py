@@ -31,7 +31,6 @@ ADDED = {
     "imu evaluate": "--seconds 5",
     "latency": "--seconds 0.2 --policy other --no-firmware",
     "mismatch prove": "--cases 1 --jobs 1",
-    "mismatch real": "",
     "ramp": "--virtual",
     "read": "--virtual",
     "run": "--seconds 3 --record out/run.mcap",
@@ -43,7 +42,7 @@ ADDED = {
 }
 OF_A_RUN = ("export", "recover", "replay")
 # recordings of people, which are not part of the repository
-OF_HANDS = ("hands", "mismatch real", "tremor evaluate", "tremor inspect", "tremor report", "tremor train")
+OF_HANDS = ("hands", "tremor evaluate", "tremor inspect", "tremor report", "tremor train")
 # over two seconds each: `make test-all`
 SLOW = (
     "calibrate piezo",
@@ -54,7 +53,6 @@ SLOW = (
     "mismatch apply",
     "mismatch diagnose",
     "mismatch prove",
-    "mismatch real",
     "mismatch simulate",
     "reproduce",
     "sensing budget",
