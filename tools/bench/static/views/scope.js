@@ -17,7 +17,9 @@ const SLACK = 0.3; // further part of the window in which a trigger may be found
 export function mount(root, { link, catalogue }) {
   const settings = persistent("scope.2", {
     channels: catalogue.filter((c) => ["tip_displacement", "command"].includes(c.group)).map((c) => c.name),
-    maths: [], traces: {}, rows: 2000, side: true, display: "lanes", mode: "time", top: 30, first: "", second: "",
+    // the tip also wanders, by more than it trembles: without that the tremor is seen
+    traces: Object.fromEntries(["x", "y", "z"].map((axis) => [`tip_displacement_${axis}`, { filter: "high" }])),
+    maths: [], rows: 2000, side: true, display: "lanes", mode: "time", top: 30, first: "", second: "",
     trigger: { on: true, channel: "tip_displacement_x", level: 0, slope: "up", mode: "auto" },
   });
   const known = new Map(catalogue.map((c) => [c.name, c]));
@@ -211,11 +213,10 @@ export function mount(root, { link, catalogue }) {
     dirty = true;
   }
 
-  /** What AC coupling takes from the channel of the trigger. */
-  function triggerBase(buckets) {
+  /** The channel of the trigger as it is drawn; null when it is not. */
+  function triggerTrace(buckets) {
     const trace = traces.find((t) => !t.op && t.name === settings.trigger.channel);
-    if (!trace || trace.set.coupling !== "ac") return 0;
-    return samplesOf({ ...trace, set: { ...trace.set, filter: "none" } }, buckets, columns, HZ).base;
+    return trace ? samplesOf(trace, buckets, columns, HZ / buckets.perBucket) : null;
   }
 
   function draw() {
@@ -226,7 +227,7 @@ export function mount(root, { link, catalogue }) {
     analysedAt = performance.now();
     const live = subscription?.buckets;
     if (!paused && live?.n && settings.trigger.on) {
-      const found = trigger.update(live, { channels: columns, rows: settings.rows, base: triggerBase(live) });
+      const found = trigger.update(live, { channels: columns, rows: settings.rows, seen: triggerTrace(live) });
       if (found === "single") pause();
     }
     const held = settings.trigger.on && settings.mode === "time" ? trigger.held : null;

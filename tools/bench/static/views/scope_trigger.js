@@ -26,14 +26,13 @@ export class Trigger {
   }
 
   /** Look for the newest trigger that has enough after it; says "single" when the picture shall stay. */
-  update(buckets, scope) { // scope: {channels, rows, base}; base: what AC coupling takes from the trigger's channel
+  update(buckets, scope) { // scope: {channels, rows, seen}; seen: the channel as it is drawn, {low, high, base}, or null
     const s = this.settings;
     if (!s.on) { this.held = null; return ""; }
     const c = scope.channels.indexOf(s.slope === "event" ? "status" : s.channel);
     if (c < 0) return "";
-    const low = buckets.lows(c);
-    const high = buckets.highs(c);
-    const level = s.level + (scope.base || 0);
+    const { low, high, base } = (s.slope !== "event" && scope.seen) || { low: buckets.lows(c), high: buckets.highs(c), base: 0 };
+    const level = s.level + base;
     const after = Math.ceil(((1 - PRE) * scope.rows) / buckets.perBucket);
     const before = Math.ceil((PRE * scope.rows) / buckets.perBucket);
     for (let i = low.length - after; i >= Math.max(1, before); i--) {
