@@ -121,6 +121,7 @@ MADE: dict[str, Callable[[], object]] = {
     "golden diff": lambda: call("capture"),
     "mismatch apply": diagnosed,
     "mismatch simulate": lambda: (diagnosed(), call("mismatch apply")),
+    "mismatch cut": lambda: recorded_stack("rec"),
     "mismatch diagnose": lambda: recorded_stack("recordings/stack"),
     "noise": logs,
     "read": lambda: shutil.copy(CHIP / "bench.toml", "lab.toml"),
