@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from tools.mismatch import keys
+from tools.mismatch import key_tables as keys
 from tools.mismatch.keys import Key
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 

@@ -14,8 +14,9 @@ import pytest
 from typer.testing import CliRunner
 
 from tools.cli.main import app
-from tools.mismatch import keys
+from tools.mismatch import key_tables as keys
 from tools.mismatch.export.write import FORMATS
+from tools.mismatch.keys import Key
 from tools.mismatch.own_data import page
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.vocabulary import KINDS
@@ -93,5 +94,5 @@ def test_only_the_keys_of_the_tables_are_known(tmp_path: Path) -> None:
 
 def test_a_key_that_nobody_described_is_listed() -> None:
     """What a parser knows is on the page, whether or not somebody has written a line about it."""
-    found = keys.listed((keys.Key("a", "number", "the first"), keys.Key("gone", "number", "was dropped")), {"a", "new"})
+    found = keys.listed((Key("a", "number", "the first"), Key("gone", "number", "was dropped")), {"a", "new"})
     assert [k.name for k in found] == ["a", "new"]
