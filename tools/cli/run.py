@@ -5,9 +5,11 @@ from __future__ import annotations
 import json
 import signal
 import subprocess
+import sys
 import tempfile
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -168,11 +170,39 @@ def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] |
     from firmware_py.app import run_in_process
     from tools.reports.run_live import TipWatch
 
-    watch = TipWatch()
-    with Live(console=console(), refresh_per_second=8, transient=True) as live:
-        return run_in_process(
-            request, lambda status: live.update(_shown(status, request.seconds, watch)), on_open=watch.attach
-        )
+    watch, key = TipWatch(), RearmKey(lambda: signal.raise_signal(signal.SIGUSR1))
+    opening = Spinner("dots", "opening the emulated bench")
+    with Live(opening, console=console(), refresh_per_second=8, transient=True) as live:
+
+        def show(status: dict[str, Any]) -> None:
+            key.look(status)
+            live.update(_shown(status, request.seconds, watch))
+
+        return run_in_process(request, show, on_open=watch.attach)
+
+
+class RearmKey:
+    """Enter on a terminal ends a hold that waits for the operator. ``rearm`` is called while such a hold lasts only."""
+
+    def __init__(self, rearm: Callable[[], object]) -> None:
+        self._rearm = rearm
+        self._is_asked_for = False
+        if sys.stdin is not None and sys.stdin.isatty():
+            threading.Thread(target=self._read, daemon=True).start()
+
+    def look(self, status: Mapping[str, Any]) -> None:
+        """Know from the firmware's status whether a hold waits for the operator."""
+        hold = status.get("hold")
+        self._is_asked_for = bool(hold) and hold["rearm"] == "operator"
+
+    def press(self) -> None:
+        """Enter was pressed."""
+        if self._is_asked_for:
+            self._rearm()
+
+    def _read(self) -> None:
+        for _ in sys.stdin:
+            self.press()
 
 
 def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
@@ -224,11 +254,13 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     assert process.stdout is not None
     from tools.reports.run_live import TipWatch
 
-    watch = TipWatch()
+    watch, key = TipWatch(), RearmKey(lambda: process.send_signal(signal.SIGUSR1))
     starting = "starting the emulated world and the firmware"
     with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
-            live.update(_shown(json.loads(line), seconds, watch))
+            status = json.loads(line)
+            key.look(status)
+            live.update(_shown(status, seconds, watch))
 
 
 def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None, json_file: str | None) -> None:

@@ -90,6 +90,9 @@ class TipWatch:
 def live_line(status: Mapping[str, Any], seconds: float, watch: TipWatch) -> str:
     """One line of at most 80 columns: time, state, tremor without and with compensation, holds, time left."""
     t_s = status["t_s"]
+    if hold := status.get("hold"):
+        key = "Enter resumes" if hold["rearm"] == "operator" else ""
+        return f"{t_s:6.1f} s  {key or 'holds'}: {hold['cause']}"[:80]
     tip = watch.rms_um()
     if tip is not None:
         tremor = f"tremor {tip[0]:5.1f} um without, {tip[1]:5.1f} with"
