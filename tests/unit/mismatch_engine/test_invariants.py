@@ -59,6 +59,7 @@ def made(seed: int, order: int, inputs: int, outputs: int, stretch: float, gain:
     return recording("state_space", u, y, belief)
 
 
+@pytest.mark.slow
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     seed=st.integers(0, 10**6),
