@@ -142,6 +142,10 @@ def corrected(rec: Recording, placed: list[Placed], seed: int = 1) -> Corrected:
             size = 5e-5 if rec.twin.parameters.get("discrete") and model.placed[p.placed].site == "feedback" else 0.05
             theta[i] = size * p.scale * rng.standard_normal()
             theta[i] = abs(theta[i]) if p.lo == 0.0 else theta[i]
+    # a force that throws the plant to infinity says nothing
+    while not all(np.all(np.isfinite(y)) for y in whole_run(rec, model, theta).values()):
+        for k in range(len(placed)):
+            theta[model.slices(k)[1]] *= 0.1
     return Corrected(rec.twin.kind, "", (), (), rec, model, theta)
 
 
