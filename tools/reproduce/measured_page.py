@@ -63,7 +63,7 @@ def document(found: Sequence[Scored]) -> str:
             continue
         lines += [
             f"What the tool said of the fit part: {f.report.get('summary', '')} Stage {location.get('stage') or '-'};"
-            f" worst at {location.get('regime') or '-'}.",
+            f" {location.get('regime') or '-'}.",
             "",
             f"{explained(f)[0].upper()}{explained(f)[1:]}.",
             "",
