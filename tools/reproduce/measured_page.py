@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
+from tools.reproduce.measured_rows import Scored, explained, rows_of
 from tools.reproduce.measured_sets import SETS
-
-if TYPE_CHECKING:
-    from tools.reproduce.measured import Scored
 
 _HEAD = (
     "Made by `micron reproduce measured --out docs/mismatch-on-real-data.md`; do not edit. Each set starts from "
@@ -23,8 +20,6 @@ _HEAD = (
 
 def document(found: Sequence[Scored]) -> str:
     """The text of the page; sets that were not run are named."""
-    from tools.reproduce.measured import explained, rows_of
-
     by_name = {s.name: s for s in SETS}
     absent = [s.name for s in SETS if s.name not in {f.name for f in found}]
     goals = [row for f in found for row in rows_of(f) if row.source.startswith("goal")]

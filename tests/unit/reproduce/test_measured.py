@@ -13,9 +13,10 @@ from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.reproduce import measured
-from tools.reproduce.measured import Scored, chosen, rows_of, score
+from tools.reproduce import measured, measured_rows
+from tools.reproduce.measured import chosen, score
 from tools.reproduce.measured_page import document
+from tools.reproduce.measured_rows import Scored, rows_of
 from tools.reproduce.measured_sets import SETS, Goal, MeasuredSet, Published
 from tools.reproduce.names import expand
 
@@ -114,7 +115,7 @@ def test_the_engine_never_sees_the_test_and_the_file_is_scored(made: Path, monke
 
 
 def rows_of_stack(done: Scored, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-    monkeypatch.setattr(measured, "SETS", (STACK,))
+    monkeypatch.setattr(measured_rows, "SETS", (STACK,))
     return rows_of(done)
 
 

@@ -155,7 +155,8 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         return _text(plant_of(theta), links, theta, inputs, outputs, m)
 
     continuous = list(poles) if not m.discrete else [np.log(p + 0j) / dt for p in poles if abs(p) > 1e-12]
-    slowest = min((-p.real for p in continuous), default=np.inf)
+    # a mode that swings integrates nothing, however lightly it is damped
+    slowest = min((abs(p) if abs(p.imag) > 1e-9 * abs(p) else -p.real for p in continuous), default=np.inf)
     seen = tuple(first for first, _ in blocks)
     return DynamicTwin(
         kind="state_space",
