@@ -105,10 +105,14 @@ class Recording:
     @property
     def tick_hz(self) -> float:
         """Ticks per second of the run; 1000 where the recording does not say. ``RecordingError`` for no rate."""
-        rate_hz = self.metadata.get("tick_hz", 1000.0)
-        if not isinstance(rate_hz, int | float) or not 0.0 < rate_hz < 1e9:
+        said: Any = self.metadata.get("tick_hz", 1000.0)
+        try:
+            rate_hz = float(said) if isinstance(said, int | float | str) else float("nan")
+        except ValueError:
+            rate_hz = float("nan")
+        if not 0.0 < rate_hz < 1e9:
             raise RecordingError(f"{self.path}: its tick_hz is not a rate")
-        return float(rate_hz)
+        return rate_hz
 
     def unit(self, name: str) -> str:
         return self.columns[self._index(name)].unit

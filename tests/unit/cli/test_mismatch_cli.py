@@ -238,13 +238,6 @@ def test_prove_prints_its_table_and_writes_json(tmp_path: Path, monkeypatch: pyt
     assert json.loads((tmp_path / "p.json").read_text())["answers_sha256"] == "abc"
 
 
-def test_real_says_where_the_recordings_are_missing(tmp_path: Path):
-    result = run("real", "--data", tmp_path / "nowhere", "--doc", tmp_path / "d.md")
-    assert result.exit_code == 2
-    assert "nowhere" in result.stderr
-    assert files(tmp_path) == []
-
-
 def test_help_does_not_wait_for_the_engine():
     code = (
         "import sys; from tools.cli import mismatch;"
@@ -254,6 +247,6 @@ def test_help_does_not_wait_for_the_engine():
     assert done.stdout.strip() == "[]"
 
 
-@pytest.mark.parametrize("command", ["diagnose", "physics", "prove", "apply", "real"])
+@pytest.mark.parametrize("command", ["diagnose", "physics", "prove", "apply"])
 def test_every_command_has_an_example(command: str):
     assert f"micron mismatch {command}" in " ".join(run(command, "--help").stdout.split())
