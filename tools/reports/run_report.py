@@ -47,7 +47,8 @@ def _compared(without_um: float | None, with_um: float | None) -> str:
         return "-"
     if without_um < NOTHING_UM or with_um > 2.0 * without_um:
         return f"adds {with_um - without_um:.2f} um"
-    return f"{100.0 * (1.0 - with_um / without_um):.0f} % less"
+    change = 100.0 * (1.0 - with_um / without_um)
+    return f"{change:.0f} % less" if change >= 0.0 else f"{-change:.0f} % more"
 
 
 def tremor_table(result: Mapping[str, Any]) -> Table:
