@@ -37,8 +37,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if left_out:
         config.hook.pytest_deselected(items=left_out)
         items[:] = kept
-    # the bench page's server and its firmware run from the first test that needs them to the end: not beside others
-    items.sort(key=lambda item: "server" in getattr(item, "fixturenames", ()))
+    # the bench page's server and the browser run from the first test that needs them to the end of the session, and the
+    # browser's library keeps an event loop in the process: nothing else comes after them
+    items.sort(key=lambda item: bool({"server", "browser"} & set(getattr(item, "fixturenames", ()))))
 
 
 @pytest.fixture(scope="session")
