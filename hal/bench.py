@@ -231,7 +231,7 @@ class OpenBench:
 
     @property
     def virtual(self) -> bool:
-        """Whether bench time is emulated, paced or not."""
+        """True where bench time is emulated, paced or not."""
         return isinstance(self.clock, VirtualClock)
 
     def close(self) -> None:

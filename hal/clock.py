@@ -124,7 +124,7 @@ class PacedClock(VirtualClock):
             self._keep_pace()
 
     def report(self) -> PaceReport:
-        """What has happened since ``begin``."""
+        """Return the figures since ``begin``."""
         emulated_ns, wall_ns = self._now_ns - self._begin_ns, self._wall_ns() - self._begin_wall_ns
         return PaceReport(emulated_ns * 1e-9, wall_ns * 1e-9, self._stalls, self._longest_ns * 1e-6)
 

@@ -1,4 +1,4 @@
-"""What the emulated world's process knows of its own pauses, in a file that the firmware's process maps.
+"""The emulated world's process writes its own pauses into a file that the firmware's process maps.
 
 A host that stands still stops the world as well as the firmware. Without this a scan that the world made late looks
 like a DAQ that is silent. One writer, one reader, aligned 64-bit words, bench time in ns.

@@ -18,7 +18,7 @@ VirtualOption = Annotated[
 
 
 def pace_of(virtual: bool) -> Pace | None:
-    """What ``--virtual`` asks for; without it an emulated bench is paced and a real one runs in real time."""
+    """Return the pace that ``--virtual`` asks for; None paces an emulated bench and runs a real one in real time."""
     return "virtual" if virtual else None
 
 

@@ -135,7 +135,7 @@ def run(
 
 
 def exit_status(result: Mapping[str, Any]) -> Exit:
-    """What the command ends with (contracts/commands.md)."""
+    """Return the exit status that tells whose fault an end was (contracts/commands.md)."""
     safe = result["safe_state"]
     if safe.get("finding") == "stopped" and "SIGINT" in safe["reason"]:
         return Exit.INTERRUPTED

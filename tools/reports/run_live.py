@@ -1,4 +1,4 @@
-"""What ``micron run`` shows before and while it runs: what runs, and one line that moves."""
+"""Text that ``micron run`` shows before and while it runs: the bench, and one line that moves."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ PACES: Mapping[Pace, str] = {
 
 
 def opening_lines(bench: BenchFile, seconds: float, pace: Pace, hand: str | None, seed: int | None) -> list[str]:
-    """What is about to run, in lines of at most 80 columns."""
+    """Describe the run that is about to start, in lines of at most 80 columns."""
     description = bench.description
     emulated, n_buses = len(description.emulated_buses()), len(description.bus)
     devices = "emulated devices" if emulated == n_buses else "real devices" if not emulated else "mixed devices"

@@ -99,7 +99,7 @@ def task_table(result: Mapping[str, Any]) -> Table:
 
 
 def task_legend(result: Mapping[str, Any]) -> str:
-    """What the two times of the task table are."""
+    """Explain the two times of the task table."""
     if result.get("clock") == "real":
         return "wall: from the start of a run to its end on this machine; CPU: without the waiting for buses."
     return (

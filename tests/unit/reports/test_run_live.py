@@ -1,4 +1,4 @@
-"""What ``micron run`` shows before and while it runs: nothing wider than 80 columns, and the tremor that is there."""
+"""``micron run`` shows nothing wider than 80 columns before and while it runs, and the tremor that is there."""
 
 from __future__ import annotations
 
