@@ -7,8 +7,11 @@ import os
 from enum import IntEnum
 from typing import NamedTuple
 
+from firmware_py.guardian.mark import MARK_BYTES, DeathMark
+
 _PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY, _INSIDE, _WATCHED, _ASKED = range(9)
-_BYTES = 9 * 8
+_MARK = 128
+_BYTES = _MARK + MARK_BYTES
 _SOMEBODY, _REPEATS = 1 << 48, 1 << 49
 
 
@@ -46,7 +49,10 @@ class Heart:
 
     def __init__(self, fd: int | None = None) -> None:
         self.fd = fd
-        self._words = memoryview(bytearray(_BYTES) if fd is None else mmap.mmap(fd, _BYTES)).cast("q")
+        memory = memoryview(bytearray(_BYTES) if fd is None else mmap.mmap(fd, _BYTES))
+        self._words = memory[:_MARK].cast("q")
+        self.mark = DeathMark(memory[_MARK:])
+        """Held by the firmware's loop: the kernel says here that it is dead."""
 
     @classmethod
     def shared(cls) -> Heart:

@@ -1,8 +1,10 @@
 """The guardian's process and its handle in the firmware.
 
-The firmware holds the writing end of a pipe: when it dies, by whatever cause, the kernel closes it and the guardian
-wakes at once. That it stands still is seen in the heartbeat. The guardian has its own connection to the amplifier's
-bus, opened at the start; it outlives the firmware, and ends when the outputs are neutral and stay so.
+The firmware's loop holds a mark in shared memory (``mark.py``) and the writing end of a pipe. When it dies, by whatever
+cause, the kernel sets the mark at once, which the guardian looks at every millisecond, and closes the pipe once it has
+freed the firmware's memory, which takes tens of milliseconds. That the firmware stands still is seen in the heartbeat.
+The guardian has its own connection to the amplifier's bus, opened at the start; it outlives the firmware, and ends when
+the outputs are neutral and stay so.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from typing import Any
 from drivers.piezo.dac_amplifier import DacAmplifier
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Why
+from firmware_py.guardian.mark import DeathMark
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
 from hal.backends import open_i2c
 from hal.children import child_command, child_environment
@@ -51,6 +54,7 @@ class GuardianProcess:
         """
         heart = Heart.shared()
         assert heart.fd is not None
+        heart.mark.hold()
         theirs, ours = os.pipe()
         report = runtime_dir / REPORT
         ourselves = os.pidfd_open(os.getpid()) if may_end_us else -1
@@ -92,6 +96,7 @@ class GuardianProcess:
         if self._pipe >= 0:
             os.close(self._pipe)
             self._pipe = -1
+            self.heart.mark.release()
             try:
                 self._process.communicate(timeout=10.0)
             except subprocess.TimeoutExpired:
@@ -102,14 +107,14 @@ class GuardianProcess:
         return None
 
 
-def serve(guardian: Guardian, pipe: int) -> None:
-    """Until the outputs need no guardian any more."""
-    alive = True
+def serve(guardian: Guardian, pipe: int, mark: DeathMark) -> None:
+    """Step ``guardian`` until the outputs need none any more. The firmware is dead when ``mark`` says so or when ``pipe``
+    has no writer any more, whichever comes first."""
+    open_pipe = [pipe]
     while guardian.state is not State.DONE:
-        readable, _, _ = select.select([pipe] if alive else [], (), (), STEP_NS * 1e-9)
-        if readable:
-            alive = bool(os.read(pipe, 64))
-        guardian.step(alive)
+        if select.select(open_pipe, (), (), STEP_NS * 1e-9)[0] and not os.read(pipe, 64):
+            open_pipe = []
+        guardian.step(alive=bool(open_pipe) and not mark.owner_died)
 
 
 def main(arguments: list[str]) -> int:
@@ -126,14 +131,15 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(f"{error}\n")
         return 1
     firmware = order["firmware"]
+    heart = Heart(order["heart"])
     guardian = Guardian(
-        Heart(order["heart"]), amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"],
+        heart, amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"],
         end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
     )  # fmt: skip
     sys.stdout.write("ready\n")
     sys.stdout.flush()
     with realtime(RealtimeConfig(priority=PRIORITY)):
-        serve(guardian, order["pipe"])
+        serve(guardian, order["pipe"], heart.mark)
     report = guardian.report()
     partial = Path(order["report"] + ".partial")
     with suppress(OSError):  # whoever wanted it may have cleaned up

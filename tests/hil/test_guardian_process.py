@@ -22,6 +22,11 @@ from tests.conftest import DEFAULT_BENCH
 pytestmark = pytest.mark.realtime
 ROOT = Path(__file__).parents[2]
 NEUTRAL_V = 50.0
+RAMP_MS = 16.0
+SAMPLE_MS = 1.0
+"""Between two rows of the devices' record."""
+RATIO = 3.0
+"""How many times the answer of a bare pipe the guardian may take before its ramp begins."""
 
 
 def wait_for(condition: Callable[[], Any], what: str, limit_s: float = 120.0) -> Any:
@@ -36,8 +41,7 @@ def wait_for(condition: Callable[[], Any], what: str, limit_s: float = 120.0) ->
 def run(tmp_path: Path) -> Iterator[Run]:
     made = Run(tmp_path)
     yield made
-    made.process.kill()
-    made.process.communicate()
+    made.end()
 
 
 class Run:
@@ -54,6 +58,10 @@ class Run:
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.communicate()
 
     def wait_until_moving(self, extra_s: float) -> None:
         assert self.process.stdout is not None
@@ -77,9 +85,30 @@ class Run:
             return truth["t_ns"], truth["amplifier_V"]
 
 
-@pytest.mark.parametrize("extra_s", [0.0, 0.137])
-def test_a_killed_firmware_leaves_neutral_outputs(run: Run, extra_s: float) -> None:
-    run.wait_until_moving(extra_s)
+def bare_pipe_ms() -> float:
+    """How long this machine takes from the kill of a small process until a reader of its pipe wakes: median of nine."""
+    all_ms: list[float] = []
+    for _ in range(9):
+        reader, writer = os.pipe()
+        process = subprocess.Popen(
+            [sys.executable, "-S", "-E", "-c", "import time; print(flush=True); time.sleep(600)"],
+            stdout=subprocess.PIPE,
+            pass_fds=(writer,),
+        )
+        os.close(writer)
+        assert process.stdout is not None
+        process.stdout.readline()
+        killed_ns = time.monotonic_ns()
+        process.kill()
+        assert os.read(reader, 1) == b""
+        all_ms.append((time.monotonic_ns() - killed_ns) * 1e-6)
+        process.communicate()
+        os.close(reader)
+    return float(np.median(all_ms))
+
+
+def kill_and_wait_for_neutral(run: Run) -> float:
+    """Milliseconds from the kill until the amplifier is at neutral for good, by the devices' own record."""
     killed_ns = time.monotonic_ns()
     run.process.kill()
     run.process.wait()
@@ -88,10 +117,29 @@ def test_a_killed_firmware_leaves_neutral_outputs(run: Run, extra_s: float) -> N
     assert report["neutral_ns"] > report["taken_ns"] >= report["last_beat_ns"] > 0
     assert "outputs neutral and read back" in describe(report)
     t_ns, volts = run.amplifier()
-    before, after = t_ns < killed_ns, t_ns > report["neutral_ns"] + 2_000_000
-    assert np.abs(volts[before] - NEUTRAL_V).max() > 0.05  # something was moving
-    assert after.sum() > 100
-    np.testing.assert_allclose(volts[after], NEUTRAL_V, atol=0.01)
+    away = np.abs(volts - NEUTRAL_V).max(axis=1) > 0.01
+    assert away[t_ns < killed_ns].any()  # something was moving
+    assert (~away[t_ns > report["neutral_ns"] + 2_000_000]).sum() > 100
+    return float(t_ns[away].max() - killed_ns) * 1e-6
+
+
+def test_a_killed_firmware_leaves_neutral_outputs_as_soon_as_a_pipe_could_tell(tmp_path: Path) -> None:
+    """The answer waits neither for a heartbeat to be missed nor for the memory of the dead to be freed. A machine that
+    is busy with something else just then may be slow once; the cause that is looked for made every answer slow."""
+    answers: list[tuple[float, float]] = []
+    for attempt in range(3):
+        folder = tmp_path / str(attempt)
+        folder.mkdir()
+        run = Run(folder)
+        try:
+            run.wait_until_moving(0.137 * attempt)
+            limit_ms = RAMP_MS + SAMPLE_MS + RATIO * bare_pipe_ms()
+            answers.append((kill_and_wait_for_neutral(run), limit_ms))
+        finally:
+            run.end()
+        if answers[-1][0] <= limit_ms:
+            return
+    raise AssertionError(f"neutral so many ms after the kill, and the limit of the moment: {answers}")
 
 
 def test_a_firmware_that_stands_still_is_taken_over_and_holds_when_it_wakes(run: Run, tmp_path: Path) -> None:
