@@ -108,8 +108,10 @@ class GuardianProcess:
 
 
 def serve(guardian: Guardian, pipe: int, mark: DeathMark) -> None:
-    """Step ``guardian`` until the outputs need none any more. The firmware is dead when ``mark`` says so or when ``pipe``
-    has no writer any more, whichever comes first."""
+    """Step ``guardian`` until the outputs need none any more.
+
+    The firmware is dead when ``mark`` says so or ``pipe`` has no writer any more, whichever comes first.
+    """
     open_pipe = [pipe]
     while guardian.state is not State.DONE:
         if select.select(open_pipe, (), (), STEP_NS * 1e-9)[0] and not os.read(pipe, 64):

@@ -38,13 +38,13 @@ the device took and that are neither received, nor reported lost, nor unread at 
 
 {bound}{beside}## When the firmware is gone: the guardian
 
-A DAC has no watchdog. A second process (`firmware_py/guardian`) holds a heartbeat in shared memory, a mark there that the
-kernel sets when the firmware's loop dies (a robust mutex), and a connection of its own to the amplifier's bus. It starts
-with every `micron run` on a bench whose output is a `dac_amplifier` (`[firmware.safety] guardian = false` leaves it
-out). Death: the guardian looks at the mark every millisecond and ramps at once, 16 steps of a millisecond, reads back,
-and watches for 50 ms for a command that was still under way. The mark does not wait for the memory of the dead to be
-freed, as a pipe does: on a machine where neutral came 62 to 78 ms after `kill -9` with a pipe, it comes after 17 ms.
-Silence: noticed after 8 ms, taken over after 41 ms.
+A DAC has no watchdog. A second process (`firmware_py/guardian`) holds a heartbeat in shared memory, a mark there that
+the kernel sets when the firmware's loop dies (a robust mutex), and a connection of its own to the amplifier's bus. It
+starts with every `micron run` on a bench whose output is a `dac_amplifier` (`[firmware.safety] guardian = false`
+leaves it out). Death: the guardian looks at the mark every millisecond and ramps at once, 16 steps of a millisecond,
+reads back, and watches for 50 ms for a command that was still under way. The mark does not wait for the memory of the
+dead to be freed, as a pipe does: on a machine where neutral came 62 to 78 ms after `kill -9` with a pipe, it comes
+after 17 ms. Silence: noticed after 8 ms, taken over after 41 ms.
 
 The outputs belong to one of the two at any time. Every command of the firmware renews a lease of 40 ms; immediately
 before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs
@@ -60,10 +60,10 @@ phases of a tick, in virtual time, exactly.
 
 `tests/unit/guardian` asserts neutral within 20 ms of death in virtual time, also with half of the transfers lost;
 `tests/hil/test_guardian_process.py` kills and stops the real processes, and compares the time to neutral by the
-devices' own record with the time that a bare pipe needs on the same machine. Limits: it runs on the same host, so it does
-not help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier (the
-CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with more
-work than processors, the ramp begins when the guardian is given the processor.
+devices' own record with the time that a bare pipe needs on the same machine. Limits: it runs on the same host, so it
+does not help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier
+(the CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with
+more work than processors, the ramp begins when the guardian is given the processor.
 
 ## What measures the amplifier
 
