@@ -194,6 +194,7 @@ def make_outcome(
         },
         "magnetometer_errors": counts.magnetometer_errors,
         "holds": loop.list_holds(),
+        "guardian": devices.guardian.describe() if devices.guardian is not None else None,
         "warnings": dict(supervisor.warnings),
         "safe_state": {
             "reached": supervisor.safe_reached,

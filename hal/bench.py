@@ -202,7 +202,7 @@ Provider = Callable[..., EmulatedWorld]
 @dataclass
 class Processes:
     """In virtual time all processes of a bench are one: which of them a fault test has killed, and what the guardian
-    reports."""
+    reports. ``dead`` may name "firmware", "guardian" (until another one is started) and "new guardians"."""
 
     dead: set[str] = field(default_factory=set[str])
     guardian_report: Callable[[], dict[str, Any]] | None = None

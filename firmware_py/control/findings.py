@@ -187,6 +187,18 @@ class Finding(Enum):
         "{error}",
         "As above; the command that was late was not sent.",
     )
+    GUARDIAN_LOST = _recoverable(
+        "the guardian is lost",
+        _HOST,
+        "the guardian of the outputs is lost: {what}; a new one is started",
+        "Nobody would take the outputs to neutral if the firmware died; they wait there until a new guardian watches.",
+    )
+    GUARDIAN_FAILED = _latched(
+        "no new guardian",
+        _HOST,
+        "the guardian of the outputs was lost, and {error}",
+        "Outputs that nobody watches over are not armed.",
+    )
     MONITOR_DEAF = _recoverable(
         "monitor",
         _LINK,

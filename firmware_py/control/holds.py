@@ -71,6 +71,11 @@ class Holds:
         if hold is not None and hold.finding is Finding.HOST_OVERSLEPT:
             hold.reason = reason
 
+    def wait_for(self, now_ns: int, what: str) -> None:
+        """``what`` is on its way and has a limit of its own: the hold waits for it and does not grow too long."""
+        self.interrupt(now_ns, what)
+        self._last_ready_ns = now_ns
+
     def is_too_long(self, now_ns: int) -> bool:
         """The hold has not become good within its limit."""
         hold = self.current

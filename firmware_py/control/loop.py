@@ -270,6 +270,7 @@ class InstrumentLoop:
         if self._scan_failed:
             self._restart_scan()
         now_ns = self._clock.now_ns()
+        self._watch.restore_guardian(now_ns)
         watched_ms = min((now_ns - self._started_ns) * 1e-6, self.holds.good_ms(now_ns))
         return self._watch.self_test_passed(watched_ms, (now_ns - self._started_ns) * 1e-6)
 
@@ -288,6 +289,7 @@ class InstrumentLoop:
             self._restart_scan()
         if waiting := self._watch.waiting_for():
             self.holds.interrupt(now_ns, ", ".join(waiting))
+        self._watch.restore_guardian(now_ns)
         if self._rearm_signalled:
             self._rearm_signalled = False
             self.holds.ask()

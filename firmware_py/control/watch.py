@@ -15,7 +15,6 @@ from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
-GUARDIAN_SILENT_NS = 100_000_000
 ROOM_MS = 100.0
 """How long temperature or supply may be outside: they are smoothed, and change slowly."""
 
@@ -59,7 +58,7 @@ class Watch:
         incidents.bad_for(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         if odd := self._check.odd():
             incidents.notice(odd)
-        self._look_after_the_guardian(t_ns)
+        self._look_after_the_guardian()
         self._listen_to_the_button()
 
     def _listen_to_the_button(self) -> None:
@@ -74,11 +73,24 @@ class Watch:
         if telemetry.button_silent() and (self._supervisor.may_move or self._supervisor.is_holding):
             incidents.report(Finding.BUTTON_SILENT, device=telemetry.name)
 
-    def _look_after_the_guardian(self, t_ns: int) -> None:
-        """Heartbeats go both ways: without a guardian the run goes on, but somebody should know."""
-        heart = self._devices.guardian
-        if heart is not None and t_ns - heart.watched_ns > GUARDIAN_SILENT_NS and self._supervisor.may_move:
-            self._incidents.notice("the guardian of the outputs is not heard any more")
+    def _look_after_the_guardian(self) -> None:
+        """Heartbeats go both ways: outputs do not move without a guardian that would take them to neutral."""
+        care, supervisor = self._devices.guardian, self._supervisor
+        if care is None or not (supervisor.may_move or supervisor.is_holding or supervisor.state is State.SELF_TEST):
+            return
+        if why := care.look():
+            self._incidents.report(Finding.GUARDIAN_LOST, what=why)
+
+    def restore_guardian(self, now_ns: int) -> None:
+        """Replace a guardian that is lost; called once per pass of the loop while the outputs rest at neutral."""
+        care = self._devices.guardian
+        if care is None:
+            return
+        try:
+            if waits_for := care.restore(now_ns):
+                self._incidents.holds.wait_for(now_ns, waits_for)
+        except HalError as error:
+            self._incidents.report(Finding.GUARDIAN_FAILED, error=error)
 
     def verify_output(self, info: TickInfo) -> None:
         """Task, 100 Hz, or 300 without a monitor: the amplifier must hold what it was told. A DAC that restarted or
@@ -95,8 +107,8 @@ class Watch:
 
     def _report_difference(self, what: str) -> None:
         """A stall of this process looks like that, too: the guardian has moved the outputs meanwhile."""
-        heart, name = self._devices.guardian, self._devices.amplifier.name
-        if heart is not None and heart.taken_ns:
+        care, name = self._devices.guardian, self._devices.amplifier.name
+        if care is not None and care.heart.taken_ns:
             self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
         else:
             self._incidents.report(Finding.OUTPUT_DIFFERS, device=name, what=what)

@@ -35,7 +35,7 @@ from drivers.specs import (
     NiOutputOptions,
     check_devices,
 )
-from firmware_py.guardian.heart import Heart
+from firmware_py.guardian.care import GuardianCare
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, OpenFailed
@@ -64,8 +64,8 @@ class Devices:
 
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
-    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian``: heartbeats of the
-    firmware and of the guardian beside it, where there is one. ``polling``: how often what is asked; ``bus_us``: what a
+    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian``: the care for
+    the guardian beside the firmware, where there is one. ``polling``: how often what is asked; ``bus_us``: what a
     transaction of each task takes on the wires.
     """
 
@@ -79,7 +79,7 @@ class Devices:
     verify_output: Callable[[], str] | None = None
     monitor: AmplifierMonitor | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
-    guardian: Heart | None = None
+    guardian: GuardianCare | None = None
     polling: Polling = NOT_POLLED
     bus_us: Mapping[str, float] = field(default_factory=dict[str, float])
 

@@ -3,35 +3,37 @@ guardian has taken the outputs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from drivers.base import wait_s
 from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
-from firmware_py.guardian.heart import Heart, Phase
+from firmware_py.guardian.heart import Phase
 from hal.contracts import Clock, Float64Array
 from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
 GIVE_BACK_NS = 200_000_000
 """So long the guardian may take to give the outputs back at neutral, of which it watches over them for 50 ms."""
+FRESH_NS = 10_000_000
+"""A sign of life of the guardian, which gives one every millisecond, counts for so long."""
 STEP_S = 0.001
 PATIENCE_NS = 22_000_000
 """So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
 
 
 class GuardedAmplifier:
-    """AnalogOutput around ``inner``. ``evict`` ends the guardian and returns when it cannot command any more."""
+    """AnalogOutput around ``inner``, armed only while the guardian of ``keeper`` lives."""
 
-    def __init__(
-        self, inner: DacAmplifier, heart: Heart, clock: Clock, *, lease_ms: float, evict: Callable[[], None]
-    ) -> None:
+    def __init__(self, inner: DacAmplifier, keeper: Keeper, clock: Clock, *, lease_ms: float) -> None:
+        heart = keeper.heart
         self.name = inner.name
         self.limits: tuple[OutputLimit, ...] = inner.limits
         self._inner = inner
         self._heart = heart
         self._clock = clock
-        self._evict = evict
+        self._keeper = keeper
         self._gate = LeaseGate(heart, clock, inner.name, lease_ms)
         self._lost_ns = 0
         self._asked = False
@@ -42,7 +44,9 @@ class GuardedAmplifier:
         return self._inner.told_V
 
     def arm(self) -> None:
-        """Raises ``SafetyTrip`` when the outputs are the guardian's and it does not give them back."""
+        """Raises ``SafetyTrip`` when nobody would take the outputs to neutral if this process died, or when they are
+        the guardian's and it does not give them back."""
+        self._require_guardian()
         self._take_up_again()
         self._heart.say(Phase.ARMING)
         self._inner.arm()
@@ -60,7 +64,7 @@ class GuardedAmplifier:
     def safe_step(self) -> bool:
         self._take_up_if_given_back()
         if (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
-            return bool(self._heart.reached_ns)
+            return self._asked
         done = self._inner.safe_step()
         if done:
             self._heart.say(Phase.IDLE)
@@ -77,14 +81,23 @@ class GuardedAmplifier:
         self._inner.close()  # where this fails, the guardian goes on trying
         self._heart.say(Phase.IDLE)
 
+    def _require_guardian(self) -> None:
+        """The guardian lives, and has given a sign of life just now or gives one soon."""
+        heart, begin_ns = self._heart, self._clock.now_ns()
+        seen_ns, now_ns = heart.watched_ns, begin_ns
+        while self._keeper.is_alive() and now_ns - begin_ns <= GIVE_BACK_NS:
+            if heart.watched_ns != seen_ns or 0 < seen_ns >= now_ns - FRESH_NS:
+                self._gate.join()
+                return
+            wait_s(self._clock, STEP_S)
+            now_ns = self._clock.now_ns()
+        raise SafetyTrip(
+            "the outputs are not armed, because no guardian watches over them; start the run again", device=self.name
+        )
+
     def _take_up_again(self) -> None:
-        """After a hold: the guardian must have given the outputs back, or be none of whose business they are."""
-        heart, gate = self._heart, self._gate
-        if gate.alone:
-            raise SafetyTrip(
-                "the guardian of the outputs had to be ended and nobody watches over them; start the run again",
-                device=self.name,
-            )
+        """After a hold: the guardian must have given the outputs back."""
+        heart = self._heart
         limit_ns = self._clock.now_ns() + GIVE_BACK_NS
         while heart.taken_ns:
             if self._clock.now_ns() > limit_ns:
@@ -103,16 +116,17 @@ class GuardedAmplifier:
         if heart.reached_ns:
             self._inner.guard.brought_to_safe_state()
             self._inner.lose_position()
+            heart.ask_back(now_ns)  # before IDLE: a guardian that sees IDLE without a wish takes its leave
             heart.say(Phase.IDLE)
-            heart.ask_back(now_ns)
             self._asked = True
             return False
         self._gate.lost = True
         heart.say(Phase.YIELDED)
         self._lost_ns = self._lost_ns or now_ns
-        if now_ns - self._lost_ns < PATIENCE_NS:
+        if self._keeper.is_alive() and now_ns - self._lost_ns < PATIENCE_NS:
             return False  # two ramps at once would not be one
-        self._evict()
+        self._keeper.evict()
         self._gate.regain()
+        self._lost_ns = 0
         self._inner.lose_position()
         return True

@@ -68,6 +68,10 @@ class LeaseGate:
         """The guardian has given the outputs back: the lease begins anew."""
         self.lost = False
 
+    def join(self) -> None:
+        """A new guardian watches: leases count again."""
+        self._alone = False
+
     def regain(self) -> None:
         """There is no guardian any more: nobody else commands."""
         self._alone = True

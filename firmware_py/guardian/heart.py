@@ -82,6 +82,11 @@ class Heart:
         """The outputs are wanted back once the guardian has done with them; no command is going out."""
         self._words[_ASKED] = t_ns
 
+    def forget_guardian(self) -> None:
+        """The guardian is gone: what it said is void. Its first ``notice`` is kept, for the run's report."""
+        for word in (_TAKEN, _REACHED, _WHY, _WATCHED, _ASKED):
+            self._words[word] = 0
+
     # -- the guardian's side
 
     def watch(self, t_ns: int) -> None:

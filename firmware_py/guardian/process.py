@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from drivers.piezo.dac_amplifier import DacAmplifier
+from firmware_py.guardian.care import start_failed
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Why
 from firmware_py.guardian.mark import DeathMark
@@ -36,60 +37,84 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 class GuardianProcess:
-    """Handle of a running guardian. Start it before real-time settings are made."""
+    """``Keeper`` of a guardian in a process of its own. Start it before real-time settings are made.
 
-    def __init__(self, process: subprocess.Popen[bytes], heart: Heart, pipe: int, report: Path) -> None:
-        """Use ``start``."""
-        self.heart = heart
-        self._process = process
-        self._pipe = pipe
-        self._report = report
+    ``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``. ``may_end_us``: this
+    process is the firmware and nothing else, and may be killed when it stands still within a command. The guardian
+    starts at once; ``await_ready`` says whether it came up.
+    """
 
-    @classmethod
-    def start(cls, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> GuardianProcess:
-        """``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``. ``may_end_us``:
-        this process is the firmware and nothing else, and may be killed when it stands still within a command.
+    def __init__(self, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> None:
+        self.heart = Heart.shared()
+        self.heart.mark.hold()
+        self._order = order
+        self._report = runtime_dir / REPORT
+        self._may_end_us = may_end_us
+        self._is_ready = False
+        self._process, self._pipe = self._start()
 
-        Returns at once; ``await_ready`` says whether it came up.
-        """
-        heart = Heart.shared()
-        assert heart.fd is not None
-        heart.mark.hold()
+    def _start(self) -> tuple[subprocess.Popen[bytes], int]:
+        assert self.heart.fd is not None
         theirs, ours = os.pipe()
-        report = runtime_dir / REPORT
-        ourselves = os.pidfd_open(os.getpid()) if may_end_us else -1
-        order = {**order, "heart": heart.fd, "pipe": theirs, "report": str(report), "firmware": ourselves}
+        ourselves = os.pidfd_open(os.getpid()) if self._may_end_us else -1
+        order = {**self._order, "heart": self.heart.fd, "pipe": theirs, "firmware": ourselves}
         process = subprocess.Popen(
-            child_command("firmware_py.guardian.process", json.dumps(order)),
+            child_command("firmware_py.guardian.process", json.dumps({**order, "report": str(self._report)})),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            pass_fds=(heart.fd, theirs, *((ourselves,) if may_end_us else ())),
+            pass_fds=(self.heart.fd, theirs, *((ourselves,) if self._may_end_us else ())),
             env=child_environment(),
             start_new_session=True,  # Ctrl-C is for the firmware
         )
         os.close(theirs)
-        if may_end_us:
+        if self._may_end_us:
             os.close(ourselves)
-        return cls(process, heart, ours, report)
+        return process, ours
 
     @property
     def pid(self) -> int:
+        """Process id of the guardian, for tests that kill it."""
         return self._process.pid
+
+    def is_alive(self) -> bool:
+        return self._is_ready and self._process.poll() is None
 
     def await_ready(self) -> None:
         """Raises ``OpenFailed`` when the guardian has no way to the amplifier."""
-        assert self._process.stdout is not None
-        ready, _, _ = select.select([self._process.stdout], (), (), START_S)
-        line = self._process.stdout.readline().decode() if ready else ""
-        if line.strip() != "ready":
+        try:
+            if not self._has_come_up(START_S):
+                raise start_failed(f"no word from it within {START_S:g} s")
+        except HalError as error:
             self.stop()
-            why = line.strip() or f"no word from it within {START_S:g} s"
-            raise OpenFailed([HalError(f"the guardian of the outputs did not start: {why}", device="guardian")])
+            raise OpenFailed([error]) from error
+
+    def came_up(self) -> bool:
+        return self._has_come_up(0.0)
+
+    def _has_come_up(self, timeout_s: float) -> bool:
+        assert self._process.stdout is not None
+        if not select.select([self._process.stdout], (), (), timeout_s)[0]:
+            return False
+        line = self._process.stdout.readline().decode().strip()
+        if line != "ready":
+            raise start_failed(line or "it ended without a word")
+        self._is_ready = True
+        return True
 
     def evict(self) -> None:
         """End it now; it commands nothing any more when this returns."""
         self._process.kill()
         self._process.wait()
+
+    def replace(self) -> None:
+        """End it and begin to start another one, which ``came_up`` asks for."""
+        self.evict()
+        assert self._process.stdout is not None
+        self._process.stdout.close()
+        os.close(self._pipe)
+        self.heart.forget_guardian()
+        self._is_ready = False
+        self._process, self._pipe = self._start()
 
     def stop(self) -> dict[str, Any] | None:
         """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent."""

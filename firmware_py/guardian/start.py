@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +12,16 @@ from drivers.specs import DacAmplifierOptions, device_options
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.wiring import Devices
 from firmware_py.guardian.amplifier import GuardedAmplifier
+from firmware_py.guardian.care import GuardianCare, start_failed
 from firmware_py.guardian.gate import LEASE_MARGIN_MS
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart
 from firmware_py.guardian.process import GuardianProcess
 from hal.bench import I2cSpec, OpenBench, Processes
 from hal.clock import VirtualClock
+
+START_NS = 500_000_000
+"""In virtual time: how long a new guardian takes to start, about as long as its process takes."""
 
 
 @contextlib.contextmanager
@@ -38,38 +42,75 @@ def guarded(
     limit_ms, notice_ms = lease_ms + LEASE_MARGIN_MS, limits.guardian_notice_ms
     options = _options(opened, amplifier.name)
     if isinstance(opened.clock, VirtualClock):
-        heart = Heart()
-        own = DacAmplifier(_bus_of(opened, amplifier.name), opened.clock, **options)
-        guardian = Guardian(heart, own, opened.clock, notice_ms=notice_ms, limit_ms=limit_ms)
-        opened.processes.guardian_report = guardian.report
-        _step_in_virtual_time(guardian, opened.clock, opened.processes)
-        process, evict = None, guardian.retire
+        clock, bus = opened.clock, _bus_of(opened, amplifier.name)
+        keeper = VirtualGuardian(
+            lambda heart: Guardian(
+                heart, DacAmplifier(bus, clock, **options), clock, notice_ms=notice_ms, limit_ms=limit_ms
+            ),
+            clock,
+            opened.processes,
+        )
     else:
         order = {**_uri(opened, amplifier.name), "options": options, "notice_ms": notice_ms, "limit_ms": limit_ms}
-        process = GuardianProcess.start(order, runtime_dir, may_end_us=may_end_us)
-        heart, evict = process.heart, process.evict
+        keeper = GuardianProcess(order, runtime_dir, may_end_us=may_end_us)
     try:
-        if process is not None:
-            process.await_ready()
-        heart.watch(opened.clock.now_ns())
-        devices.guardian = heart
-        devices.amplifier = GuardedAmplifier(amplifier, heart, opened.clock, lease_ms=lease_ms, evict=evict)
-        yield heart
+        if isinstance(keeper, GuardianProcess):
+            keeper.await_ready()
+        keeper.heart.watch(opened.clock.now_ns())
+        devices.guardian = GuardianCare(keeper)
+        devices.amplifier = GuardedAmplifier(amplifier, keeper, opened.clock, lease_ms=lease_ms)
+        yield keeper.heart
     finally:
-        evict() if process is None else process.stop()
+        keeper.stop()
 
 
-def _step_in_virtual_time(guardian: Guardian, clock: VirtualClock, processes: Processes) -> None:
-    """Half a step beside the firmware's ticks; its transfers take their time on the bus as the firmware's do."""
+class VirtualGuardian:
+    """``Keeper`` of a guardian that steps by callbacks of a virtual clock, half a step beside the firmware's ticks; its
+    transfers take their time on the bus as the firmware's do. ``processes.dead`` ends it like ``kill -9``."""
 
-    def step(t_ns: int) -> None:
-        if "guardian" in processes.dead:
-            return
-        guardian.step(alive="firmware" not in processes.dead)
-        if guardian.state is not State.DONE:
+    def __init__(self, make: Callable[[Heart], Guardian], clock: VirtualClock, processes: Processes) -> None:
+        self.heart = Heart()
+        self._make, self._clock, self._processes = make, clock, processes
+        self._ready_ns: int | None = None
+        self._guardian = self._begin()
+
+    def is_alive(self) -> bool:
+        is_there = self._ready_ns is None and self._guardian.state is not State.DONE
+        return is_there and "guardian" not in self._processes.dead
+
+    def evict(self) -> None:
+        self._guardian.retire()
+
+    def replace(self) -> None:
+        self.evict()
+        self.heart.forget_guardian()
+        self._ready_ns = self._clock.now_ns() + START_NS
+
+    def came_up(self) -> bool:
+        if self._ready_ns is None or self._clock.now_ns() < self._ready_ns:
+            return False
+        if "new guardians" in self._processes.dead:
+            raise start_failed("a fault test killed it")
+        self._ready_ns = None
+        self._processes.dead.discard("guardian")
+        self._guardian = self._begin()
+        return True
+
+    def stop(self) -> None:
+        self.evict()
+
+    def _begin(self) -> Guardian:
+        guardian, clock, dead = self._make(self.heart), self._clock, self._processes.dead
+        self._processes.guardian_report = guardian.report
+
+        def step(t_ns: int) -> None:
+            if "guardian" in dead or guardian.state is State.DONE:
+                return
+            guardian.step(alive="firmware" not in dead)
             clock.at(t_ns + STEP_NS, step)
 
-    clock.at(clock.now_ns() + STEP_NS // 2, step)
+        clock.at(clock.now_ns() + STEP_NS // 2, step)
+        return guardian
 
 
 def _bus_of(opened: OpenBench, name: str) -> Any:

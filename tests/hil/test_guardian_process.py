@@ -161,18 +161,42 @@ def test_a_firmware_that_stands_still_is_taken_over_and_holds_when_it_wakes(run:
     assert "no command for a while (guardian)" in outcome["noticed"]
 
 
-def test_a_guardian_that_is_killed_is_missed(run: Run, tmp_path: Path) -> None:
-    run.wait_until_moving(0.1)
+def guardians_of(run: Run) -> list[int]:
     task = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children")
     children = [int(pid) for pid in task.read_text().split()]
-    guardians = [pid for pid in children if b"guardian.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-    assert len(guardians) == 1
-    os.kill(guardians[0], signal.SIGKILL)
-    time.sleep(0.5)
-    run.process.send_signal(signal.SIGINT)
+    return [pid for pid in children if b"guardian.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+
+
+@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_guardian_that_is_lost_is_replaced_and_the_new_one_guards(run: Run, blow: signal.Signals) -> None:
+    """The run holds and resumes; then the firmware is killed as well, and the new guardian takes the outputs."""
+    run.wait_until_moving(0.1)
+    (first,) = guardians_of(run)
+    os.kill(first, blow)
     assert run.process.stdout is not None
+    for line in run.process.stdout:
+        status = json.loads(line)
+        if status.get("state") == "running" and status.get("holds"):
+            break
+    run.wait_until_moving(0.1)
+    (second,) = guardians_of(run)
+    assert second != first
+    kill_and_wait_for_neutral(run)
+
+
+def test_the_result_tells_of_the_lost_guardian(run: Run, tmp_path: Path) -> None:
+    run.wait_until_moving(0.1)
+    os.kill(guardians_of(run)[0], signal.SIGKILL)
+    assert run.process.stdout is not None
+    for line in run.process.stdout:
+        status = json.loads(line)
+        if status.get("state") == "running" and status.get("holds"):
+            break
+    run.process.send_signal(signal.SIGINT)
     run.process.stdout.read()
     assert run.process.wait(60.0) == 0
     outcome = json.loads((tmp_path / "outcome.json").read_text())
-    assert "the guardian of the outputs is not heard any more" in outcome["noticed"]
-    assert outcome["safe_state"]["reached"]  # the firmware is not less able to stop
+    assert outcome["guardian"] == {"watching": True, "replaced": 1}
+    held = [hold for hold in outcome["holds"] if hold["finding"] == "guardian_lost"]
+    assert [hold["resumed"] for hold in held] == [True]
+    assert outcome["safe_state"]["reached"]

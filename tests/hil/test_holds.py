@@ -27,7 +27,7 @@ from hal.errors import BenchError
 from hal.middleware.faults import FaultPlan
 from hal.types import I2cOp, I2cRead
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.fault import InWorld, OnBus, OnHost
+from tools.faults.fault import InWorld, Kill, OnBus, OnHost
 from tools.faults.points import POINTS, write_bench
 from tools.faults.trial import FarBench
 
@@ -85,6 +85,7 @@ SCENES = (
     Scene(Finding.OUTPUT_TRANSFER, (InWorld("nack", "piezo", "ack", 0.002),), 2.0),
     Scene(Finding.OUTPUT_TAKEN, ("stall in read-back",), 90.0),
     Scene(Finding.LEASE_LOST, stall(60.0), 61.0),
+    Scene(Finding.GUARDIAN_LOST, (Kill("guardian"),), 12.0, 1.2),
     Scene(Finding.MONITOR_DEAF, (InWorld("nack", "monitor_adc", "ack", 0.13),), 120.0, 0.8),
     Scene(Finding.BUTTON_BUS, ("bus-off for 30 ms",), 20.0),
     Scene(Finding.BUTTON_SILENT, (InWorld("silence", "can0", "speak", 1.52),), 1600.0, 2.8),
@@ -215,6 +216,8 @@ def test_three_times_in_one_run_and_resumed_each_time(scene: Scene, tmp_path: Pa
         assert hold["length_s"] >= LIMITS.hold_ms * 1e-3
         assert hold["t_s"] == pytest.approx(hold["t_ns"] * 1e-9, abs=0.2)
     assert outcome["safe_state"]["normal"], outcome["safe_state"]["reason"]
+    if outcome["guardian"] is not None:
+        assert outcome["guardian"] == {"watching": True, "replaced": 3 * (scene.finding is Finding.GUARDIAN_LOST)}
 
 
 REFUSED = next(scene for scene in SCENES if scene.finding is Finding.OUTPUT_TRANSFER)
@@ -263,6 +266,36 @@ def test_a_run_waits_for_the_end_of_a_hold_and_then_ends_well(tmp_path: Path):
     assert outcome["safe_ns"] - outcome["holds"][0]["t_ns"] >= LIMITS.hold_ms * 1e6
     _, stop = Path3(demands).rest_after(struck[0], 0.0)
     assert stop == len(demands)
+
+
+def test_a_guardian_that_cannot_be_replaced_ends_the_run(tmp_path: Path):
+    scene = next(scene for scene in SCENES if scene.finding is Finding.GUARDIAN_LOST)
+    outcome, demands, struck = run_scene(
+        Scene(scene.finding, (*scene.strikes, Kill("new guardians")), 12.0), 1, tmp_path
+    )
+    safe = outcome["safe_state"]
+    assert (safe["finding"], safe["class"], safe["reached"], safe["normal"]) == ("guardian_failed", "host", True, False)
+    assert safe["reason"].startswith(
+        "the guardian of the outputs was lost, and the guardian of the outputs did not start"
+    )
+    assert outcome["guardian"] == {"watching": False, "replaced": 0}
+    assert [hold["resumed"] for hold in outcome["holds"]] == [False]
+    _, stop = Path3(demands).rest_after(struck[0], 0.0)
+    assert stop == len(demands), "it moved without a guardian"
+
+
+def test_a_guardian_that_dies_in_the_self_test_is_replaced_before_anything_moves(tmp_path: Path):
+    def kill_early(opened: OpenBench) -> None:
+        clock: Any = opened.clock
+        clock.at(round(0.4e9), lambda _: opened.processes.dead.add("guardian"))
+
+    outcome, demands, _ = run_scene(REFUSED, 0, tmp_path, after_s=0.5, on_open=kill_early)
+    assert outcome["guardian"] == {"watching": True, "replaced": 1}
+    assert "the guardian is lost" in outcome["noticed"]
+    assert outcome["holds"] == []
+    assert outcome["safe_state"]["normal"], outcome["safe_state"]["reason"]
+    assert outcome["armed_ns"] > 0.9e9
+    assert demands
 
 
 def test_a_latched_finding_in_a_hold_ends_the_run(tmp_path: Path):

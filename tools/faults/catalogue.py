@@ -203,5 +203,5 @@ def host() -> tuple[Fault, ...]:
         Fault("host: stalls for 500 ms", OnHost(500.0), "resumes", ("daq", "host"), 1.1, effect=0, why=GUARDED),
         Fault("host: 8 MB of memory left", OutOfMemory(8.0), "harmless", effect=0, why="a tick allocates nothing"),
         Fault("host: firmware killed (kill -9)", Kill("firmware"), "safe state", ("firmware died",), 0.3),
-        Fault("host: guardian killed (kill -9)", Kill("guardian"), "noticed", ("guardian",), 0.3),
+        Fault("host: guardian killed (kill -9)", Kill("guardian"), "resumes", ("guardian",), 1.1),
     )

@@ -47,16 +47,18 @@ dead to be freed, as a pipe does: on a machine where neutral came 62 to 78 ms af
 after 17 ms. Silence: noticed after 8 ms, taken over after 41 ms.
 
 The outputs belong to one of the two at any time. Every command of the firmware renews a lease of 40 ms; immediately
-before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs
-or its lease is over, and only then sends. A lease that is over stays over: the firmware goes to its safe state, says
-so, and sends nothing more. The guardian waits until the lease has certainly expired, takes the outputs, and a step
-later looks whether a command was going out: none, or one that the DAC holds already, and it ramps; one that is still
-to come (the firmware stands still between its look and the wire), and it ends the firmware's process first and waits
-for the kernel to confirm that. Where it may not end it (firmware inside another program) it waits 100 ms, and its
-report says that a command may have come afterwards. The other way round the firmware ends a guardian that has not
-reached neutral 22 ms after it took the outputs, and then ramps itself. Heartbeats go both ways: a guardian that is
-not heard for 100 ms is noticed. `tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at seven
-phases of a tick, in virtual time, exactly.
+before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs or
+its lease is over, and only then sends. A lease that is over stays over: the firmware goes to its safe state, says so,
+and sends nothing more. The guardian waits until the lease has certainly expired, takes the outputs, and a step later
+looks whether a command was going out: none, or one that the DAC holds already, and it ramps; one that is still to come
+(the firmware stands still between its look and the wire), and it ends the firmware's process first and waits for the
+kernel to confirm that. Where it may not end it (firmware inside another program) it waits 100 ms, and its report says
+that a command may have come afterwards. The other way round the firmware ends a guardian that has not reached neutral
+22 ms after it took the outputs, and then ramps itself. Heartbeats go both ways: a guardian whose process has ended
+(known within 10 ms) or that is not heard for 100 ms is a finding. The outputs ramp to neutral and hold there, a new
+guardian is started, and they move again once it watches; one that does not come up within 10 s latches. Nothing is
+armed without a sign of life of the guardian. `tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at
+seven phases of a tick, in virtual time, exactly.
 
 `tests/unit/guardian` asserts neutral within 20 ms of death in virtual time, also with half of the transfers lost;
 `tests/hil/test_guardian_process.py` kills and stops the real processes, and compares the time to neutral by the

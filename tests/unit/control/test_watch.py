@@ -12,7 +12,7 @@ from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.findings import CauseClass
 from firmware_py.control.incidents import Incidents, LoopCounts
 from firmware_py.control.safety import SafetyLimits, State, Supervisor
-from firmware_py.control.watch import GUARDIAN_SILENT_NS, Watch
+from firmware_py.control.watch import Watch
 from firmware_py.frame import LAYOUT, STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.guardian.heart import Heart, Why
 from firmware_py.scheduler.task import TickInfo
@@ -42,7 +42,7 @@ def test_an_output_that_the_guardian_has_moved_is_not_the_amplifiers_fault(taken
         amplifier=SimpleNamespace(name="piezo"),
         verify_output=lambda: "output 1 holds 50 V and was told 29 V",
         monitor=SimpleNamespace(poll=lambda: "output 1 is at 50 V", forget=lambda: None, name="monitor"),
-        guardian=heart,
+        guardian=SimpleNamespace(heart=heart),
     )
     config = SimpleNamespace(safety=SimpleNamespace(monitor_ms=100.0))
     watch = Watch(cast(Any, devices), cast(Any, config), cast(Any, None), cast(Any, None), supervisor, incidents)
@@ -130,12 +130,13 @@ def test_the_stop_button_and_its_silence() -> None:
     assert not Watched(State.SELF_TEST, telemetry=button(silent=True)).supervise()
 
 
-def test_a_guardian_that_is_not_heard_is_noticed_and_the_run_goes_on() -> None:
-    bench = Watched(guardian=SimpleNamespace(watched_ns=0, taken_ns=0))
-    assert not bench.supervise(GUARDIAN_SILENT_NS * 1e-6)
-    assert not bench.counts.noticed
-    assert not bench.supervise(GUARDIAN_SILENT_NS * 1e-6 + 1.0)
-    assert list(bench.counts.noticed) == ["the guardian of the outputs is not heard any more"]
+def test_a_guardian_that_is_lost_holds_the_outputs_and_where_nothing_is_armed_nobody_looks() -> None:
+    lost = SimpleNamespace(look=lambda: "its process has ended")
+    assert Watched(guardian=lost).supervise() == (
+        "the guardian of the outputs is lost: its process has ended; a new one is started"
+    )
+    assert not Watched(guardian=SimpleNamespace(look=lambda: "")).supervise()
+    assert not Watched(State.SENSING_ONLY, guardian=lost).supervise()
 
 
 def broken() -> str:

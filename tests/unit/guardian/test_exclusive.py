@@ -19,6 +19,7 @@ from hal.types import I2cOp, I2cWrite, PortInfo
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.transports.lockstep import LockstepI2cBus
+from tests.unit.guardian.test_guardian import Held
 
 MS = 1_000_000
 LEASE_MS = 40.0
@@ -62,8 +63,10 @@ class Stand:
             notice_ms=8.0, limit_ms=LEASE_MS + 1.0, end=end,
         )  # fmt: skip
         self.amplifier = GuardedAmplifier(
-            DacAmplifier(self.slow, self.clock), self.heart, self.clock, lease_ms=LEASE_MS, evict=self.guardian.retire
+            DacAmplifier(self.slow, self.clock), Held(self), self.clock, lease_ms=LEASE_MS
         )
+        self.clock.burn_ns(STEP_NS)
+        self.heart.watch(self.clock.now_ns())
         self.amplifier.arm()
         if guardian_steps:
             self.clock.at(self.clock.now_ns() + STEP_NS // 2, self._step)
@@ -179,6 +182,7 @@ def test_a_firmware_that_dies_after_it_got_its_outputs_back_is_brought_to_neutra
 def test_a_guardian_that_keeps_the_outputs_or_had_to_be_ended_ends_the_run():
     stand = Stand(guardian_steps=False)
     stand.run(5)
+    stand.heart.watch(stand.clock.now_ns())
     stand.heart.take(Why.SILENT, stand.clock.now_ns())
     with pytest.raises(SafetyTrip, match="does not give the outputs back"):
         stand.amplifier.arm()
@@ -186,7 +190,7 @@ def test_a_guardian_that_keeps_the_outputs_or_had_to_be_ended_ends_the_run():
     stand.run(5)
     stand.clock.burn_ns(50 * MS)
     assert stand.run(42)
-    with pytest.raises(SafetyTrip, match="had to be ended"):
+    with pytest.raises(SafetyTrip, match="no guardian watches over them"):
         stand.amplifier.arm()
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -20,11 +22,31 @@ MS = 1_000_000
 FAR = np.array([90.0, 10.0, 60.0])
 
 
+class Held:
+    """``Keeper`` of the guardian of ``stand``; nobody starts another one."""
+
+    def __init__(self, stand: Any) -> None:
+        self._stand = stand
+        self.heart: Heart = stand.heart
+
+    def is_alive(self) -> bool:
+        return self._stand.guardian.state is not State.DONE
+
+    def evict(self) -> None:
+        self._stand.guardian.retire()
+
+    def replace(self) -> None:
+        raise NotImplementedError
+
+    def came_up(self) -> bool:
+        raise NotImplementedError
+
+
 class Stand:
     """One DAC, two masters: the firmware's guarded amplifier and the guardian with an amplifier of its own."""
 
     def __init__(self, *, loss: float = 0.0) -> None:
-        self.clock = VirtualClock()
+        self.clock = VirtualClock(MS)  # 0 is "never"
         line = I2cLine(400_000)
         self.dac = Ad5696r(on_output=lambda channel, volts, t_ns: self.path.append((t_ns, channel, 20.0 * volts)))
         self.path: list[tuple[int, int, float]] = []
@@ -32,13 +54,13 @@ class Stand:
         bus = LockstepI2cBus("i2c0", line, self.clock, lambda: None)
         lossy = FaultI2c(bus, self.clock, FaultPlan(loss=loss, seed=3))
         self.heart = Heart()
-        self.amplifier = GuardedAmplifier(
-            DacAmplifier(bus, self.clock), self.heart, self.clock, lease_ms=40.0, evict=lambda: self.guardian.retire()
-        )
+        self.heart.watch(self.clock.now_ns())
+        self.amplifier = GuardedAmplifier(DacAmplifier(bus, self.clock), Held(self), self.clock, lease_ms=40.0)
         self.guardian = Guardian(self.heart, DacAmplifier(lossy, self.clock), self.clock, notice_ms=8.0, limit_ms=41.0)
 
     def moving(self) -> None:
         """Armed and out at ``FAR``."""
+        self.tick()  # a sign of life
         self.amplifier.arm()
         for _ in range(5):
             self.tick()
