@@ -197,6 +197,18 @@ def felt_at_most(ad: Array, longest: int) -> int:
     return min(longest, 50 * (ad.shape[0] + 1) + int(42.0 * ad.shape[0] / -np.log(max(slowest, 1e-12))))
 
 
+def forgets(ad: Array, samples: int) -> bool:
+    """Whether no mode integrates or grows within so many samples: each decays, or swings and does not grow."""
+    poles = np.linalg.eigvals(ad)
+    size = np.abs(poles)
+    swings = (size <= 1.0 + 1e-12) & (np.abs(np.angle(poles)) * samples > 1.0)
+    return bool(np.all((size**samples < FORGOTTEN) | swings))
+
+
+FORGOTTEN = 0.6
+"""Size of a free response at the end of a stretch, over that at its beginning, below which it is no integrator's."""
+
+
 def _while_felt(free: Array, window: int) -> Array:
     """Free responses up to where they have decayed below 1e-12 of their largest, at least over ``window``."""
     size = np.abs(free).max(axis=1, initial=0.0)
@@ -280,16 +292,73 @@ def start_state(
         weight = {o: 1.0 / (float(np.std(measured[o][seen])) or 1.0) for o in rows}
     known: dict[bytes, Array] = {}
     solvers: list[Array] = []
+    stretch = max(b - a for a, b in spans)
+    horizon = min(stretch, felt_at_most(ad, stretch)) if forgets(ad, stretch) else window
+    shape = np.concatenate([response_shape(ad, c, horizon, blocks) * weight[o] for o, c in rows.items()])
+    rough = max(
+        LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW, *(_roughness(measured[o]) for o in rows)
+    )
     for (a, _), samples in zip(spans, at, strict=True):
         since = samples - a
         name = since.tobytes()
         if name not in known:
             stacked = np.concatenate([_padded(free[o], since) * weight[o] for o in rows])
-            known[name] = np.asarray(np.linalg.pinv(stacked, rcond=1e-9), np.float64)
+            known[name] = held_inverse(stacked, shape, rough)
         solvers.append(known[name])
     made = StartState(tuple(rows), free, weight, spans, at, tuple(solvers))
     memo[key] = made
     return made
+
+
+LEAST_ROUGH = 0.01
+"""Misfit of a simulation, as a fraction of the recorded range, that start states have to stand at least."""
+LEAST_ROUGH_OF_A_WINDOW = 0.03
+"""The same where the first samples alone set a state: the twin may be as given, and nothing was fitted to them."""
+NUMERICAL_RANK = 1e-10
+"""Combinations of start states whose response is smaller than this, relative to the largest, are not told apart."""
+
+
+def held_inverse(seen: Array, whole: Array, rough: float) -> Array:
+    """Least-squares inverse (s, rows) of free responses, in which what the data do not determine stays at zero.
+
+    ``seen`` (rows, s): the responses to unit start states at the samples that set the state; ``whole`` (m, s): at
+    samples of the whole stretch; ``rough``: misfit over recorded range. A combination of start states is determined
+    where a misfit of that size at the samples moves its response nowhere by more than the range. The weight of a
+    combination falls with the fourth power of that ratio (filter factors, steeper than Tikhonov's: P. C. Hansen,
+    Rank-Deficient and Discrete Ill-Posed Problems, 1998): smooth in the poles, without a bias where the data speak.
+    The result does not depend on the coordinates of the state.
+    """
+    size = np.maximum(np.max(np.abs(whole), axis=0, initial=0.0), 1e-300)
+    responses, strength, combine = np.linalg.svd(whole / size, full_matrices=False)
+    kept = strength > NUMERICAL_RANK * strength[0]
+    to_state = combine[kept].T / strength[kept] / size[:, None]
+    left, shown, right = np.linalg.svd(seen @ to_state, full_matrices=False)
+    peak = np.max(np.abs(responses[:, kept] @ right.T), axis=0)
+    ratio = rough * peak / np.maximum(shown, 1e-300)
+    gain = 1.0 / (np.maximum(shown, 1e-300) * (1.0 + np.minimum(ratio, 1e60) ** 4))
+    return np.ascontiguousarray((to_state @ right.T * gain) @ left.T)
+
+
+def response_shape(ad: Array, c: Array, length: int, blocks: tuple[tuple[int, int], ...]) -> Array:
+    """``free_response`` (m, s) at all of its first samples, then at every second, fourth and so on up to ``length``."""
+    parts = [free_by_blocks(ad, c, min(length, 2 * OCTAVE), blocks)]
+    stride = 1
+    while 2 * OCTAVE * stride < length:
+        stride *= 2
+        ad = ad @ ad
+        count = min(2 * OCTAVE, -(-length // stride))
+        parts.append(free_by_blocks(ad, c, count, blocks)[OCTAVE:])
+    return np.concatenate(parts)
+
+
+OCTAVE = 128
+"""Samples of a free response in every octave of time since its start."""
+
+
+def _roughness(x: Array) -> float:
+    """Noise of a record over its range, by its second differences (median)."""
+    size = float(np.ptp(x))
+    return 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / np.sqrt(6.0) / size if size > 0.0 and x.size > 2 else 0.0
 
 
 def _setting(start: int, stop: int, window: int, setting: NDArray[np.int64] | None) -> NDArray[np.int64]:
