@@ -12,7 +12,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -103,6 +103,7 @@ def run_in_process(
             )
         report = RealtimeReport()
         summary: RecordingSummary | None = None
+        interrupts = stack.enter_context(_count_interrupts()) if own_process else lambda: 0
         try:
             with scheduling(request, opened) as report:
                 loop.run(request.seconds)
@@ -111,7 +112,11 @@ def run_in_process(
                 summary = recorder.stop(loop.scheduler.snapshot().as_dict())
         if heart is not None and heart.noticed_ns:
             loop.counts.noticed.setdefault("no command for a while (guardian)", heart.noticed_ns)
-        outcome = make_outcome(request, opened, devices, loop, report, summary)
+        # before the emulated world ends: the guardian may still have something to do
+        last_word, so_far = {}, interrupts()
+        if devices.guardian is not None:
+            last_word = devices.guardian.finish(hurry=lambda: interrupts() > so_far)
+        outcome = make_outcome(request, opened, devices, loop, report, summary, last_word)
         if injections:
             outcome["injected"] = injector.counts()
         return outcome, truth_of(opened)
@@ -152,14 +157,23 @@ def make_outcome(
     loop: InstrumentLoop,
     report: RealtimeReport,
     recording: RecordingSummary | None,
+    guardian: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The part of the run's JSON that the firmware itself knows."""
+    """The part of the run's JSON that the firmware itself knows. ``guardian``: the guardian's last report."""
     snapshot = loop.scheduler.snapshot()
     supervisor, counts = loop.supervisor, loop.counts
     trip = supervisor.trip_cause
     reason = trip.reason if trip is not None else "never left the boot state"
-    if supervisor.ramp_failure:
+    reached, reached_ns = supervisor.safe_reached, loop.safe_reached_ns
+    if not reached and (guardian.get("neutral_ns") or 0) > (reached_ns or 0):
+        reached, reached_ns = True, guardian["neutral_ns"]
+        reason += f"; the firmware did not reach the outputs ({supervisor.ramp_failure}), but the guardian did"
+    elif supervisor.ramp_failure:
         reason += f"; neutral NOT confirmed ({supervisor.ramp_failure}): switch the amplifier off"
+    late_ms = None
+    if trip is not None and reached_ns and reached and (supervisor.was_late or not supervisor.safe_reached):
+        late_ms = (reached_ns - trip.t_ns) * 1e-6
+        reason += f"; neutral was confirmed only after {late_ms:.0f} ms"
     return {
         "format": 1,
         "bench": opened.file.description.name,
@@ -197,14 +211,15 @@ def make_outcome(
         "guardian": devices.guardian.describe() if devices.guardian is not None else None,
         "warnings": dict(supervisor.warnings),
         "safe_state": {
-            "reached": supervisor.safe_reached,
+            "reached": reached,
+            "late_ms": late_ms,
             "reason": reason,
             "finding": trip.finding.name.lower() if trip is not None else None,
             "class": trip.cause.value if trip is not None else None,
-            "normal": trip is not None and trip.normal and supervisor.safe_reached,
+            "normal": trip is not None and trip.normal and reached and late_ms is None,
             "tick": trip.tick if trip is not None else -1,
             "asked_ns": loop.asked_safe_ns,
-            "reached_ns": loop.safe_reached_ns,
+            "reached_ns": reached_ns,
         },
         "estimator": loop.stages.configs.tremor.method,
         "kinematics": {
@@ -229,6 +244,22 @@ def _die_with_parent() -> None:
     """SIGTERM to this process when the one that started it dies: the loop then ramps to neutral."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
+
+
+@contextlib.contextmanager
+def _count_interrupts() -> Iterator[Callable[[], int]]:
+    """Beside the loop, which has handlers of its own, SIGINT and SIGTERM are only counted: a run that ends is told to
+    the end, with an outcome file."""
+    count = 0
+
+    def handle(_number: int, _frame: object) -> None:
+        nonlocal count
+        count += 1
+
+    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    yield lambda: count
+    for number, handler in previous.items():
+        signal.signal(number, handler)
 
 
 def _status_pipe() -> StatusSink:

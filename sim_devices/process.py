@@ -42,7 +42,10 @@ from sim_devices.world import Plant, World
 POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
-LINGER_NS = 1_000_000_000  # after the death of the firmware
+LINGER_NS = 1_000_000_000
+"""After the death of the firmware the world goes on for so long, and while a guardian is connected to an I2C bus."""
+LONGEST_LINGER_NS = 60_000_000_000
+"""A client that does not go away keeps the world for so long at most."""
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
@@ -80,7 +83,7 @@ class WorldProcess:
         self._control.bind(str(sockets / "control.sock"))
         self._control.setblocking(False)
         self._stop = False
-        self._ends_ns: int | None = None
+        self._orphaned_ns: int | None = None
         self._worst_late_ns = 0
         self._lateness = Lateness(self._runtime_dir)
         self._turns = 0
@@ -94,8 +97,16 @@ class WorldProcess:
 
     def outlive_parent(self, *_: object) -> None:
         """The firmware is gone; a device does not end with it, and a guardian may still want it."""
-        if self._ends_ns is None:
-            self._ends_ns = self._clock.now_ns() + LINGER_NS
+        if self._orphaned_ns is None:
+            self._orphaned_ns = self._clock.now_ns()
+
+    def _is_wanted(self) -> bool:
+        """There is a firmware, or one has just died, or its guardian is still at work."""
+        if self._orphaned_ns is None:
+            return True
+        alone_ns = self._now_ns - self._orphaned_ns
+        guarded = any(server.has_clients for server in self._i2c.values())
+        return alone_ns < (LONGEST_LINGER_NS if guarded else LINGER_NS)
 
     def endpoints(self) -> dict[str, str]:
         """URI of each bus for the ordinary adapters of hal."""
@@ -120,7 +131,7 @@ class WorldProcess:
                 check_ns = self._now_ns + PARENT_CHECK_NS
                 if os.getppid() != self._parent:
                     self.outlive_parent()
-                if self._ends_ns is not None and self._now_ns >= self._ends_ns:
+                if not self._is_wanted():
                     break
         self._finish()
 

@@ -45,6 +45,7 @@ SAFETY_RANGES: Mapping[str, tuple[float, float]] = {
     "monitor_ms": (1.0, 10_000.0),
     "guardian_notice_ms": (1.0, 1000.0),
     "guardian_ms": (2.0, 1000.0),
+    "neutral_retry_s": (0.1, 600.0),
 }
 """What each limit of ``SafetyLimits`` may be; of a pair, both, the lower one first."""
 

@@ -47,6 +47,8 @@ from hal.types import ScanBlock, Status, TimeSource
 
 MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
+LONGEST_PAUSE_NS = 10_000_000
+"""Between two tries of a ramp over a bus that fails; the pauses double up to here."""
 LATE_PART = 0.9  # of a period: the prediction bridges a known delay, not this one
 
 
@@ -87,6 +89,8 @@ class InstrumentLoop:
         self._last_scan_ns = 0
         self._warned = 0
         self._interrupted = ""
+        self._interrupts = 0
+        self._is_told_to_give_up = False
         self.counts = LoopCounts()
         self.supervisor = Supervisor(devices.amplifier)
         self.incidents = Incidents(self.supervisor, self.counts, clock, recorder, config.safety)
@@ -179,6 +183,7 @@ class InstrumentLoop:
     def _catch_signals(self) -> dict[signal.Signals, Any]:
         def interrupt(number: int, _frame: object) -> None:
             self._interrupted = signal.Signals(number).name
+            self._interrupts += 1
 
         def rearm(number: int, _frame: object) -> None:
             self._rearm_signalled = True
@@ -361,9 +366,14 @@ class InstrumentLoop:
 
     def _ramp_without_scans(self) -> None:
         """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
+        pause_ns, interrupts = self._period_ns, None
         while self.supervisor.state is State.SAFE_RAMP:
-            due_ns = self._clock.now_ns() + self._period_ns
+            due_ns = self._clock.now_ns() + pause_ns
             self._step_ramp()
+            if self.supervisor.is_retrying:
+                interrupts = self._interrupts if interrupts is None else interrupts
+                pause_ns = min(2 * pause_ns, LONGEST_PAUSE_NS) if self.supervisor.ramp_failure else self._period_ns
+                self._is_told_to_give_up = self._interrupts > interrupts
             self._clock.sleep_until_ns(due_ns)
         self._clock.sleep_until_ns(self._clock.now_ns() + SETTLE_TICKS * self._period_ns)
 
@@ -464,11 +474,17 @@ class InstrumentLoop:
 
     def _step_ramp(self) -> None:
         was_holding = self.supervisor.is_holding
-        if self.supervisor.step() and self.safe_reached_ns is None:
+        if self.supervisor.step(may_retry=self._may_retry()) and self.safe_reached_ns is None:
             self.safe_reached_ns = self._clock.now_ns()
         trip = self.supervisor.trip_cause
         if was_holding and trip is not None:
             self.incidents.note({"event": "safe state", "reason": trip.reason})
+
+    def _may_retry(self) -> bool:
+        """A ramp that fails is tried again for a stated time, unless the operator interrupts that."""
+        trip = self.supervisor.trip_cause
+        since_ns = 0 if trip is None else self._clock.now_ns() - trip.t_ns
+        return not self._is_told_to_give_up and since_ns < self._config.safety.neutral_retry_s * 1e9
 
     def _publish(self, info: TickInfo) -> None:
         """Rows are scans: a tick without one leaves none, so that a replay sees what the filters saw."""

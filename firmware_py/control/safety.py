@@ -52,6 +52,7 @@ class SafetyLimits(BaseModel):
     ``monitor_ms``: how long the amplifier's monitor may be deaf.
     ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
     ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
+    ``neutral_retry_s``: how long firmware and guardian try to reach neutral over a bus that fails; then they give up.
     ``hold_ms``: after a recoverable finding, scans and self-test must have been good for so long without interruption
     before the outputs move again. ``hold_limit_ms``: a hold that has not become good for so long ends the run.
     ``holds_per_minute``: one more within a minute ends the run; with 0 every finding does.
@@ -70,6 +71,7 @@ class SafetyLimits(BaseModel):
     guardian: bool = True
     guardian_notice_ms: float = 8.0
     guardian_ms: float = 40.0
+    neutral_retry_s: float = 10.0
     hold_ms: float = Field(default=200.0, ge=20.0, le=60_000.0)
     hold_limit_ms: float = Field(default=3000.0, ge=100.0, le=600_000.0)
     holds_per_minute: int = Field(default=3, ge=0, le=1000)
@@ -116,6 +118,8 @@ class Supervisor:
         self.trip_cause: Trip | None = None
         self.safe_reached = False
         self.ramp_failure = ""
+        self.was_late = False
+        """Neutral was reached, but only when the ramp had been tried again beyond its time."""
         self.holds: list[Hold] = []
         self.warnings: dict[str, int] = {"jerk": 0, "drift": 0}
         """How often each was reported: what the run's report shows beside the reason of its end."""
@@ -130,7 +134,14 @@ class Supervisor:
         """A ramp that somebody or something asked for runs on the host clock: the loop would wait for scans, and they
         may be what broke. Only the planned end of a run is recorded to its last step."""
         trip = self.trip_cause
-        return self.state is State.SAFE_RAMP and trip is not None and trip.finding is not Finding.FINISHED
+        if self.state is not State.SAFE_RAMP or trip is None:
+            return False
+        return trip.finding is not Finding.FINISHED or self.is_retrying
+
+    @property
+    def is_retrying(self) -> bool:
+        """The ramp has failed within its time, and is tried again until it succeeds or is given up."""
+        return self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS
 
     @property
     def is_holding(self) -> bool:
@@ -180,11 +191,12 @@ class Supervisor:
         """Something is not as it should be and does not end the run."""
         self.warnings[what] = self.warnings.get(what, 0) + 1
 
-    def step(self) -> bool:
+    def step(self, *, may_retry: bool = False) -> bool:
         """One tick of the ramp; True once neutral is reached or has to be given up.
 
-        A transfer that is refused is tried again at once, one that fails otherwise on the next tick, until twice the
-        ramp's time is over; then the report says that neutral could not be confirmed, and why.
+        A transfer that is refused is tried again at once, one that fails otherwise on the next tick. When twice the
+        ramp's time is over, a hold becomes the end of the run; the ramp is given up unless it ``may_retry``. Then the
+        report says that neutral could not be confirmed, and why.
         """
         if self.state not in (State.SAFE_RAMP, State.HOLD_RAMP):
             return self.state is State.SAFE
@@ -200,16 +212,17 @@ class Supervisor:
             break
         if at_neutral:
             self.ramp_failure = ""
+            self.was_late = self.is_retrying
             self.safe_reached = self.state is State.SAFE_RAMP
             self.state = State.SAFE if self.safe_reached else State.HOLD
         elif self._ramp_ticks >= 2 * RAMP_TICKS:
-            self._give_up()
+            self._be_late(may_retry)
         return self.state is State.SAFE
 
-    def _give_up(self) -> None:
+    def _be_late(self, may_retry: bool) -> None:
         """Neutral was not confirmed in time. A hold without it is none: its finding becomes the end of the run."""
         self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
         if self.state is State.HOLD_RAMP:
             hold = self.holds[-1]
             self.trip(Finding.NEUTRAL_NOT_REACHED, hold.reason, tick=hold.tick, t_ns=hold.t_ns, cause=hold.cause)
-        self.state = State.SAFE
+        self.state = State.SAFE_RAMP if may_retry else State.SAFE

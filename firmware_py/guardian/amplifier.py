@@ -11,7 +11,7 @@ from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Phase
 from hal.contracts import Clock, Float64Array
-from hal.errors import SafetyTrip
+from hal.errors import HalError, SafetyTrip
 from hal.types import OutputLimit
 
 GIVE_BACK_NS = 200_000_000
@@ -19,6 +19,8 @@ GIVE_BACK_NS = 200_000_000
 FRESH_NS = 10_000_000
 """A sign of life of the guardian, which gives one every millisecond, counts for so long."""
 STEP_S = 0.001
+BACK_NS = 30_000_000
+"""Additional patience with the guardian after the bus failed: its next try comes up to 10 ms later."""
 PATIENCE_NS = 22_000_000
 """So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
 
@@ -74,11 +76,13 @@ class GuardedAmplifier:
         return self._inner.readback_V()
 
     def close(self) -> None:
-        if self._gate.lost or self._heart.taken_ns:
-            self._lost_ns = 1  # no more patience
-            if self._is_ours_again():
-                self._inner.safe_step()
-        self._inner.close()  # where this fails, the guardian goes on trying
+        """Bring the outputs to neutral unless they are there. Raises ``HalError`` when that cannot be confirmed; the
+        guardian is not ended then, and goes on trying."""
+        while (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
+            if self._asked:
+                break  # the guardian has read neutral back
+            wait_s(self._clock, STEP_S)
+        self._inner.close()
         self._heart.say(Phase.IDLE)
 
     def _require_guardian(self) -> None:
@@ -123,8 +127,14 @@ class GuardedAmplifier:
         self._gate.lost = True
         heart.say(Phase.YIELDED)
         self._lost_ns = self._lost_ns or now_ns
-        if self._keeper.is_alive() and now_ns - self._lost_ns < PATIENCE_NS:
-            return False  # two ramps at once would not be one
+        if self._keeper.is_alive():
+            if now_ns - self._lost_ns < PATIENCE_NS:
+                return False  # two ramps at once would not be one
+            try:
+                self._inner.read_codes()
+            except HalError:  # the bus fails, not the guardian, which is as well placed as we are once it is back
+                self._lost_ns = self._clock.now_ns() + BACK_NS
+                raise
         self._keeper.evict()
         self._gate.regain()
         self._lost_ns = 0

@@ -5,7 +5,8 @@ Models: the health pings of F Prime (``Svc::Health``), ArduPilot's refusal to ar
 
 from __future__ import annotations
 
-from typing import Protocol
+from collections.abc import Callable
+from typing import Any, Protocol
 
 from firmware_py.guardian.heart import Heart
 from hal.errors import HalError
@@ -34,6 +35,10 @@ class Keeper(Protocol):
         """End it and begin to start another one; returns at once."""
         ...
 
+    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        """Let it go once it has done what is left to do; what it reports. Idempotent. In a ``hurry`` do not wait."""
+        ...
+
     def came_up(self) -> bool:
         """Return whether the new one is ready; raises ``HalError`` when it could not start."""
         ...
@@ -49,6 +54,7 @@ class GuardianCare:
         self._silent = 0
         self._lost = ""
         self._starting_ns: int | None = None
+        self._was_watching: bool | None = None
 
     @property
     def heart(self) -> Heart:
@@ -90,9 +96,21 @@ class GuardianCare:
             raise start_failed(f"no word from it within {START_LIMIT_NS * 1e-9:g} s")
         return "a new guardian of the outputs"
 
+    def finish(self, hurry: Callable[[], bool]) -> dict[str, Any]:
+        """Let the guardian go at the end of a run; unless in a ``hurry``, wait until it has done what is left to do.
+
+        Return what it reports; empty when it leaves no word.
+        """
+        self._was_watching = self._is_watching()
+        return self._keeper.stop(hurry) or {}
+
+    def _is_watching(self) -> bool:
+        return not self._lost and self._keeper.is_alive()
+
     def describe(self) -> dict[str, object]:
         """What the run's result says of the guardian, as JSON values."""
-        return {"watching": not self._lost and self._keeper.is_alive(), "replaced": self.replaced}
+        watching = self._is_watching() if self._was_watching is None else self._was_watching
+        return {"watching": watching, "replaced": self.replaced}
 
 
 def start_failed(why: str) -> HalError:

@@ -18,7 +18,11 @@ from hal.errors import HalError, I2cNack
 STEP_NS = 1_000_000
 HOLD_NS = 50_000_000
 """A command that the firmware had under way may still arrive after the ramp: so long it is looked for and undone."""
-GIVE_UP_NS = 2_000_000_000
+RETRY_S = 10.0
+"""How long the ramp is tried again while the bus or the amplifier does not answer."""
+EAGER_NS = 40_000_000
+"""So long every step tries again what failed; after that the pauses double, up to ``LONGEST_PAUSE_NS``."""
+LONGEST_PAUSE_NS = 10_000_000
 CLAIM_NS = 5_000_000
 """A command that has been going out for so long will not arrive by itself: its process is ended."""
 LAST_RESORT_NS = 100_000_000
@@ -45,7 +49,8 @@ class State(Enum):
 
 class Guardian:
     """``notice_ms`` without a beat is remembered, ``limit_ms`` without one takes the outputs. ``end`` kills the
-    firmware's process; without it one that stands still within a command can only be waited for."""
+    firmware's process; without it one that stands still within a command can only be waited for. What the bus refuses
+    is tried again for ``retry_s``, longer and longer apart."""
 
     def __init__(
         self,
@@ -56,6 +61,7 @@ class Guardian:
         notice_ms: float,
         limit_ms: float,
         end: Callable[[], None] | None = None,
+        retry_s: float = RETRY_S,
     ) -> None:
         self.state = State.WATCHING
         self.problem = ""
@@ -69,6 +75,9 @@ class Guardian:
         self._clock = clock
         self._notice_ns = round(notice_ms * 1e6)
         self._limit_ns = round(limit_ms * 1e6)
+        self._retry_ns = round(retry_s * 1e9)
+        self._pause_ns = STEP_NS
+        self._next_try_ns = 0
 
     def step(self, alive: bool) -> None:
         """``alive``: the firmware's process exists."""
@@ -128,51 +137,79 @@ class Guardian:
     def _take(self, why: Why, now_ns: int) -> None:
         """From now on no command begins; the next step looks whether one had begun."""
         self._heart.take(why, now_ns)
-        self.state = State.RAMPING if why is Why.DIED else State.CLAIMING
         self._output.lose_position()
+        self._pause_ns, self._next_try_ns = STEP_NS, 0
+        self.state = State.RAMPING if why is Why.DIED else State.CLAIMING
 
     def _claim(self, alive: bool) -> None:
-        if alive and self._heart.inside is not None and not self._arrived():
-            waited_ns = self._clock.now_ns() - self._heart.taken_ns
-            if waited_ns > CLAIM_NS and self._end is not None and not self.ended:
-                self.ended = True
-                self._end()
-            if waited_ns < LAST_RESORT_NS:
+        if alive and self._heart.inside is not None:
+            now_ns = self._clock.now_ns()
+            waited_ns = now_ns - self._heart.taken_ns
+            if now_ns < self._next_try_ns and waited_ns < self._retry_ns:
                 return
-            self.exclusive = False
+            try:
+                may_come = not self._arrived()
+            except HalError as error:
+                # the bus answers nobody, so the firmware does not stand still: its transfer waits, as ours would
+                self.problem = str(error)
+                self._pause()
+                if waited_ns < self._retry_ns:
+                    return
+                may_come = True
+            if may_come:
+                if waited_ns > CLAIM_NS and self._end is not None and not self.ended:
+                    self.ended = True
+                    self._end()
+                if waited_ns < LAST_RESORT_NS:
+                    return
+                self.exclusive = False
         self._output.lose_position()
-        self.state = State.RAMPING
+        self._begin_ramp()
 
     def _arrived(self) -> bool:
         """The command that the firmware stands in is the one that the DAC holds: nothing is still to come. One that
         does not change anything cannot be told from one that has not been sent, and counts as not arrived."""
         ordered = self._heart.inside
-        try:
-            return ordered is not None and not ordered.repeats and self._output.read_codes() == list(ordered.codes)
-        except HalError:
-            return False
+        return ordered is not None and not ordered.repeats and self._output.read_codes() == list(ordered.codes)
+
+    def _begin_ramp(self) -> None:
+        self.state = State.RAMPING
+        self._pause_ns, self._next_try_ns = STEP_NS, 0
+
+    def _pause(self) -> None:
+        """Something failed: try again after a pause, eagerly at first."""
+        now_ns = self._clock.now_ns()
+        if now_ns - self._heart.taken_ns > EAGER_NS:
+            self._pause_ns = min(2 * self._pause_ns, LONGEST_PAUSE_NS)
+        self._next_try_ns = now_ns + self._pause_ns - STEP_NS // 2
 
     def _ramp(self) -> None:
         now_ns = self._clock.now_ns()
+        if now_ns < self._next_try_ns:
+            return
         for _ in range(ATTEMPTS):
             try:
                 if self._output.safe_step():
                     self.problem = ""
                     self._heart.reach(self._clock.now_ns())
                     self.state = State.HOLDING
+                self._pause_ns = STEP_NS
             except HalError as error:
                 self.problem = str(error)
                 if isinstance(error, I2cNack):
                     continue
+                self._pause()
             break
-        if self.state is State.RAMPING and now_ns - self._heart.taken_ns > GIVE_UP_NS:
+        else:
+            self._pause()
+        if self.state is State.RAMPING and now_ns - self._heart.taken_ns > self._retry_ns:
             self.state = State.DONE
 
     def _hold(self, alive: bool) -> None:
         with suppress(HalError):  # it has been read back once; this is for what comes after
             if self._output.verify():
                 self._output.lose_position()
-                self.state = State.RAMPING
+                self._begin_ramp()
                 return
         heart = self._heart
         if self._clock.now_ns() - heart.reached_ns <= HOLD_NS:

@@ -15,6 +15,8 @@ import select
 import signal
 import subprocess
 import sys
+import time
+from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -32,16 +34,21 @@ from hal.errors import HalError, OpenFailed
 
 PRIORITY = 85  # above the loop: it does almost nothing, but must do it while the loop is stuck
 START_S = 30.0
+END_S = 5.0
+"""How much longer than its tries the guardian may take to end."""
+END_POLL_S = 0.002
 REPORT = "guardian.json"
+STARTED = "guardian.started"
+"""There is a guardian; the file holds the seconds for which it may try to reach neutral."""
 _ROOT = Path(__file__).resolve().parents[2]
 
 
 class GuardianProcess:
     """``Keeper`` of a guardian in a process of its own. Start it before real-time settings are made.
 
-    ``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms; see ``main``. ``may_end_us``: this
-    process is the firmware and nothing else, and may be killed when it stands still within a command. The guardian
-    starts at once; ``await_ready`` says whether it came up.
+    ``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms, retry_s; see ``main``. The guardian
+    starts at once; ``await_ready`` says whether it came up. ``may_end_us``: this process is the firmware and nothing
+    else, and may be killed when it stands still within a command.
     """
 
     def __init__(self, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> None:
@@ -51,6 +58,7 @@ class GuardianProcess:
         self._report = runtime_dir / REPORT
         self._may_end_us = may_end_us
         self._is_ready = False
+        (runtime_dir / STARTED).write_text(str(order["retry_s"]), encoding="utf-8")
         self._process, self._pipe = self._start()
 
     def _start(self) -> tuple[subprocess.Popen[bytes], int]:
@@ -116,17 +124,22 @@ class GuardianProcess:
         self._is_ready = False
         self._process, self._pipe = self._start()
 
-    def stop(self) -> dict[str, Any] | None:
-        """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent."""
+    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        """Let it go once the outputs are at rest; what it reports, ``None`` if it cannot any more. Idempotent.
+
+        When the caller is in a ``hurry``, the guardian goes on alone and its report is not waited for.
+        """
         if self._pipe >= 0:
             os.close(self._pipe)
             self._pipe = -1
             self.heart.mark.release()
-            try:
-                self._process.communicate(timeout=10.0)
-            except subprocess.TimeoutExpired:
-                self._process.kill()
-                self._process.communicate()
+            deadline_s = time.monotonic() + self._order["retry_s"] + END_S
+            while self._process.poll() is None and not hurry():
+                if time.monotonic() > deadline_s:
+                    self.evict()
+                time.sleep(END_POLL_S)
+            assert self._process.stdout is not None
+            self._process.stdout.close()
         with suppress(OSError, ValueError):
             return json.loads(self._report.read_text(encoding="utf-8"))
         return None
@@ -161,6 +174,7 @@ def main(arguments: list[str]) -> int:
     heart = Heart(order["heart"])
     guardian = Guardian(
         heart, amplifier, clock, notice_ms=order["notice_ms"], limit_ms=order["limit_ms"],
+        retry_s=order["retry_s"],
         end=(lambda: signal.pidfd_send_signal(firmware, signal.SIGKILL)) if firmware >= 0 else None,
     )  # fmt: skip
     sys.stdout.write("ready\n")

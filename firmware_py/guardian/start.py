@@ -39,19 +39,19 @@ def guarded(
         return
     # without scans there are no commands: the loop's own limit for those comes first
     lease_ms = max(limits.guardian_ms, 2.0 * limits.stale_ms)
-    limit_ms, notice_ms = lease_ms + LEASE_MARGIN_MS, limits.guardian_notice_ms
+    times: dict[str, Any] = {
+        "notice_ms": limits.guardian_notice_ms,
+        "limit_ms": lease_ms + LEASE_MARGIN_MS,
+        "retry_s": limits.neutral_retry_s,
+    }
     options = _options(opened, amplifier.name)
     if isinstance(opened.clock, VirtualClock):
         clock, bus = opened.clock, _bus_of(opened, amplifier.name)
         keeper = VirtualGuardian(
-            lambda heart: Guardian(
-                heart, DacAmplifier(bus, clock, **options), clock, notice_ms=notice_ms, limit_ms=limit_ms
-            ),
-            clock,
-            opened.processes,
+            lambda heart: Guardian(heart, DacAmplifier(bus, clock, **options), clock, **times), clock, opened.processes
         )
     else:
-        order = {**_uri(opened, amplifier.name), "options": options, "notice_ms": notice_ms, "limit_ms": limit_ms}
+        order = {**_uri(opened, amplifier.name), "options": options, **times}
         keeper = GuardianProcess(order, runtime_dir, may_end_us=may_end_us)
     try:
         if isinstance(keeper, GuardianProcess):
@@ -96,8 +96,10 @@ class VirtualGuardian:
         self._guardian = self._begin()
         return True
 
-    def stop(self) -> None:
+    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
+        report = self._guardian.report()
         self.evict()
+        return report
 
     def _begin(self) -> Guardian:
         guardian, clock, dead = self._make(self.heart), self._clock, self._processes.dead

@@ -14,7 +14,7 @@ import time
 from collections.abc import Sequence
 
 from hal.backends.i2c_checks import check_address
-from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, I2cNack, ProtocolError
+from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, HalTimeout, I2cNack, ProtocolError
 from hal.types import I2cOp, I2cWrite, PortInfo
 
 _HEAD = struct.Struct("<BBq")
@@ -23,24 +23,43 @@ _REPLY = struct.Struct("<BH")
 
 
 class UnixI2c:
-    """Client of one emulated bus. ``timeout_s`` bounds one transfer."""
+    """Client of one emulated bus. ``timeout_s`` bounds one transfer.
+
+    A transfer without an answer is a ``HalTimeout``, a server that has gone is ``Disconnected``. Either spoils the
+    connection, because half an answer may still be under way: the next transfer connects anew.
+    """
 
     def __init__(self, path: str, speed_hz: int = 400_000, timeout_s: float = 0.5) -> None:
         self._path = path
         self._speed_hz = speed_hz
         self._timeout_s = timeout_s
         self._reply = memoryview(bytearray(1 << 16))
-        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         self._open = True
+        self._socket: socket.socket | None = None
         try:
-            # the kernel's own timeouts: Python's would cost two more system calls per transfer
-            limit = struct.pack("@ll", int(timeout_s), round(timeout_s % 1 * 1e6))
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-            self._socket.connect(path)
+            self._connect()
         except OSError as error:
-            self._socket.close()
             raise DeviceNotFound(f"nobody serves this socket: {error}", device=path) from error
+
+    def _connect(self) -> socket.socket:
+        if self._socket is None:
+            made = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+            try:
+                # the kernel's own timeouts: Python's would cost two more system calls per transfer
+                limit = struct.pack("@ll", int(self._timeout_s), round(self._timeout_s % 1 * 1e6))
+                made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+                made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
+                made.connect(self._path)
+            except OSError:
+                made.close()
+                raise
+            self._socket = made
+        return self._socket
+
+    def _disconnect(self) -> None:
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         check_address(address, self._path)
@@ -54,25 +73,29 @@ class UnixI2c:
             else:
                 parts.append(_SEGMENT.pack(1, op.n))
         try:
-            self._socket.sendall(b"".join(parts))
-            n = self._receive_at_least(_REPLY.size, 0)
+            connection = self._connect()
+            connection.sendall(b"".join(parts))
+            n = self._receive_at_least(connection, _REPLY.size, 0)
             status, length = _REPLY.unpack_from(self._reply)
-            n = self._receive_at_least(_REPLY.size + length, n)
+            n = self._receive_at_least(connection, _REPLY.size + length, n)
+        except BlockingIOError as error:
+            self._disconnect()
+            raise HalTimeout(
+                f"the emulated bus gave no answer within {self._timeout_s} s", device=self._path
+            ) from error
         except OSError as error:
-            # half a reply may still be under way: this connection cannot be used any more
-            self.close()
-            what = f"no answer within {self._timeout_s} s" if isinstance(error, BlockingIOError) else str(error)
-            raise Disconnected(f"the emulated bus has gone: {what}", device=self._path) from error
+            self._disconnect()
+            raise Disconnected(f"the emulated bus has gone: {error}", device=self._path) from error
         if n != _REPLY.size + length:
-            self.close()
+            self._disconnect()
             raise ProtocolError(f"{n} bytes in a reply of {_REPLY.size + length}", device=self._path)
         if status:
             raise _error(status, address, self._path)
         return self._reply[_REPLY.size : n].tobytes()
 
-    def _receive_at_least(self, wanted: int, have: int) -> int:
+    def _receive_at_least(self, connection: socket.socket, wanted: int, have: int) -> int:
         while have < wanted:
-            n = self._socket.recv_into(self._reply[have:])
+            n = connection.recv_into(self._reply[have:])
             if n == 0:
                 raise ConnectionResetError("connection closed")
             have += n
@@ -88,7 +111,7 @@ class UnixI2c:
 
     def close(self) -> None:
         self._open = False
-        self._socket.close()
+        self._disconnect()
 
 
 def _error(status: int, address: int, device: str) -> BusError:

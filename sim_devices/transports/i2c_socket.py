@@ -43,6 +43,11 @@ class I2cSocketServer:
         self._free_ns = 0
         self._held: list[tuple[int, bytes]] | None = None
 
+    @property
+    def has_clients(self) -> bool:
+        """Somebody is connected."""
+        return bool(self._clients)
+
     def filenos(self) -> list[int]:
         return [self._listener.fileno(), *self._clients]
 

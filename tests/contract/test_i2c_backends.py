@@ -90,15 +90,34 @@ class TestUnixSocket(I2cContract):
             bus.transfer(0x7F, [I2cRead(1)])
 
 
-def test_stuck_world_is_a_bounded_wait(tmp_path: Path):
+def test_stuck_world_is_a_bounded_wait_and_is_connected_to_anew(tmp_path: Path):
+    """What hung comes back: the late answer to a request that was given up is not taken for the next one's."""
     path = tmp_path / "stuck.sock"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
         listener.bind(str(path))
-        listener.listen(1)  # connects, but nobody ever answers
+        listener.listen(4)  # connects, but nobody answers yet
         bus = UnixI2c(str(path), timeout_s=0.05)
-        with pytest.raises(Disconnected, match=r"no answer within 0\.05 s"):
+        with pytest.raises(HalTimeout, match=r"no answer within 0\.05 s"):
             bus.transfer(MEMORY, [I2cRead(1)])
+        late, _ = listener.accept()
+        late.close()
+        server = threading.Thread(target=serve, args=(listener, RegisterDevice()))
+        server.start()
+        assert len(bus.transfer(MEMORY, [I2cWrite(b"\x00"), I2cRead(1)])) == 1
+        bus.close()
+        server.join()
         with pytest.raises(Closed):
+            bus.transfer(MEMORY, [I2cRead(1)])
+
+
+def test_a_world_that_has_gone_stays_a_disconnect(tmp_path: Path):
+    path = tmp_path / "gone.sock"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as listener:
+        listener.bind(str(path))
+        listener.listen(1)
+        bus = UnixI2c(str(path), timeout_s=0.05)
+    for _ in range(3):
+        with pytest.raises(Disconnected, match="the emulated bus has gone"):
             bus.transfer(MEMORY, [I2cRead(1)])
 
 

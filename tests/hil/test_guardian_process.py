@@ -17,7 +17,7 @@ import pytest
 
 from firmware_py.guardian.process import REPORT, describe
 from firmware_py.run_request import RunRequest
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import copy_of_default_bench
 
 pytestmark = pytest.mark.realtime
 ROOT = Path(__file__).parents[2]
@@ -47,14 +47,16 @@ def run(tmp_path: Path) -> Iterator[Run]:
 class Run:
     """The firmware as ``micron run`` starts it, and what it leaves behind."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, safety: str = "") -> None:
         self.folder = folder
         request = folder / "request.json"
+        bench = copy_of_default_bench(folder, f"\n[firmware.safety]\nholds_per_minute = 60\n{safety}")
         # limits of a busy test machine for scans; the guardian's are then twice that for silence, none for death
-        request.write_text(RunRequest(DEFAULT_BENCH, 60.0, pace="realtime", stale_ms=300.0).to_json(folder))
+        request.write_text(RunRequest(bench, 60.0, pace="realtime", stale_ms=300.0).to_json(folder))
         self.process = subprocess.Popen(
             [sys.executable, "-m", "firmware_py.app", str(request)],
             stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             text=True,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )
@@ -72,6 +74,18 @@ class Run:
                 time.sleep(extra_s)
                 return
         raise AssertionError("the firmware never moved anything")
+
+    def world(self) -> int:
+        """Process id of the emulated world."""
+        (world,) = children_of(self.process.pid, b"sim_devices.process")
+        return world
+
+    def outcome(self) -> dict[str, Any]:
+        """What the run says at its end; it has to leave an outcome file, without a traceback."""
+        _, errors = self.process.communicate(timeout=120.0)
+        assert "Traceback" not in errors, errors
+        assert self.process.returncode == 0, errors
+        return json.loads((self.folder / "outcome.json").read_text())
 
     def report(self) -> dict[str, Any]:
         path = self.folder / REPORT
@@ -161,10 +175,13 @@ def test_a_firmware_that_stands_still_is_taken_over_and_holds_when_it_wakes(run:
     assert "no command for a while (guardian)" in outcome["noticed"]
 
 
+def children_of(pid: int, module: bytes) -> list[int]:
+    children = [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [child for child in children if module in Path(f"/proc/{child}/cmdline").read_bytes()]
+
+
 def guardians_of(run: Run) -> list[int]:
-    task = Path(f"/proc/{run.process.pid}/task/{run.process.pid}/children")
-    children = [int(pid) for pid in task.read_text().split()]
-    return [pid for pid in children if b"guardian.process" in Path(f"/proc/{pid}/cmdline").read_bytes()]
+    return children_of(run.process.pid, b"guardian.process")
 
 
 @pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
@@ -200,3 +217,52 @@ def test_the_result_tells_of_the_lost_guardian(run: Run, tmp_path: Path) -> None
     held = [hold for hold in outcome["holds"] if hold["finding"] == "guardian_lost"]
     assert [hold["resumed"] for hold in held] == [True]
     assert outcome["safe_state"]["reached"]
+
+
+def test_a_bus_that_hangs_for_more_than_half_a_second_is_opened_anew_and_brought_to_neutral(run: Run) -> None:
+    """All devices stand still. Nobody is ended for it, the outputs come to neutral, and the run says how it was."""
+    run.wait_until_moving(0.1)
+    (guardian,) = guardians_of(run)
+    world = run.world()
+    os.kill(world, signal.SIGSTOP)
+    time.sleep(1.2)
+    os.kill(world, signal.SIGCONT)
+    time.sleep(1.0)
+    assert guardians_of(run) in ([guardian], [])  # [] where the run has ended by itself
+    run.process.send_signal(signal.SIGINT)
+    outcome = run.outcome()
+    safe = outcome["safe_state"]
+    assert safe["reached"], safe["reason"]
+    assert outcome["guardian"]["replaced"] == 0
+    assert outcome["holds"] or not safe["normal"]
+    _, volts = run.amplifier()
+    np.testing.assert_allclose(volts[-1], NEUTRAL_V, atol=0.01)
+
+
+def test_a_world_that_is_killed_before_an_interrupt_leaves_an_outcome_that_says_so(run: Run) -> None:
+    """Interrupts end the tries of ten seconds, and whatever part of its end the run is in, it leaves an outcome."""
+    run.wait_until_moving(0.1)
+    os.kill(run.world(), signal.SIGKILL)
+    time.sleep(0.3)
+    for _ in range(3):
+        run.process.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+    outcome = run.outcome()
+    safe = outcome["safe_state"]
+    assert not safe["reached"]
+    assert "neutral NOT confirmed" in safe["reason"]
+    assert "switch the amplifier off" in safe["reason"]
+
+
+def test_a_firmware_that_dies_while_its_bus_hangs_leaves_a_guardian_and_a_world_until_both_are_done(run: Run) -> None:
+    run.wait_until_moving(0.1)
+    world = run.world()
+    os.kill(world, signal.SIGSTOP)
+    run.process.kill()
+    run.process.wait()
+    time.sleep(2.5)  # longer than the guardian once tried, and than the world once waited
+    os.kill(world, signal.SIGCONT)
+    report = run.report()
+    assert report["neutral_ns"], describe(report)
+    _, volts = run.amplifier()
+    np.testing.assert_allclose(volts[-1], NEUTRAL_V, atol=0.01)

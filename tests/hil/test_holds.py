@@ -243,6 +243,38 @@ def test_without_holds_every_finding_ends_the_run(tmp_path: Path):
     assert outcome["holds"] == []
 
 
+@pytest.mark.parametrize("hangs_s", [0.6, 3.0])
+def test_an_amplifier_that_comes_back_is_brought_to_neutral_and_the_report_says_when(hangs_s: float, tmp_path: Path):
+    scene = Scene(Finding.OUTPUT_TRANSFER, (InWorld("nack", "piezo", "ack", hangs_s),), 2.0)
+    outcome, demands, struck = run_scene(scene, 1, tmp_path, after_s=hangs_s)
+    safe = outcome["safe_state"]
+    assert (safe["finding"], safe["reached"], safe["normal"]) == ("neutral_not_reached", True, False)
+    assert 1e3 * hangs_s - 5.0 < safe["late_ms"] < 1e3 * hangs_s + 100.0
+    assert f"neutral was confirmed only after {safe['late_ms']:.0f} ms" in safe["reason"]
+    assert "NOT confirmed" not in safe["reason"]
+    path = Path3(demands)
+    row, stop = path.rest_after(struck[0] + round(hangs_s * 1e9), 0.0)
+    assert stop == len(demands)
+    assert path.t_ns[row] <= safe["reached_ns"]
+
+
+def test_an_amplifier_that_does_not_come_back_is_tried_for_ten_seconds_and_said_loudly(tmp_path: Path):
+    scene = Scene(Finding.OUTPUT_TRANSFER, (InWorld("nack", "piezo"),), 2.0)
+    ended: list[int] = []
+
+    def note_end(opened: OpenBench) -> None:
+        ended.append(0)
+        opened.closers.append(lambda: ended.append(opened.clock.now_ns()))
+
+    outcome, _, struck = run_scene(scene, 1, tmp_path, on_open=note_end)
+    safe = outcome["safe_state"]
+    assert not safe["reached"]
+    assert safe["late_ms"] is None
+    assert "neutral NOT confirmed" in safe["reason"]
+    assert safe["reason"].endswith("switch the amplifier off")
+    assert 9.9e9 < ended[-1] - struck[0] < 10.5e9
+
+
 def test_a_hold_that_does_not_pass_latches_after_its_limit(tmp_path: Path):
     scene = Scene(Finding.SCANS_MISSING, (OnBus("daq0", {"silent_after_s": 0.0}),), 6.0)
     outcome, demands, struck = run_scene(scene, 1, tmp_path, more="\n[firmware.safety]\nhold_limit_ms = 400.0\n")

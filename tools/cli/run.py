@@ -20,7 +20,7 @@ from rich.spinner import Spinner
 from rich.text import Text
 
 from firmware_py.endoscope.wiring import is_endoscope
-from firmware_py.guardian.process import REPORT, describe
+from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
 from firmware_py.run_request import RunRequest
 from hal.bench import check_pace, load_bench
@@ -35,7 +35,6 @@ from tools.prepare import prepare
 if TYPE_CHECKING:
     from tools.reports.run_live import TipWatch
 
-GUARDIAN_S = 3.0
 SETTLE_S = 2.0
 """After arming, the estimator locks and the soft start ends within this time; figures are taken after it."""
 
@@ -241,8 +240,8 @@ def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | Non
 
 def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
     """The firmware was killed: what became of the outputs."""
-    report = runtime_dir / REPORT
-    limit_s = time.monotonic() + GUARDIAN_S
+    report, started = runtime_dir / REPORT, runtime_dir / STARTED
+    limit_s = time.monotonic() + (float(started.read_text()) + END_S if started.exists() else 0.0)
     while not report.exists() and time.monotonic() < limit_s:
         time.sleep(0.01)
     said = describe(json.loads(report.read_text())) if report.exists() else "no word from a guardian of the outputs"

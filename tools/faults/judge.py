@@ -132,7 +132,7 @@ def judge(
         message=reason if tripped or not holds else str(holds[0]["cause"]),
         confirmed=confirmed,
         unsafe=rough_demands(seen.demands)
-        + (confirmed and (neutral is None or neutral > RAMP_MS))
+        + (confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + (safe.get("late_ms") or 0.0))))
         + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in holds),
         uncounted=max(0, seen.scans - counted),
         astray_um=1e6 * float(away_m[before].max(initial=0.0)),

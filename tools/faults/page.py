@@ -60,12 +60,21 @@ guardian is started, and they move again once it watches; one that does not come
 armed without a sign of life of the guardian. `tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at
 seven phases of a tick, in virtual time, exactly.
 
+When the bus or the amplifier does not answer, firmware and guardian try again for `[firmware.safety] neutral_retry_s`
+(10 s), every millisecond at first and then every 10 ms, and open a connection anew that failed. While the bus answers
+nobody, neither ends the other: a command that waits there is no command that stands still, and a guardian that cannot
+ramp is no guardian that does not come. A hold whose ramp fails for 40 ms becomes the end of the run; what comes back
+within the time is ramped and read back, and the report says after how many milliseconds (`late_ms`). What does not is
+called "neutral NOT confirmed"; an interrupt ends the tries. A run waits for its guardian before it ends the emulated
+world, and the world outlives a killed firmware until its guardian has done.
+
 `tests/unit/guardian` asserts neutral within 20 ms of death in virtual time, also with half of the transfers lost;
-`tests/hil/test_guardian_process.py` kills and stops the real processes, and compares the time to neutral by the
-devices' own record with the time that a bare pipe needs on the same machine. Limits: it runs on the same host, so it
-does not help when the host or the bus adapter loses power or the kernel stops; that needs a watchdog at the amplifier
-(the CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a machine without real-time priority, or with
-more work than processors, the ramp begins when the guardian is given the processor.
+`tests/hil/test_guardian_process.py` kills and stops the real processes (firmware, guardian, emulated world), and
+compares the time to neutral by the devices' own record with the time that a bare pipe needs on the same machine.
+Limits: it runs on the same host, so it does not help when the host or the bus adapter loses power or the kernel stops;
+that needs a watchdog at the amplifier (the CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a
+machine without real-time priority, or with more work than processors, the ramp begins when the guardian is given the
+processor.
 
 ## What measures the amplifier
 

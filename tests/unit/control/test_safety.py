@@ -101,6 +101,41 @@ def test_a_refused_step_is_tried_again_within_its_tick():
     assert supervisor.safe_reached
 
 
+def test_a_bus_that_comes_back_late_is_ramped_and_the_supervisor_knows_that_it_was_late():
+    supervisor = running(FakeAmplifier(ticks=5, failing=600))
+    supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)
+    steps = 0
+    while not supervisor.step(may_retry=True):
+        steps += 1
+        assert supervisor.is_retrying == (steps >= 2 * RAMP_TICKS)
+        assert steps < 1000
+    assert steps == 204  # three refusals a tick
+    assert supervisor.safe_reached
+    assert supervisor.was_late
+    assert supervisor.ramp_failure == ""
+
+
+def test_a_retry_ends_when_it_may_not_go_on():
+    supervisor = running(FakeAmplifier(failing=100_000))
+    supervisor.trip(Finding.FINISHED, "run finished", tick=1, t_ns=1)
+    assert not supervisor.must_not_wait
+    assert not any(supervisor.step(may_retry=True) for _ in range(500))
+    assert supervisor.must_not_wait, "the loop would wait for scans between its tries"
+    assert supervisor.step(may_retry=False)
+    assert (supervisor.state, supervisor.safe_reached, supervisor.was_late) == (State.SAFE, False, False)
+    assert supervisor.ramp_failure
+
+
+def test_a_hold_whose_ramp_fails_becomes_the_end_and_goes_on_trying():
+    supervisor = running(FakeAmplifier(ticks=5, failing=600))
+    supervisor.hold(Finding.OUTPUT_TRANSFER, "piezo: no answer", tick=1, t_ns=1)
+    while not supervisor.step(may_retry=True):
+        pass
+    assert supervisor.trip_cause is not None
+    assert supervisor.trip_cause.finding is Finding.NEUTRAL_NOT_REACHED
+    assert (supervisor.state, supervisor.safe_reached, supervisor.was_late) == (State.SAFE, True, True)
+
+
 def test_a_dead_bus_ends_in_a_report_not_in_a_loop():
     supervisor = running(FakeAmplifier(failing=10_000))
     supervisor.trip(Finding.DAQ_GONE, "link lost", tick=1, t_ns=1)

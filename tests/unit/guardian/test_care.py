@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,10 @@ class Kept:
         self.heart.forget_guardian()
         self.started += 1
 
+    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any]:
+        self.evict()
+        return {"why": "nothing"}
+
     def came_up(self) -> bool:
         if self.error is not None:
             raise self.error
@@ -54,6 +59,14 @@ def test_a_death_is_known_at_the_next_look():
     keeper.alive = False
     assert care.look() == "its process has ended"
     assert not care.describe()["watching"]
+
+
+def test_the_end_of_a_run_is_no_loss():
+    keeper, care = cared()
+    keeper.heart.watch(1)
+    care.look()
+    assert care.finish(lambda: False) == {"why": "nothing"}
+    assert care.describe() == {"watching": True, "replaced": 0}
 
 
 def test_silence_counts_in_passes_and_not_while_the_guardian_has_the_outputs():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -36,6 +37,9 @@ class Held:
         self._stand.guardian.retire()
 
     def replace(self) -> None:
+        raise NotImplementedError
+
+    def stop(self, hurry: Callable[[], bool] = lambda: False) -> dict[str, Any] | None:
         raise NotImplementedError
 
     def came_up(self) -> bool:

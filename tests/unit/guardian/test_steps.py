@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.guardian.gate import LeaseGate
-from firmware_py.guardian.guardian import CLAIM_NS, GIVE_UP_NS, HOLD_NS, STEP_NS, Guardian, State
+from firmware_py.guardian.guardian import CLAIM_NS, HOLD_NS, LONGEST_PAUSE_NS, RETRY_S, STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Order, Phase, Why
 from hal.clock import VirtualClock
 from hal.errors import HalError, HalTimeout, I2cNack, SafetyTrip
@@ -81,13 +81,33 @@ def test_what_is_refused_is_tried_three_times_a_step_and_other_errors_once() -> 
 
 
 @pytest.mark.parametrize("deaf", [True, False])
-def test_it_gives_up_two_seconds_after_it_took_the_outputs(deaf: bool) -> None:
-    output = Output(deaf=True) if deaf else Output(errors=tuple(nack() for _ in range(9000)))
+def test_it_gives_up_ten_seconds_after_it_took_the_outputs(deaf: bool) -> None:
+    output = Output(deaf=True) if deaf else Output(errors=tuple(nack() for _ in range(90_000)))
     stand = Stand(output)
-    stand.pass_ms(GIVE_UP_NS // MS, alive=False)
+    stand.pass_ms(round(RETRY_S * 1000), alive=False)
     assert stand.guardian.state is State.RAMPING
-    stand.pass_ms(2, alive=False)
+    stand.pass_ms(2 + LONGEST_PAUSE_NS // MS, alive=False)
     assert stand.guardian.state is State.DONE
+    assert stand.guardian.problem
+
+
+def test_what_fails_is_tried_every_step_at_first_and_then_less_often() -> None:
+    stand = Stand(Output(deaf=True))
+    stand.pass_ms(40, alive=False)
+    assert stand.output.asked == 40
+    stand.pass_ms(1000, alive=False)
+    assert 100 <= stand.output.asked - 40 <= 110
+
+
+@pytest.mark.parametrize("hangs_ms", [30, 500, 2500, 9900])
+def test_a_bus_that_comes_back_within_the_time_is_ramped_and_confirmed(hangs_ms: int) -> None:
+    stand = Stand(Output(steps=3, deaf=True))
+    stand.pass_ms(hangs_ms, alive=False)
+    stand.output.deaf = False
+    stand.pass_ms(LONGEST_PAUSE_NS // MS + 3, alive=False)
+    assert stand.guardian.state is State.HOLDING
+    assert stand.guardian.problem == ""
+    assert stand.heart.reached_ns
 
 
 def test_it_holds_for_as_long_as_the_firmware_lives_and_has_not_given_in() -> None:
@@ -107,14 +127,31 @@ def test_it_holds_for_fifty_ms_after_a_death() -> None:
     assert stand.guardian.state is State.DONE
 
 
-def test_a_command_that_nobody_can_read_back_has_not_arrived() -> None:
+def test_while_the_bus_answers_nobody_the_firmware_is_not_ended_for_a_command_that_waits() -> None:
+    """Its transfer hangs, as the guardian's read does: it does not stand still."""
     stand = Stand(Output(deaf=True))
     stand.heart.enter(ORDER)
     while not stand.heart.taken_ns:
         stand.pass_ms(1)
-    stand.pass_ms(CLAIM_NS // MS)
+    stand.pass_ms(3000)
     assert (stand.guardian.state, stand.ended) == (State.CLAIMING, 0)
+    stand.heart.leave()  # the transfer ran into its time limit
     stand.pass_ms(1)
+    assert stand.guardian.state is State.RAMPING
+    stand.output.deaf = False
+    stand.pass_ms(LONGEST_PAUSE_NS // MS + 3)
+    assert (stand.guardian.state, stand.ended, stand.guardian.exclusive) == (State.HOLDING, 0, True)
+
+
+def test_when_the_bus_is_back_a_command_that_has_not_arrived_ends_the_firmware() -> None:
+    stand = Stand(Output(deaf=True))
+    stand.heart.enter(ORDER)
+    while not stand.heart.taken_ns:
+        stand.pass_ms(1)
+    stand.pass_ms(3 + CLAIM_NS // MS)
+    assert stand.ended == 0
+    stand.output.deaf = False
+    stand.pass_ms(1 + LONGEST_PAUSE_NS // MS)
     assert stand.ended == 1
 
 

@@ -1,0 +1,93 @@
+"""A bus that answers nobody for a while: nobody is ended for it, and the outputs are brought to neutral afterwards."""
+
+from __future__ import annotations
+
+import pytest
+
+from firmware_py.guardian.guardian import State
+from hal.errors import BusError, HalError
+from tests.unit.guardian.test_exclusive import FAR_V, MS, Stand, alternating
+
+
+class HangingStand(Stand):
+    """Firmware and guardian at one DAC, and a bus that can hang for both."""
+
+    def hang(self) -> None:
+        self.dac.nack_address = True
+
+    def come_back(self) -> None:
+        self.dac.nack_address = False
+
+    def pass_ms(self, count: int) -> list[str]:
+        """The firmware's way to neutral, a step a millisecond, until it is there; what was said."""
+        said: list[str] = []
+        for _ in range(count):
+            try:
+                if self.amplifier.safe_step():
+                    return [*said, "neutral"]
+            except HalError as error:
+                said.append(str(error))
+            self.tick()
+        return said
+
+
+@pytest.mark.parametrize("hangs_ms", [60, 500, 3000])
+def test_the_guardian_is_not_ended_while_the_bus_answers_nobody_and_ramps_when_it_is_back(hangs_ms: int):
+    stand = HangingStand()
+    stand.run(5, alternating)
+    stand.clock.burn_ns(50 * MS)  # the guardian takes the outputs
+    stand.hang()
+    assert stand.run(1, alternating)
+    said = stand.pass_ms(hangs_ms)
+    assert "neutral" not in said
+    assert stand.guardian.state is State.RAMPING, "it was ended, or has given up"
+    stand.come_back()
+    back_ns = stand.clock.now_ns()
+    assert "neutral" in stand.pass_ms(60)
+    assert stand.volts() == pytest.approx([50.0] * 3)
+    assert not [t_ns for t_ns in stand.commands_of("firmware") if t_ns > back_ns]  # one ramp, not two
+
+
+def test_closing_leaves_the_guardian_at_work_where_the_bus_answers_nobody():
+    stand = HangingStand()
+    stand.run(5, alternating)
+    stand.clock.burn_ns(50 * MS)
+    stand.hang()
+    assert stand.run(1, alternating)
+    with pytest.raises(BusError):
+        stand.amplifier.close()
+    assert stand.guardian.state is State.RAMPING
+    stand.come_back()
+    stand.alive = False  # the run is over
+    for _ in range(100):
+        stand.tick()
+    assert stand.guardian.state is State.DONE
+    assert stand.volts() == pytest.approx([50.0] * 3)
+
+
+def test_the_firmware_takes_the_outputs_of_a_guardian_that_does_nothing_on_a_bus_that_answers():
+    stand = HangingStand(guardian_steps=False)
+    stand.run(5)
+    stand.clock.burn_ns(50 * MS)
+    stand.hang()
+    assert stand.run(5)
+    assert stand.guardian.state is not State.DONE
+    stand.come_back()
+    assert "neutral" in stand.pass_ms(100)
+    assert stand.guardian.state is State.DONE
+    assert stand.volts() == pytest.approx([50.0] * 3)
+
+
+def test_a_hang_in_the_firmware_s_own_ramp_is_taken_over_and_brought_to_neutral():
+    """The firmware's transfers fail without a pause; its heart beats on until it tries less often than its lease."""
+    stand = HangingStand()
+    stand.run(5, lambda k: FAR_V)
+    stand.hang()
+    said = stand.pass_ms(45)
+    assert "neutral" not in said
+    stand.clock.burn_ns(60 * MS)
+    stand.come_back()
+    for _ in range(60):
+        stand.tick()
+    assert "neutral" in stand.pass_ms(60)
+    assert stand.volts() == pytest.approx([50.0] * 3)
