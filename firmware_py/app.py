@@ -248,18 +248,19 @@ def _die_with_parent() -> None:
 
 @contextlib.contextmanager
 def _count_interrupts() -> Iterator[Callable[[], int]]:
-    """Beside the loop, which has handlers of its own, SIGINT and SIGTERM are only counted: a run that ends is told to
-    the end, with an outcome file."""
+    """Beside the loop, which has handlers of its own, SIGINT and SIGTERM are only counted, and ignored once the run is
+    over: it is told to the end, with an outcome file."""
     count = 0
 
     def handle(_number: int, _frame: object) -> None:
         nonlocal count
         count += 1
 
-    previous = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
     yield lambda: count
-    for number, handler in previous.items():
-        signal.signal(number, handler)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def _status_pipe() -> StatusSink:

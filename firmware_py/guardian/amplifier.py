@@ -11,7 +11,7 @@ from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Phase
 from hal.contracts import Clock, Float64Array
-from hal.errors import HalError, SafetyTrip
+from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
 GIVE_BACK_NS = 200_000_000
@@ -19,8 +19,13 @@ GIVE_BACK_NS = 200_000_000
 FRESH_NS = 10_000_000
 """A sign of life of the guardian, which gives one every millisecond, counts for so long."""
 STEP_S = 0.001
-BACK_NS = 30_000_000
-"""Additional patience with the guardian after the bus failed: its next try comes up to 10 ms later."""
+BACK_NS = 60_000_000
+"""So long the guardian may take for its ramp after the bus has come back: its next try comes up to 10 ms later, over a
+bus on which others wait as well."""
+LOOK_NS = 4_000_000
+"""Between two looks at the outputs, at the end of the guardian's time: outputs that move are its ramp."""
+SLOW_NS = 5_000_000
+"""A read-back that takes longer had to wait for the bus."""
 PATIENCE_NS = 22_000_000
 """So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
 
@@ -39,6 +44,8 @@ class GuardedAmplifier:
         self._gate = LeaseGate(heart, clock, inner.name, lease_ms)
         self._lost_ns = 0
         self._asked = False
+        self._bus_fails = False
+        self._codes: list[int] | None = None
         inner.gate = self._gate
 
     @property
@@ -78,10 +85,13 @@ class GuardedAmplifier:
     def close(self) -> None:
         """Bring the outputs to neutral unless they are there. Raises ``HalError`` when that cannot be confirmed; the
         guardian is not ended then, and goes on trying."""
-        while (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
-            if self._asked:
+        while self._gate.lost or self._heart.taken_ns:
+            if self._is_ours_again():
+                self._inner.safe_step()
+            elif self._asked:
                 break  # the guardian has read neutral back
-            wait_s(self._clock, STEP_S)
+            else:
+                wait_s(self._clock, STEP_S)
         self._inner.close()
         self._heart.say(Phase.IDLE)
 
@@ -111,7 +121,7 @@ class GuardedAmplifier:
 
     def _take_up_if_given_back(self) -> None:
         if self._asked and not self._heart.taken_ns:
-            self._asked, self._lost_ns = False, 0
+            self._asked, self._lost_ns, self._codes = False, 0, None
             self._gate.take_up()
 
     def _is_ours_again(self) -> bool:
@@ -127,16 +137,30 @@ class GuardedAmplifier:
         self._gate.lost = True
         heart.say(Phase.YIELDED)
         self._lost_ns = self._lost_ns or now_ns
-        if self._keeper.is_alive():
-            if now_ns - self._lost_ns < PATIENCE_NS:
-                return False  # two ramps at once would not be one
-            try:
-                self._inner.read_codes()
-            except HalError:  # the bus fails, not the guardian, which is as well placed as we are once it is back
-                self._lost_ns = self._clock.now_ns() + BACK_NS
-                raise
+        if self._keeper.is_alive() and self._is_guardian_at_work(now_ns):
+            return False  # two ramps at once would not be one
         self._keeper.evict()
+        heart.forget_guardian()
         self._gate.regain()
-        self._lost_ns = 0
+        self._lost_ns, self._codes = 0, None
         self._inner.lose_position()
         return True
+
+    def _is_guardian_at_work(self, now_ns: int) -> bool:
+        """The guardian's time is not over yet, or the outputs move, or the bus has only just come back.
+
+        Raises ``HalError`` when the amplifier does not answer: then the bus fails, not the guardian.
+        """
+        waited_ns = now_ns - self._lost_ns
+        if waited_ns < PATIENCE_NS - LOOK_NS or (waited_ns < PATIENCE_NS and self._codes is not None):
+            return True
+        before, failed = self._codes, self._bus_fails
+        self._codes, self._bus_fails = None, True
+        codes = self._inner.read_codes()
+        read_ns = self._clock.now_ns()
+        self._codes, self._bus_fails = codes, False
+        if failed or read_ns - now_ns > SLOW_NS:
+            self._lost_ns = read_ns + BACK_NS - PATIENCE_NS
+        elif before is not None and codes != before:
+            self._lost_ns = read_ns - PATIENCE_NS + LOOK_NS
+        return before is None or read_ns - self._lost_ns < PATIENCE_NS

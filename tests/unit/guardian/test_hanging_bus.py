@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.guardian.guardian import State
+from firmware_py.guardian.heart import Why
 from hal.errors import BusError, HalError
+from hal.middleware.faults import FaultPlan
 from tests.unit.guardian.test_exclusive import FAR_V, MS, Stand, alternating
 
 
@@ -90,4 +92,34 @@ def test_a_hang_in_the_firmware_s_own_ramp_is_taken_over_and_brought_to_neutral(
     for _ in range(60):
         stand.tick()
     assert "neutral" in stand.pass_ms(60)
+    assert stand.volts() == pytest.approx([50.0] * 3)
+
+
+@pytest.mark.parametrize("slow_ms", [0, 400])
+def test_a_read_that_waited_for_the_bus_gives_the_guardian_its_time(slow_ms: int):
+    """The firmware's look at the bus fails, or hangs and then succeeds: the guardian's ramp comes only after it."""
+    stand = HangingStand()
+    stand.run(5, alternating)
+    stand.clock.burn_ns(50 * MS)
+    stand.hang()
+    assert stand.run(1, alternating)
+    stand.pass_ms(100)
+    stand.come_back()
+    if slow_ms:
+        stand.slow.arm(FaultPlan(delay=1.0, delay_s=slow_ms * 1e-3))
+        stand.clock.at(stand.clock.now_ns() + 1 * MS, lambda _: stand.slow.arm(FaultPlan()))
+    assert "neutral" in stand.pass_ms(80)
+    assert stand.guardian.state is not State.DONE, "it was ended"
+    assert stand.volts() == pytest.approx([50.0] * 3)
+
+
+def test_the_firmware_s_own_ramp_after_it_ended_a_guardian_that_had_taken_the_outputs_takes_its_sixteen_steps():
+    stand = HangingStand(guardian_steps=False)
+    stand.run(5)
+    stand.heart.take(Why.SILENT, stand.clock.now_ns())  # and then it stands still
+    stand.clock.burn_ns(50 * MS)
+    said = stand.pass_ms(100)
+    assert said == ["neutral"]
+    assert stand.guardian.state is State.DONE
+    assert len(stand.commands_of("firmware")) <= 5 + 3 + 18
     assert stand.volts() == pytest.approx([50.0] * 3)
