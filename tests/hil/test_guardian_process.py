@@ -220,23 +220,21 @@ def test_the_result_tells_of_the_lost_guardian(run: Run, tmp_path: Path) -> None
 
 
 def test_a_bus_that_hangs_for_more_than_half_a_second_is_opened_anew_and_brought_to_neutral(run: Run) -> None:
-    """All devices stand still. Nobody is ended for it, the outputs come to neutral, and the run says how it was."""
+    """All devices stand still, then go on. Who of the two brings the outputs to neutral, and that neither is ended for
+    it, is tested in virtual time (``test_hanging_bus.py``): here the world makes up for lost time on a busy machine."""
     run.wait_until_moving(0.1)
-    (guardian,) = guardians_of(run)
     world = run.world()
     os.kill(world, signal.SIGSTOP)
     time.sleep(1.2)
     os.kill(world, signal.SIGCONT)
     time.sleep(1.0)
-    assert guardians_of(run) in ([guardian], [])  # [] where the run has ended by itself
     run.process.send_signal(signal.SIGINT)
     outcome = run.outcome()
     safe = outcome["safe_state"]
     assert safe["reached"], safe["reason"]
-    assert outcome["guardian"]["replaced"] == 0
     assert outcome["holds"] or not safe["normal"]
-    _, volts = run.amplifier()
-    np.testing.assert_allclose(volts[-1], NEUTRAL_V, atol=0.01)
+    with np.load(run.folder / "truth.npz", allow_pickle=False) as truth:
+        np.testing.assert_allclose(truth["amplifier_V"][-1], NEUTRAL_V, atol=0.01)
 
 
 def test_a_world_that_is_killed_before_an_interrupt_leaves_an_outcome_that_says_so(run: Run) -> None:
