@@ -12,7 +12,7 @@ import json
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +30,15 @@ from firmware_py.inject import Injector, check_injections, parse_injection
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
-from firmware_py.run_request import RunRequest, describe_host, describe_scheduling, open_requested, scheduling, truth_of
+from firmware_py.run_request import (
+    RunRequest,
+    count_interrupts,
+    describe_host,
+    describe_scheduling,
+    open_requested,
+    scheduling,
+    truth_of,
+)
 from firmware_py.scheduler.realtime import RealtimeReport
 from hal.bench import BenchFile, OpenBench, Port, load_bench
 from hal.contracts import Clock
@@ -63,7 +71,7 @@ def run_in_process(
     if is_endoscope(bench.description):
         from firmware_py.endoscope.app import run_request
 
-        return run_request(request, bench, on_status, runtime_dir, on_open, wrap)
+        return run_request(request, bench, on_status, runtime_dir, on_open, wrap, own_process=own_process)
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
     _, configs = load_firmware_config(bench, {}, request.method)
     Stages(configs).warm_up()
@@ -103,7 +111,7 @@ def run_in_process(
             )
         report = RealtimeReport()
         summary: RecordingSummary | None = None
-        interrupts = stack.enter_context(_count_interrupts()) if own_process else lambda: 0
+        interrupts = stack.enter_context(count_interrupts()) if own_process else lambda: 0
         try:
             with scheduling(request, opened) as report:
                 loop.run(request.seconds)
@@ -244,23 +252,6 @@ def _die_with_parent() -> None:
     """SIGTERM to this process when the one that started it dies: the loop then ramps to neutral."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
-
-
-@contextlib.contextmanager
-def _count_interrupts() -> Iterator[Callable[[], int]]:
-    """Beside the loop, which has handlers of its own, SIGINT and SIGTERM are only counted, and ignored once the run is
-    over: it is told to the end, with an outcome file."""
-    count = 0
-
-    def handle(_number: int, _frame: object) -> None:
-        nonlocal count
-        count += 1
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, handle)
-    yield lambda: count
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
 
 
 def _status_pipe() -> StatusSink:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import signal
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -107,6 +108,25 @@ def scheduling(request: RunRequest, opened: OpenBench) -> Iterator[RealtimeRepor
         return
     with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
         yield report
+
+
+@contextlib.contextmanager
+def count_interrupts() -> Iterator[Callable[[], int]]:
+    """Count SIGINT and SIGTERM beside the loop, which has handlers of its own, and ignore them after the block.
+
+    For a process that is the firmware and nothing else: a run that ends is told to the end, with an outcome file.
+    """
+    count = 0
+
+    def handle(_number: int, _frame: object) -> None:
+        nonlocal count
+        count += 1
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, handle)
+    yield lambda: count
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
 
 
 def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,15 @@ from firmware_py.endoscope.targets import GameState
 from firmware_py.endoscope.wiring import open_sensors
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
-from firmware_py.run_request import RunRequest, describe_host, describe_scheduling, open_requested, scheduling, truth_of
+from firmware_py.run_request import (
+    RunRequest,
+    count_interrupts,
+    describe_host,
+    describe_scheduling,
+    open_requested,
+    scheduling,
+    truth_of,
+)
 from firmware_py.sensing.fusion import Fusion
 from hal.bench import BenchFile, OpenBench, Port
 from hal.contracts import Clock
@@ -30,13 +39,15 @@ def run_request(
     runtime_dir: Path | None,
     on_open: Callable[[OpenBench], None] | None,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
+    *,
+    own_process: bool = False,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """What ``firmware_py.app.run_in_process`` does, for an endoscope bench."""
     config = load_endoscope_config(bench)  # before a device is touched
     with open_requested(request, bench, runtime_dir, wrap) as opened:
         if on_open is not None:
             on_open(opened)
-        _, outcome = run_endoscope(request, bench, opened, on_status, config=config)
+        _, outcome = run_endoscope(request, bench, opened, on_status, config=config, own_process=own_process)
         return outcome, truth_of(opened)
 
 
@@ -49,6 +60,7 @@ def run_endoscope(
     config: EndoscopeConfig | None = None,
     on_state: StateSink | None = None,
     until_done: bool = False,
+    own_process: bool = False,
 ) -> tuple[EndoscopeLoop, dict[str, Any]]:
     """Run on an opened bench; the loop (finished) and the outcome for JSON. ``config`` overrides the bench's.
 
@@ -70,7 +82,8 @@ def run_endoscope(
             on_status=on_status,
             on_state=on_state,
         )
-        with scheduling(request, opened) as report:
+        telling = count_interrupts() if own_process else contextlib.nullcontext()
+        with telling, scheduling(request, opened) as report:
             loop.run(request.seconds, until_done=until_done)
     finally:
         if recorder is not None:

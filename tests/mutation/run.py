@@ -37,7 +37,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
     ),
     "safety": (("firmware_py/control/safety.py",), ("tests/unit/control/test_safety.py",)),
     "guardian": (
-        ("firmware_py/guardian/gate.py", "firmware_py/guardian/guardian.py", "firmware_py/guardian/heart.py"),
+        tuple(f"firmware_py/guardian/{name}.py" for name in ("amplifier", "care", "gate", "guardian", "heart")),
         ("tests/unit/guardian",),
     ),
     "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
