@@ -20,10 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from hal import plugins
 from hal.clock import MonotonicClock, Pace, PacedClock, VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.toml_file import parse_toml, read_text
+from hal.trust import path_inside, require_package
 from hal.validation import validate_table
 
 SIM_SCHEME = "sim://"
@@ -111,10 +113,10 @@ class BenchFile:
     description: BenchDescription
 
     def resolve(self, relative: str) -> Path:
-        """A path named in the bench file, relative to the file. ``BenchError`` for one that no file can have."""
-        if "\0" in relative:
-            raise BenchError(f"{self.path}: {relative!r} is no path; name a file")
-        return (self.path.parent / relative).resolve()
+        """A path named in the bench file, relative to the file. ``NotTrusted`` when it lies outside the file's folder,
+        ``BenchError`` for one that no file can have.
+        """
+        return path_inside(self.path, relative)
 
 
 def load_bench(path: Path) -> BenchFile:
@@ -126,7 +128,35 @@ def load_bench(path: Path) -> BenchFile:
         raise BenchError(f"{path}: not valid TOML: {error}") from error
     description = validate_table(BenchDescription, table, str(path))
     _check_references(description, str(path))
+    _check_trust(description, path)
     return BenchFile(path.resolve(), text, description)
+
+
+def named_packages(description: BenchDescription) -> list[str]:
+    """Return ``module:object`` of the code that a bench names: its provider, and drivers and estimators of packages."""
+    found = [str(description.emulation["provider"])] if "provider" in description.emulation else []
+    drivers = {spec.driver for spec in description.device.values()}
+    tremor: Any = description.firmware.get("tremor")
+    methods = {str(cast(Any, tremor).get("method"))} if isinstance(tremor, dict) else set[str]()
+    for group, names in ((plugins.DRIVERS, drivers), (plugins.DEVICES, drivers), (plugins.ESTIMATORS, methods)):
+        found += [entry.value for name, entry in plugins.offered(group).items() if name in names]
+    return found
+
+
+def named_files(description: BenchDescription) -> list[str]:
+    """Return the files that a bench names: calibrations, noise, corrected twins."""
+    firmware, emulation = description.firmware, description.emulation
+    every: list[Any] = []
+    for group in (firmware.get("calibration"), firmware.get("noise"), emulation.get("twin")):
+        every += cast(list[Any], group) if isinstance(group, list) else [group]
+    return [name for name in every if isinstance(name, str)]
+
+
+def _check_trust(description: BenchDescription, path: Path) -> None:
+    for target in named_packages(description):
+        require_package(target, path)
+    for name in named_files(description):
+        path_inside(path, name)
 
 
 def _check_references(description: BenchDescription, where: str) -> None:

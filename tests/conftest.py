@@ -1,5 +1,6 @@
 """Options of the hardware tests: which bench, and how much they may disturb it."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -40,6 +41,15 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     # the bench page's server and the browser run from the first test that needs them to the end of the session, and the
     # browser's library keeps an event loop in the process: nothing else comes after them
     items.sort(key=lambda item: bool({"server", "browser"} & set(getattr(item, "fixturenames", ()))))
+
+
+@pytest.fixture(scope="session", autouse=True)
+def state_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Decisions about other people's programs that tests record are not the user's."""
+    folder = tmp_path_factory.mktemp("state")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_STATE_HOME", str(folder))
+        yield folder
 
 
 @pytest.fixture(scope="session")

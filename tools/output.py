@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
+from hal.trust import allow_name
 from tools.errors import InputError, OutputError
 
 
@@ -42,6 +43,12 @@ def to_jsonable(value: Any) -> Any:
 def write_text_atomic(path: Path, text: str) -> None:
     """All of the file or nothing of it. ``OutputError`` when it cannot be written."""
     write_bytes_atomic(path, text.encode())
+
+
+def write_calibration(path: Path, text: str) -> None:
+    """Write a calibration, or another file that benches of other folders may name."""
+    write_text_atomic(path, text)
+    allow_name(path)
 
 
 def write_bytes_atomic(path: Path, data: bytes) -> None:

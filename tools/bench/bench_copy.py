@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
+from hal.trust import allow_name
 from sim_devices.config import emulation_config
 from sim_devices.plant_factory import stack_twins
 from tools.output import write_text_atomic
@@ -22,6 +23,7 @@ _TWIN = re.compile(r"^twin\s*=\s*(\[.*?\]|[^\n]*)[^\n]*\n", re.MULTILINE | re.DO
 def with_calibration(bench: BenchFile, calibration: Path, out: Path) -> Path:
     """Write ``out``: the bench with ``calibration`` as its last calibration file, paths made absolute."""
     wanted = [name for name in _calibrations(bench) if name != str(calibration)] + [str(calibration)]
+    allow_name(calibration)
     write_text_atomic(out, _calibrated(bench, wanted))
     load_bench(out)
     return out
@@ -36,6 +38,7 @@ def with_twin(bench: BenchFile, twin: Path, out: Path) -> Path:
     if "provider" not in description["emulation"]:
         raise BenchError(f"{bench.path}: nothing is emulated there; a corrected twin runs on an emulated bench")
     file = str(twin.resolve())
+    allow_name(twin)
     description["emulation"]["twin"] = file
     stack_twins(emulation_config(description), description)
     text = _calibrated(bench, _calibrations(bench))
@@ -57,7 +60,10 @@ def _table_span(text: str) -> tuple[int, int]:
 
 
 def _calibrations(bench: BenchFile) -> list[str]:
-    return [str(bench.resolve(name)) for name in bench.description.firmware.get("calibration", ())]
+    files = [bench.resolve(name) for name in bench.description.firmware.get("calibration", ())]
+    for file in files:
+        allow_name(file)  # the copy lies elsewhere
+    return [str(file) for file in files]
 
 
 def _calibrated(bench: BenchFile, wanted: list[str]) -> str:

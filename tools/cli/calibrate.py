@@ -11,7 +11,7 @@ from rich.table import Table
 from tools.cli import calibrate_actuation, calibrate_axes, calibrate_gyroscope, calibrate_positions
 from tools.cli.calibrate_axes import Model, OnDrift
 from tools.cli.common import JsonOption, clear_errors, console
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_calibration, write_json
 
 calibrate = typer.Typer(help="Identify sensors and stacks from calibration recordings.")
 
@@ -49,7 +49,7 @@ def sensors(
         check_writable(json_file, out)
         result = identify(load_tumble(recording), quadratic=model is Model.COMPOSITE, fit_drift=drift is OnDrift.FIT)
         made_by = f"micron calibrate sensors {recording}"
-        write_text_atomic(
+        write_calibration(
             out, calibration_toml("sensors", made_by, {"sensing": {**result.table, "gravity_m_s2": gravity}})
         )
         table = Table(

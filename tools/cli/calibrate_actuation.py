@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_calibration, write_json
 
 if TYPE_CHECKING:
     from tools.calibrate.piezo_feedforward import Feedforward
@@ -70,7 +70,7 @@ def piezo(
         ]
         predictions = [predict(fit) for fit in fits]
         inverse = feedforward_of(fits)
-        write_text_atomic(out, piezo_calibration(fits, "piezo stacks"))
+        write_calibration(out, piezo_calibration(fits, "piezo stacks"))
         _show(fits, predictions, inverse)
         console().print(f"written: {out}")
         write_json(
@@ -163,7 +163,7 @@ def manipulator(
     with clear_errors():
         check_writable(json_file, out)
         fit = identify_manipulator(load_scan(recording))
-        write_text_atomic(out, manipulator_calibration(fit, f"manipulator from {recording.name}"))
+        write_calibration(out, manipulator_calibration(fit, f"manipulator from {recording.name}"))
         table = Table(title=f"{fit.positions} positions, condition {fit.condition:.0f}", title_justify="left")
         for heading in ("parameter", "value", "95 % interval"):
             table.add_column(heading, justify="left" if heading == "parameter" else "right")

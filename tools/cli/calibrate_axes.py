@@ -12,7 +12,7 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_calibration, write_json
 
 STANDARD_GRAVITY = 9.80665
 
@@ -126,7 +126,7 @@ def accelerometer(
         print_parameters(f"accelerometer, {method.value}", result.parameters, notes, json_file)
         if out is not None:
             values = {name: e.value for name, e in result.parameters.items()}
-            write_text_atomic(
+            write_calibration(
                 out,
                 calibration_toml(
                     "accelerometer", f"micron calibrate accelerometer {recording}", {"accelerometer": values}
@@ -173,7 +173,7 @@ def _stage(
     if out is not None:
         tables = {n: {k: e.value for k, e in axis.parameters.items()} for n, axis in zip("xyz", fit.axes, strict=True)}
         made_by = f"micron calibrate accelerometer {recording} --method stage"
-        write_text_atomic(out, calibration_toml("accelerometer", made_by, tables))
+        write_calibration(out, calibration_toml("accelerometer", made_by, tables))
     write_json({"format": 1, "method": "stage", **asdict(fit)}, json_file)
 
 
@@ -232,7 +232,7 @@ def magnetometer(
             if offset is not None:
                 table["bridge_offset"] = [e.value for e in offset]
             made_by = f"micron calibrate magnetometer {recording}"
-            write_text_atomic(out, calibration_toml("magnetometer", made_by, {"magnetometer": table}))
+            write_calibration(out, calibration_toml("magnetometer", made_by, {"magnetometer": table}))
         body = None if turn is None else asdict(turn)
         write_json(
             {"format": 1, **asdict(result), "bridge_offset": offset and [asdict(e) for e in offset], "body": body},

@@ -10,7 +10,7 @@ import typer
 
 from tools.cli.calibrate_axes import STANDARD_GRAVITY, Columns, print_parameters, three
 from tools.cli.common import JsonOption, clear_errors
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_calibration, write_json
 
 
 def gyroscope(
@@ -54,5 +54,5 @@ def gyroscope(
         if out is not None:
             values = {name: e.value for name, e in result.parameters.items()}
             made_by = f"micron calibrate gyroscope {recording}"
-            write_text_atomic(out, calibration_toml("gyroscope", made_by, {"gyroscope": values}))
+            write_calibration(out, calibration_toml("gyroscope", made_by, {"gyroscope": values}))
         write_json({"format": 1, **asdict(result)}, json_file)

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_calibration, write_json
 
 
 def positions(
@@ -60,7 +60,7 @@ def positions(
         data_console().print(table)
         if out is not None:
             made_by = f"micron calibrate positions {recording} --bench {bench}"
-            write_text_atomic(
+            write_calibration(
                 out,
                 calibration_toml("sensor positions", made_by, {"sensing": {"positions_m": fit.places.tolist()}}),
             )

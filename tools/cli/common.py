@@ -6,6 +6,8 @@ Exit codes (contracts/commands.md): 0 done, 1 failed, 2 bad usage or input, 3 fi
 
 from __future__ import annotations
 
+import shlex
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Annotated
@@ -18,12 +20,17 @@ from rich.text import Text
 
 from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
+from hal.trust import NotTrusted
 from tools.errors import InputError, OutputError
 from tools.terminal import plain_console
 
 JsonOption = Annotated[
     str | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON; '-' is standard output.")
 ]
+
+
+DECIDING = (("mismatch", "diagnose"), ("mismatch", "apply"), ("mismatch", "simulate"), ("run",))
+"""The commands that take ``--trust`` and ``--allow-outside``."""
 
 
 def console() -> Console:
@@ -73,8 +80,20 @@ def clear_errors() -> Iterator[None]:
         _fail(error, Exit.FAILED)
     except InputError as error:
         _fail(error, Exit.BAD_INPUT)
+    except NotTrusted as error:
+        print_error(f"{error}.\n{_how_to_trust(error)}")
+        raise typer.Exit(Exit.BAD_INPUT) from error
     except HalError as error:
         _fail(error, exit_code_of(error))
+
+
+def _how_to_trust(error: NotTrusted) -> str:
+    """The command that decides for what was refused: this one with its option, where it has it, else micron trust."""
+    if any(tuple(sys.argv[1 : 1 + len(command)]) == command for command in DECIDING):
+        again = shlex.join(["micron", *sys.argv[1:], error.option])
+        return f"If you trust its author, repeat: {again}"
+    option = [] if error.option == "--trust" else [error.option]
+    return f"If you trust its author: {shlex.join(['micron', 'trust', str(error.subject), *option])}; then repeat this"
 
 
 def _fail(error: Exception, code: Exit) -> None:

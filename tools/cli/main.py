@@ -84,6 +84,10 @@ COMMANDS = {
     "golden": ("diagnose:golden", "Golden transcripts."),
     "log": ("diagnose:log", "The log of a running bench."),
     "calibrate": ("calibrate:calibrate", "Identify sensors and stacks from calibration recordings."),
+    "trust": (
+        "trust:trust",
+        "Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.",
+    ),
     "endoscope": ("endoscope:endoscope", "Steer a field of view with a motion card (document 002, chapter 6)."),
     "imu": ("imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
     "manipulator": ("manipulator:app", "The three-legged manipulator at the tip."),

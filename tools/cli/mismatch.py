@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
+from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import Outputs, check_writable, write_json, write_text_atomic
 from tools.terminal import task_name
@@ -83,6 +84,8 @@ def diagnose(
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="With a folder: run on this Dask cluster (extra 'dask').")
     ] = None,
+    trust: TrustOption = False,
+    allow_outside: OutsideOption = False,
 ) -> None:
     """Locate the mismatch, name the physics that is missing, fit it, and show the fit improve on unseen data.
 
@@ -91,6 +94,7 @@ def diagnose(
     with _clear_errors():
         _check_targets(json_file, html)
         _check_folder(out)
+        decide_on([recording], trust, allow_outside)
         from tools.mismatch.batch import is_folder_of_recordings
 
         processes = jobs or os.cpu_count() or 1
@@ -264,6 +268,8 @@ def apply(
     bench_out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The bench with the twin; default: bench.toml beside the twin.")
     ] = None,
+    trust: TrustOption = False,
+    allow_outside: OutsideOption = False,
 ) -> None:
     """Write the corrected twin: base parameters re-fitted beside the effects, and the effects themselves.
 
@@ -282,6 +288,7 @@ def apply(
         if bench is not None and out.suffix.lower() != ".toml":
             raise InputError(f"--bench takes a twin file; name one that ends in .toml with --out, not {out.name}")
         copy = bench_out or out.with_name("bench.toml")
+        decide_on([recording], trust, allow_outside)
         _check_targets(out, *([] if bench is None else [copy]))
         original = None
         if bench is not None:
@@ -314,6 +321,8 @@ def simulate(
     recording: RecordingArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
     json_file: JsonOption = None,
+    trust: TrustOption = False,
+    allow_outside: OutsideOption = False,
 ) -> None:
     """Run a corrected twin freely over a whole recording and print how far it is from what was recorded.
 
@@ -321,6 +330,7 @@ def simulate(
     """
     with _clear_errors():
         _check_targets(out, json_file)
+        decide_on([twin, recording], trust, allow_outside)
         from tools.mismatch.export.run import Residual, residuals, simulate_file
         from tools.mismatch.export.write import columns
         from tools.mismatch.recording_load import load

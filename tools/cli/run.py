@@ -28,6 +28,7 @@ from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.tremor_evaluate import estimator_name
+from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_writable, write_json
 from tools.prepare import prepare
@@ -73,6 +74,8 @@ def run(
         int | None,
         typer.Option(min=0, max=4, help="With --inject on a real bus: 1 may spoil readings, 4 may move the outputs."),
     ] = None,
+    trust: TrustOption = False,
+    allow_outside: OutsideOption = False,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
     image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = Path(
@@ -94,6 +97,7 @@ def run(
             raise InputError("--max-effect belongs to --inject; give both or neither")
         if virtual and realtime:
             raise InputError("--virtual and --realtime exclude each other; give one of them")
+        decide_on([bench_path(bench)], trust, allow_outside)
         file = load_bench(bench_path(bench))
         pace = check_pace(file, "virtual" if virtual else "realtime" if realtime else None)
         request = RunRequest(

@@ -13,8 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
+from hal.errors import BenchError
 from tools.errors import InputError
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.report.wording import number, scaled, words
 
 if TYPE_CHECKING:
@@ -110,7 +110,7 @@ def diagnose_one(job: Job) -> Row:
         if job.out is not None:
             write_reports(report, job.out)
         return Row(job.name, str(job.path), report.to_json())
-    except (RecordingError, InputError) as error:
+    except (InputError, BenchError) as error:
         return Row(job.name, str(job.path), error=str(error), bad_input=True)
     except Exception as error:  # one recording that breaks the engine must not take the others with it
         return Row(job.name, str(job.path), error=f"the engine failed: {type(error).__name__}: {error}")

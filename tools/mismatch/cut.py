@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.trust import allow_name, path_inside
 from tools.errors import InputError
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_columns import read_columns
@@ -44,7 +45,7 @@ def cut(path: Path, out: Path, start_s: float | None = None, stop_s: float | Non
     channels = [c for c in text.get("channels", []) if isinstance(c, dict)]
     names = [str(c["column"]) for c in channels if "column" in c]
     clock = text.get("time_column")
-    data = path.parent / str(text.get("data"))
+    data = path_inside(path, str(text.get("data")))
     columns = read_columns(data, list(dict.fromkeys([*names, *([clock] if isinstance(clock, str) else [])])))
     n = next(iter(columns.values())).size
     if isinstance(clock, str):
@@ -87,7 +88,9 @@ def _write(path: Path, text: dict[str, Any], out: Path, columns: dict[str, Array
     head |= {"data": "data.npz", "rate_hz": rate_hz}
     twin = head.get("twin")
     if isinstance(twin, dict) and isinstance(twin.get("file"), str):
-        head["twin"] = {"file": os.path.relpath(path.parent / twin["file"], out)}
+        file = path_inside(path, twin["file"])
+        allow_name(file)  # the new folder names it where it is
+        head["twin"] = {"file": os.path.relpath(file, out.resolve())}
     np.savez(out / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
     (out / "recording.toml").write_text(toml_text(head), encoding="utf-8")
 

@@ -11,6 +11,7 @@ from typing import Any, get_args
 
 import numpy as np
 
+from hal.trust import path_inside
 from tools.mismatch import units
 from tools.mismatch.recording import Array, Recording, RecordingError, Split, TwinText
 from tools.mismatch.recording_columns import read_columns
@@ -70,7 +71,7 @@ def load(path: Path | str) -> Recording:
             raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
         if time_column not in names:
             names.append(time_column)
-    data_path = path.parent / data_name
+    data_path = path_inside(path, data_name)
     columns = read_columns(data_path, names)
     n = columns[names[0]].size
     if n < MIN_SAMPLES:
@@ -171,7 +172,7 @@ def _twin_table(path: Path, value: object) -> object:
     name = value["file"]
     if not isinstance(name, str) or len(value) > 1:
         raise RecordingError(f"{path}: [twin] file must be the name of a twin file, and stand alone")
-    other = path.parent / name
+    other = path_inside(path, name)
     if not other.is_file():
         raise RecordingError(f"{path}: [twin] file: {other} does not exist")
     table = _toml(other).get("twin")
@@ -223,6 +224,9 @@ def _channels(where: str, value: object, words: Vocabulary, kind: str, notes: li
             if not isinstance(entry.get(key), str) or not entry[key]:
                 raise RecordingError(f"{at}: '{key}' is missing or not a text")
         column, role, signal = entry["column"], entry["role"], entry["signal"]
+        for key in ("column", "signal"):  # both stand in the text of exported programs
+            if not entry[key].isprintable() or set(entry[key]) & {'"', "\\"}:
+                raise RecordingError(f"{at}: '{key}' holds quotes, backslashes or unprintable characters; rename it")
         at += f" ('{column}')"
         notes.extend(f"[[channels]] {i + 1}: key '{k}' is unknown and not used" for k in entry if k not in _CHANNEL)
         if role not in get_args(Role):
@@ -391,7 +395,7 @@ def _split(path: Path, value: object, n: int) -> Split:
                 raise RecordingError(f"{at} must be a number of samples below {n}, got {v!r}")
             initialization = v
         elif isinstance(v, str) and re.search(r"\.toml$", v):
-            found[key] = path.parent / v
+            found[key] = path_inside(path, v)
         elif isinstance(v, list) and len(v) == 2 and all(isinstance(i, int) and not isinstance(i, bool) for i in v):
             if not 0 <= v[0] < v[1] <= n:
                 raise RecordingError(f"{at}: [{v[0]}, {v[1]}] does not lie in the {n} samples of the recording")

@@ -8,6 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hal.trust import allow_name, path_inside
+
 Table = Mapping[str, Any]
 
 
@@ -17,7 +19,10 @@ def write_variant(bench: Path, changes: Table, folder: Path, name: str) -> Path:
     firmware = table.get("firmware", {})
     if "calibration" in firmware:
         # the copy lives elsewhere
-        firmware["calibration"] = [str(bench.parent.resolve() / file) for file in firmware["calibration"]]
+        files = [path_inside(bench, file) for file in firmware["calibration"]]
+        for path in files:
+            allow_name(path)
+        firmware["calibration"] = [str(path) for path in files]
     file = folder / f"{name}.toml"
     file.write_text("".join(f"{key} = {_inline(value)}\n" for key, value in table.items()), encoding="utf-8")
     return file

@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import pickle
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hal.trust import NotTrusted, digest_of, trust_program
 from tests.unit.mismatch_model.made import recording
+from tools.guest.fmu import OpenFmu
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins.fmu import FmuRun
 from tools.mismatch.twins.make import make
 
 pytest.importorskip("fmpy", reason="the extra 'fmu' is not installed")
@@ -47,12 +49,15 @@ def fmu(tmp_path_factory: pytest.TempPathFactory) -> Path:
     builder = pytest.importorskip("pythonfmu.builder", reason="PythonFMU is not installed")
     folder = tmp_path_factory.mktemp("fmu")
     (folder / "heated.py").write_text(HEATED)
-    return Path(builder.FmuBuilder.build_FMU(folder / "heated.py", dest=folder))
+    built = Path(builder.FmuBuilder.build_FMU(folder / "heated.py", dest=folder))
+    trust_program(built)
+    return built
 
 
 def of(path: Path, **more: object) -> Recording:
     given = {"path": str(path), "um_per_W": 2.0, "time_constant_s": 0.5, **more}
-    return recording("fmu", DT, {"power": POWER}, {"position": 2.0 * POWER}, {}, given)
+    made = recording("fmu", DT, {"power": POWER}, {"position": 2.0 * POWER}, {}, given)
+    return replace(made, path=path.parent / "made.toml")
 
 
 def truth(gain: float, tau: float) -> np.ndarray:
@@ -87,17 +92,19 @@ def test_what_is_no_fmu_or_lacks_a_variable_is_said(fmu: Path, tmp_path: Path) -
         make(of(tmp_path / "text.fmu"))
     with zipfile.ZipFile(tmp_path / "empty.fmu", "w") as z:
         z.writestr("readme.txt", "nothing")
+    with pytest.raises(NotTrusted, match=r"names the program .*empty.fmu"):
+        make(of(tmp_path / "empty.fmu"))
+    trust_program(tmp_path / "empty.fmu")
     with pytest.raises(RecordingError, match="cannot be opened as an FMU"):
         make(of(tmp_path / "empty.fmu"))
 
 
 def test_stepping_it_ourselves_is_what_fmpy_does(fmu: Path) -> None:
-    run = FmuRun(fmu, ("power",), ("position",), DT)
+    run = OpenFmu(fmu, digest_of(fmu.read_bytes()), ("position",), DT)
     inputs, start = {"power": POWER, "t": np.arange(N) * DT}, {"um_per_W": 3.0, "time_constant_s": 0.2}
     mine = run(inputs, start)["position"]
-    _, _, instance = run._opened()
-    instance.reset()
-    np.testing.assert_allclose(mine, run._simulated(inputs, start)["position"], rtol=0.0, atol=1e-12)
+    run.instance.reset()
+    np.testing.assert_allclose(mine, run.simulated(inputs, start)["position"], rtol=0.0, atol=1e-12)
 
 
 def test_values_that_the_fmu_cannot_take_end_no_search_but_the_engineers_own_do(fmu: Path) -> None:

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+from hal.trust import trust_program
 from sim_devices.physics.catalogue import EFFECTS
+from tools.guest.equations import Builder, EquationError, trace
 from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.recording_load import load
@@ -18,7 +20,7 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
-from tools.mismatch.twins.program import Builder, EquationError, parse, run_program, trace
+from tools.mismatch.twins.program import parse, run_program
 
 RATE_HZ = 100.0
 
@@ -333,6 +335,7 @@ def test_a_function_beside_the_recording_is_a_twin(tmp_path: Path) -> None:
         "    speed = (parameters['gain'] * inputs['command'] - states['speed']) / parameters['tau']\n"
         "    return {'angle': states['speed'], 'speed': speed}\n"
     )
+    trust_program(tmp_path / "motor.py")
     u = command()
     one = recorded(tmp_path, text, u, 0.1 * u[::-1])
     other = recorded(tmp_path / "text", MOTOR, u, 0.1 * u[::-1])

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import sys
+from dataclasses import replace
+from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.signal import StateSpace, dlsim, lsim
 
+from hal.trust import NotTrusted, trust_package
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.mismatch.placed import Placed
@@ -234,25 +239,29 @@ def test_cluster_against_rigid_body() -> None:
     np.testing.assert_allclose(model.simulate(View.whole(rec), theta)["accel_1z"][2:-2], full[2:-2, 2], atol=2e-4)
 
 
-def test_user_twin_from_an_entry_point(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Squarer:
-        def simulate(self, inputs: dict[str, Array], parameters: dict[str, Any]) -> dict[str, Array]:
-            return {"y": parameters["gain"] * inputs["u"] ** 2}
+SQUARER = """
+class Squarer:
+    def simulate(self, inputs, parameters):
+        return {"y": parameters["gain"] * inputs["u"] ** 2}
+"""
 
-    class Entry:
-        name, value = "squarer", "here:Squarer"
 
-        def load(self) -> type:
-            return Squarer
-
+def test_user_twin_from_an_entry_point(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "squarer_of_hers.py").write_text(SQUARER)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    entry = EntryPoint("squarer", "squarer_of_hers:Squarer", "micron.twins")
     module = importlib.import_module("tools.mismatch.twins.core")
-    monkeypatch.setattr(module, "user_kinds", lambda: {"squarer": Entry()})
+    monkeypatch.setattr(module, "user_kinds", lambda: {"squarer": entry})
     u = np.linspace(-1, 1, 60)
     rec = recording("squarer", 0.1, {"u": u}, {"y": u}, {}, {"gain": 3.0, "label": "x"})
+    with pytest.raises(NotTrusted, match="squarer_of_hers"):
+        as_given(rec)
+    trust_package(entry.value)
     np.testing.assert_allclose(as_given(rec)["y"], 3 * u**2)
     broken = recording("squarer", 0.1, {"u": u}, {"y": u, "z": u}, {}, {"gain": 3.0})
     with pytest.raises(RecordingError, match="returned no output 'z'"):
         as_given(broken)
+    assert "squarer_of_hers" not in sys.modules
 
 
 def test_fmu_needs_its_extra(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -263,7 +272,7 @@ def test_fmu_needs_its_extra(tmp_path: Any, monkeypatch: pytest.MonkeyPatch) -> 
     u = np.ones(60)
     rec = recording("fmu", 0.1, {"u": u}, {"y": u}, {}, {"path": str(tmp_path / "m.fmu")})
     with pytest.raises(RecordingError, match="extra 'fmu'"):
-        make(rec)
+        make(replace(rec, path=tmp_path / "made.toml"))
 
 
 def test_linear_kernels_equal_python() -> None:

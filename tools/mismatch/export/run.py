@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -10,7 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from hal.trust import trusted_program
 from sim_devices.physics.effect import Array
+from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.recording_load import load, load_twin
@@ -70,7 +71,7 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
             found = free_run(other)
             return {o: units.convert(y, rec.unit[o], rec.file_unit[o]) for o, y in found.items()}
         case ".py":
-            return _of(path, rec, _simulate_of(path)(in_file_units(rec), dt=rec.dt))
+            return _of(path, rec, _run_module(path, rec))
         case ".fmu":
             return _run_fmu(path, rec)
         case suffix:
@@ -96,29 +97,33 @@ def in_file_units(recording: Recording) -> dict[str, Array]:
     return {s: units.convert(x, recording.unit[s], recording.file_unit[s]) for s, x in recording.signals.items()}
 
 
-def _simulate_of(path: Path) -> Any:
-    spec = importlib.util.spec_from_file_location(f"twin_{path.stem}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+def _run_module(path: Path, recording: Recording) -> dict[str, Array]:
+    """What ``simulate`` of a Python twin returns, run in a process of its own."""
+    source = trusted_program(path, path).decode("utf-8", "replace")
+    opening = {"ask": "open_module", "path": str(path), "source": source, "dt": recording.dt}
+    guest = GuestProcess(str(path), opening)
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise RecordingError(f"{path}: cannot be imported ({error!r})") from error
-    if not callable(getattr(module, "simulate", None)):
-        raise RecordingError(f"{path}: has no simulate(inputs, parameters, dt); write one with 'micron mismatch apply'")
-    return module.simulate
+        guest.opened()
+    except GuestError as error:
+        raise RecordingError(
+            f"{path}: cannot be imported ({error.kind}: {error}); write one with 'micron mismatch apply'"
+        ) from error
+    try:
+        return guest.run(in_file_units(recording), {})
+    except GuestError as error:
+        raise RecordingError(f"{path}: simulate() failed ({error.kind}: {error})") from error
+    finally:
+        guest.end()
 
 
 def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
     """The outputs (n,) of an FMU in the units of the recording's file; those of an FMU are the recording's own."""
-    fmu = FmuRun(path, tuple(recording.inputs), tuple(recording.outputs), recording.dt)
+    fmu = FmuRun(path, tuple(recording.outputs), recording.dt)
     known = fmu.names()
     signals = {s: x for s, x in recording.signals.items() if s in known}
     lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
     if lost:
         raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
-    fmu.inputs = tuple(signals)
     found = fmu({**signals, "t": recording.t}, {})
     return {o: units.convert(np.asarray(y), recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
 

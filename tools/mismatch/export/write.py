@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.trust import allow_name, trust_program
 from sim_devices.physics.effect import Array
 from tools.errors import InputError
 from tools.mismatch import units
@@ -60,6 +61,9 @@ def write_twin(twin: Corrected, report: Mapping[str, Any], out: Path) -> None:
             to = {o: twin.recording.file_unit[o] for o in found}
             simulated = {o: units.convert(y, twin.recording.unit[o], to[o]) for o, y in found.items()}
             write_text_atomic(out, columns(twin.recording, simulated))
+    allow_name(out)
+    if out.suffix.lower() in (".py", ".fmu"):
+        trust_program(out)  # this program wrote it, from equations
 
 
 def module_of(twin: Corrected, report: Mapping[str, Any]) -> str:

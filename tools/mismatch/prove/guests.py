@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from hal.trust import decide, trust_program
+
 FMU, USER, INSTRUMENT = "fmu", "lever_arm", "instrument"
 PACKAGES = "packages"
 """Folder beside the recordings with what ``pip install`` would have put on the path."""
@@ -81,6 +83,7 @@ def build_fmu(target: Path) -> None:
         source = Path(tmp) / "expander.py"
         source.write_text(_EXPANDER)
         shutil.move(str(FmuBuilder.build_FMU(source, dest=tmp)), target)
+    trust_program(target)  # this program wrote it
 
 
 def write_bench(target: Path, unit: int) -> None:
@@ -96,6 +99,7 @@ def install_user_twin(folder: Path) -> None:
     (packages / "lever_arm.py").write_text(_LEVER)
     (about / "METADATA").write_text("Metadata-Version: 2.1\nName: lever-arm\nVersion: 1.0\n")
     (about / "entry_points.txt").write_text(f"[micron.twins]\n{USER} = lever_arm:LeverArm\n")
+    decide("run", f"package lever_arm at {packages / 'lever_arm.py'}", "lever_arm:LeverArm")  # this program wrote it
 
 
 @contextmanager

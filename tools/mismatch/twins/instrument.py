@@ -22,6 +22,7 @@ from scipy.interpolate import CubicSpline
 
 from hal.bench import load_bench
 from hal.errors import BenchError
+from hal.trust import NotTrusted, path_inside
 from sim_devices.config import EmulationConfig, emulation_config
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
@@ -146,8 +147,10 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
                 )
     own_hand, start_s = _world(recording)
     try:
-        file = load_bench((recording.path.parent / bench).resolve())
+        file = load_bench(path_inside(recording.path, bench))
         config = emulation_config(file.description.model_dump())
+    except NotTrusted:
+        raise
     except BenchError as error:
         raise RecordingError(f"{recording.path}: [twin.parameters] bench: {error}") from error
 

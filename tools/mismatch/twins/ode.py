@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import FLOW, UNCENTRED
+from tools.guest.equations import Program
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
@@ -19,7 +20,6 @@ from tools.mismatch.twins.feedback import Rows, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
-from tools.mismatch.twins.program import Program
 
 MOST_SUBSTEPS = 200
 LEAST_WINDOW = 20

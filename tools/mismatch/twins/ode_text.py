@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import importlib.util
 import keyword
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
+from tools.guest.equations import Builder, EquationError, builder_of
+from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.ode import FORGOTTEN, NOTHING, Equations, OdeTwin, Place, Programs, State, linearise, rates_at
-from tools.mismatch.twins.program import Builder, EquationError, parse, trace
+from tools.mismatch.twins.program import parse
 
 TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")
 """Keys of an ode twin that are no numbers; beside ``parameters`` in ``[twin]``, or inside it."""
@@ -264,7 +265,8 @@ def _programs(
         results = parse(builder, renamed, [f"derivative of {s}" for s in own])
         beside = {k: v for k, v in texts.items() if k not in own}
     else:
-        found = trace(builder, _function(recording, function), {"states": own, "inputs": signals, "parameters": names})
+        groups = {"states": own, "inputs": signals, "parameters": names}
+        builder, found = _traced(recording, function, every, groups)
         missing = [s for s in own if s not in found]
         if missing:
             raise EquationError(f"derivatives returned {', '.join(found) or 'nothing'}, and no '{missing[0]}'")
@@ -291,26 +293,33 @@ def _texts(key: str, table: object) -> dict[str, str]:
     return out
 
 
-def _function(recording: Recording, name: object) -> Callable[..., object]:
-    """``file.py:name`` beside the recording. Raises EquationError."""
+def _traced(
+    recording: Recording, name: object, names: tuple[str, ...], groups: Mapping[str, Sequence[str]]
+) -> tuple[Builder, dict[str, int]]:
+    """Operations and results of ``file.py:name`` beside the recording. The file runs in a process of its own, once.
+
+    Raises EquationError, and ``NotTrusted`` for a file that the user has not trusted.
+    """
     if not isinstance(name, str) or ":" not in name:
         raise EquationError(f"function must be 'file.py:name' with a file beside the recording, got {name!r}")
     file, _, attribute = name.rpartition(":")
-    path = (recording.path.parent / file).resolve()
+    path = path_inside(recording.path, file)
     if not path.is_file():
         raise EquationError(f"function: {path} does not exist")
-    spec = importlib.util.spec_from_file_location(Path(file).stem, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
+    source = trusted_program(path, recording.path).decode("utf-8", "replace")
+    request = {"ask": "trace", "path": str(path), "source": source, "attribute": attribute}
+    guest = GuestProcess(str(path), {**request, "names": names, "groups": groups})
     try:
-        spec.loader.exec_module(module)
-    except Exception as error:
-        raise EquationError(f"function: {path} cannot be loaded ({error!r})") from error
-    found = getattr(module, attribute, None)
-    if not callable(found):
-        raise EquationError(f"function: {path} has no function '{attribute}'")
-    return found
+        head, arrays = guest.opened()
+    except GuestError as error:
+        said = f"{error}" if error.kind == "EquationError" else f"{path} cannot be loaded ({error.kind}: {error})"
+        raise EquationError(f"function: {said}") from error
+    finally:
+        guest.end()
+    try:
+        return builder_of(names, head["operations"], arrays["registers"], head["results"])
+    except (KeyError, ValueError, TypeError) as error:
+        raise EquationError(f"function: {path} gave something that is no list of operations ({error})") from error
 
 
 def _number(value: object) -> bool:

@@ -6,13 +6,17 @@ Nothing is known of the inside: effects sit at inputs and outputs only, base par
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, cast
+from typing import Any, Protocol
 
 import numpy as np
 
+from hal import plugins
+from hal.trust import require_package
 from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
+from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 
@@ -146,23 +150,29 @@ def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequen
 
 
 def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
-    """From an entry point: loads it, makes an instance of a class."""
+    """The twin of an entry point, an object or a class, in a process of its own. ``NotTrusted`` before it may run."""
+    target = str(entry.value)
+    require_package(target, recording.path)
+    request = {"ask": "open_entry", "name": entry.name, "value": target, "group": plugins.TWINS}
+    guest = GuestProcess(f"twin '{recording.twin.kind}' ({target})", {**request, "import_path": sys.path})
     try:
-        loaded = entry.load()
-        thing = cast(UserTwin, loaded() if isinstance(loaded, type) else loaded)
-    except Exception as error:
+        guest.opened()
+    except GuestError as error:
         raise RecordingError(
-            f"{recording.path}: [twin] kind '{recording.twin.kind}' cannot be loaded from {entry.value}: {error}"
+            f"{recording.path}: [twin] kind '{recording.twin.kind}' cannot be loaded from {target}: {error}"
         ) from error
-    if not callable(getattr(thing, "simulate", None)):
-        raise RecordingError(
-            f"{recording.path}: [twin] kind '{recording.twin.kind}' ({entry.value}) has no simulate(inputs, parameters)"
-        )
 
-    def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+    return opaque_twin(recording, PackagedRun(guest), target)
+
+
+@dataclass(frozen=True)
+class PackagedRun:
+    """One free run of an entry point's twin per call."""
+
+    guest: GuestProcess
+
+    def __call__(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
         try:
-            return thing.simulate(inputs, parameters)
-        except Exception as error:
-            raise RecordingError(f"twin '{recording.twin.kind}' ({entry.value}) failed: {error!r}") from error
-
-    return opaque_twin(recording, call, str(entry.value))
+            return self.guest.run(inputs, parameters)
+        except GuestError as error:
+            raise RecordingError(f"{self.guest.name} failed: {error.kind}: {error}") from error

@@ -1,0 +1,90 @@
+"""``micron trust``: the user's decisions about programs and files that other people's folders name."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from hal.trust import decisions, decisions_file, forget_all
+from tools.cli.common import clear_errors, console, data_console
+from tools.errors import InputError
+
+TrustOption = Annotated[
+    bool, typer.Option("--trust", help="Run the programs that it names, now and later (docs/security.md).")
+]
+OutsideOption = Annotated[
+    bool, typer.Option("--allow-outside", help="Let it name files outside its folder, now and later.")
+]
+
+
+def decide_on(paths: list[Path], run: bool, outside: bool) -> None:
+    """Record what the options allow for all that ``paths`` name; on a terminal, ask about the rest.
+
+    What stays undecided is refused by whatever would use it.
+    """
+    from tools.programs import Program, named_in
+
+    for path in paths:
+        if not path.exists():
+            continue  # the command says what is wrong with it
+        for item in named_in(path):
+            if item.is_trusted:
+                continue
+            if isinstance(item, Program):
+                question = f"{item.named_by} names the program {item}. Run it, now and later?"
+                if run or _says_yes(question):
+                    item.trust()
+            else:
+                question = f"{item.named_by} names a file outside its folder: {item}. Read it, now and later?"
+                if outside or _says_yes(question):
+                    item.trust()
+
+
+def _says_yes(question: str) -> bool:
+    if sys.stdin is None or not sys.stdin.isatty():
+        return False
+    return typer.confirm(question, default=False, err=True)
+
+
+def trust(
+    paths: Annotated[
+        list[Path] | None,
+        typer.Argument(metavar="PATH...", help="A recording, twin, bench, folder, .py or .fmu; none: the list."),
+    ] = None,
+    allow_outside: OutsideOption = False,
+    forget: Annotated[bool, typer.Option("--forget", help="Drop every decision.")] = False,
+) -> None:
+    """Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.
+
+    A decision about a file holds for its content: when the file changes, it is asked for again.
+
+    Example: micron trust recordings/from-a-stranger
+    """
+    with clear_errors():
+        if forget:
+            if paths:
+                raise InputError("--forget drops every decision; leave the paths out")
+            console().print(f"{forget_all()} decisions dropped")
+            return
+        if not paths:
+            for decision in decisions():
+                what = "may run" if decision.act == "run" else "may be named"
+                data_console().print(f"{decision.day} {what}: {decision.label}", soft_wrap=True)
+            console().print(f"kept in {decisions_file()}", soft_wrap=True)
+            return
+        from tools.programs import Program, named_in
+
+        for path in paths:
+            found = named_in(path)
+            for item in found:
+                is_program = isinstance(item, Program)
+                if not is_program and not allow_outside and not item.is_trusted:
+                    console().print(f"{item}: outside the folder; --allow-outside lets it be named", soft_wrap=True)
+                    continue
+                item.trust()
+                console().print(f"{item}: may {'run' if is_program else 'be named'}", soft_wrap=True)
+            if not found:
+                console().print(f"{path}: names no program and no file outside its folder", soft_wrap=True)
