@@ -19,6 +19,7 @@ from pydantic import BaseModel
 
 from hal.trust import allow_name
 from tools.errors import InputError, OutputError
+from tools.interrupt import is_stopped
 
 
 def to_jsonable(value: Any) -> Any:
@@ -97,6 +98,8 @@ def write_json(result: Any, destination: str | None) -> None:
     """Write ``result`` where ``--json`` said."""
     if destination is None:
         return
+    if is_stopped() and isinstance(result, dict):
+        result = {**result, "stopped": True}  # Ctrl-C came before it was whole
     text = json.dumps(to_jsonable(result), indent=2) + "\n"
     if destination == "-":
         try:

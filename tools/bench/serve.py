@@ -84,10 +84,15 @@ def serve(
     names: tuple[str, ...] = (),
     token: str | None = None,
 ) -> None:
-    """Run until SIGINT or SIGTERM; the firmware is then in its safe state. ``announce`` gets the page's address."""
+    """Run until SIGINT or SIGTERM; the firmware is then in its safe state. ``announce`` gets the page's address.
+
+    SIGINT ends with KeyboardInterrupt, as everywhere.
+    """
     address, port = sock.getsockname()[:2]
     token = token or secrets.token_urlsafe(24)
     access = access_for(address, port, token, names)
+
+    interrupted: list[bool] = []
 
     async def run() -> None:
         session = Session(choice, recordings)
@@ -96,12 +101,14 @@ def serve(
         server = uvicorn.Server(config_for(app))
         loop = asyncio.get_running_loop()
 
-        def leave() -> None:
+        def leave(number: int) -> None:
+            interrupted.append(number == signal.SIGINT)
+            server.force_exit = server.should_exit  # the second one
             server.should_exit = True
 
         server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, leave)
+            loop.add_signal_handler(number, leave, number)
         shown = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
         announce(f"http://{shown if ':' not in shown else f'[{shown}]'}:{port}/#token={token}")
         try:
@@ -111,3 +118,5 @@ def serve(
             await jobs.close()
 
     asyncio.run(run())
+    if any(interrupted):
+        raise KeyboardInterrupt

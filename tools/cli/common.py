@@ -22,6 +22,7 @@ from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
 from hal.trust import NotTrusted
 from tools.errors import InputError, OutputError
+from tools.interrupt import forget_stop, is_stopped, note_stop
 from tools.terminal import plain_console
 
 JsonOption = Annotated[
@@ -71,11 +72,15 @@ def print_note(message: str) -> None:
 
 @contextmanager
 def clear_errors() -> Iterator[None]:
-    """Turn what went wrong into one message on standard error and the exit code of the contract."""
+    """Turn what went wrong into one message on standard error and the exit code of the contract; Ctrl-C too."""
+    forget_stop()
     try:
         yield
+    except KeyboardInterrupt:
+        note_stop()
     except typer.Exit:
-        raise
+        if not is_stopped():
+            raise
     except OutputError as error:
         _fail(error, Exit.FAILED)
     except InputError as error:
@@ -85,6 +90,9 @@ def clear_errors() -> Iterator[None]:
         raise typer.Exit(Exit.BAD_INPUT) from error
     except HalError as error:
         _fail(error, exit_code_of(error))
+    if is_stopped():
+        print_error("stopped by Ctrl-C")
+        raise typer.Exit(Exit.INTERRUPTED)
 
 
 def _how_to_trust(error: NotTrusted) -> str:

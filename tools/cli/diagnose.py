@@ -16,6 +16,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error
 from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 
 YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
@@ -112,7 +113,16 @@ def scope(
             opened_bench(bench_path(bench), pace=pace_of(virtual)) as opened,
             Live(console=console(), refresh_per_second=8, transient=True) as live,
         ):
-            seen = look(opened, seconds, lambda so_far: live.update(Text(text(so_far), no_wrap=True)))
+            kept: list[Look] = []
+
+            def show(so_far: Look) -> None:
+                kept[:] = [so_far]
+                live.update(Text(text(so_far), no_wrap=True))
+
+            with keep_what_is_there():
+                show(look(opened, seconds, show))
+        need_some(kept)
+        seen = kept[0]
         if json_file != "-":
             typer.echo(text(seen))
         lines = {x.name: {k: getattr(x, k) for k in ("low_V", "mean_V", "high_V", "rms_V")} for x in seen.lines()}
@@ -141,14 +151,16 @@ def latency(
         every: tuple[Policy, ...] = ("other", "fifo")
         policies: list[Policy] = [p for p in every if policy is PolicyChoice.BOTH or p == policy.value]
         found: list[Lateness] = []
-        for chosen in policies:
-            with console().status(f"bare loop, policy {chosen}, {seconds:g} s"):
-                found.append(bare_loop(seconds, chosen))
-            with console().status(f"loop and pty, policy {chosen}, {seconds:g} s"):
-                found.append(bare_loop(seconds, chosen, with_pty=True))
-            if firmware:
-                with console().status(f"firmware, policy {chosen}, {seconds:g} s"):
-                    found.append(firmware_loop(path, seconds, chosen))
+        with keep_what_is_there():
+            for chosen in policies:
+                with console().status(f"bare loop, policy {chosen}, {seconds:g} s"):
+                    found.append(bare_loop(seconds, chosen))
+                with console().status(f"loop and pty, policy {chosen}, {seconds:g} s"):
+                    found.append(bare_loop(seconds, chosen, with_pty=True))
+                if firmware:
+                    with console().status(f"firmware, policy {chosen}, {seconds:g} s"):
+                        found.append(firmware_loop(path, seconds, chosen))
+        need_some(found)
         out = data_console()
         table = Table(title="Lateness of a 1 ms tick, us", title_justify="left")
         for heading in ("loop", "policy", "ticks", "p50", "p99", "p99.9", "worst", "scheduling granted"):
@@ -211,7 +223,15 @@ def ramp(
             )
 
         with opened_bench(path, pace=pace_of(virtual)) as opened:
-            found = climb(opened, channels, steps, dwell_s, show)
+            found: list[RampStep] = []
+
+            def keep(step: RampStep) -> None:
+                found.append(step)
+                show(step)
+
+            with keep_what_is_there():
+                climb(opened, channels, steps, dwell_s, keep)
+        need_some(found)
         data_console().print(table)
         worst = max(found, key=lambda s: abs(s.error_V))
         write_json(
@@ -256,7 +276,7 @@ def can_dump(
         if not buses:
             raise InputError(f"{path}: this bench has no CAN bus")
         heard = []
-        with opened_bench(path, pace=pace_of(virtual)) as opened:
+        with opened_bench(path, pace=pace_of(virtual)) as opened, keep_what_is_there():
             for one in listen(opened, buses, seconds, count):
                 heard.append(one.as_dict())
                 if json_file != "-":
@@ -346,14 +366,13 @@ def log_follow(
         check_writable(json_file)
         lines = []
         try:
-            for line in follow(url, seconds):
-                lines.append(line)
-                if json_file != "-":
-                    typer.echo(f"{line['when']} {line['level']:<5} {line['text']}")
-                    sys.stdout.flush()
+            with keep_what_is_there():
+                for line in follow(url, seconds):
+                    lines.append(line)
+                    if json_file != "-":
+                        typer.echo(f"{line['when']} {line['level']:<5} {line['text']}")
+                        sys.stdout.flush()
         except ConnectionError as error:
             print_error(str(error))
             raise typer.Exit(Exit.DEVICE_MISSING) from error
-        except KeyboardInterrupt:
-            pass
         write_json({"format": 1, "lines": lines}, json_file)

@@ -13,7 +13,8 @@ from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
 from firmware_py.recording.revision import git_revision
-from hal.bench import load_bench
+from hal.bench import load_bench, named_files
+from hal.trust import allow_name
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
@@ -115,7 +116,10 @@ def _chosen(option: str, text: str) -> list[Fault]:
 
 
 def _emulated(path: Path, chosen: Sequence[Fault]) -> None:
-    description = load_bench(path).description
+    bench = load_bench(path)
+    description = bench.description
+    for name in named_files(description):
+        allow_name(bench.resolve(name))  # the campaign's copies of the bench lie elsewhere
     daq = description.device.get("daq")
     if daq is None or daq.driver != "di4108" or "piezo" not in description.device:
         raise InputError(

@@ -12,6 +12,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
 from tools.terminal import task_name
@@ -40,7 +41,10 @@ def hands(
         rows: list[HandRow] = []
         with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
-            rows.extend(run_hands(file, data, seconds, lambda text: progress.update(task, description=text)))
+            with keep_what_is_there():
+                for row in run_hands(file, data, seconds, lambda text: progress.update(task, description=text)):
+                    rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
+        need_some(rows)
         page = markdown(rows, seconds, revision_and_day())
         if out is not None:
             write_text_atomic(out, page)

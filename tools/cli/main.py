@@ -13,6 +13,9 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from firmware_py.exit_codes import Exit
+from tools.interrupt import install_handler, was_interrupted
+
 # name -> where it is, and its line in the list
 COMMANDS = {
     "run": ("run:run", "Run the instrument in closed loop and report what was left of the tremor."),
@@ -161,6 +164,9 @@ def options(
     micron run: the instrument for ten seconds, with a picture at its end
     micron bench: its page in a browser
     micron COMMAND --help: each command, with an example
+
+    Ctrl-C stops any command: what was measured is printed and written, the exit status is 130. A second one ends it
+    at once.
     """
 
 
@@ -178,7 +184,13 @@ for _name, (_, _says) in COMMANDS.items():
 
 def main() -> None:
     """What the ``micron`` script calls."""
-    app()
+    install_handler()
+    try:
+        app()
+    except SystemExit:
+        if was_interrupted():  # also while a command was still being imported
+            raise SystemExit(Exit.INTERRUPTED) from None
+        raise
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ import typer
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
 from tools.output import Outputs, check_writable, write_json, write_text_atomic
 from tools.terminal import task_name
 
@@ -169,9 +170,11 @@ def _diagnose_folder(
         console=console(), transient=True,
     ) as progress:  # fmt: skip
         bar = progress.add_task("recordings", total=len(work))
-        for row in stream:
-            rows.append(row)
-            progress.update(bar, advance=1, description=row.name)
+        with keep_what_is_there():
+            for row in stream:
+                rows.append(row)
+                progress.update(bar, advance=1, description=row.name)
+    need_some(rows)
     rows.sort(key=lambda row: row.name)
     (console() if json_file == "-" else data_console()).print(batch_report([row.cells for row in rows]))
     write_json(batch.to_json(folder, rows), json_file)

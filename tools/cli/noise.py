@@ -10,6 +10,7 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 
 if TYPE_CHECKING:
@@ -61,14 +62,16 @@ def noise(
             console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")
         rate = log.need_rate()
         found: dict[str, tuple[AllanCurve, NoiseModel]] = {}
-        for name in names:
-            try:
-                curve = allan_curve(log.matrix((name,))[:, 0] * scale, rate)
-                found[name] = curve, identify(curve, shortest_s)
-            except ValueError as error:
-                if isinstance(error, InputError):
-                    raise
-                raise InputError(f"{log.path}: '{name}': {error}") from error
+        with keep_what_is_there():
+            for name in names:
+                try:
+                    curve = allan_curve(log.matrix((name,))[:, 0] * scale, rate)
+                    found[name] = curve, identify(curve, shortest_s)
+                except ValueError as error:
+                    if isinstance(error, InputError):
+                        raise
+                    raise InputError(f"{log.path}: '{name}': {error}") from error
+        need_some(found)
         table = Table(title=f"{log.path}, {rate:g} Hz", title_justify="left")
         for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)", "fit from (s)"):
             table.add_column(heading, no_wrap=heading == "column")
@@ -77,7 +80,7 @@ def noise(
             for term in TERMS:
                 c = getattr(model, term)
                 seen = f"{c.value:.3g} [{c.low:.2g}, {c.high:.2g}]"
-                cells.append(seen.replace("[", r"\[") if c.value > 0.0 else f"< {c.high:.2g}")
+                cells.append(seen if c.value > 0.0 else f"< {c.high:.2g}")
             missed = f", off by {100.0 * model.excess:.0f} %" if model.excess > 0.0 else ""
             table.add_row(name, *cells, f"{model.shortest_s:g}{missed}")
         data_console().print(table)

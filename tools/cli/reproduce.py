@@ -12,6 +12,7 @@ from rich.text import Text
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
 
@@ -88,9 +89,11 @@ def reproduce(
         if options and wanted != ["measured"]:
             raise InputError("--set and --rows belong to 'micron reproduce measured' alone")
         tables: list[Table] = []
-        for name in ready(wanted):
-            tables.append(reproduce_table(name, **options))
-            show(tables[-1])
+        with keep_what_is_there():
+            for name in ready(wanted):
+                tables.append(reproduce_table(name, **options))
+                show(tables[-1])
+        need_some(tables)
         if out is not None:
             command = f"micron reproduce {' '.join(names)} --out {out}"
             text = tables[0].page if len(tables) == 1 and tables[0].page else ""

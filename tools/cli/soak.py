@@ -12,6 +12,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
+from tools.interrupt import note_stop
 from tools.output import check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
 
@@ -55,6 +56,8 @@ def soak(
                 run = with_wires(path, seconds, start_ns=start_ns, on_time=on_time)
             else:
                 run = without_wires(path, seconds, on_time=on_time)
+        if "SIGINT" in run.ended:
+            note_stop()  # the firmware took the signal and ended in order
         asked = f"--seconds {seconds:g} " + (f"--start-ns {start_ns} " if start_ns else "")
         command = f"micron soak {asked}{'' if wires else '--without-wires '}--out {out or 'FILE'}"
         text = block(run, command, revision_and_day())

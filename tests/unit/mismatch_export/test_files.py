@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from hal.trust import NotTrusted, trust_program
 from sim_devices.physics.catalogue import EFFECTS
 from tools.cli.main import app
 from tools.mismatch.engine.diagnose import diagnose
@@ -209,9 +210,13 @@ def test_another_ending_and_a_foreign_twin_are_bad_input(
     folder, file, _ = found
     assert "'.docx' is none" in " ".join(run("apply", folder, file, "--out", tmp_path / "twin.docx", code=2).split())
     (tmp_path / "bad.py").write_text("import nothing_of_that_name\n")
+    with pytest.raises(NotTrusted, match="names the program"):
+        simulate_file(tmp_path / "bad.py", folder)
+    trust_program(tmp_path / "bad.py")
     with pytest.raises(RecordingError, match="cannot be imported"):
         simulate_file(tmp_path / "bad.py", folder)
     (tmp_path / "other.py").write_text("def simulate(inputs, dt=1.0):\n    return {'level': [0.0]}\n")
+    trust_program(tmp_path / "other.py")
     with pytest.raises(RecordingError, match="returned no output"):
         simulate_file(tmp_path / "other.py", folder)
     (tmp_path / "other.toml").write_text('[twin]\nkind = "magnetometer"\n')

@@ -82,7 +82,7 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "channels as a table": (GOOD.split("[[channels]]")[0] + "[channels]\na = 1\n", None, r"must be a list"),
     "no data key": (GOOD.replace('data = "data.csv"', ""), None, "'data' must name the data file"),
     "data is a number": (GOOD.replace('"data.csv"', "3"), None, "'data' must name the data file"),
-    "data is a folder": (GOOD.replace('"data.csv"', '"/tmp"'), None, "data file does not exist"),
+    "data is a folder": (GOOD.replace('"data.csv"', '"."'), None, "data file does not exist"),
     "parameter as text": (GOOD.replace("0.125", '"big"'), None, "gain_um_per_V must be a finite number, got 'big'"),
     "parameter nan": (GOOD.replace("0.125", "nan"), None, "gain_um_per_V must be a finite number, got nan"),
     "too many values": (GOOD.replace("0.125", "[1, 2]"), None, "gain_um_per_V has 2 entries"),

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hal.trust import allow_name
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_report.systems import TWIN, recording
 from tools.errors import InputError
@@ -21,6 +22,12 @@ from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 
 FEW = [EFFECTS[n] for n in ("dead_zone", "hysteresis", "vibration")]
+
+
+def written(file: Path, text: str) -> None:
+    """As ``micron mismatch apply`` writes it: recordings of other folders may name it."""
+    file.write_text(text)
+    allow_name(file)
 
 
 def dead_zone(u: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -59,7 +66,7 @@ def test_round_trip(tmp_path: Path, change, name: str):
     first = recording(tmp_path / "first", change=change, samples=2500)
     report = report_of(first)
     assert [p["name"] for p in report["physics"]] == [name]
-    (tmp_path / "twin.toml").write_text(corrected_twin(first, report).text)
+    written(tmp_path / "twin.toml", corrected_twin(first, report).text)
     again = report_of(
         recording(tmp_path / "second", change=change, seed=2, samples=2500, twin='file = "../twin.toml"\n')
     )
@@ -74,7 +81,7 @@ def test_the_content_may_be_pasted(tmp_path: Path, dead: tuple[Path, dict]):
     text = corrected_twin(path, report).text
     pasted = text.split("\n[twin]\n")[1]
     by_paste = load(recording(tmp_path / "a", change=dead_zone, twin=pasted))
-    (tmp_path / "twin.toml").write_text(text)
+    written(tmp_path / "twin.toml", text)
     by_file = load(recording(tmp_path / "b", change=dead_zone, twin='file = "../twin.toml"\n'))
     assert by_paste.twin == by_file.twin
     assert [e["name"] for e in by_file.twin.effects] == ["dead_zone"]
@@ -82,7 +89,7 @@ def test_the_content_may_be_pasted(tmp_path: Path, dead: tuple[Path, dict]):
 
 def test_the_written_twin_simulates_what_was_fitted(tmp_path: Path, dead: tuple[Path, dict]):
     path, report = dead
-    (tmp_path / "twin.toml").write_text(corrected_twin(path, report).text)
+    written(tmp_path / "twin.toml", corrected_twin(path, report).text)
     rec = load(recording(tmp_path / "again", change=dead_zone, twin='file = "../twin.toml"\n'))
     twin = make(rec)
     residual = Model(twin).residual(View.whole(rec), twin.start(rec))["displacement"]
@@ -92,7 +99,7 @@ def test_the_written_twin_simulates_what_was_fitted(tmp_path: Path, dead: tuple[
 
 def test_a_corrected_twin_can_be_corrected_again(tmp_path: Path, dead: tuple[Path, dict]):
     path, report = dead
-    (tmp_path / "twin.toml").write_text(corrected_twin(path, report).text)
+    written(tmp_path / "twin.toml", corrected_twin(path, report).text)
     moved = recording(
         tmp_path / "moved", change=lambda u, t: 1.1 * dead_zone(u, t), seed=3, twin='file = "../twin.toml"\n'
     )

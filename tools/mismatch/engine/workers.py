@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from multiprocessing import parent_process
 from typing import Any
 
 import numpy as np
 from joblib import Parallel, delayed
 from threadpoolctl import threadpool_limits
 
+from hal.children import begin_as_worker
 from tools.mismatch.engine.problem import Problem
 
 LEAST_SAMPLES = 40_000  # samples times outputs above which processes pay for a handful of pieces
@@ -17,6 +19,8 @@ LEAST_WORK = 1_500_000  # samples times outputs times pieces above which they pa
 
 def quietly(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
     """One piece: the linear algebra with one thread, and no warnings of trials that run away."""
+    if parent_process() is not None:
+        begin_as_worker()
     with np.errstate(all="ignore"), threadpool_limits(1):
         return function(*arguments)
 

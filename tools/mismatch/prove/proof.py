@@ -16,6 +16,8 @@ from typing import Any
 import numpy as np
 
 from firmware_py.recording.revision import git_revision
+from hal.children import begin_as_worker
+from tools.interrupt import keep_what_is_there, need_some
 from tools.mismatch.prove import draw, guests, seal
 from tools.mismatch.prove.disk import write
 from tools.mismatch.prove.plans import SELDOM
@@ -93,7 +95,7 @@ def generate(
     """
     work = [(seed, i, p, folder, max_samples, each_noise[i] if each_noise else None) for i, p in enumerate(plans)]
     if jobs > 1:
-        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin_as_worker) as pool:
             done = list(pool.map(draw_one, work))
     else:
         done = [draw_one(w) for w in work]
@@ -141,11 +143,13 @@ def prove(
         say(f"{len(reports)} of them diagnosed before")
     # the longest first: a process that begins one last would work alone
     left = sorted((k for k in paths if k not in reports), key=lambda k: SELDOM.get(asked[int(k[1:])].twin, 1.0))
-    for done in diagnose_all({k: paths[k] for k in left}, jobs, diagnose):
-        reports[done.name] = done
-        (kept / "unfinished").write_text(json.dumps(asdict(done), indent=1))
-        (kept / "unfinished").replace(kept / f"{done.name}.json")
-        say(f"{len(reports)}/{len(paths)}  {done.name}  {done.wall_s:.1f} s, {done.cpu_s:.1f} s of CPU")
+    with keep_what_is_there():
+        for done in diagnose_all({k: paths[k] for k in left}, jobs, diagnose):
+            reports[done.name] = done
+            (kept / "unfinished").write_text(json.dumps(asdict(done), indent=1))
+            (kept / "unfinished").replace(kept / f"{done.name}.json")
+            say(f"{len(reports)}/{len(paths)}  {done.name}  {done.wall_s:.1f} s, {done.cpu_s:.1f} s of CPU")
+    need_some(reports)
     opened = seal.opened(folder / "sealed", digest)
     rows: list[dict[str, Any]] = []
     for name in sorted(reports):

@@ -13,6 +13,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+from hal.children import begin_as_worker
 from tools.mismatch.prove.guests import installed
 
 Diagnose = Callable[[Path], dict[str, Any]]
@@ -78,6 +79,8 @@ def in_processes(function: Callable[[A], B], items: Sequence[A], jobs: int) -> I
         return
     for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(key, "1")
-    with ProcessPoolExecutor(min(jobs, len(items)), mp_context=get_context("spawn")) as pool:
+    with ProcessPoolExecutor(
+        min(jobs, len(items)), mp_context=get_context("spawn"), initializer=begin_as_worker
+    ) as pool:
         for done in as_completed([pool.submit(function, item) for item in items]):
             yield done.result()
