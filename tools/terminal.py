@@ -1,22 +1,45 @@
 """Consoles that print what they are given: brackets in a message are text, never markup.
 
 Rich reads ``[running]`` or ``[firmware]`` as a style and leaves it out. Style is given by ``rich.text.Text`` or
-``style=`` instead, so that no message has to be escaped.
+``style=`` instead, so that no message has to be escaped. Some parts of rich read markup whatever the console was told
+(spinners, titles of panels, columns of a progress display): they are made here, or get constants or ``Text``.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.progress import TextColumn
+from rich.status import Status
+from rich.text import Text
+
+
+class PlainStatus(Status):
+    """A spinner with a text that may change."""
+
+    def update(self, status: RenderableType | None = None, **options: Any) -> None:
+        """Show ``status``; ``options`` as for ``rich.status.Status.update``."""
+        super().update(_plain(status), **options)
+
+
+class PlainConsole(Console):
+    """See ``plain_console``."""
+
+    def status(self, status: RenderableType, **options: Any) -> PlainStatus:
+        """A spinner beside ``status``, as ``rich.console.Console.status``."""
+        return PlainStatus(_plain(status) or "", console=self, **options)
 
 
 def plain_console(**options: Any) -> Console:
     """A console without markup, emoji codes and highlighting; ``options`` as for ``rich.console.Console``."""
-    return Console(markup=False, emoji=False, highlight=False, **options)
+    return PlainConsole(markup=False, emoji=False, highlight=False, **options)
 
 
 def task_name() -> TextColumn:
     """The column of a progress display that names the task, as plain text."""
     return TextColumn("{task.description}", markup=False)
+
+
+def _plain(text: RenderableType | None) -> RenderableType | None:
+    return Text(text) if isinstance(text, str) else text

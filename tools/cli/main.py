@@ -7,6 +7,7 @@ help (a test compares them).
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -187,10 +188,12 @@ def main() -> None:
     install_handler()
     try:
         app()
-    except SystemExit:
-        if was_interrupted():  # also while a command was still being imported
-            raise SystemExit(Exit.INTERRUPTED) from None
-        raise
+    except BaseException as end:
+        if not was_interrupted() or (isinstance(end, SystemExit) and end.code == Exit.INTERRUPTED):
+            raise
+        # Ctrl-C while a command was still being imported: extension modules make an ImportError of it
+        sys.stderr.write("micron: stopped by Ctrl-C\n")
+        raise SystemExit(Exit.INTERRUPTED) from None
 
 
 if __name__ == "__main__":

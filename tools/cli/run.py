@@ -258,8 +258,8 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     from tools.reports.run_live import TipWatch
 
     watch, key = TipWatch(), RearmKey(lambda: process.send_signal(signal.SIGUSR1))
-    starting = "starting the emulated world and the firmware"
-    with Live(Spinner("dots", starting), console=console(), refresh_per_second=8, transient=True) as live:
+    starting = Spinner("dots", "starting the emulated world and the firmware")
+    with Live(starting, console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
             status = json.loads(line)
             key.look(status)

@@ -172,7 +172,7 @@ class GuestProcess:
     def _dead(self, what: str, last: str) -> GuestDied:
         self.end()
         tail = f"; its last line was: {last}" if last else ""
-        return GuestDied(f"{self.name}: the program {what}{tail}. Nothing of this program's own was lost; repair it")
+        return GuestDied(f"{self.name}: the program {what}{tail}; repair it, or leave it out")
 
 
 def _end(process: subprocess.Popen[bytes], said: IO[bytes]) -> None:

@@ -103,6 +103,17 @@ def test_brackets_in_what_is_shown_meanwhile() -> None:
     assert "[daq0] lost [ni]" in out.getvalue()
 
 
+def test_brackets_beside_a_spinner() -> None:
+    out = io.StringIO()
+    shown = plain_console(file=out, width=200, force_terminal=True, color_system=None)
+    with shown.status("first [ni]", refresh_per_second=0.01) as status:
+        status._live.refresh()
+        status.update("then [daq0]")
+        status._live.refresh()
+    assert "first [ni]" in out.getvalue()
+    assert "then [daq0]" in out.getvalue()
+
+
 def test_styles_are_given_by_objects_and_consoles_made_in_one_place() -> None:
     """Who writes markup into a text would see it printed."""
     wrong = [
@@ -111,6 +122,50 @@ def test_styles_are_given_by_objects_and_consoles_made_in_one_place() -> None:
         if path not in (ROOT / "tools" / "terminal.py", ROOT / "tools" / "cli" / "main.py")
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
         if re.search(r"\[/\]|\[/?(bold|dim|red|green|yellow|cyan)\b[^\]]*\]|rich\.markup|from_markup|\bConsole\(", line)
+    ]
+    assert wrong == []
+
+
+READS_MARKUP = {"Spinner", "Panel", "TextColumn", "Status", "track", "SpinnerColumn", "Prompt", "Confirm"}
+"""What of rich reads markup whatever the console was told."""
+
+
+def read_as_markup(source: str) -> Iterator[tuple[int, str]]:
+    """Line and text of every argument of those that is neither a constant without brackets nor a ``Text``."""
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Call):
+            continue
+        name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+        if name not in READS_MARKUP:
+            continue
+        places = {"Panel": (), "track": ()}.get(name, node.args)
+        named = [k.value for k in node.keywords if k.arg in ("text", "title", "subtitle", "description", "status")]
+        for argument in (*places, *named):
+            is_constant = isinstance(argument, ast.Constant) and "[" not in str(argument.value)
+            if not is_constant and not ast.unparse(argument).startswith("Text("):
+                yield node.lineno, ast.unparse(argument)
+
+
+def test_no_text_from_outside_is_read_as_markup_behind_the_consoles_back() -> None:
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: {text}"
+        for path in SOURCES
+        if path.parts[-3:-1] != ("tools", "reproduce") and "rich" in (source := path.read_text(encoding="utf-8"))
+        for line, text in read_as_markup(source)
+    ]
+    assert wrong == []
+    assert list(read_as_markup("Spinner('dots', name)\nPanel(x, title=f'{y}')")) == [(1, "name"), (2, "f'{y}'")]
+    assert list(read_as_markup("Spinner('dots', 'go')\nPanel(x, title=Text(y))")) == []
+
+
+def test_nobody_escapes_by_hand() -> None:
+    """With plain consoles a backslash before a bracket would be printed (``micron noise`` did)."""
+    wrong = [
+        f"{path.relative_to(ROOT)}:{number}"
+        for path in SOURCES
+        if path.is_relative_to(ROOT / "tools")
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+        if re.search(r"""replace\(["']\[["'],""", line)
     ]
     assert wrong == []
 

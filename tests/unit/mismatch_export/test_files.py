@@ -209,7 +209,7 @@ def test_another_ending_and_a_foreign_twin_are_bad_input(
 ) -> None:
     folder, file, _ = found
     assert "'.docx' is none" in " ".join(run("apply", folder, file, "--out", tmp_path / "twin.docx", code=2).split())
-    (tmp_path / "bad.py").write_text("import nothing_of_that_name\n")
+    (tmp_path / "bad.py").write_text(f"import nothing_of_that_name  # {tmp_path}\n")
     with pytest.raises(NotTrusted, match="names the program"):
         simulate_file(tmp_path / "bad.py", folder)
     trust_program(tmp_path / "bad.py")

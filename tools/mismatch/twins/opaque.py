@@ -150,7 +150,7 @@ def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequen
 
 
 def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
-    """The twin of an entry point, an object or a class, in a process of its own. ``NotTrusted`` before it may run."""
+    """The twin of an entry point (a ``UserTwin`` or its class), in a process of its own. ``NotTrusted`` before that."""
     target = str(entry.value)
     require_package(target, recording.path)
     request = {"ask": "open_entry", "name": entry.name, "value": target, "group": plugins.TWINS}
