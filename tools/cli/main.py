@@ -191,7 +191,7 @@ def main() -> None:
     except BaseException as end:
         if not was_interrupted() or (isinstance(end, SystemExit) and end.code == Exit.INTERRUPTED):
             raise
-        # Ctrl-C while a command was still being imported: extension modules make an ImportError of it
+        # Ctrl-C while a command was still being imported: compiled modules make an ImportError of it
         sys.stderr.write("micron: stopped by Ctrl-C\n")
         raise SystemExit(Exit.INTERRUPTED) from None
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hal.errors import BenchError
+from hal.trust import allow_name
 from sim_devices.plant.lab import main
 from sim_devices.twin_file import load_twin
 from tools.mismatch.recording_load import load
@@ -52,6 +53,7 @@ c3 = 0.005
 
 def test_the_lab_drives_a_corrected_twin_and_diagnose_reads_the_result(tmp_path: Path) -> None:
     (tmp_path / "twin.toml").write_text(TWIN)
+    allow_name(tmp_path / "twin.toml")
     out = tmp_path / "lab"
     given = ["piezo", "--out", str(out), "--seconds", "2", "--rate-hz", "3", "--twin", str(tmp_path / "twin.toml")]
     assert main(given) == 0
