@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Mapping
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import BaseModel, ConfigDict, Field
 
 from drivers.specs import check_devices
 from firmware_py.control.plausibility import PlausibilityLimits
@@ -35,21 +35,6 @@ class SelfTestLimits(BaseModel):
     limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)
 
 
-SAFETY_RANGES: Mapping[str, tuple[float, float]] = {
-    "stale_ms": (1.0, 10_000.0),
-    "temperature_C": (-100.0, 200.0),
-    "supply_V": (0.0, 10.0),
-    "saturated_ms": (1.0, 10_000.0),
-    "stalled_ms": (1.0, 10_000.0),
-    "magnetometer_ms": (1.0, 10_000.0),
-    "monitor_ms": (1.0, 10_000.0),
-    "guardian_notice_ms": (1.0, 1000.0),
-    "guardian_ms": (2.0, 1000.0),
-    "neutral_retry_s": (0.1, 600.0),
-}
-"""What each limit of ``SafetyLimits`` may be; of a pair, both, the lower one first."""
-
-
 class FirmwareConfig(BaseModel):
     """The checked [firmware] table. ``stages`` holds the tables of the three stages, calibration merged in."""
 
@@ -65,16 +50,6 @@ class FirmwareConfig(BaseModel):
     sensing: dict[str, Any] = Field(default_factory=dict[str, Any])
     tremor: dict[str, Any] = Field(default_factory=dict[str, Any])
     actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
-
-    @field_validator("safety")
-    @classmethod
-    def _check_ranges(cls, safety: SafetyLimits) -> SafetyLimits:
-        for name, (least, most) in SAFETY_RANGES.items():
-            value = getattr(safety, name)
-            both = value if isinstance(value, tuple) else (value,)
-            if not (least <= both[0] <= both[-1] <= most) or (len(both) == 2 and both[0] == both[1]):
-                raise ValueError(f"{name} = {value} is outside {least:g} to {most:g}, or its ends are exchanged")
-        return safety
 
 
 def load_firmware_config(

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from firmware_py.control.findings import CauseClass, Finding
 from hal.contracts import AnalogOutput
@@ -22,7 +22,7 @@ from hal.errors import HalError, I2cNack
 RAMP_TICKS = 20
 """Neutral within 20 ms of the decision; the amplifier's ramp is shorter, so that steps can be tried again."""
 ATTEMPTS = 3
-"""Of a step that nobody acknowledged, within its tick: a refusal takes a tenth of the time of a transfer."""
+"""Attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of the time of a transfer."""
 
 
 class State(IntEnum):
@@ -43,13 +43,20 @@ class State(IntEnum):
         return "hold" if self is State.HOLD_RAMP else self.name.lower().replace("_", " ")
 
 
-class SafetyLimits(BaseModel):
-    """When data count as stale, what is too hot, how long an axis may sit at its limit.
+Time_ms = Annotated[float, Field(ge=1.0, le=10_000.0)]
+Temperature_C = Annotated[float, Field(ge=-100.0, le=200.0)]
+Supply_V = Annotated[float, Field(ge=0.0, le=10.0)]
 
+
+class SafetyLimits(BaseModel):
+    """The limits beyond which the outputs leave their work.
+
+    ``stale_ms``: the DAQ may be silent for so long. ``temperature_C`` and ``supply_V``: the lowest and the highest
+    reading. ``saturated_ms``: an axis may stay at its limit for so long.
     ``stalled_ms``: scans that come in one piece after so long say that the host stood still, uncontrolled.
-    ``magnetometer_ms``: how long the heading may coast; a rate that is integrated from accelerations does not keep it
-    for longer.
-    ``monitor_ms``: how long the amplifier's monitor may be deaf.
+    ``magnetometer_ms``: the heading may coast for so long; a rate that is integrated from accelerations does not keep
+    it for longer.
+    ``monitor_ms``: the amplifier's monitor may be silent for so long.
     ``guardian``: a second process takes the outputs to neutral when this one dies, or gives no command for
     ``guardian_ms``; it notices a pause of ``guardian_notice_ms``.
     ``neutral_retry_s``: how long firmware and guardian try to reach neutral over a bus that fails; then they give up.
@@ -61,21 +68,28 @@ class SafetyLimits(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    stale_ms: float = 5.0
-    temperature_C: tuple[float, float] = (0.0, 60.0)
-    supply_V: tuple[float, float] = (4.5, 5.5)
-    saturated_ms: float = 50.0
-    stalled_ms: float = 100.0
-    magnetometer_ms: float = 150.0
-    monitor_ms: float = 100.0
+    stale_ms: Time_ms = 5.0
+    temperature_C: tuple[Temperature_C, Temperature_C] = (0.0, 60.0)
+    supply_V: tuple[Supply_V, Supply_V] = (4.5, 5.5)
+    saturated_ms: Time_ms = 50.0
+    stalled_ms: Time_ms = 100.0
+    magnetometer_ms: Time_ms = 150.0
+    monitor_ms: Time_ms = 100.0
     guardian: bool = True
-    guardian_notice_ms: float = 8.0
-    guardian_ms: float = 40.0
-    neutral_retry_s: float = 10.0
+    guardian_notice_ms: float = Field(default=8.0, ge=1.0, le=1000.0)
+    guardian_ms: float = Field(default=40.0, ge=2.0, le=1000.0)
+    neutral_retry_s: float = Field(default=10.0, ge=0.1, le=600.0)
     hold_ms: float = Field(default=200.0, ge=20.0, le=60_000.0)
     hold_limit_ms: float = Field(default=3000.0, ge=100.0, le=600_000.0)
     holds_per_minute: int = Field(default=3, ge=0, le=1000)
     rearm: Literal["automatic", "operator"] = "automatic"
+
+    @field_validator("temperature_C", "supply_V")
+    @classmethod
+    def _check_order(cls, limits: tuple[float, float]) -> tuple[float, float]:
+        if limits[0] >= limits[1]:
+            raise ValueError(f"the lower limit {limits[0]:g} is not below the upper limit {limits[1]:g}")
+        return limits
 
 
 @dataclass(frozen=True)
