@@ -45,6 +45,7 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("gate_smoothing", "f8"),
             ("tremor", "f8", (LEVELS, m, m)),
             ("rest", "f8", (m, m)),
+            ("quiet", "f8", (m, m)),
             ("cross", "f8", (LEVELS, OUTPUTS, m)),
             ("noise_cross", "f8", (OUTPUTS, m)),
             ("noise_power", "f8"),
@@ -110,6 +111,7 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         gate_smoothing=1.0 - exp(-1.0 / (a.gate_s * config.tick_hz)),
         tremor=d.tremor,
         rest=d.rest,
+        quiet=d.quiet,
         cross=d.cross,
         noise_cross=d.noise_cross,
         noise_power=d.noise_power,
@@ -291,11 +293,14 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
     m = len(a)
     count = state.count[axis, level]
     n0 = params.prior_blocks[level]
+    rows = n0
+    for other in range(AXES):
+        rows += (1.0 if other == axis else params.share) * state.count[other, level]
     known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power * count
     power = max(known / (count + n0), params.least_power)
     for i in range(m):
         for j in range(i + 1):
-            a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[i, j])
+            a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[i, j]) + rows * params.quiet[i, j]
         for o in range(OUTPUTS):
             right[o, i] = n0 * power * params.cross[level, o, i]
     for other in range(AXES):

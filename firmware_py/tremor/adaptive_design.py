@@ -27,7 +27,6 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GRID_STEP_HZ = 0.02
-GRID_STOP_HZ = 250.0
 OUTPUTS = 3  # now, ahead, the part of ahead in the core band
 LEVELS = 2  # calm, burst
 
@@ -59,7 +58,7 @@ class AdaptiveDesign:
     """``taps`` (3, L) on block means: the outputs' targets ``L // 2`` blocks ago. ``weight``, ``gate``: b0 b1 b2 a1 a2.
 
     Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m); ``rest`` (m, m) is what does not
-    scale with the tremor; ``noise_cross`` (3, m) and ``noise_power`` are the sensor noise's share in learning. All are
+    scale with the tremor, ``quiet`` (m, m) the penalty on what the filter passes above the band; ``noise_cross`` (3, m) and ``noise_power`` are the sensor noise's share in learning. All are
     of weighted signals except ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present
     features. ``gate_power``: of the gate's output, where both levels count the same.
     """
@@ -72,6 +71,7 @@ class AdaptiveDesign:
     gate_power: float
     tremor: Array
     rest: Array
+    quiet: Array
     cross: Array
     noise_cross: Array
     noise_power: float
@@ -109,7 +109,7 @@ def sensor_response(config: TremorConfig, hz: Array) -> Complex:
 def spectra(config: TremorConfig) -> _Spectra:
     """The prior hand in the sensor's eyes."""
     a = config.adaptive
-    hz = np.arange(GRID_STEP_HZ, min(GRID_STOP_HZ, 0.5 * config.tick_hz), GRID_STEP_HZ)
+    hz = np.arange(GRID_STEP_HZ, 0.5 * config.tick_hz, GRID_STEP_HZ)
     seen = sensor_response(config, hz)
     narrow = 1.0 / (1.0 + np.abs((hz - a.tremor_hz) / a.tremor_half_width_hz) ** 6)
     narrow /= np.sum(narrow) * GRID_STEP_HZ
@@ -235,8 +235,11 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     as_seen = np.abs(s.seen) ** 2 * s.tremor
     power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
+    top_hz = a.cancel_to_hz[1]
+    above = np.clip(s.hz / top_hz - 1.0, 0.0, 1.0)
+    quiet = covariance(plain, a.quiet * above * s.noise)
     plain_sum = [
-        p * covariance(plain, seen) + covariance(plain, s.rest) for p, seen in zip(power, as_seen, strict=True)
+        p * covariance(plain, seen) + covariance(plain, s.rest) + quiet for p, seen in zip(power, as_seen, strict=True)
     ]
     plain_cross = [
         p * np.stack([cross(plain * s.seen, t * e) for e in wanted]) for p, t in zip(power, s.tremor, strict=True)
@@ -251,6 +254,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
         gate_power=a.gate_ratio * float(np.sum(s.rest * np.abs(through_gate) ** 2) * GRID_STEP_HZ),
         tremor=np.stack([covariance(phi, seen) / u for seen, u in zip(as_seen, unit, strict=True)]),
         rest=covariance(phi, s.rest),
+        quiet=quiet,
         cross=np.stack(
             [
                 np.stack([cross(phi * s.seen, weight * t * e) for e in wanted]) / u

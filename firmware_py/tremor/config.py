@@ -137,6 +137,7 @@ class AdaptiveConfig(_Table):
     gate_q: Positive = 0.5
     gate_s: Positive = 0.05
     gate_ratio: Positive = 150.0
+    quiet: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
     least_rms_m: Positive = 2e-6
