@@ -28,7 +28,9 @@ if TYPE_CHECKING:
 
 def faults(
     bench: BenchOption = None,
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs per fault and operating point.")] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs per fault, phase and operating point.")] = 1,
+    seed: Annotated[int, typer.Option(min=1, max=2**31, help="First seed: hands, noise, instants, pairs.")] = 1,
+    pairs: Annotated[int, typer.Option(min=0, max=5000, help="Pairs of faults beside them.")] = 0,
     only: Annotated[str, typer.Option(metavar="TEXT", help="Only faults whose name contains this.")] = "",
     jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = os.cpu_count() or 1,
     beside: Annotated[
@@ -43,13 +45,16 @@ def faults(
 ) -> None:
     """Break the emulated instrument in every way of the catalogue, and print what it did.
 
-    Exit status 1 when an output was unsafe, a sample uncounted or a message wrong.
+    Each fault strikes in every phase of a run: self-test, learning, steady, hold and ramp.
 
-    Example: micron faults --seeds 20 --out docs/reliability.md
+    Exit status 1 when an output was unsafe, a sample uncounted, a message wrong or an answer not as expected.
+
+    Example: micron faults --seeds 5 --pairs 300 --out docs/reliability.md
     """
     from tools.faults.campaign import run_campaign, totals
     from tools.faults.drift_bound import drift_bounds
     from tools.faults.page import Beside, markdown
+    from tools.faults.phases import PHASES
     from tools.faults.points import POINTS
 
     with clear_errors():
@@ -66,12 +71,13 @@ def faults(
         for file, chosen in benches:
             _emulated(file, chosen)
         with Progress(task_name(), BarColumn(), TimeElapsedColumn(), console=console(), transient=True) as progress:
-            task = progress.add_task("starting", total=len(POINTS) * seeds * len(benches))
+            task = progress.add_task("starting", total=len(POINTS) * seeds * (len(PHASES) + 1) * len(benches))
             rows, *others_rows = (
                 run_campaign(
                     file,
                     chosen,
-                    seeds=range(1, seeds + 1),
+                    seeds=range(seed, seed + seeds),
+                    n_pairs=pairs if file == path else 0,
                     jobs=jobs,
                     progress=lambda text: progress.update(task, advance=1, description=text),
                     keep=keep,
@@ -85,7 +91,7 @@ def faults(
         outputs = Outputs()
         if out is not None:
             asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
-            command = f"micron faults --seeds {seeds}{asked} --out {out}"
+            command = f"micron faults --seeds {seeds} --seed {seed} --pairs {pairs}{asked} --out {out}"
             with outputs.part("page"):
                 write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
         if json_file != "-":
@@ -100,7 +106,8 @@ def faults(
             write_json({**result, "beside": more} if more else result, json_file)
         outputs.finish()
     for figures in (total, *(totals(b.rows) for b in besides)):
-        if figures["unsafe_outputs"] or figures["uncounted_samples"] or figures["wrong_messages"]:
+        wrong = figures["unsafe_outputs"] + figures["uncounted_samples"] + figures["wrong_messages"]
+        if wrong or figures["as_expected"] < figures["runs"]:
             raise typer.Exit(1)
 
 
@@ -140,6 +147,8 @@ def _emulated(path: Path, chosen: Sequence[Fault]) -> None:
 def _print(rows: list, total: dict) -> None:
     table = Table("fault", "hand", "answer", "known ms", "neutral ms", "tip um", "as expected", title="Faults")
     for row in rows:
+        if row.fault.is_pair and row.is_good:
+            continue
         d = row.as_dict()
         known, neutral = d["detect_ms"]["max"], d["answer_ms"]["max"]
         table.add_row(

@@ -21,7 +21,9 @@ import numpy as np
 
 from hal.bench import load_bench
 from tools.faults.fault import Fault
-from tools.faults.judge import Observation
+from tools.faults.judge import ENDED_WELL, Observation
+from tools.faults.pairs import draw_pairs
+from tools.faults.phases import LEARNING, PHASES, START, STEADY, Phase, accepted_answers
 from tools.faults.points import POINTS, Point, write_bench
 from tools.faults.trial import observe_running, observe_start
 
@@ -33,8 +35,7 @@ WITHIN_MS = 20.0  # from the moment at which the tip has gone 5 um astray
 
 @dataclass(frozen=True)
 class FaultRow:
-    """What one fault did at one operating point, over all seeds. ``late``: runs in which the tip went more than 5 um
-    astray and nothing was known of it 20 ms later."""
+    """One fault at one operating point, in all phases, over all seeds."""
 
     fault: Fault
     point: str
@@ -51,30 +52,43 @@ class FaultRow:
 
     @property
     def answer(self) -> str:
-        """The commonest answer."""
-        answers = [o.answer for o in self.observations]
+        """The commonest answer where the outputs work when the fault strikes, or before the devices are opened."""
+        usual = [o for o in self.observations if o.phase in (LEARNING.name, STEADY.name, START.name)]
+        answers = [o.answer for o in usual or self.observations]
         return max(sorted(set(answers)), key=answers.count)
 
     @property
     def as_expected(self) -> int:
-        # a fault that comes and goes may let the outputs resume until it comes again
-        also = {"harmless": "none", "cannot be seen": "none", "holds": "resumes"}.get(self.fault.expected)
-        return sum(o.answer in (self.fault.expected, also) for o in self.observations)
+        return sum(o.answer in accepted_answers(self.fault, o.phase) for o in self.observations)
 
     @property
     def late(self) -> int:
+        """Runs in which the tip went more than 5 um astray and nothing was known of it 20 ms later."""
         return sum(moved_unseen(o) for o in self.observations)
 
     @property
     def unsafe(self) -> int:
-        """Unsafe demands that were the firmware's; what the fault itself does to the output is counted apart."""
-        return 0 if self.fault.own_output else sum(o.unsafe for o in self.observations)
+        """Unsafe demands that were the firmware's, and reports of a neutral that was none. What the fault itself does
+        to the output is counted apart, but no fault excuses such a report."""
+        rough = 0 if self.fault.own_output else sum(o.rough for o in self.observations)
+        return rough + sum(o.false_neutral for o in self.observations)
 
     @property
     def wrong_messages(self) -> int:
-        """Trips, holds and refusals whose message names none of the words that belong to the fault."""
-        told = [o for o in self.observations if o.answer in TOLD]
-        return sum(not any(word.lower() in o.message.lower() for word in self.fault.names) for o in told)
+        """How many trips, holds and refusals have a message that names none of the words that belong to the fault."""
+        return sum(self.is_misnamed(o) for o in self.observations)
+
+    def is_misnamed(self, o: Observation) -> bool:
+        """The message of ``o`` names none of the words that belong to the fault."""
+        # a self-test that still waits when its run is ended has not said anything yet
+        told = o.answer in TOLD and not o.held_on and not o.message.startswith(ENDED_WELL)
+        return told and not any(word.lower() in o.message.lower() for word in self.fault.names)
+
+    @property
+    def is_good(self) -> bool:
+        """Every answer is as expected; nothing is unsafe, uncounted or wrongly named."""
+        bad = self.unsafe + self.wrong_messages + sum(o.uncounted for o in self.observations)
+        return not bad and self.as_expected == self.seeds
 
     @property
     def known_by(self) -> str:
@@ -90,7 +104,7 @@ class FaultRow:
         return sum(any(part.lower() in text for part in parts) for text in said)
 
     def as_dict(self) -> dict[str, Any]:
-        """Row of the contract's JSON, and what else is known."""
+        """Row of the contract's JSON, and what else is known. Times and distances are those of outputs that work."""
         return {
             "fault": self.fault.name,
             "point": self.point,
@@ -125,16 +139,17 @@ def moved_unseen(o: Observation) -> bool:
 def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
     """Sums over the campaign; the goals are those of the reliability page."""
     runs = [o for row in rows for o in row.observations]
-    moving = [o for o in runs if o.moved_ms is not None]
+    moving = [o for row in rows if not row.fault.is_pair for o in row.observations if o.moved_ms is not None]
     return {
-        "faults": len({row.fault.name for row in rows}),
+        "faults": len({row.fault.name for row in rows if not row.fault.is_pair}),
+        "pairs": len({row.fault.name for row in rows if row.fault.is_pair}),
         "points": len({row.point for row in rows}),
         "runs": len(runs),
         "as_expected": sum(row.as_expected for row in rows),
         "moving_the_tip_5_um": len(moving),
         "of_these_known_within_20_ms": sum(not moved_unseen(o) for o in moving),
         "unsafe_outputs": sum(row.unsafe for row in rows),
-        "jumps_of_the_fault": sum(o.unsafe for row in rows if row.fault.own_output for o in row.observations),
+        "jumps_of_the_fault": sum(o.rough for row in rows if row.fault.own_output for o in row.observations),
         "uncounted_samples": sum(o.uncounted for o in runs),
         "wrong_messages": sum(row.wrong_messages for row in rows),
     }
@@ -145,13 +160,16 @@ def run_campaign(
     faults: Sequence[Fault],
     *,
     points: Sequence[Point] = POINTS,
+    phases: Sequence[Phase] = PHASES,
     seeds: Sequence[int],
+    n_pairs: int = 0,
     jobs: int,
     progress: Callable[[str], None],
     keep: Path | None = None,
     revision: str = "",
 ) -> list[FaultRow]:
-    """Every fault at every point with every seed, in virtual time, in ``jobs`` processes. Deterministic.
+    """Every fault at every point in every phase with every seed, in virtual time, in ``jobs`` processes; after them
+    the rows of ``n_pairs`` pairs of faults, which are drawn from the first seed. Deterministic.
 
     ``keep``: a folder in which what is done is kept; a campaign that was stopped goes on from there. Kept results of
     another ``revision``, bench or choice of faults are not used.
@@ -163,26 +181,59 @@ def run_campaign(
         benches = {point.name: write_bench(bench, point, folder) for point in points}
         key = hashlib.sha256(repr((revision, bench.read_text(encoding="utf-8"), faults)).encode()).hexdigest()[:16]
         kept = _Kept(keep, key)
-        tasks: list[tuple[Any, ...]] = []
-        done: list[list[Observation]] = []
-        for point in points:
-            for seed in seeds:
-                if (observations := kept.read(point.name, seed)) is None:
-                    tasks.append((benches[point.name], point.name, tuple(faults), seed))
-                else:
-                    done.append(observations)
+        at_start = tuple(fault for fault in faults if fault.at_start)
+        running = tuple(fault for fault in faults if not fault.at_start)
+        planned = [
+            Trial(benches[point.name], point.name, phase, group, seed)
+            for point in points
+            for seed in seeds
+            for phase, group in [(None, at_start), *((phase, running) for phase in phases)]
+            if group
+        ]
+        pairs = draw_pairs(running, n_pairs, seeds[0])
+        for k, group in enumerate(pairs):
+            point = points[k % len(points)]
+            phase = phases[k // len(points) % len(phases)]
+            planned.append(Trial(benches[point.name], point.name, phase, group, seeds[0] + k, pairs=True))
+        trials = [trial for trial in planned if kept.read(trial) is None]
+        done = [observations for trial in planned if (observations := kept.read(trial)) is not None]
         found: dict[tuple[str, str], list[Observation]] = {}
-        for observations in chain(done, map(kept.write, _in_parallel(tasks, jobs))):
-            progress(f"{observations[0].point} hand, seed {observations[0].seed}")
+        for observations in chain(done, (kept.write(trial, answer) for trial, answer in _in_parallel(trials, jobs))):
+            first = observations[0]
+            progress(f"{first.point} hand, {first.phase}, seed {first.seed}")
             for o in observations:
                 found.setdefault((o.fault, o.point), []).append(o)
         return [
-            FaultRow(fault, point.name, tuple(sorted(found[fault.name, point.name], key=lambda o: o.seed)))
-            for fault in faults
+            FaultRow(fault, point.name, tuple(sorted(rows, key=lambda o: (o.seed, o.phase))))
+            for fault in (*faults, *chain(*pairs))
             for point in points
+            if (rows := found.get((fault.name, point.name)))
         ]
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One hand, one seed, one phase (``None``: before the devices are opened) and the faults that strike there."""
+
+    bench: Path
+    point: str
+    phase: Phase | None
+    faults: tuple[Fault, ...]
+    seed: int
+    pairs: bool = False
+
+    @property
+    def name(self) -> str:
+        """The trial among all of a campaign."""
+        phase = self.phase.name if self.phase else "start"
+        return f"{self.point}-{phase}-{self.seed}" + ("-pairs" if self.pairs else "")
+
+    def observe(self) -> list[Observation]:
+        if self.phase is None:
+            return [observe_start(self.bench, self.point, fault, self.seed) for fault in self.faults]
+        return observe_running(self.bench, self.point, self.faults, self.seed, self.phase)
 
 
 @dataclass(frozen=True)
@@ -190,17 +241,17 @@ class _Kept:
     folder: Path | None
     key: str
 
-    def _path(self, point: str, seed: int) -> Path | None:
-        return None if self.folder is None else self.folder / f"{self.key}-{point}-{seed}.json"
+    def _path(self, trial: Trial) -> Path | None:
+        return None if self.folder is None else self.folder / f"{self.key}-{trial.name}.json"
 
-    def read(self, point: str, seed: int) -> list[Observation] | None:
-        path = self._path(point, seed)
+    def read(self, trial: Trial) -> list[Observation] | None:
+        path = self._path(trial)
         if path is None or not path.is_file():
             return None
         return [Observation(**table) for table in json.loads(path.read_text(encoding="utf-8"))]
 
-    def write(self, observations: list[Observation]) -> list[Observation]:
-        path = self._path(observations[0].point, observations[0].seed)
+    def write(self, trial: Trial, observations: list[Observation]) -> list[Observation]:
+        path = self._path(trial)
         if path is not None:
             part = path.with_suffix(".part")
             part.write_text(json.dumps([asdict(o) for o in observations]), encoding="utf-8")
@@ -214,19 +265,16 @@ def has_redundancy(bench: Path) -> bool:
     return sum(len(device.options().get("channels", ())) for device in devices) > 6
 
 
-def _one(bench: Path, point: str, faults: Sequence[Fault], seed: int) -> list[Observation]:
-    running = [fault for fault in faults if not fault.at_start]
-    observations = observe_running(bench, point, running, seed) if running else []
-    return observations + [observe_start(bench, point, fault, seed) for fault in faults if fault.at_start]
+def _observe(trial: Trial) -> tuple[Trial, list[Observation]]:
+    return trial, trial.observe()
 
 
-def _in_parallel(tasks: Sequence[tuple[Any, ...]], jobs: int) -> Iterator[list[Observation]]:
+def _in_parallel(trials: Sequence[Trial], jobs: int) -> Iterator[tuple[Trial, list[Observation]]]:
     if jobs <= 1:
-        for task in tasks:
-            yield _one(*task)
+        yield from map(_observe, trials)
         return
     with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_die_with_parent) as pool:
-        waiting: set[Future[list[Observation]]] = {pool.submit(_one, *task) for task in tasks}
+        waiting: set[Future[tuple[Trial, list[Observation]]]] = {pool.submit(_observe, trial) for trial in trials}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
-Expected = Literal["safe state", "holds", "resumes", "noticed", "harmless", "refused", "cannot be seen"]
+Expected = Literal["safe state", "holds", "resumes", "noticed", "harmless", "refused", "cannot be seen", "any"]
 LEFT_OUT = "the axis is left out once the others contradict it by seven deviations of their noise"
 
 
@@ -50,7 +50,16 @@ class OutOfMemory:
     left_MB: float
 
 
-How = InWorld | OnBus | OnHost | Kill | OutOfMemory
+@dataclass(frozen=True)
+class Both:
+    """``second`` strikes ``gap_s`` after ``first``."""
+
+    first: How
+    second: How
+    gap_s: float
+
+
+How = InWorld | OnBus | OnHost | Kill | OutOfMemory | Both
 
 
 @dataclass(frozen=True)
@@ -77,6 +86,7 @@ class Fault:
     why: str = ""
     redundant: Expected | None = None
     part: str = ""
+    is_pair: bool = False
 
     @property
     def part_of_bench(self) -> str:

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.faults.phases import STEADY, Phase
+
 LO_V, HI_V, NEUTRAL_V = 0.0, 100.0, 50.0
 RAMP_MS = 21.0  # 20 steps, and the tick in which it was decided
 SLEW_V_PER_MS = 20.0
@@ -32,13 +34,15 @@ class Seen:
 class Observation:
     """Times in ms from the strike; ``None``: did not happen.
 
-    ``held_ms``: the first hold began; ``resumed``: the last one ended and the outputs moved again.
-    ``unsafe``: demands at the amplifier beyond its range, faster than the slew limit, not neutral 20 ms after the
-    decision although the report says so, or anything but the ramp and neutral in a hold. ``uncounted``: scans of the
-    device that the firmware cannot account for.
+    ``held_ms``: the first hold began, 0 if the outputs held already and went on to; ``resumed``: the last one ended and
+    the outputs moved again.
+    ``rough``: demands at the amplifier beyond its range, faster than the slew limit, or anything but the ramp and
+    neutral in a hold. ``false_neutral``: a channel was not neutral 21 ms after the decision although the report says
+    that it is. ``uncounted``: scans of the device that the firmware cannot account for.
     ``lost``: scans that the firmware reports as lost.
+    ``phase``: of the run, when the fault struck (``phases.py``).
     ``astray_um``: largest distance of the tip from the same run without the fault, until the decision; ``moved_ms``:
-    when it passed 5 um.
+    when it passed 5 um; neither is judged where the outputs did not work when the fault struck.
     """
 
     fault: str
@@ -51,18 +55,20 @@ class Observation:
     neutral_ms: float | None
     message: str
     confirmed: bool
-    unsafe: int
+    rough: int
+    false_neutral: bool
     uncounted: int
     astray_um: float
     moved_ms: float | None
     lost: int = 0
     held_ms: float | None = None
     resumed: bool = False
+    phase: str = "steady"
 
     @classmethod
-    def refusal(cls, fault: str, point: str, seed: int, message: str) -> Observation:
+    def refusal(cls, fault: str, point: str, seed: int, message: str, phase: str) -> Observation:
         """The bench could not be opened, and nothing moved."""
-        return cls(fault, point, seed, True, None, None, "", None, message, True, 0, 0, 0.0, None)
+        return cls(fault, point, seed, True, None, None, "", None, message, True, 0, False, 0, 0.0, None, phase=phase)
 
     @property
     def answer(self) -> str:
@@ -76,12 +82,17 @@ class Observation:
         return "noticed" if self.noticed_ms is not None else "none"
 
     @property
+    def held_on(self) -> bool:
+        """The outputs held when the fault struck, for another cause, and went on to."""
+        return self.held_ms == 0.0 and self.tripped_ms is None
+
+    @property
     def known_by(self) -> str:
         """What was said first."""
         decided = [t for t in (self.tripped_ms, self.held_ms) if t is not None]
         if self.noticed_ms is not None and (not decided or self.noticed_ms < min(decided)):
             return self.noticed
-        return self.message if self.refused or decided else ""
+        return self.message if (self.refused or decided) and not self.held_on else ""
 
     @property
     def detect_ms(self) -> float | None:
@@ -97,15 +108,19 @@ def judge(
     seen: Seen,
     reference_m: NDArray[np.float64],
     tip_m: NDArray[np.float64] | None = None,
+    phase: Phase = STEADY,
 ) -> Observation:
-    """``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms. ``tip_m``: what to compare with
-    it instead of the tip that was seen: for faults that redraw the noise both are of runs without noise."""
+    """Judge one run. ``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms. ``tip_m``: it is
+    compared with that instead of the tip that was seen: for faults that redraw the noise both are of runs without
+    noise."""
     outcome = seen.outcome
     safe = outcome["safe_state"]
     reason = str(safe["reason"])
     tripped = not reason.startswith(ENDED_WELL)
     ended_ns = int(outcome["safe_ns"])
-    holds = [hold for hold in outcome.get("holds", ()) if hold["t_ns"] >= seen.strike_ns]
+    all_holds = outcome.get("holds", ())
+    holds = [hold for hold in all_holds if hold["t_ns"] >= seen.strike_ns]
+    held_on = bool(all_holds) and not holds and not all_holds[-1]["resumed"]
     decided_ns = holds[0]["t_ns"] if holds else ended_ns
     confirmed = bool(safe["reached"])
     noticed = {what: t_ns for what, t_ns in outcome["noticed"].items() if t_ns >= seen.strike_ns}
@@ -131,15 +146,16 @@ def judge(
         neutral_ms=neutral,
         message=reason if tripped or not holds else str(holds[0]["cause"]),
         confirmed=confirmed,
-        unsafe=rough_demands(seen.demands)
-        + (confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + (safe.get("late_ms") or 0.0))))
-        + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in holds),
+        rough=rough_demands(seen.demands)
+        + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in all_holds),
+        false_neutral=confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + (safe.get("late_ms") or 0.0))),
         uncounted=max(0, seen.scans - counted),
-        astray_um=1e6 * float(away_m[before].max(initial=0.0)),
-        moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size else None,
+        astray_um=1e6 * float(away_m[before].max(initial=0.0)) if phase.works else 0.0,
+        moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size and phase.works else None,
         lost=int(samples["lost"]),
-        held_ms=(decided_ns - seen.strike_ns) * 1e-6 if holds else None,
+        held_ms=(decided_ns - seen.strike_ns) * 1e-6 if holds else 0.0 if held_on else None,
         resumed=bool(holds and holds[-1]["resumed"]),
+        phase=phase.name,
     )
 
 

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tools.faults.campaign import FaultRow, totals
+from tools.faults.campaign import FaultRow, moved_unseen, totals
 from tools.faults.drift_bound import FALSE_PER_HOUR, SEEN, DriftBound
+from tools.faults.phases import PHASES, START, accepted_answers
 
 HEAD = """# Reliability: what breaks, what the instrument does
 
 Made by `{command}`, firmware revision {revision}. The emulated bench in virtual time: {faults} kinds of fault at
-{points} operating points ({names}), {seeds} seeds each, {runs} runs. Each fault strikes a running closed loop at a
-random instant, or is there when the bench is opened ("at start").
+{points} operating points ({names}), {runs} runs. Each fault strikes at a random instant of five phases of a run:
+self-test, learning (0.8 to 2 s), steady (2 to 12 s), in a hold, in the ramp of a run that ends; or it is there when the
+bench is opened ("at start"). Beside them {pairs} pairs: the second fault strikes up to 0.1 s after the first.
 
 | figure | goal | measured |
 |---|---|---|
@@ -23,14 +25,25 @@ random instant, or is there when the bench is opened ("at start").
 | messages that do not name the cause | 0 | {wrong_messages} |
 | answers as expected below | all | {as_expected} of {runs} |
 
+| phase | runs | as expected | moved 5 um, known within 20 ms | unsafe |
+|---|---|---|---|---|
+{phases}
+
 How it is measured. Known: the firmware tripped, held, or counted it under a name (`noticed` in the run's JSON), or
 refused to start; within 20 ms of the instant at which the tip is 5 um astray. The tip's error is its distance from the
 same run without the fault (same hand, same noise, bit for bit the same until the strike), until the decision. Faults
 that also shift when samples are taken would meet other noise: their tip is that of two more runs, both without noise
 from the strike on. Unsafe: a demand that arrives at the amplifier beyond 0..100 V or faster than 20 V/ms; a channel
 that is not neutral 21 ms after the decision although the report says that it is (one that says "neutral NOT confirmed"
-makes no such claim); or anything but the ramp and neutral from the begin to the end of a hold. Uncounted: scans that
-the device took and that are neither received, nor reported lost, nor unread at the end.
+makes no such claim); or anything but the ramp and neutral from the begin to the end of a hold. A demand that the fault
+itself makes is counted apart; a report of neutral that is none is never excused. The tip is judged where the outputs
+work when the fault strikes (learning, steady). In self-test, hold and ramp a latching fault must not end in outputs
+that work (`tools/faults/phases.py`). Uncounted: scans that the device took and that are neither received, nor reported
+lost, nor unread at the end.
+
+## Answers that were not as expected
+
+{unexpected}
 
 ## What is not seen, or too late
 
@@ -160,27 +173,68 @@ def markdown(
 ) -> str:
     """The whole page. ``beside``: other benches, told by their totals and by what is otherwise than on the first."""
     total = totals(rows)
+    single = [row for row in rows if not row.fault.is_pair]
     return HEAD.format(
         bound=_bound(bounds),
         beside="".join(_beside(other, rows) for other in beside),
-        matrix="\n".join(_matrix(rows)),
+        matrix="\n".join(_matrix(single)),
         command=command,
         revision=revision,
         names=", ".join(dict.fromkeys(row.point for row in rows)),
-        seeds=max((row.seeds for row in rows), default=0),
+        phases="\n".join(_phases(rows)),
+        unexpected="\n".join(_unexpected(rows)) or "None.",
         known=total["of_these_known_within_20_ms"],
         moving=total["moving_the_tip_5_um"],
-        unseen="\n".join(_unseen(rows)) or "Nothing.",
-        rows="\n".join(_line(row) for row in rows),
+        unseen="\n".join(_unseen(single)) or "Nothing.",
+        rows="\n".join(_line(row) for row in single),
         **{key: value for key, value in total.items() if f"{{{key}}}" in HEAD},
     )
+
+
+def _phases(rows: Sequence[FaultRow]) -> list[str]:
+    lines: list[str] = []
+    every = [(row, o) for row in rows for o in row.observations]
+    for is_pair in (False, True):
+        for phase in (START, *PHASES):
+            here = [(row, o) for row, o in every if o.phase == phase.name and row.fault.is_pair == is_pair]
+            if not here:
+                continue
+            good = sum(o.answer in accepted_answers(row.fault, o.phase) for row, o in here)
+            unsafe = sum(o.false_neutral or (o.rough > 0 and not row.fault.own_output) for row, o in here)
+            moving = [o for _, o in here if o.moved_ms is not None] if not is_pair else []
+            known = f"{sum(not moved_unseen(o) for o in moving)} of {len(moving)}" if moving else "-"
+            lines.append(f"| {'pairs, ' * is_pair}{phase.name} | {len(here)} | {good} | {known} | {unsafe} |")
+    return lines
+
+
+def _unexpected(rows: Sequence[FaultRow]) -> list[str]:
+    lines: list[str] = []
+    for row in rows:
+        for phase in (START, *PHASES):
+            wrong = [
+                o for o in row.observations
+                if o.phase == phase.name and o.answer not in accepted_answers(row.fault, o.phase)
+            ]  # fmt: skip
+            misnamed = [o for o in row.observations if o.phase == phase.name and row.is_misnamed(o)]
+            if misnamed:
+                lines.append(
+                    f"- {row.fault.name}, {row.point} hand, {phase.name}: the message does not name the cause: "
+                    f'"{_short(misnamed[0].message)}" ({len(misnamed)})'
+                )
+            if wrong:
+                answers = ", ".join(sorted({o.answer for o in wrong}))
+                lines.append(
+                    f"- {row.fault.name}, {row.point} hand, {phase.name}: {answers} instead of {row.fault.expected} "
+                    f"({len(wrong)} of {sum(o.phase == phase.name for o in row.observations)})"
+                )
+    return lines
 
 
 def _unseen(rows: Sequence[FaultRow]) -> list[str]:
     lines: list[str] = []
     for name in dict.fromkeys(row.fault.name for row in rows):
         mine = [row for row in rows if row.fault.name == name]
-        late, unsafe = sum(row.late for row in mine), sum(o.unsafe for row in mine for o in row.observations)
+        late, unsafe = sum(row.late for row in mine), sum(o.rough for row in mine for o in row.observations)
         blind = mine[0].fault.expected == "cannot be seen"
         if not (late or blind or unsafe):
             continue

@@ -11,12 +11,10 @@ import os
 import pickle
 import resource
 import signal
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn, cast
-
-import numpy as np
 
 from firmware_py.app import run_in_process
 from firmware_py.guardian.process import describe
@@ -26,18 +24,11 @@ from hal.clock import VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import HalError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
-from tools.faults.fault import Fault, How, InWorld, Kill, OnBus, OnHost, OutOfMemory
+from tools.faults.fault import Both, Fault, How, InWorld, Kill, OnBus, OnHost, OutOfMemory
 from tools.faults.judge import Observation, Seen, judge
-
-STRIKE_S = 2.0  # the run proper begins at about 0.58 s, commands 0.7 s after the first scan
-SPREAD_S = 0.1  # one period of the tremor
+from tools.faults.phases import RUN_BEGINS_S, SELF_TEST, START, STEADY, Phase, Stop
 
 Sabotaged = FaultSerial | FaultI2c | FaultCan
-
-
-def strike_s(seed: int) -> float:
-    """When, on the bench clock; anywhere within a tick and within a period of the tremor."""
-    return STRIKE_S + SPREAD_S * float(np.random.default_rng([seed, 4711]).random())
 
 
 @dataclass
@@ -90,6 +81,9 @@ class FarBench:
                 mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
                 most = resource.getrlimit(resource.RLIMIT_AS)[1]
                 resource.setrlimit(resource.RLIMIT_AS, (mapped + round(left_MB * 1e6), most))
+            case Both(first, second, gap_s):
+                self.strike(first, seed)
+                self.clock.at(now_ns + round(gap_s * 1e9), lambda _: self.strike(second, seed + 1))
 
     def scans(self) -> int:
         return int(self.world.world.devices["daq"].scans)
@@ -123,10 +117,17 @@ def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observati
     try:
         outcome, truth = run_in_process(RunRequest(bench, 0.2, pace="virtual", seed=seed), on_open=open_hook)
     except HalError as error:
-        return Observation.refusal(fault.name, point, seed, str(error))
+        return Observation.refusal(fault.name, point, seed, str(error), START.name)
     assert truth is not None
     seen = Seen(0, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans())
-    return judge(fault.name, point, seed, seen, truth["tip_m"])
+    return judge(fault.name, point, seed, seen, truth["tip_m"], phase=START)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """The answer of a run that never began."""
+
+    message: str
 
 
 class _AllStruck(BaseException):
@@ -134,14 +135,15 @@ class _AllStruck(BaseException):
 
 
 def observe_running(
-    bench: Path, point: str, faults: Sequence[Fault], seed: int, done: Callable[[], None] = lambda: None
+    bench: Path, point: str, faults: Sequence[Fault], seed: int, phase: Phase = STEADY
 ) -> list[Observation]:
-    """Each of ``faults`` strikes the same run at the same instant; ``done`` is called after each."""
+    """Each of ``faults`` strikes the same run at the same instant of ``phase``."""
     far = FarBench()
-    at_ns = round(strike_s(seed) * 1e9)
+    begin_ns, at_ns = phase.instants_ns(seed)
+    longer_s = RUN_BEGINS_S if phase is SELF_TEST else 0.0
     answers: list[Any] = []
     me = _Child()
-    shifting = [fault for fault in faults if fault.redraws]
+    shifting = [fault for fault in faults if fault.redraws] if phase.works else []
     references = [(False, None, max(fault.watch_s for fault in faults))]
     if shifting:
         references.append((True, None, max(fault.watch_s for fault in shifting)))
@@ -160,14 +162,22 @@ def observe_running(
                     far.strike(fault.how, seed)
                 if "firmware" in far.processes.dead:
                     me.answer(far.after_death(at_ns, watch_s))
-                far.clock.at(at_ns + round(watch_s * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
+                far.clock.at(at_ns + round((watch_s + longer_s) * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
                 return
-            if fault is not None and not quiet:
-                done()
         raise _AllStruck
+
+    def begin(_: int) -> None:
+        match phase.prelude:
+            case None:
+                pass
+            case Stop():
+                signal.raise_signal(signal.SIGINT)
+            case how:
+                far.strike(how, seed)
 
     def open_hook(opened: OpenBench) -> None:
         far.attach(opened)
+        far.clock.at(begin_ns, begin)
         far.clock.at(at_ns, at_strike)
 
     request = RunRequest(bench, 60.0, pace="virtual", seed=seed)
@@ -177,27 +187,27 @@ def observe_running(
         pass
     except BaseException as error:
         if me.is_child:
-            me.answer(error)
+            me.answer(Refused(str(error)) if isinstance(error, HalError) and phase is SELF_TEST else error)
         raise
     else:
         if not me.is_child:
             raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
         assert truth is not None
         me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans()))
-    if any("SIGTERM" in str(seen.outcome["safe_state"]["reason"]) for seen in answers):
+    finished = [answer for answer in answers if isinstance(answer, Seen)]
+    if any("SIGTERM" in str(seen.outcome["safe_state"]["reason"]) for seen in finished):
         raise SystemExit("the campaign was ended from outside")  # the run heard it, and took it for its operator
     of = {(quiet, fault and fault.name): seen for (quiet, fault, _), seen in zip(runs, answers, strict=True)}
-    return [
-        judge(
-            fault.name,
-            point,
-            seed,
-            of[False, fault.name],
-            of[fault.redraws, None].tip_m,
-            of[True, fault.name].tip_m if fault.redraws else None,
-        )
-        for fault in faults
-    ]
+
+    def judged(fault: Fault) -> Observation:
+        seen = of[False, fault.name]
+        if isinstance(seen, Refused):
+            return Observation.refusal(fault.name, point, seed, seen.message, phase.name)
+        quiet = fault in shifting
+        tip_m = of[True, fault.name].tip_m if quiet else None
+        return judge(fault.name, point, seed, seen, of[quiet, None].tip_m, tip_m, phase)
+
+    return [judged(fault) for fault in faults]
 
 
 class _Child:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tools.faults.campaign import FaultRow, moved_unseen, totals
-from tools.faults.fault import Fault, InWorld
+from tools.faults.fault import Fault, InWorld, Kill
 from tools.faults.judge import Observation, Seen, judge, neutral_ms, rough_demands
+from tools.faults.pairs import draw_pairs
+from tools.faults.phases import HOLD, LEARNING, PHASES, SELF_TEST, STEADY, accepted_answers
 
 MS = 1_000_000
 
@@ -76,5 +78,58 @@ def test_neutral_counts_from_the_decision_and_needs_every_channel():
 
 
 def test_a_refusal_moves_nothing():
-    o = Observation.refusal("f", "p", 1, "no such device")
-    assert (o.answer, o.unsafe, o.uncounted) == ("refused", 0, 0)
+    o = Observation.refusal("f", "p", 1, "no such device", "start")
+    assert (o.answer, o.rough, o.false_neutral, o.uncounted) == ("refused", 0, False, 0)
+
+
+def test_no_fault_excuses_a_report_of_neutral_that_is_none():
+    answer = seen(outcome("piezo: gone", 31), np.zeros(100))
+    answer.demands.append((40 * MS, 0, 62.0))
+    o = judge("f", "p", 1, answer, np.zeros((100, 3)))
+    assert o.false_neutral
+    row = FaultRow(Fault("f", InWorld("x", ""), "safe state", names=("piezo",), own_output=True), "p", (o,))
+    assert row.unsafe == 1
+    assert not row.is_good
+
+
+def test_the_tip_is_not_judged_where_the_outputs_rest():
+    tip = np.where(np.arange(100) > 50, 600.0, 0.0)
+    o = judge("f", "p", 1, seen(outcome("run finished", 99), tip), np.zeros((100, 3)), phase=HOLD)
+    assert (o.moved_ms, o.astray_um, o.phase) == (None, 0.0, "hold")
+
+
+def test_a_hold_that_another_cause_began_is_not_the_answer_to_the_fault_unless_it_lasts():
+    hold = {"t_ns": 10 * MS, "length_s": 0.05, "cause": "overflow", "resumed": True}
+    resumed = outcome("run finished", 99) | {"holds": [hold]}
+    lasts = outcome("run finished", 99) | {"holds": [hold | {"resumed": False}]}
+    assert judge("f", "p", 1, seen(resumed, np.zeros(100)), np.zeros((100, 3)), phase=HOLD).answer == "none"
+    o = judge("f", "p", 1, seen(lasts, np.zeros(100)), np.zeros((100, 3)), phase=HOLD)
+    assert (o.answer, o.held_on, o.known_by) == ("holds", True, "")
+
+
+def test_instants_stay_in_their_phase_and_repeat():
+    for phase in PHASES:
+        for seed in range(200):
+            begin_ns, strike_ns = phase.instants_ns(seed)
+            assert phase.from_s * 1e9 <= begin_ns <= phase.to_s * 1e9
+            assert begin_ns <= strike_ns <= begin_ns + phase.within_s * 1e9
+            assert phase.instants_ns(seed) == (begin_ns, strike_ns)
+
+
+def test_a_fault_that_latches_may_never_be_answered_by_outputs_that_work():
+    latching = Fault("f", InWorld("x", ""), "safe state")
+    for phase in (SELF_TEST, LEARNING, STEADY, HOLD):
+        assert not accepted_answers(latching, phase.name) & {"none", "noticed", "resumes", "harmless"}
+
+
+def test_pairs_are_drawn_once_each_and_keep_what_is_worse():
+    one = Fault("one", InWorld("x", ""), "safe state", ("a",), watch_s=0.2)
+    two = Fault("two", InWorld("y", ""), "holds", ("b",), own_output=True)
+    dead = Fault("dead", Kill("firmware"), "safe state")
+    groups = draw_pairs([one, two, dead], 50, 3)
+    pairs = [pair for group in groups for pair in group]
+    assert sorted(pair.name for pair in pairs) == ["one + two", "two + one"]
+    assert groups == draw_pairs([one, two, dead], 50, 3)
+    for pair in pairs:
+        assert (pair.expected, pair.own_output, set(pair.names)) == ("safe state", True, {"a", "b"})
+        assert "holds" in accepted_answers(pair, STEADY.name)
