@@ -30,6 +30,8 @@ def recorded_configs(recording: Recording) -> StageConfigs:
         raise RecordingError(f"{recording.path}: its stage configuration cannot be read: {error}") from error
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise RecordingError(f"{recording.path}: its stage configuration is not a table for every stage")
+    # a recording that does not name the penalty was made before there was one
+    tables.setdefault("tremor", {}).setdefault("adaptive", {}).setdefault("quiet", 0.0)
     return StageConfigs.from_dict(tables, str(recording.path))
 
 

@@ -27,6 +27,7 @@ Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 GRID_STEP_HZ = 0.02
+GRID_STOP_HZ = 250.0
 OUTPUTS = 3  # now, ahead, the part of ahead in the core band
 LEVELS = 2  # calm, burst
 
@@ -58,9 +59,9 @@ class AdaptiveDesign:
     """``taps`` (3, L) on block means: the outputs' targets ``L // 2`` blocks ago. ``weight``, ``gate``: b0 b1 b2 a1 a2.
 
     Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m); ``rest`` (m, m) is what does not
-    scale with the tremor, ``quiet`` (m, m) the penalty on what the filter passes above the band; ``noise_cross`` (3, m) and ``noise_power`` are the sensor noise's share in learning. All are
-    of weighted signals except ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present
-    features. ``gate_power``: of the gate's output, where both levels count the same.
+    scale with the tremor, ``quiet`` (m, m) the penalty on what the filter passes above the band; ``noise_cross`` (3, m)
+    and ``noise_power`` are the sensor noise's share in learning. All are of weighted signals except ``quiet``,
+    ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present features. ``gate_power``: of the gate's output, where both levels count the same.
     """
 
     bank: Bank
@@ -106,10 +107,33 @@ def sensor_response(config: TremorConfig, hz: Array) -> Complex:
     return _complex(-(w**2) * low_pass if config.sees == "acceleration" else low_pass)
 
 
+def sensor_noise(config: TremorConfig, hz: Array) -> Array:
+    """One-sided density of the sensor's noise in a sample, in the sample's unit squared per Hz."""
+    a, per_sample = config.adaptive, 2.0 / config.tick_hz
+    if config.sees == "displacement":
+        return np.full(len(hz), a.reading_noise_m**2 * per_sample)
+    low_pass = np.abs(sensor_response(config, hz) / (2.0 * pi * hz) ** 2) ** 2
+    return np.asarray(low_pass * a.sensor_noise_m_s2_rtHz**2 + a.reading_noise_m_s2**2 * per_sample)
+
+
+def _penalty_above_band(config: TremorConfig, bank: Bank) -> Array:
+    """(m, m): the bank's covariance under ``quiet`` times the sensor's noise above the cancelled band.
+
+    The penalty rises over one octave from the upper edge of the band and holds up to half the tick rate. A tip has
+    nothing to cancel there: all that a filter passes shakes it, and the stacks' resonance amplifies it.
+    """
+    a = config.adaptive
+    hz = np.arange(a.cancel_to_hz[1], 0.5 * config.tick_hz, 0.5)
+    above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
+    features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
+    density = a.quiet * above * sensor_noise(config, hz)
+    return np.asarray(np.real((features * density) @ features.conj().T) * 0.5)
+
+
 def spectra(config: TremorConfig) -> _Spectra:
     """The prior hand in the sensor's eyes."""
     a = config.adaptive
-    hz = np.arange(GRID_STEP_HZ, 0.5 * config.tick_hz, GRID_STEP_HZ)
+    hz = np.arange(GRID_STEP_HZ, min(GRID_STOP_HZ, 0.5 * config.tick_hz), GRID_STEP_HZ)
     seen = sensor_response(config, hz)
     narrow = 1.0 / (1.0 + np.abs((hz - a.tremor_hz) / a.tremor_half_width_hz) ** 6)
     narrow /= np.sum(narrow) * GRID_STEP_HZ
@@ -121,12 +145,7 @@ def spectra(config: TremorConfig) -> _Spectra:
     mixed = a.burst_share * burst + (1.0 - a.burst_share) * narrow
     slow = a.voluntary_m**2 / a.voluntary_hz / (1.0 + (hz / a.voluntary_hz) ** 6)
     slow += a.unsteadiness_m**2 * 0.6 / (1.0 + hz**2) ** 2
-    per_sample = 2.0 / config.tick_hz
-    if config.sees == "acceleration":
-        low_pass = np.abs(seen / (2.0 * pi * hz) ** 2) ** 2
-        noise = low_pass * a.sensor_noise_m_s2_rtHz**2 + a.reading_noise_m_s2**2 * per_sample
-    else:
-        noise = np.full(len(hz), a.reading_noise_m**2 * per_sample)
+    noise = sensor_noise(config, hz)
     rest = noise + _drift(config, hz) + np.abs(seen) ** 2 * slow
     return _Spectra(hz, seen, np.stack([narrow, mixed]), rest, noise)
 
@@ -235,9 +254,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     as_seen = np.abs(s.seen) ** 2 * s.tremor
     power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
-    top_hz = a.cancel_to_hz[1]
-    above = np.clip(s.hz / top_hz - 1.0, 0.0, 1.0)
-    quiet = covariance(plain, a.quiet * above * s.noise)
+    quiet = _penalty_above_band(config, bank)
     plain_sum = [
         p * covariance(plain, seen) + covariance(plain, s.rest) + quiet for p, seen in zip(power, as_seen, strict=True)
     ]

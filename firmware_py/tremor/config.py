@@ -114,7 +114,8 @@ class AdaptiveConfig(_Table):
     ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out; ``core_hz``: the part of it that
     does not yield when the manipulator runs out of stroke. Two filters are learned, for a calm hand and for a burst,
     and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
-    all that is no tremor. ``share``: what an axis takes from the others.
+    all that is no tremor. ``share``: what an axis takes from the others. ``quiet``: above the band, sensor noise counts
+    for so many times its power, so that the filter does not shake the tip there.
     """
 
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
@@ -137,7 +138,7 @@ class AdaptiveConfig(_Table):
     gate_q: Positive = 0.5
     gate_s: Positive = 0.05
     gate_ratio: Positive = 150.0
-    quiet: Annotated[float, Field(ge=0.0, le=1e6)] = 0.0
+    quiet: Annotated[float, Field(ge=0.0, le=1e6)] = 100.0
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
     least_rms_m: Positive = 2e-6

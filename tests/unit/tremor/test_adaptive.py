@@ -7,10 +7,12 @@ import pytest
 from scipy.signal import lfilter
 
 from firmware_py.tremor.adaptive_design import (
+    GRID_STEP_HZ,
     band,
     bank_of,
     block_response,
     design_adaptive,
+    sensor_noise,
     sensor_response,
     solve_scaled,
     spectra,
@@ -95,7 +97,8 @@ def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
     def error(row: np.ndarray, level: int, rms_m: float) -> float:
         through = row @ phi
         missed = np.abs(through * hand.seen - wanted) ** 2 * hand.tremor[level] * rms_m**2
-        return float(np.sum(missed + np.abs(through) ** 2 * hand.rest))
+        mean_square = float(np.sum(missed + np.abs(through) ** 2 * hand.rest)) * GRID_STEP_HZ
+        return mean_square + float(row @ d.quiet @ row)
 
     for level, rms_m in enumerate((config.adaptive.tremor_rms_m, config.adaptive.burst_rms_m)):
         row = d.start[level, 0]
@@ -207,7 +210,7 @@ def test_learning_is_least_squares_with_the_prior() -> None:
         known = state.power[0, level] + n0 * param.weighted_power[level] - count * param.noise_power
         power = known / (count + n0)
         normal = np.tril(state.normal[0, level]) + np.tril(state.normal[0, level], -1).T
-        matrix = normal + n0 * (power * param.tremor[level] + param.rest)
+        matrix = normal + n0 * (power * param.tremor[level] + param.rest) + (n0 + count) * param.quiet
         right = state.right[0, level] - count * param.noise_cross + n0 * power * param.cross[level]
         direct = solve_scaled(matrix, np.asarray(right))
         found = np.array(state.filter[0, level])
@@ -220,3 +223,29 @@ def test_edges_out_of_order_are_refused() -> None:
         TremorConfig.from_dict({"adaptive": {"cancel_from_hz": [6.0, 4.0]}})
     with pytest.raises(BenchError, match="core_hz"):
         TremorConfig.from_dict({"adaptive": {"core_hz": [6.0, 8.0, 7.0, 16.0]}})
+
+
+def _noise_above_band_um(quiet: float) -> float:
+    """rms of what a filter makes of the sensor's noise above 40 Hz, as an integral over frequency."""
+    config = TremorConfig(adaptive=AdaptiveConfig(quiet=quiet))
+    d = design_adaptive(config)
+    hz = np.arange(40.0, 500.0, 0.5)
+    response = d.start[0, 1] @ d.bank.response(np.exp(2j * np.pi * hz / config.tick_hz).astype(np.complex128))
+    return 1e6 * float(np.sqrt(np.sum(np.abs(response) ** 2 * sensor_noise(config, hz)) * 0.5))
+
+
+def test_the_penalty_quietens_the_filter_above_the_band() -> None:
+    loud, quiet, quieter = (_noise_above_band_um(q) for q in (0.0, 100.0, 1000.0))
+    assert quiet < 0.5 * loud
+    assert quieter < 0.7 * quiet
+
+
+def test_what_is_learned_is_penalized_as_the_prior_is() -> None:
+    """The regression's rows carry the penalty, too: data do not make the filter loud again."""
+    record = make_record(105, "two tones", 20.0)
+    rough: dict[float, float] = {}
+    for quiet in (0.0, 100.0):
+        config = TremorConfig(adaptive=AdaptiveConfig(quiet=quiet))
+        ahead = Estimator(config, axes=1).run(record.acceleration[:, None]).ahead_m[:, 0]
+        rough[quiet] = float(np.std(np.diff(ahead[-10_000:], 2)))
+    assert rough[100.0] < 0.3 * rough[0.0]
