@@ -296,7 +296,7 @@ def start_state(
     horizon = min(stretch, felt_at_most(ad, stretch)) if forgets(ad, stretch) else window
     shape = np.concatenate([response_shape(ad, c, horizon, blocks) * weight[o] for o, c in rows.items()])
     rough = max(
-        LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW, *(_roughness(measured[o]) for o in rows)
+        LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW, *(_roughness(measured[o], memo, o) for o in rows)
     )
     for (a, _), samples in zip(spans, at, strict=True):
         since = samples - a
@@ -355,10 +355,15 @@ OCTAVE = 128
 """Samples of a free response in every octave of time since its start."""
 
 
-def _roughness(x: Array) -> float:
-    """Noise of a record over its range, by its second differences (median)."""
-    size = float(np.ptp(x))
-    return 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / np.sqrt(6.0) / size if size > 0.0 and x.size > 2 else 0.0
+def _roughness(x: Array, memo: dict[object, object], output: str) -> float:
+    """Noise of a record over its range, by its second differences (median); remembered."""
+    key = ("roughness", output)
+    found = memo.get(key)
+    if not isinstance(found, float):
+        size = float(np.ptp(x))
+        rough = 1.4826 * float(np.median(np.abs(np.diff(x, 2)))) / np.sqrt(6.0) if x.size > 2 else 0.0
+        found = memo[key] = rough / size if size > 0.0 else 0.0
+    return found
 
 
 def _setting(start: int, stop: int, window: int, setting: NDArray[np.int64] | None) -> NDArray[np.int64]:
