@@ -241,8 +241,11 @@ def cut(
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],
     start: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing before this time.")] = None,
     stop: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing from this time on.")] = None,
+    every: Annotated[bool, typer.Option("--every", help="Keep every stretch, each as a run of its own.")] = False,
 ) -> None:
     """Keep the longest stretch without gaps, on a uniform clock, as a recording of its own.
+
+    With --every all stretches are kept, one behind the other; a plant with states starts afresh in each.
 
     Example: micron mismatch cut rec --out whole
     """
@@ -250,10 +253,11 @@ def cut(
         _check_folder(out)
         from tools.mismatch.cut import cut as cut_recording
 
-        kept = cut_recording(recording, out, start, stop)
+        kept = cut_recording(recording, out, start, stop, every)
+        stretches = "stretch" if kept.parts == 1 else "stretches"
         console().print(
             f"{kept.samples} samples at {kept.rate_hz:.6g} Hz, {kept.start_s:g} to {kept.stop_s:g} s of the original"
-            f" ({kept.parts} {'stretch' if kept.parts == 1 else 'stretches'}), {kept.filled} samples filled: {out}",
+            f" ({kept.kept} of {kept.parts} {stretches}), {kept.filled} samples filled: {out}",
             soft_wrap=True,
         )
 

@@ -16,13 +16,13 @@ from hal.trust import allow_name, path_inside
 from tools.errors import InputError
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_columns import read_columns
-from tools.mismatch.recording_load import LONGEST_GAP, MIN_SAMPLES, descriptor, on_grid
+from tools.mismatch.recording_load import LONGEST_GAP, MIN_SAMPLES, MIN_SPAN, descriptor, on_grid
 
 
 @dataclass(frozen=True)
 class Stretch:
     """What was kept: ``samples`` on a uniform clock of ``rate_hz``, from ``start_s`` to ``stop_s`` of the original;
-    ``filled`` of them stand where the original had none; ``parts``: how many stretches there were.
+    ``filled`` of them stand where the original had none; ``parts``: how many stretches there were, ``kept`` of them.
     """
 
     samples: int
@@ -31,10 +31,15 @@ class Stretch:
     stop_s: float
     filled: int
     parts: int
+    kept: int = 1
 
 
-def cut(path: Path, out: Path, start_s: float | None = None, stop_s: float | None = None) -> Stretch:
+def cut(
+    path: Path, out: Path, start_s: float | None = None, stop_s: float | None = None, every: bool = False
+) -> Stretch:
     """Write the longest stretch without gaps between two times into the folder ``out``, resampled to uniform steps.
+
+    With ``every`` all stretches of at least ``MIN_SPAN`` samples are kept, one behind the other, as segments.
 
     A gap is more than ``LONGEST_GAP`` usual steps without a sample that is finite in every column; shorter ones are
     filled by straight lines and counted. A time column may be out of order. Raises RecordingError for a descriptor or a
@@ -62,30 +67,46 @@ def cut(path: Path, out: Path, start_s: float | None = None, stop_s: float | Non
         raise InputError(f"{data}: {order.size} usable samples between these times; at least {MIN_SAMPLES} are needed")
     steps = np.diff(t[order])
     usual = float(np.median(steps))
-    edges = np.r_[0, np.flatnonzero(steps > LONGEST_GAP * usual) + 1, order.size]
+    begins = text.get("segments")
+    run = np.searchsorted(np.array(begins if isinstance(begins, list) else [], np.int64), order, side="right")
+    edges = np.r_[0, np.flatnonzero((steps > LONGEST_GAP * usual) | (np.diff(run) > 0)) + 1, order.size]
     long_s = t[order[edges[1:] - 1]] - t[order[edges[:-1]]]
-    first = int(np.argmax(long_s))
-    kept = order[edges[first] : edges[first + 1]]
+    chosen = [int(np.argmax(long_s))]
+    if every:
+        chosen = [k for k in range(edges.size - 1) if edges[k + 1] - edges[k] >= MIN_SPAN] or chosen
+    kept = np.concatenate([order[edges[k] : edges[k + 1]] for k in chosen])
     if kept.size < MIN_SAMPLES:
         raise InputError(f"{data}: the longest stretch has {kept.size} samples; at least {MIN_SAMPLES} are needed")
-    stamps = t[kept]
-    close = np.diff(stamps) <= 1.5 * usual
-    dt = float(np.mean(np.diff(stamps)[close])) if close.any() else usual
-    count = max(1, round(float(stamps[-1] - stamps[0]) / dt))
-    dt = float(stamps[-1] - stamps[0]) / count
-    grid = stamps[0] + dt * np.arange(count + 1)
-    written: dict[str, Array] = {c: on_grid(grid, dt, stamps, columns[c][kept]) for c in names}
-    nearest = np.abs(stamps[np.clip(np.searchsorted(stamps, grid - 0.5 * dt), 0, stamps.size - 1)] - grid)
-    _write(path, text, out, written, 1.0 / dt)
-    filled = int(np.sum(nearest > 0.75 * dt))
-    return Stretch(count + 1, 1.0 / dt, float(stamps[0]), float(stamps[-1]), filled, edges.size - 1)
+    close = steps[steps <= 1.5 * usual]
+    dt = float(np.mean(close)) if close.size else usual
+    parts: list[dict[str, Array]] = []
+    filled, sizes = 0, []
+    for k in chosen:
+        one = order[edges[k] : edges[k + 1]]
+        stamps = t[one]
+        count = max(1, round(float(stamps[-1] - stamps[0]) / dt))
+        # one stretch sets its own step; several share one
+        dt = float(stamps[-1] - stamps[0]) / count if len(chosen) == 1 else dt
+        grid = stamps[0] + dt * np.arange(count + 1)
+        parts.append({c: on_grid(grid, dt, stamps, columns[c][one]) for c in names})
+        nearest = np.abs(stamps[np.clip(np.searchsorted(stamps, grid - 0.5 * dt), 0, stamps.size - 1)] - grid)
+        filled += int(np.sum(nearest > 0.75 * dt))
+        sizes.append(count + 1)
+    written = {c: np.concatenate([p[c] for p in parts]) for c in names}
+    _write(path, text, out, written, 1.0 / dt, [int(k) for k in np.cumsum(sizes)[:-1]])
+    whole = sum(sizes)
+    return Stretch(whole, 1.0 / dt, float(t[kept[0]]), float(t[kept[-1]]), filled, edges.size - 1, len(chosen))
 
 
-def _write(path: Path, text: dict[str, Any], out: Path, columns: dict[str, Array], rate_hz: float) -> None:
+def _write(
+    path: Path, text: dict[str, Any], out: Path, columns: dict[str, Array], rate_hz: float, segments: list[int]
+) -> None:
     """The descriptor and its data; a split in samples no longer means anything and is left out."""
     out.mkdir(parents=True, exist_ok=True)
-    head = {k: v for k, v in text.items() if k not in ("time_column", "split")}
+    head = {k: v for k, v in text.items() if k not in ("time_column", "split", "segments")}
     head |= {"data": "data.npz", "rate_hz": rate_hz}
+    if segments:
+        head["segments"] = segments
     twin = head.get("twin")
     if isinstance(twin, dict) and isinstance(twin.get("file"), str):
         file = path_inside(path, twin["file"])

@@ -25,6 +25,7 @@ TOP = (
     Key("time_column", "column name", "time stamps in seconds, for recordings without rate_hz", "none"),
     Key("twin", "table", "the simulation that the recording is compared with"),
     Key("channels", "list of tables", "one per column that is used"),
+    Key("segments", "list of samples", "where a new run begins: plants with states start there afresh", "one run"),
     Key("split", "table", "which samples may be fitted and which are the test", "the tool splits by itself"),
 )
 CHANNEL = (

@@ -44,7 +44,8 @@ class Recording:
 
     ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
-    ``tolerance``: differences of an output that do not matter to the user, in its contract unit.
+    ``tolerance``: differences of an output that do not matter to the user, in its contract unit. ``segments``: samples
+    other than the first at which a new run begins: plants with states start there afresh.
     """
 
     path: Path
@@ -63,11 +64,16 @@ class Recording:
     tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     warnings: tuple[str, ...] = ()
     declared_unit: Mapping[str, str] = field(default_factory=dict[str, str])
+    segments: tuple[int, ...] = ()
 
     @property
     def file_unit(self) -> dict[str, str]:
         """The unit of each signal in the data file."""
         return {**self.unit, **self.declared_unit}
+
+    def segments_of(self, start: int, stop: int) -> tuple[int, ...]:
+        """The segments that begin within samples ``start`` to ``stop``, counted from ``start``."""
+        return tuple(s - start for s in self.segments if start < s < stop)
 
     @property
     def n(self) -> int:

@@ -23,7 +23,7 @@ LONGEST_GAP = 20.0  # usual steps of a time column
 MOST_MISSING = 0.02  # of the time
 CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch without gaps"
 MOST_SIZE = 1e100  # of any value: squares must stay finite
-_TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split"}
+_TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments"}
 _CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance"}
 
 
@@ -82,6 +82,7 @@ def load(path: Path | str) -> Recording:
             i = int(np.argmax(bad))
             line = f" (line {i + 2})" if data_path.suffix.lower() == ".csv" else ""
             raise RecordingError(f"{data_path}: column '{name}' sample {i}{line}: {values[i]}; {CUT}")
+    grid: Array | None = None
     if time_column is not None:
         stamps = columns[time_column]
         dt, grid = _step(data_path, time_column, stamps, rate, notes)
@@ -133,6 +134,7 @@ def load(path: Path | str) -> Recording:
             c.signal: units.convert_difference(c.tolerance, c.unit, c.to) for c in channels if c.tolerance is not None
         },
         warnings=tuple(notes),
+        segments=_segments(path, text.get("segments"), n, twin.kind, grid is not None),
     )
     if twin.kind == "state_space":
         from tools.mismatch.recording_units import in_twin_units
@@ -379,6 +381,29 @@ def _enough(path: Path, found: Mapping[str, tuple[int, int] | Path], initializat
     fit, test = found.get("fit"), found.get("test")
     if isinstance(fit, tuple) and isinstance(test, tuple) and fit[0] < test[1] and test[0] < fit[1]:
         raise RecordingError(f"{path}: [split] fit {list(fit)} and test {list(test)} share samples")
+
+
+APART = ("state_space", "mechanical_axis", "ode", "piezo_stack", "accelerometer", "magnetometer")
+"""Kinds of twins whose plants start afresh at a segment, or have no state."""
+
+
+def _segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> tuple[int, ...]:
+    """The samples at which further runs begin."""
+    if value is None:
+        return ()
+    if not isinstance(value, list) or not all(isinstance(i, int) and not isinstance(i, bool) for i in value):
+        raise RecordingError(f"{path}: segments must be a list of samples at which a new run begins, got {value!r}")
+    lengths = np.diff([0, *value, n])
+    if np.any(lengths < MIN_SPAN):
+        raise RecordingError(
+            f"{path}: segments {value} leave a run of {int(lengths.min())} of the {n} samples; each needs {MIN_SPAN},"
+            " in rising order"
+        )
+    if kind not in APART:
+        raise RecordingError(f"{path}: a twin of kind '{kind}' runs through; make a recording of each of the segments")
+    if resampled:
+        raise RecordingError(f"{path}: segments count samples, which an irregular time column does not keep; {CUT}")
+    return tuple(value)
 
 
 def _split(path: Path, value: object, n: int) -> Split:

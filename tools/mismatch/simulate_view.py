@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array
 from tools.mismatch.recording import Recording
+from tools.mismatch.steady import steady_period
 from tools.mismatch.twins.base import Run, Twin
 
 
@@ -62,7 +63,12 @@ class View:
             first = a + self.init if twin.restart else self.init
             if self.fit and (not twin.restart or (a, b) in self.fit):
                 first = a  # its start is fitted like any parameter
-            out.append(np.arange(a, b) >= first)
+            at = np.arange(a, b)
+            counts = at >= first
+            if not self.fit and not self.period:
+                for s in self.recording.segments:
+                    counts &= (at < s) | (at >= s + self.init)
+            out.append(counts)
         return np.concatenate(out)
 
     def setting(self, twin: Twin) -> NDArray[np.int64] | None:
@@ -75,6 +81,12 @@ class View:
         if twin.restart:
             spans += [(a, min(a + self.init, b)) for a, b in self.ranges if (a, b) not in self.fit]
         return np.concatenate([np.arange(a, b) for a, b in sorted(spans)])
+
+    @cached_property
+    def period(self) -> int:
+        """Samples after which all inputs and outputs of the recording repeat from its start on, 0 if they do not."""
+        rec = self.recording
+        return steady_period(rec.inputs, rec.outputs, (0, *rec.segments))
 
     def measured(self, output: str) -> Array:
         """(m,) the recorded output on the view."""
@@ -94,7 +106,10 @@ def view_run(twin: Twin, view: View) -> Run:
     rec = view.recording
     starts, window = (0,), view.init
     if twin.restart:
-        starts = tuple(dict.fromkeys((0, *(max(0, a - view.lead) for a, _ in view.ranges))))
+        starts = tuple(sorted({0, *rec.segments, *(max(0, a - view.lead) for a, _ in view.ranges)}))
         window += view.lead
+    elif rec.segments:
+        starts = (0, *rec.segments)
     setting = view.setting(twin)
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting)
+    period = 0 if twin.restart else view.period
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting, period)

@@ -78,3 +78,27 @@ def test_a_gap_in_a_record_without_a_clock_and_a_wanted_part(tmp_path: Path) -> 
     with pytest.raises(InputError, match="usable samples"):
         cut(folder, tmp_path / "none", start_s=8.9)
     assert not (tmp_path / "none").exists()
+
+
+def test_every_stretch_is_kept_as_a_run_of_its_own(tmp_path: Path) -> None:
+    t = np.concatenate([np.arange(200) * 0.01, 10 + np.arange(600) * 0.01, 20 + np.arange(12) * 0.01])
+    folder = write(tmp_path, t, np.sin(t), 'time_column = "t"')
+    kept = cut(folder, tmp_path / "new", every=True)
+    assert (kept.parts, kept.kept, kept.samples) == (3, 2, 800)
+    found = load(tmp_path / "new")
+    assert (found.n, found.segments) == (800, (200,))
+    np.testing.assert_allclose(found.inputs["command"], np.sin(t[:800]), atol=1e-6)
+    again = cut(tmp_path / "new", tmp_path / "longest")
+    assert (again.parts, again.kept, again.samples) == (2, 1, 600)
+    np.testing.assert_allclose(load(tmp_path / "longest").inputs["command"], np.sin(t[200:800]), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("segments", "message"),
+    [("3", "must be a list of samples"), ("[10]", "a run of 10 of the 300"), ("[200, 100]", "rising order")],
+)
+def test_segments_that_mean_nothing_are_refused(tmp_path: Path, segments: str, message: str) -> None:
+    t = np.arange(300) * 0.01
+    folder = write(tmp_path, t, np.sin(t), f"rate_hz = 100.0\nsegments = {segments}")
+    with pytest.raises(RecordingError, match=message):
+        load(folder)

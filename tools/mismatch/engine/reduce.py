@@ -91,6 +91,7 @@ def thinned_copy(recording: Recording, samples: int = LONG_PART) -> Recording:
         context={s: mean(x) for s, x in recording.context.items()},
         noise=dict.fromkeys(recording.noise),
         split=Split(),
+        segments=tuple(s // k for s in recording.segments if 0 < s // k < m),
     )
 
 
@@ -103,4 +104,5 @@ def _part(recording: Recording, part: slice, dt: float) -> Recording:
         outputs={s: x[part] for s, x in recording.outputs.items()},
         context={s: x[part] for s, x in recording.context.items()},
         split=Split(),
+        segments=recording.segments_of(part.start, part.stop),
     )

@@ -59,7 +59,8 @@ class Run:
 
     ``starts``: samples of the stretch where the base physics starts afresh. ``window``: samples of measured output
     after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,). ``setting``:
-    sorted sample numbers that may set the states of a linear run instead (None: those of the window).
+    sorted sample numbers that may set the states of a linear run instead (None: those of the window). ``period``:
+    samples after which all inputs and outputs repeat from every start on (0: they do not): it sets the start states.
     """
 
     t: Array
@@ -71,6 +72,7 @@ class Run:
     window: int
     memo: dict[object, object]
     setting: NDArray[np.int64] | None = None
+    period: int = 0
 
 
 class Twin(Protocol):

@@ -127,7 +127,7 @@ class DynamicTwin(Head):
         plant = self.plant_of(theta)
         # one state and one input: a single run from the right start state does, without columns
         alone = join and len(self.inputs) == 1 and len(self.groups) == 1 and len(plant.blocks) < 2
-        if forces or (alone and run.setting is None):
+        if forces or (alone and run.setting is None and (self.start_given or not run.period)):
             return self._with_forces(run, inputs, theta, forces)
         d = discretise_blocks(plant, run.dt, self.hold)
         where = {r: (k, r - a) for k, (a, b) in enumerate(plant.parts) for r in range(a, b)}
@@ -217,7 +217,8 @@ class DynamicTwin(Head):
                     else:
                         y[o] += run_output(part.ad, part.g0, part.g1, c, u, at)
             if ss is not None:
-                y[output] += ss.response(ss.states({o: -v for o, v in y.items()}), output, change.size)
+                x0 = ss.steady(y, run.period) if run.period else ss.states({o: -v for o, v in y.items()})
+                y[output] += ss.response(x0, output, change.size)
             return y[output]
 
         return carry
@@ -234,7 +235,7 @@ class DynamicTwin(Head):
         """Add the free response of the start states: the engineer's, or what the first samples say."""
         n = run.t.size
         zero = np.zeros(n)
-        given = self.start_given or run.window == 0
+        given = self.start_given or (run.window == 0 and not run.period)
         if given and run.setting is None and self.fixed_free is not None and run.starts == (0,):
             for o, y in self.fixed_free(n).items():
                 value[o] = value[o] + y
@@ -242,13 +243,19 @@ class DynamicTwin(Head):
             for group in self.groups:
                 # a value and its columns are settled alike: the start state is an affine function of them
                 ss = self._start_state(run, ad, blocks, group)
-                x0 = ss.states({o: run.measured[o] - value[o] for o in group})
+                mine = {o: value[o] for o in group}
+                x0 = (
+                    ss.steady(mine, run.period)
+                    if run.period
+                    else ss.states({o: run.measured[o] - mine[o] for o in mine})
+                )
                 for o in group:
                     value[o] = ss.added(value[o].copy(), x0, o)
                 for entry in columns.values():
                     if not any(o in entry for o in group):
                         continue
-                    x0 = -ss.states({o: entry.get(o, zero) for o in group})
+                    mine = {o: entry.get(o, zero) for o in group}
+                    x0 = ss.steady(mine, run.period) if run.period else -ss.states(mine)
                     for o in group:
                         # a column may be one that is remembered
                         entry[o] = ss.added(np.array(entry.get(o, zero), np.float64), x0, o)
@@ -347,7 +354,11 @@ class DynamicTwin(Head):
             )  # fmt: skip
 
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        if self.fixed_free is not None and run.starts == (0,) and (self.start_given or run.window == 0):
+        if (
+            self.fixed_free is not None
+            and run.starts == (0,)
+            and (self.start_given or (run.window == 0 and not run.period))
+        ):
             # forces make the start state no linear function of what was measured: the engineer's own stands
             free = self.fixed_free(run.t.size)
             x = go(np.zeros((1, plant.a.shape[0])), u, starts, ends)
@@ -358,6 +369,11 @@ class DynamicTwin(Head):
         if forces and self.counted:
             # the rows of the outputs do not show where it stands; how it came there was recorded
             x0[:, 0] = travelled(run.measured[self.feedback_on], run.dt, self.counted)[starts]
+        if run.period:
+            begin = shot_to_repeat(go, np.linalg.matrix_power(full, run.period), x0, u, starts, run.period)
+            if begin is not None:
+                x = go(begin, u, starts, ends)
+                return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
         # what sets the state is simulated alone, one window after the other
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)
         seen = np.concatenate([np.arange(a, b) for a, b in zip(starts, stop, strict=True)])
@@ -372,6 +388,38 @@ class DynamicTwin(Head):
             x0 = x0 + ss.states(need)
         x = go(x0, u, starts, ends)
         return {o: Signal(x @ rows[o] + extra[o], {}, (*token, o)) for o in self.outputs}
+
+
+Go = Callable[[Array, Array, NDArray[np.int64], NDArray[np.int64]], Array]
+MOST_SHOTS = 12
+REPEATS = 1e-9
+"""Change of a state over a period, relative to the largest state, at which it repeats."""
+NEARLY = 1e-3
+"""The same where shooting may end without it."""
+
+
+def shot_to_repeat(go: Go, full: Array, x0: Array, u: Array, starts: NDArray[np.int64], period: int) -> Array | None:
+    """Start states (starts, s) that a run leads back to after ``period`` samples, by shooting from ``x0``.
+
+    ``go(x0, u, starts, stops)``: states (n, s); ``full`` (s, s): the linear plant over one period, in place of the
+    slopes of what is added to it. None where that leads nowhere: a plant that integrates, or a memory that does not
+    repeat.
+    """
+    stop = np.asarray((np.arange(starts.size) + 1) * (period + 1), np.int64)
+    part = np.concatenate([u[a : a + period + 1] for a in starts])
+    system = np.eye(full.shape[0]) - full
+    if np.linalg.cond(system) > 1e10:
+        return None
+    away = np.inf
+    for _ in range(MOST_SHOTS):
+        x = go(x0, part, stop - (period + 1), stop)
+        size = max(float(np.max(np.abs(x))), 1e-300)
+        change = x[stop - 1] - x0
+        away = float(np.max(np.abs(change))) / size
+        if not np.isfinite(away) or away <= REPEATS:
+            break
+        x0 = x0 + np.linalg.solve(system, change.T).T
+    return x0 if away <= NEARLY else None
 
 
 def discretise_blocks(plant: Plant, dt: float, hold: Hold) -> list[Discrete]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -230,6 +230,8 @@ class StartState:
     spans: tuple[tuple[int, int], ...]
     samples: tuple[NDArray[np.int64], ...]
     solvers: tuple[Array, ...]
+    ad: Array
+    memo: dict[object, Array] = field(default_factory=dict[object, Array], compare=False, repr=False)
 
     def states(self, need: dict[str, Array]) -> Array:
         """(starts, s): start states whose free response meets ``need`` (n,) per output at the samples."""
@@ -237,6 +239,32 @@ class StartState:
         for at, solver in zip(self.samples, self.solvers, strict=True):
             stacked = np.concatenate([need[o][at] * self.weight[o] for o in self.outputs])
             rows.append(solver @ stacked)
+        return np.stack(rows)
+
+    def steady(self, y: Mapping[str, Array], period: int) -> Array:
+        """(starts, s): start states with which responses ``y`` (n,) from rest to inputs that repeat do so, too.
+
+        From rest ``y`` differs one period later by the free response of the state x that it has reached by then, and
+        the steady state starts from x / (1 - A^period).
+        """
+        key = ("steady", period)
+        if key not in self.memo:
+            length = min(max(f.shape[0] for f in self.free.values()), MOST_SETTING)
+            least = min(length, *(b - a - period for a, b in self.spans))
+            seen = np.concatenate([_padded(self.free[o], np.arange(least)) * self.weight[o] for o in self.outputs])
+            inverse = held_inverse(seen, seen, ROUGH_OF_A_PERIOD)
+            full = np.linalg.matrix_power(self.ad, period)
+            solved = np.linalg.lstsq(np.eye(full.shape[0]) - full, inverse, rcond=1e-14)[0]
+            self.memo[key] = np.asarray(solved, np.float64)
+        solver = self.memo[key]
+        m = solver.shape[1] // len(self.outputs)
+        rows = [
+            solver
+            @ np.concatenate(
+                [(y[o][a + period : a + period + m] - y[o][a : a + m]) * self.weight[o] for o in self.outputs]
+            )
+            for a, _ in self.spans
+        ]
         return np.stack(rows)
 
     def response(self, states: Array, output: str, n: int) -> Array:
@@ -296,7 +324,8 @@ def start_state(
     horizon = min(stretch, felt_at_most(ad, stretch)) if forgets(ad, stretch) else window
     shape = np.concatenate([response_shape(ad, c, horizon, blocks) * weight[o] for o, c in rows.items()])
     rough = max(
-        LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW, *(_roughness(measured[o], memo, o) for o in rows)
+        LEAST_ROUGH if setting is not None else LEAST_ROUGH_OF_A_WINDOW,
+        *(_roughness(measured[o], memo, o) for o in rows),
     )
     for (a, _), samples in zip(spans, at, strict=True):
         since = samples - a
@@ -305,13 +334,15 @@ def start_state(
             stacked = np.concatenate([_padded(free[o], since) * weight[o] for o in rows])
             known[name] = held_inverse(stacked, shape, rough)
         solvers.append(known[name])
-    made = StartState(tuple(rows), free, weight, spans, at, tuple(solvers))
+    made = StartState(tuple(rows), free, weight, spans, at, tuple(solvers), ad)
     memo[key] = made
     return made
 
 
 LEAST_ROUGH = 0.01
 """Misfit of a simulation, as a fraction of the recorded range, that start states have to stand at least."""
+ROUGH_OF_A_PERIOD = 1e-6
+"""The same for a start state that follows from the period: no measurement is involved, only digits."""
 LEAST_ROUGH_OF_A_WINDOW = 0.03
 """The same where the first samples alone set a state: the twin may be as given, and nothing was fitted to them."""
 NUMERICAL_RANK = 1e-10

@@ -16,6 +16,7 @@ from tools.guest.equations import Program
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
+from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.feedback import Rows, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
@@ -368,8 +369,19 @@ class OdeTwin(Head):
             return self.equations.states(x0, first, stop, u, held, t, run.dt, sub, values, inside, limits)
 
         given = np.array([[x.start for x in self.state_list]])
-        if run.window == 0 and run.starts == (0,):
+        if run.window == 0 and run.starts == (0,) and (np.any(given) or not run.period):
             return go(given, starts, ends, u, run.t)
+        if run.period:
+            ad = discretise(self.linearised(values).a, np.zeros(given.shape[1]), run.dt, "zero").ad
+
+            def once(x0: Array, part: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:
+                times = np.concatenate([run.t[a : a + run.period + 1] for a in starts])
+                return go(x0, first, stop, part, times)
+
+            full = np.linalg.matrix_power(ad, run.period)
+            begin = shot_to_repeat(once, full, np.repeat(given, starts.size, axis=0), u, starts, run.period)
+            if begin is not None:
+                return go(begin, starts, ends, u, run.t)
         # what sets the state is simulated alone, one window after the other
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
         stop = np.asarray(np.minimum(starts + window, ends), np.int64)

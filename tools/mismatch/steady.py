@@ -1,0 +1,63 @@
+"""Records in steady state: inputs that repeat from the first sample on, and outputs that do so, too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.physics.periods import period_of
+
+Array = NDArray[np.float64]
+
+REPEATS = 1e-3
+"""Largest rms difference of an input from itself one period later, over its rms: it was commanded, not measured."""
+OUTPUT_REPEATS = 0.05
+"""The same for an output, whose difference may hold noise."""
+LOUDER_AT_FIRST = 1.5
+"""Rms of that difference at the start of a stretch over the rest of it, above which a transient decays there."""
+DRIFTS = 0.3
+"""Mean of that difference over its rms, above which the output drifts or has not settled."""
+EXACT = 1e-6  # of the output's rms: differences below are rounding
+
+
+def steady_period(inputs: Mapping[str, Array], outputs: Mapping[str, Array], starts: Sequence[int] = (0,)) -> int:
+    """The number of samples after which every input and output (n,) repeats, in each stretch from its first sample on.
+
+    0 where there is none: an input does not repeat within a whole number of samples, or an output has a transient.
+    ``starts``: first samples of the stretches, in order.
+    """
+    moving = [x for x in inputs.values() if float(np.std(x)) > 0.0]
+    if not moving:
+        return 0
+    n = moving[0].size
+    spans = list(zip(starts, (*starts[1:], n), strict=True))
+    a, b = spans[0]
+    found = period_of(max(moving, key=lambda x: float(np.std(x[a:b])))[a:b])
+    if found is None:
+        return 0
+    lag = found.lag
+    if any(b - a < 2 * lag for a, b in spans):
+        return 0
+    repeat = all(_difference(x[a:b], lag) <= REPEATS * float(np.std(x)) for x in moving for a, b in spans)
+    return lag if repeat and all(_settled(y[a:b], lag) for y in outputs.values() for a, b in spans) else 0
+
+
+def _difference(x: Array, lag: int) -> float:
+    return _rms(x[lag:] - x[:-lag])
+
+
+def _settled(y: Array, lag: int) -> bool:
+    d = y[lag:] - y[:-lag]
+    size, all_of_it = float(np.std(y)), _rms(d)
+    early = max(8, lag // 8)
+    if all_of_it > OUTPUT_REPEATS * np.sqrt(2.0) * size:
+        return False
+    if _rms(d[:early]) <= EXACT * size:
+        return True
+    return _rms(d[:early]) <= LOUDER_AT_FIRST * _rms(d[early:]) and abs(float(np.mean(d))) <= DRIFTS * all_of_it
+
+
+def _rms(x: Array) -> float:
+    return float(np.sqrt(np.mean(x * x))) if x.size else 0.0
