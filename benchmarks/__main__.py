@@ -23,6 +23,7 @@ from rich.table import Table
 
 from benchmarks.machine import machine
 from benchmarks.row import Row
+from hal.children import use_one_thread
 
 RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
@@ -172,7 +173,7 @@ def main(chosen: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    use_one_thread()
     if sys.argv[1:2] == ["--rows"]:
         work(sys.argv[2], Path(sys.argv[3]))
     else:

@@ -27,6 +27,16 @@ def child_environment() -> dict[str, str]:
     return environment
 
 
+def use_one_thread() -> None:
+    """Give one thread to every linear algebra call of this process and its children, unless the user chose otherwise.
+
+    Call it before numpy is imported. Work is parallel in processes here. Beside a real-time loop, a second thread of
+    ordinary priority makes every large call wait for a processor.
+    """
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+
+
 def begin_as_worker() -> None:
     """Leave Ctrl-C to the process that started this one, and end with it (Linux)."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)

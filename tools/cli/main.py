@@ -15,6 +15,7 @@ import typer
 from typer.core import TyperGroup
 
 from firmware_py.exit_codes import Exit
+from hal.children import use_one_thread
 from tools.interrupt import install_handler, was_interrupted
 
 # name -> where it is, and its line in the list
@@ -185,6 +186,7 @@ for _name, (_, _says) in COMMANDS.items():
 
 def main() -> None:
     """What the ``micron`` script calls."""
+    use_one_thread()
     install_handler()
     try:
         app()

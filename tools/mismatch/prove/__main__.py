@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from pathlib import Path
+
+from hal.children import use_one_thread
 
 
 def _only(text: str) -> tuple[str, str, float]:
@@ -16,8 +17,7 @@ def _only(text: str) -> tuple[str, str, float]:
 
 def main() -> int:
     """Exit 0 when the proof ran, whatever its figures; 2 on bad usage."""
-    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(key, "1")
+    use_one_thread()
     from tools.mismatch.prove.proof import MOST_SAMPLES
 
     p = argparse.ArgumentParser(prog="python -m tools.mismatch.prove", description="Blind self-proof, for tuning.")

@@ -16,6 +16,7 @@ from typing import Any
 from scipy.stats import beta
 
 from firmware_py.recording.revision import git_revision
+from hal.children import use_one_thread
 from tools.mismatch.prove import draw, seal
 from tools.mismatch.prove.catalog import TWINS
 from tools.mismatch.prove.noise import KINDS
@@ -257,10 +258,8 @@ def document(result: NullResult, before: str = "") -> str:
 
 def main() -> None:
     import argparse
-    import os
 
-    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(key, "1")
+    use_one_thread()
     p = argparse.ArgumentParser(description="null simulations: false-alarm rate with its confidence bound")
     p.add_argument("--n", type=int, default=300)
     p.add_argument("--seed", type=int, default=None)

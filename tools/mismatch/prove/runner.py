@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -13,7 +12,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
-from hal.children import begin_as_worker
+from hal.children import begin_as_worker, use_one_thread
 from tools.mismatch.prove.guests import installed
 
 Diagnose = Callable[[Path], dict[str, Any]]
@@ -77,8 +76,7 @@ def in_processes(function: Callable[[A], B], items: Sequence[A], jobs: int) -> I
     if jobs <= 1 or len(items) < 2:
         yield from map(function, items)
         return
-    for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(key, "1")
+    use_one_thread()
     with ProcessPoolExecutor(
         min(jobs, len(items)), mp_context=get_context("spawn"), initializer=begin_as_worker
     ) as pool:
