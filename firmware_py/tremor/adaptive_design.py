@@ -61,7 +61,8 @@ class AdaptiveDesign:
     Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m); ``rest`` (m, m) is what does not
     scale with the tremor, ``quiet`` (m, m) the penalty on what the filter passes above the band; ``noise_cross`` (3, m)
     and ``noise_power`` are the sensor noise's share in learning. All are of weighted signals except ``quiet``,
-    ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present features. ``gate_power``: of the gate's output, where both levels count the same.
+    ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present features.
+    ``gate_power``: of the gate's output, where both levels count the same.
     """
 
     bank: Bank
