@@ -25,7 +25,7 @@ from hal.clock import MonotonicClock, Pace, PacedClock, VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.toml_file import parse_toml, read_text
-from hal.trust import path_inside, require_package
+from hal.trust import is_our_package, path_inside, require_package
 from hal.validation import validate_table
 
 SIM_SCHEME = "sim://"
@@ -338,13 +338,21 @@ def open_bench(
                 table["emulation"]["seed"] = seed
             if truth_s is not None:
                 table["emulation"]["truth_s"] = truth_s
-            world = _provider(bench)(
-                table,
-                clock=clock if isinstance(clock, VirtualClock) else None,
-                runtime_dir=runtime_dir,
-                hand_file=hand_file,
-                hand_scale=hand_scale,
-            )
+            provider, target = _provider(bench), str(description.emulation["provider"])
+            try:
+                world = provider(
+                    table,
+                    clock=clock if isinstance(clock, VirtualClock) else None,
+                    runtime_dir=runtime_dir,
+                    hand_file=hand_file,
+                    hand_scale=hand_scale,
+                )
+            except HalError:
+                raise
+            except Exception as error:
+                if is_our_package(target):
+                    raise
+                raise BenchError(f"{bench.path}: [emulation.provider] '{target}' failed: {error!r}") from error
             opened.world = world
             opened.closers.append(world.stop)
         failures: list[HalError] = []

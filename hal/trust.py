@@ -143,14 +143,18 @@ def trust_package(target: str) -> None:
     decide("run", key, target)
 
 
-def is_trusted_package(target: str) -> bool:
-    """Return whether ``module:object`` is ours, or its package may run, or there is no such package (no harm then)."""
-    key, place = package_of(target)
+def is_our_package(target: str) -> bool:
+    """Return whether ``module:object`` came with this program, or there is no such package."""
+    _, place = package_of(target)
     if place is None:
         return True
     top = target.partition(":")[0].partition(".")[0]
-    ours = (top in OURS and place.resolve().is_relative_to(ROOT)) or is_ours(place)
-    return ours or is_decided("run", key)
+    return (top in OURS and place.resolve().is_relative_to(ROOT)) or is_ours(place)
+
+
+def is_trusted_package(target: str) -> bool:
+    """Return whether ``module:object`` is ours or may run."""
+    return is_our_package(target) or is_decided("run", package_of(target)[0])
 
 
 def require_package(target: str, named_by: Path) -> None:

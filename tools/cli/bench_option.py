@@ -23,7 +23,14 @@ def pace_of(virtual: bool) -> Pace | None:
 
 
 def bench_path(chosen: Path | None) -> Path:
-    """The chosen bench, or the one that ships with the package."""
+    """The chosen bench, or the one that ships with the package. Where a chosen one names code that is not ours, the
+    command goes on in a process of its own, and this call ends with its status.
+    """
     import benches
 
-    return chosen if chosen is not None else Path(benches.__file__).with_name("micron.toml")
+    if chosen is None:
+        return Path(benches.__file__).with_name("micron.toml")
+    from tools.cli.supervise import supervise
+
+    supervise(chosen)
+    return chosen

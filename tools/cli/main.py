@@ -7,6 +7,7 @@ help (a test compares them).
 
 from __future__ import annotations
 
+import os
 import sys
 from importlib import import_module
 from typing import Annotated, Any
@@ -17,6 +18,9 @@ from typer.core import TyperGroup
 from firmware_py.exit_codes import Exit
 from hal.children import use_one_thread
 from tools.interrupt import install_handler, was_interrupted
+
+SUPERVISED = "MICRON_SUPERVISED"
+"""Names the file handle on which a supervised command says that it ended by itself (``tools.cli.supervise``)."""
 
 # name -> where it is, and its line in the list
 COMMANDS = {
@@ -188,6 +192,11 @@ def main() -> None:
     """What the ``micron`` script calls."""
     use_one_thread()
     install_handler()
+    handle = None
+    if SUPERVISED in os.environ:
+        from tools.cli.supervise import begin_supervised
+
+        handle = begin_supervised()
     try:
         app()
     except BaseException as end:
@@ -196,6 +205,9 @@ def main() -> None:
         # Ctrl-C while a command was still being imported: compiled modules make an ImportError of it
         sys.stderr.write("micron: stopped by Ctrl-C\n")
         raise SystemExit(Exit.INTERRUPTED) from None
+    finally:
+        if handle is not None:
+            os.write(handle, b".")  # the end is ours, not that of code that the bench names
 
 
 if __name__ == "__main__":

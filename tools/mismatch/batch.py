@@ -7,6 +7,7 @@ of a linear algebra library only fight for the same core.
 from __future__ import annotations
 
 import importlib.util
+import shlex
 import tomllib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -14,6 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from hal.errors import BenchError
+from hal.trust import NotTrusted
 from tools.errors import InputError
 from tools.mismatch.report.wording import number, scaled, words
 
@@ -110,6 +112,10 @@ def diagnose_one(job: Job) -> Row:
         if job.out is not None:
             write_reports(report, job.out)
         return Row(job.name, str(job.path), report.to_json())
+    except NotTrusted as error:
+        decide = shlex.join(["micron", "trust", str(error.subject)])
+        more = "" if error.option == "--trust" else f" {error.option}"
+        return Row(job.name, str(job.path), error=f"{error}; to allow it: {decide}{more}", bad_input=True)
     except (InputError, BenchError) as error:
         return Row(job.name, str(job.path), error=str(error), bad_input=True)
     except Exception as error:  # one recording that breaks the engine must not take the others with it
