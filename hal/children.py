@@ -9,6 +9,8 @@ import sys
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
+SUPERVISED = "MICRON_SUPERVISED"
+"""Environment variable with the file handle on which a supervised command says that it ended by itself."""
 
 
 def child_command(module: str, *arguments: str) -> list[str]:

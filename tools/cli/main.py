@@ -16,11 +16,8 @@ import typer
 from typer.core import TyperGroup
 
 from firmware_py.exit_codes import Exit
-from hal.children import use_one_thread
+from hal.children import SUPERVISED, use_one_thread
 from tools.interrupt import install_handler, was_interrupted
-
-SUPERVISED = "MICRON_SUPERVISED"
-"""Names the file handle on which a supervised command says that it ended by itself (``tools.cli.supervise``)."""
 
 # name -> where it is, and its line in the list
 COMMANDS = {

@@ -15,10 +15,9 @@ from pathlib import Path
 import typer
 
 from hal.bench import load_bench, named_packages
-from hal.children import child_command, child_environment
+from hal.children import SUPERVISED, child_command, child_environment
 from hal.trust import NotTrusted, is_our_package
 from tools.cli.common import Exit, print_error
-from tools.cli.main import SUPERVISED
 
 MEMORY_BYTES = 8 << 30
 
