@@ -1,4 +1,4 @@
-"""Where the parts become an instrument: wiring, the loop, its tasks, and the supervisor that may stop it.
+"""Joins the parts into an instrument: wiring, the loop, its tasks, and the supervisor that may stop it.
 
 What lives here: who runs when (``tasks``), the pass of a tick (``loop``), what may end a run (``watch``,
 ``plausibility``, ``safety``) and what follows from a finding (``incidents``).

@@ -1,4 +1,4 @@
-"""[firmware] of a bench file: stages, safety limits, task budgets; calibration files laid over them."""
+"""Reads [firmware] of a bench file (stages, safety limits, task budgets) and merges the calibration files into it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,10 @@ STAGES = ("sensing", "tremor", "actuation")
 
 
 class SelfTestLimits(BaseModel):
-    """How long the sensors are watched before anything may move, and by when they must have answered."""
+    """Sets how long the sensors must be good without interruption before arming, and the time limit of the self-test.
+
+    ``watch_ms``: required time without interruption. ``limit_ms``: a self-test that takes longer trips.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,7 +39,7 @@ class SelfTestLimits(BaseModel):
 
 
 class FirmwareConfig(BaseModel):
-    """The checked [firmware] table. ``stages`` holds the tables of the three stages, calibration merged in."""
+    """Holds the checked [firmware] table. The tables of the three stages are checked by ``StageConfigs``."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -46,7 +49,7 @@ class FirmwareConfig(BaseModel):
     budget_us: dict[str, float] = Field(default_factory=dict[str, float])
     calibration: tuple[str, ...] = ()
     noise: str | None = None
-    """JSON of ``micron noise`` for the filters' covariances."""
+    """Names the JSON file of ``micron noise`` from which the filters' covariances are computed."""
     sensing: dict[str, Any] = Field(default_factory=dict[str, Any])
     tremor: dict[str, Any] = Field(default_factory=dict[str, Any])
     actuation: dict[str, Any] = Field(default_factory=dict[str, Any])
@@ -55,8 +58,8 @@ class FirmwareConfig(BaseModel):
 def load_firmware_config(
     bench: BenchFile, wired: Mapping[str, Any], method: str | None = None
 ) -> tuple[FirmwareConfig, StageConfigs]:
-    """Bench table, then calibration files over it (in order), then what the wiring decides, then measured noise, then
-    ``method``.
+    """Return the configuration of firmware and stages. Later sources override earlier ones: bench table, calibration
+    files (in order), ``wired`` (what the wiring decides), measured noise, ``method``.
 
     ``method``: another tremor estimator than the bench file's. Raises ``BenchError`` naming file and key.
     """
@@ -77,7 +80,7 @@ def load_firmware_config(
 
 
 def _check_tasks(bench: BenchFile, config: FirmwareConfig) -> None:
-    """Raises ``BenchError`` where the rates and budgets of the bench do not fit its ticks, before it is opened."""
+    """Raise ``BenchError`` where the rates and budgets of the bench do not fit its ticks, before it is opened."""
     description, where = bench.description, str(bench.path)
     polling, bus_us = bus_plan(description, check_devices(description, where))
 

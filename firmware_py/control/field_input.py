@@ -1,4 +1,4 @@
-"""The magnetometer beside the scans: polled a channel at a time, handed to sensing when three fresh volts are there."""
+"""Polls the magnetometer one channel at a time, and hands a reading to sensing when all three axes are fresh."""
 
 from __future__ import annotations
 
@@ -17,8 +17,11 @@ USUAL_NS = 11_000_000
 
 
 class FieldInput:
-    """``limit_ms``: how long the field may be missing or stand still before the outputs hold. ``outlier_V``: a second
-    difference of an axis' readings beyond it is noticed; a hand turns and trembles too slowly for it."""
+    """Polls the magnetometer and checks its readings.
+
+    ``limit_ms``: how long the field may be missing or stand still before the outputs hold. ``outlier_V``: a second
+    difference of an axis' readings beyond it is noticed; a hand turns and trembles too slowly for it.
+    """
 
     def __init__(
         self, magnetometer: Hmc2003, incidents: Incidents, counts: LoopCounts, limit_ms: float, outlier_V: float
@@ -35,19 +38,19 @@ class FieldInput:
         self._hangs = False
 
     def fill(self, frame: NDArray[np.float64]) -> None:
-        """Into the frame's columns, once per reading."""
+        """Write a fresh reading into the frame's columns, once per reading, and mark whether there was one."""
         frame[MAGNETOMETER_FRESH] = float(self._fresh)
         if self._fresh:
             frame[MAGNETOMETER_RAW : MAGNETOMETER_RAW + 3] = self._volts
             self._fresh = False
 
     def poll(self, info: TickInfo) -> None:
-        """Task: one transfer on the bus."""
+        """Run the magnetometer's task: one transfer on the bus, and the checks of a completed reading."""
         magnetometer, incidents = self._magnetometer, self._incidents
         try:
             if magnetometer.poll():
                 volts = magnetometer.volts
-                # three axes never read the same twice; one converter that hangs gives its last word for all
+                # three axes never read the same value twice; a converter that hangs repeats its last one for all
                 hangs = bool(volts[0] == volts[1] == volts[2])
                 if hangs and self._hangs:
                     incidents.notice("magnetometer's converter hangs")
@@ -65,11 +68,12 @@ class FieldInput:
             incidents.bad_for(Finding.MAGNETOMETER_SILENT, True, info.due_ns, self._limit_ms, error=error)
 
     def _look_for_outliers(self, volts: NDArray[np.float64], t_ns: int) -> None:
-        """The I2C bus has no checksum: a flipped bit is a reading out of line with its neighbours. The second
-        difference of a turn grows with the square of the time between readings, and so does what is allowed."""
+        """Notice a reading out of line with its neighbours: the I2C bus has no checksum, so a flipped bit looks like
+        that. The second difference of a turn grows with the square of the time between readings, and so does the
+        limit."""
         slope = volts - self._before
         allowed_V = self._outlier_V * max(1.0, ((t_ns - self._before_ns) / USUAL_NS) ** 2)
         self._before_ns = t_ns
-        if np.any(np.abs(slope - self._slope) > allowed_V):  # never of the first two: NaN
+        if np.any(np.abs(slope - self._slope) > allowed_V):  # never true for the first two: NaN
             self._incidents.notice(f"{self._magnetometer.name} read a value out of line with its neighbours")
         self._slope, self._before = slope, volts.copy()

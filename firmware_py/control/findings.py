@@ -1,8 +1,9 @@
-"""Everything that can make the outputs leave their work, in one table: what it is, whose fault it is, what then.
+"""Lists every finding that interrupts or ends normal operation, with its message, its cause and its consequence.
 
 A finding is *recoverable* or *latched*. A recoverable one has a cause that can pass, and what follows can be checked
 before the outputs move again: the outputs ramp to neutral, hold there, and go on (``holds.py``). A latched one says
-that what is known of the sensors or the outputs is wrong, or that a person wanted the end: safe until a person acts.
+that what is known of the sensors or the outputs is wrong, or that a person wanted the end: the outputs stay in the
+safe state until a person acts.
 Models: ArduPilot's failsafe actions, IEC 61800-5-2 (a stop that holds against one that removes power), the fault
 protection of F Prime. ``docs/findings.md`` is this table, made by ``python -m tools.reports.findings_page``.
 """
@@ -25,7 +26,7 @@ from hal.errors import (
 
 
 class CauseClass(StrEnum):
-    """Where the cause of a finding is."""
+    """Names the place where the cause of a finding lies."""
 
     HOST = "host"
     LINK = "link"
@@ -34,7 +35,8 @@ class CauseClass(StrEnum):
 
 
 class FindingEntry(NamedTuple):
-    """One row of the table. ``says`` is the message with its words in braces, ``why`` the reason for the class."""
+    """Holds one row of the table. ``says`` is the message with its fields in braces, ``why`` the reason for the row's
+    consequence."""
 
     title: str
     cause: CauseClass
@@ -42,7 +44,7 @@ class FindingEntry(NamedTuple):
     says: str
     why: str
     normal: bool = False
-    """An ordinary end of a run: exit status 0."""
+    """True for an ordinary end of a run, which exits with status 0."""
 
 
 def _recoverable(title: str, cause: CauseClass, says: str, why: str) -> FindingEntry:
@@ -62,7 +64,7 @@ _HOST, _LINK, _DEVICE, _OPERATOR = CauseClass
 
 @unique
 class Finding(Enum):
-    """All findings. The value is the table's row."""
+    """Enumerates all findings. The value of a member is its row of the table."""
 
     # -- scans
     SCANS_MISSING = _recoverable(
@@ -300,7 +302,8 @@ class Finding(Enum):
 
 
 def finding_of_scans(error: HalError, stall_ms: float) -> Finding:
-    """What an error of reading scans means; ``stall_ms``: how long this host has just stood still, 0 if it has not."""
+    """Return the finding for an error of reading scans. ``stall_ms`` is how long this host has just stood still (ms),
+    0 if it has not."""
     match error:
         case Disconnected():
             return Finding.DAQ_GONE
@@ -315,12 +318,13 @@ def finding_of_scans(error: HalError, stall_ms: float) -> Finding:
 
 
 def finding_of_button(error: HalError) -> Finding:
-    """What an error of the stop button's bus means."""
+    """Return the finding for an error of the stop button's bus."""
     return Finding.BUTTON_GONE if isinstance(error, Disconnected) else Finding.BUTTON_BUS
 
 
 def finding_of_output(error: HalError) -> Finding:
-    """What an error of a command or of a read-back means. One that contradicts a command is never a lost transfer."""
+    """Return the finding for an error of a command or a read-back. An error that contradicts a command is never taken
+    for a lost transfer."""
     match error:
         case LeaseLost():
             return Finding.LEASE_LOST

@@ -1,6 +1,6 @@
-"""When a hold may end: scans have flowed and the self-test has passed for a stated time, and a person agreed if asked.
+"""Decides when a hold may end: scans and self-test have been good for a stated time, and a person agreed if asked.
 
-The supervisor owns the states, this owns the times. All times are the bench clock's, in ns.
+The supervisor owns the states; this module owns the times. All times are the bench clock's, in ns.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ class Holds:
 
     @property
     def current(self) -> Hold | None:
-        """The hold that lasts, if one does."""
+        """Return the hold that lasts now, or ``None``."""
         return self._supervisor.holds[-1] if self._supervisor.is_holding else None
 
     def within_a_minute(self, now_ns: int) -> int:
-        """How many holds began within the last minute."""
+        """Return the number of holds that began within the last minute."""
         return sum(now_ns - hold.t_ns < MINUTE_NS for hold in self._supervisor.holds)
 
     def interrupt(self, now_ns: int, why: str) -> None:
-        """Something was not good: the time begins anew."""
+        """Restart the time that must be good without interruption, because of ``why``."""
         self._good_since_ns, self.waits_for = now_ns, why
         self._is_ready = self._asked = False
 
     def good_ms(self, now_ns: int) -> float:
-        """For how long nothing has been wrong."""
+        """Return the time since the last interruption, ms."""
         return (now_ns - self._good_since_ns) * 1e-6
 
     def may_end(self, now_ns: int) -> bool:
-        """Whether the outputs may move again; called once per pass of the loop while the outputs are at neutral."""
+        """Return True if the outputs may move again. Called once per pass of the loop while they are at neutral."""
         self._is_ready = self.good_ms(now_ns) >= self._limits.hold_ms
         if not self._is_ready:
             return False
@@ -55,36 +55,36 @@ class Holds:
 
     @property
     def is_ready(self) -> bool:
-        """The cause has passed; what is still missing, if anything, is the operator."""
+        """True once the cause has passed, so that at most the operator's consent is missing."""
         return self._is_ready
 
     def ask(self) -> bool:
-        """The operator wants the outputs to move again. False: there is nothing to end yet, and it is not kept."""
+        """Take the operator's request to move again. Return False, and forget the request, if no hold can end yet."""
         self._asked = self._is_ready and self._supervisor.state is State.HOLD
         return self._asked
 
     def wait_out_host(self, now_ns: int, reason: str) -> None:
-        """The host stands still within a hold: that time is not the cause's, and a hold that the host began tells how
-        long it was in all."""
+        """Exclude a stall of the host within a hold from the hold's time limit. A hold that the host caused takes
+        ``reason`` as its own."""
         self._last_ready_ns = now_ns
         hold = self.current
         if hold is not None and hold.finding is Finding.HOST_OVERSLEPT:
             hold.reason = reason
 
     def wait_for(self, now_ns: int, what: str) -> None:
-        """``what`` is on its way and has a limit of its own: the hold waits for it and does not grow too long."""
+        """Let the hold wait for ``what``, which has a time limit of its own and does not count towards the hold's."""
         self.interrupt(now_ns, what)
         self._last_ready_ns = now_ns
 
     def is_too_long(self, now_ns: int) -> bool:
-        """The hold has not become good within its limit."""
+        """Return True if the hold has not become good within ``hold_limit_ms``."""
         hold = self.current
         if hold is None or self._is_ready:
             return False
         return (now_ns - max(hold.t_ns, self._last_ready_ns)) * 1e-6 >= self._limits.hold_limit_ms
 
     def end(self, now_ns: int) -> Hold:
-        """The outputs move again."""
+        """Mark the last hold as ended with the outputs moving again, and return it."""
         hold = self._supervisor.holds[-1]
         hold.end_ns, hold.resumed = now_ns, True
         self._is_ready = self._asked = False
@@ -92,7 +92,7 @@ class Holds:
         return hold
 
     def as_status(self, now_ns: int) -> dict[str, Any] | None:
-        """The hold that lasts, for page and terminal; ``None`` while there is none."""
+        """Return the hold that lasts now as JSON values for page and terminal, or ``None``."""
         hold = self.current
         if hold is None:
             return None
@@ -105,8 +105,8 @@ class Holds:
         }
 
     def as_list(self, started_ns: int, now_ns: int) -> list[dict[str, Any]]:
-        """All holds as the run's JSON has them; ``t_s`` counts from ``started_ns``, as a recording's time does. What
-        ended a hold that was not ``resumed`` is the end of the run."""
+        """Return all holds as the run's JSON has them. ``t_s`` counts from ``started_ns``, as a recording's time does.
+        A hold that was not ``resumed`` ended with the run."""
         return [
             {
                 "t_s": (hold.t_ns - started_ns) * 1e-9,

@@ -1,10 +1,10 @@
-"""When this host stood still: what tells a device that is silent from a loop that did not look."""
+"""Records when this host stood still, which distinguishes a silent device from a loop that did not run."""
 
 from __future__ import annotations
 
 
 class HostGaps:
-    """Gaps of at least ``limit_ms`` in which the loop was due and did not run. Times are the bench clock's."""
+    """Counts gaps of at least ``limit_ms`` in which the loop was due and did not run. Times are the bench clock's."""
 
     def __init__(self, limit_ms: float) -> None:
         self.stalls = 0
@@ -14,7 +14,8 @@ class HostGaps:
         self._last_ns: int | None = None
 
     def look(self, due_ns: int, now_ns: int) -> None:
-        """The loop was to be awake at ``due_ns`` and is at ``now_ns``; an emulated world may tell of its own gaps."""
+        """Note that the loop was to be awake at ``due_ns`` and is awake at ``now_ns``. An emulated world may report its
+        own gaps."""
         late_ms = (now_ns - due_ns) * 1e-6
         if late_ms < self._limit_ms:
             return
@@ -23,7 +24,7 @@ class HostGaps:
         self._last_ms, self._last_ns = late_ms, now_ns
 
     def recent_ms(self, now_ns: int, within_ms: float) -> float:
-        """Length of the last gap if it ended within the last ``within_ms``, else 0."""
+        """Return the length of the last gap, ms, if it ended within the last ``within_ms``, else 0."""
         if self._last_ns is None or (now_ns - self._last_ns) * 1e-6 > within_ms:
             return 0.0
         return self._last_ms

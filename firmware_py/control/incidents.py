@@ -1,4 +1,4 @@
-"""What went wrong or was remarkable, in one place: counted, written to the recording, and answered by the table."""
+"""Handles every finding and remarkable event in one place: counts it, records it, and acts as the table states."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from hal.errors import HalError
 
 
 class Recorder(Protocol):
-    """Where finished frames go; never blocks, counts what it drops."""
+    """Receives finished frames and events. It never blocks, and counts what it drops."""
 
     def push(self, row: NDArray[np.float64]) -> bool: ...
     def event(self, event: dict[str, object]) -> bool: ...
@@ -25,12 +25,13 @@ class Recorder(Protocol):
 
 @dataclass
 class LoopCounts:
-    """What the loop counted besides the scheduler's figures.
+    """Holds the loop's own counters, beside the scheduler's figures.
 
     ``lost``: scans known to be missing; ``unread``: scans that were due after the last one read, when the loop stopped.
-    ``commands``: those that left for the amplifier; ``superseded``: ticks whose values a slow one passed over for
-    newer ones. ``clipped``: ticks whose command ran into a limit (yielding is none). ``latency``: of those that left.
-    ``noticed``: bench time at which something that does not end a run was first seen.
+    ``commands``: commands sent to the amplifier; ``superseded``: ticks whose values a slow amplifier passed over for
+    newer ones. ``clipped``: ticks whose command ran into a limit (yielding does not count). ``latency``: time from
+    sample to command of the commands sent. ``noticed``: bench time (ns) at which a condition that does not end a run
+    was first seen.
     """
 
     expected: int = 0
@@ -46,8 +47,8 @@ class LoopCounts:
 
 
 class Incidents:
-    """The one way from a finding to its consequence, which ``findings.Finding`` states. ``tick`` is kept by the loop;
-    ``error`` is the first hardware error that ended a run."""
+    """Turns every finding into the consequence that ``findings.Finding`` states. The loop keeps ``tick``; ``error`` is
+    the first hardware error that ended a run."""
 
     def __init__(
         self,
@@ -68,12 +69,12 @@ class Incidents:
         self.error: HalError | None = None
 
     def note(self, event: dict[str, object]) -> None:
-        """Into the recording, with time and tick."""
+        """Write ``event`` into the recording, with time and tick."""
         if self._recorder is not None:
             self._recorder.event({"t_ns": self._clock.now_ns(), "tick": self.tick, **event})
 
     def notice(self, what: str) -> None:
-        """Something that does not end the run: when it was first seen is kept."""
+        """Keep the time at which ``what``, which does not end the run, was first seen."""
         self._counts.noticed.setdefault(what, self._clock.now_ns())
 
     def report(self, finding: Finding, **words: object) -> None:
@@ -95,7 +96,7 @@ class Incidents:
             self.error = error
 
     def bad_for(self, finding: Finding, bad: bool, t_ns: int, patience_ms: float, **words: object) -> None:
-        """Doubt when ``bad`` has held for ``patience_ms``."""
+        """Report ``finding`` when ``bad`` has held for ``patience_ms``; where nothing is armed, notice it only."""
         if not bad:
             self._bad_since.pop(finding, None)
         elif (t_ns - self._bad_since.setdefault(finding, t_ns)) * 1e-6 >= patience_ms:
@@ -129,7 +130,7 @@ class Incidents:
             self.note({"event": "hold begins", "reason": reason, "finding": finding.name.lower(), "class": cause})
 
     def give_hold_up(self) -> None:
-        """The hold has lasted too long: its finding ends the run."""
+        """End the run because the hold has lasted too long."""
         hold = self.holds.current
         if hold is None:
             return
@@ -141,7 +142,7 @@ class Incidents:
         self._trip(Finding.HOLD_TOO_LONG, text, hold.cause)
 
     def end_hold(self) -> None:
-        """The outputs move again."""
+        """End the hold, because the outputs move again, and record its length."""
         hold = self.holds.end(self._clock.now_ns())
         assert hold.end_ns is not None
         self.note({"event": "hold ends", "reason": hold.reason, "length_s": (hold.end_ns - hold.t_ns) * 1e-9})

@@ -1,6 +1,6 @@
-"""The instrument's loop: scans in, commands out, one pass a tick, with a supervisor that may stop it.
+"""Runs the instrument's loop: one pass per tick turns a scan into a command; a supervisor may stop it.
 
-A tick is due when its scan was taken (device clock). Order within a tick: sense, estimate, actuate, then
+A tick is due when its scan was taken (device clock). A tick runs sense, estimate and actuate first, then
 everything that can wait. Nothing here knows whether the bench is real.
 """
 
@@ -46,10 +46,10 @@ from hal.errors import HalError
 from hal.types import ScanBlock, Status, TimeSource
 
 MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
-SETTLE_TICKS = 5  # the amplifier's own lag, after the last step of the ramp
+SETTLE_TICKS = 5  # covers the amplifier's own lag after the last step of the ramp
 LONGEST_PAUSE_NS = 10_000_000
-"""Between two tries of a ramp over a bus that fails; the pauses double up to here."""
-LATE_PART = 0.9  # of a period: the prediction bridges a known delay, not this one
+"""Longest pause between two attempts at a ramp step over a failing bus. The pauses double up to this value."""
+LATE_PART = 0.9  # latency of a late command, in periods; the prediction bridges a known delay, which this exceeds
 
 
 class InstrumentLoop:
@@ -142,22 +142,22 @@ class InstrumentLoop:
 
     @property
     def error(self) -> HalError | None:
-        """The hardware error that ended the run, if one did."""
+        """Return the hardware error that ended the run, or ``None``."""
         return self.incidents.error
 
     @property
     def asked_safe_ns(self) -> int | None:
-        """When the page asked for the safe state."""
+        """Return the bench time (ns) at which the page asked for the safe state, or ``None``."""
         return self._orders.asked_safe_ns if self._orders is not None else None
 
     def list_holds(self) -> list[dict[str, Any]]:
-        """Every hold of the run, as its JSON has them."""
+        """Return every hold of the run, as its JSON has them."""
         return self.holds.as_list(self._started_ns, self._clock.now_ns())
 
     # -- running ------------------------------------------------------------------------------------------
 
     def run(self, seconds: float) -> None:
-        """Self-test, arm, run for ``seconds`` after arming, ramp to neutral. Always ends in the safe state.
+        """Run the self-test, arm, run for ``seconds`` after arming, ramp to neutral. Always ends in the safe state.
 
         A hardware error becomes the reason of the trip and is kept in ``error``; anything else is raised
         again after the ramp.
@@ -236,7 +236,7 @@ class InstrumentLoop:
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
 
     def _wait(self, ticker: ScanTicker) -> Ticks:
-        """The next ticks. A scan that failed is reported, and the host clock drives the loop until it runs again."""
+        """Return the next ticks. A failed scan is reported, and the host clock drives the loop until it runs again."""
         try:
             return ticker.wait()
         except HalError:
@@ -246,7 +246,7 @@ class InstrumentLoop:
         return ticker.tick_without_scan()
 
     def _look_at(self, ticks: Ticks) -> None:
-        """What the arrival of ``ticks`` says of the link and of this host."""
+        """Report what the arrival of ``ticks`` reveals about the link and this host."""
         limits, name = self._config.safety, self._devices.daq.name
         if ticks.n > 1:
             self.incidents.notice("scans came late")
@@ -266,7 +266,7 @@ class InstrumentLoop:
                 self.incidents.report(Finding.SCANS_MISSING, device=name, limit_ms=limits.stale_ms)
 
     def _host_stalled_ms(self) -> float:
-        """How long this host has stood still just now, 0 if it has not, by this loop and by others that it runs."""
+        """Return how long (ms) this loop or another process of this host has just stood still, 0 if neither has."""
         now_ns, within_ms = self._clock.now_ns(), 2.0 * self._config.safety.stale_ms
         others_ms = self._others_stalled_ms(now_ns, within_ms) if self._others_stalled_ms is not None else 0.0
         return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
@@ -280,11 +280,11 @@ class InstrumentLoop:
         return self._watch.self_test_passed(watched_ms, (now_ns - self._started_ns) * 1e-6)
 
     def _may_finish(self) -> bool:
-        """A run does not end within a hold whose cause has not passed: it would hide what it was."""
+        """Return False within a hold whose cause has not passed: an end of the run there would hide the cause."""
         return not self.supervisor.is_holding or self.holds.is_ready
 
     def _look_after_hold(self) -> None:
-        """Outputs are on their way to neutral or there: end the hold, wait, or give it up."""
+        """End the hold, wait, or give it up, while the outputs are on their way to neutral or there."""
         now_ns = self._clock.now_ns()
         self.manual.stop()
         if self.supervisor.state is not State.HOLD:
@@ -313,8 +313,8 @@ class InstrumentLoop:
             self.incidents.end_hold()
 
     def _restart_scan(self) -> None:
-        """Begin a new scan after one that failed, with outputs at neutral: the driver may take a while for it. What the
-        device has taken meanwhile is lost."""
+        """Begin a new scan after one that failed, with outputs at neutral, because the driver may take a while for it.
+        Scans that the device has taken meanwhile are lost."""
         daq = self._devices.daq
         try:
             daq.stop()
@@ -360,7 +360,7 @@ class InstrumentLoop:
         return block
 
     def _count_unread(self) -> None:
-        """Scans that the device has had time for since the last one that was read."""
+        """Count the scans that the device has had time for since the last one that was read."""
         if self._last_scan_ns:
             self.counts.unread = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
 
@@ -378,7 +378,7 @@ class InstrumentLoop:
         self._clock.sleep_until_ns(self._clock.now_ns() + SETTLE_TICKS * self._period_ns)
 
     def _tell_end(self) -> None:
-        """The bench page need not wait for the outcome to know that the outputs are safe."""
+        """Report the safe state to the bench page before the run's outcome is there."""
         trip = self.supervisor.trip_cause
         if self._live is not None and self._on_status is not None and trip is not None:
             self._on_status(
@@ -398,7 +398,7 @@ class InstrumentLoop:
             try:
                 close()
             except HalError as error:
-                # the link may be what failed: the first error is the one to tell
+                # the link may be what failed: the first error is the one to report
                 self.incidents.error = self.error or (None if self.supervisor.safe_reached else error)
 
     # -- tasks --------------------------------------------------------------------------------------------
@@ -424,7 +424,7 @@ class InstrumentLoop:
             self._field.fill(frame)
 
     def _estimate(self, info: TickInfo) -> None:
-        """The whole step in one compiled call; of scans that came late only the newest is commanded."""
+        """Run the whole step in one compiled call. Of scans that came late, only the newest leads to a command."""
         assert self._ticks is not None
         if int(self._frame[STATUS]) & FrameStatus.STALE:
             return
@@ -437,7 +437,7 @@ class InstrumentLoop:
                 self.stages.command()
         self.stages.step()
         bits = int(self._frame[STATUS])
-        # before the command goes out: a sensor that contradicts its twin must not move anything
+        # check before the command goes out: a sensor that contradicts its twin must not move anything
         if self._redundancy.there:
             if unclear := self._redundancy.agree(self._frame):
                 self.incidents.doubt(Finding.AXES_CONTRADICT, what=unclear)
@@ -481,13 +481,14 @@ class InstrumentLoop:
             self.incidents.note({"event": "safe state", "reason": trip.reason})
 
     def _may_retry(self) -> bool:
-        """A ramp that fails is tried again for a stated time, unless the operator interrupts that."""
+        """Return True while a failing ramp is retried: for ``neutral_retry_s``, unless the operator interrupts it."""
         trip = self.supervisor.trip_cause
         since_ns = 0 if trip is None else self._clock.now_ns() - trip.t_ns
         return not self._is_told_to_give_up and since_ns < self._config.safety.neutral_retry_s * 1e9
 
     def _publish(self, info: TickInfo) -> None:
-        """Rows are scans: a tick without one leaves none, so that a replay sees what the filters saw."""
+        """Publish and record the frame. A tick without a scan writes no row, so that a replay sees what the filters
+        saw."""
         if int(self._frame[STATUS]) & FrameStatus.STALE:
             return
         if self._live is not None:
@@ -496,7 +497,7 @@ class InstrumentLoop:
             self._recorder.push(self._frame)
 
     def _supervise(self, info: TickInfo) -> None:
-        """100 Hz: the page's orders, then everything that may end the run and is not seen by the task that needs it."""
+        """Obey the page's orders, then check, at 100 Hz, what may end the run and no other task sees."""
         if self._orders is not None:
             self._orders.obey_all()
         self._watch.supervise(info)

@@ -1,8 +1,8 @@
-"""Driving the actuators by hand: jog for diagnosis, in place of the compensation.
+"""Drives the actuators by hand: jogs them for diagnosis, in place of the compensation.
 
-Armed by a switch that must be renewed, moved only while a button is held: an order to move is good for ``HOLD_S``.
-When the switch is not renewed for ``ARM_S``, or is opened, the outputs go back to neutral at ``RETURN_V_PER_S`` and
-compensation fades in again.
+A switch that must be renewed arms the manual drive. The outputs move only while a button is held: an order to move is
+valid for ``HOLD_S``. When the switch is not renewed for ``ARM_S``, or is opened, the outputs go back to neutral at
+``RETURN_V_PER_S`` and compensation fades in again.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ RETURN_V_PER_S = 200.0
 
 
 class ManualDrive:
-    """Where the hand wants the outputs. ``active`` while they are its, ``armed`` while it may move them."""
+    """Computes the outputs that the operator's orders ask for. ``active`` is True while the manual drive determines
+    the outputs, ``armed`` returns True while orders may move them."""
 
     def __init__(self, low_V: float, high_V: float, neutral_V: float) -> None:
         self._low_V, self._high_V, self._neutral_V = low_V, high_V, neutral_V
@@ -38,7 +39,7 @@ class ManualDrive:
         return self.active and now_ns < self._armed_until_ns
 
     def arm(self, now_ns: int, command_V: NDArray[np.float64]) -> None:
-        """Take over where the outputs are, or renew."""
+        """Take over the outputs at ``command_V`` (3,) V, or renew the time for which the drive is armed."""
         if not self.active:
             self._target_V[:] = command_V
             self._last_ns = now_ns
@@ -49,20 +50,20 @@ class ManualDrive:
         self._armed_until_ns = self._hold_until_ns = 0
 
     def stop(self) -> None:
-        """The outputs have been taken to neutral: nothing is left to return from."""
+        """End the manual drive without a return to neutral, because the outputs have been taken there already."""
         self.disarm()
         self._target_V[:] = self._neutral_V
         self.active = False
 
     def jog(self, now_ns: int, channel: int, rate_V_per_s: float) -> None:
-        """Move ``channel`` 0..2 for the next ``HOLD_S``; nothing happens when not armed or when it makes no sense."""
+        """Move ``channel`` 0..2 for the next ``HOLD_S``. Has no effect when not armed or for invalid arguments."""
         if self.armed(now_ns) and channel in (0, 1, 2) and math.isfinite(rate_V_per_s):
             self._channel = channel
             self._rate_V_per_s = max(-MAX_RATE_V_PER_S, min(MAX_RATE_V_PER_S, rate_V_per_s))
             self._hold_until_ns = now_ns + round(HOLD_S * 1e9)
 
     def step(self, now_ns: int) -> NDArray[np.float64]:
-        """The outputs (3,) V wanted now; ends the manual drive once it has returned to neutral."""
+        """Return the outputs (3,) V wanted now. Ends the manual drive once it has returned to neutral."""
         passed_s = min(0.01, (now_ns - self._last_ns) * 1e-9)
         self._last_ns = now_ns
         target = self._target_V
@@ -78,8 +79,8 @@ class ManualDrive:
 
 @kernel
 def follow_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
-    """The stage follows ``command`` that something else chose: memory of the model moves along, compensation is
-    off, ``stroke`` is what the hysteresis model says of the command."""
+    """Let the stage follow a ``command`` that something else chose. The model's memory moves along, compensation is
+    off, and ``stroke`` is what the hysteresis model predicts for the command."""
     state = states[0]
     param = params[0]
     for i in range(3):

@@ -1,4 +1,4 @@
-"""What the bench page may ask of a running loop: safe state, end of a hold, jogging by hand, gain of compensation."""
+"""Obeys the bench page's orders to a running loop: safe state, end of a hold, jogging by hand, compensation gain."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ MAX_GAIN = 1.5
 
 
 class PageOrders:
-    """Obeys the orders that have arrived; one that makes no sense is dropped. ``asked_safe_ns`` is the bench time at
-    which the page asked for the safe state."""
+    """Obeys the orders that have arrived, and drops invalid ones. ``asked_safe_ns`` is the bench time at which the page
+    asked for the safe state."""
 
     def __init__(
         self,

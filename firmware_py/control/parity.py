@@ -1,8 +1,8 @@
-"""With seven or eight axes: which one contradicts the others, and going on without it.
+"""Finds, with seven or eight axes, the axis that contradicts the others, so that sensing can go on without it.
 
-The frame's ``parity`` is what the axes beyond six contradict, in deviations of a sample's noise. What calibration
-leaves of it is usual and slow. An axis that fails moves it along a direction of its own (its column of ``null``): with
-two numbers, eight axes, that tells which; with one it tells only that something is wrong.
+The frame's ``parity`` is the residual of the axes beyond six, in standard deviations of a sample's noise. Calibration
+errors leave a slowly varying part of it, called usual. An axis that fails moves it along a direction of its own (its
+column of ``null``): two residuals (eight axes) tell which axis that is; one tells only that something is wrong.
 """
 
 from __future__ import annotations
@@ -13,22 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 LIMIT = 7.0
-"""Deviations from what is usual; noise alone passes that once in 10^10 samples."""
+"""Largest norm of the difference from the usual residual, in standard deviations. Noise alone exceeds it once in
+10^10 samples."""
 CLEAR = 3.0
-"""Another axis must explain it worse by so many deviations before one is named."""
+"""Margin, in standard deviations, by which every other axis must explain the residual worse before one is named."""
 ACROSS = 3.5
-"""What one failing axis may leave across its own direction: noise."""
+"""Largest residual across an axis' own direction, in standard deviations, that is noise if this axis fails alone."""
 USUAL_LIMIT = 20.0
-"""Calibration leaves one or two deviations; so many are an axis that was wrong from the beginning."""
+"""Largest norm of the usual residual, in standard deviations. Calibration leaves one or two; beyond this limit an axis
+was wrong from the beginning."""
 PATIENCE_TICKS = 25
 ALONE_TICKS = 2
-"""With one number there is nothing to wait for but a single wrong scan."""
+"""Patience with one residual only: the wait need only outlast a single wrong scan."""
 MEMORY_TICKS = 5000
 LEARN_TICKS = 100
 
 
 class Verdict(Enum):
-    """``DOUBT``: something contradicts, and which axis it is cannot be told yet. ``UNCLEAR``: nor later."""
+    """Names the result of a step. ``DOUBT``: the axes contradict, and which one is wrong cannot be told yet.
+    ``UNCLEAR``: it will not be told later either."""
 
     AGREED = "agreed"
     DOUBT = "doubt"
@@ -37,7 +40,8 @@ class Verdict(Enum):
 
 
 class Parity:
-    """``null`` (M, N): the stage's combinations; ``step`` once a tick, ``axis`` is the one found."""
+    """Watches the parity residuals for a failing axis. ``null`` (M, N): the stage's combinations; ``step`` is to be
+    called once a tick; ``axis`` is the axis found, -1 before."""
 
     def __init__(self, null: NDArray[np.float64]) -> None:
         self.axis = -1
@@ -47,7 +51,7 @@ class Parity:
         self.restart(null)
 
     def restart(self, null: NDArray[np.float64]) -> None:
-        """Other combinations; what is usual is as good as none (the stage has taken it out)."""
+        """Use other combinations ``null``. The usual residual starts at zero, because the stage has taken it out."""
         size = np.linalg.norm(null, axis=0)
         self._directions = null / np.where(size > 0.0, size, 1.0)
         self._known = np.flatnonzero(size > 0.0)
@@ -59,7 +63,7 @@ class Parity:
         off = parity - self.usual
         if self._single:
             off[1] = 0.0
-        if self._ticks < LEARN_TICKS:  # the first ones are what is usual
+        if self._ticks < LEARN_TICKS:  # the first residuals define what is usual
             self._ticks += 1
             self.usual += off / self._ticks
             return Verdict.AGREED

@@ -1,11 +1,12 @@
-"""Is a scan physically possible? Per input, from raw counts, before anybody believes the motion that they tell.
+"""Checks each input of a scan for physically impossible counts, before the motion that they indicate is used.
 
-Six axes and six unknowns leave no parity while the instrument moves (ERRATA no. 15). What is left: a sensor behind
-its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails; and of axes that point the
-same way at two places the slow parts must agree, because turning hands do not accelerate for long. Natural figures
-(three hands, nine runs of 15 s): second differences up to 2.8 mV; parallel axes never beyond 5 times their spread plus
-0.07 m/s^2 (z: 0.016). A hand hardly turns the instrument about its own axis: what the two long pairs (x and y, 116 mm
-apart) say of the other turns explains the difference of the short one (z, 20 mm) to its noise (nine runs of 56 s:
+Six axes and six unknowns leave no parity while the instrument moves (ERRATA no. 15). Three facts remain: a sensor
+behind its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails. In addition, the slow
+parts of axes that point the same way at two places must agree, because turning hands do not accelerate for long.
+Natural figures (three hands, nine runs of 15 s): second differences reach 2.8 mV; parallel axes never differ by more
+than 5 times their spread plus 0.07 m/s^2 (z: 0.016). A hand hardly turns the instrument about its own axis: what the
+two long pairs (x and y, 116 mm apart) say of the other turns explains the difference of the short one (z, 20 mm) to its
+noise (nine runs of 56 s:
 0.0095 m/s^2 rms whatever the hand, never beyond 0.043; with the turns 0.030 and 0.146 in a rough hand).
 """
 
@@ -24,7 +25,7 @@ from hal.compiled import kernel
 
 SENSORS = 6
 PAIRS = ((0, 4, "x"), (1, 3, "z"), (2, 5, "y"))
-"""Places in AXES of two sensors along one body axis: 1x and 3x, 1z and 2z, 2y and 3y."""
+"""Pairs of indices into AXES whose sensors point along one body axis: 1x and 3x, 1z and 2z, 2y and 3y."""
 
 
 Rail = Annotated[float, Field(ge=-10.0, le=10.0)]
@@ -32,13 +33,14 @@ Step = Annotated[float, Field(ge=0.001, le=50.0)]
 
 
 class PlausibilityLimits(BaseModel):
-    """What no healthy sensor does. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter.
+    """Sets limits that no healthy sensor exceeds. ``jump_V`` is per tick; a step of 1 g gives 0.09 V behind the filter.
 
-    ``outlier_V``: second difference of an accelerometer's readings, ``magnetometer_outlier_V``: of the magnetometer's
-    (10 ms apart), ``supply_step_V``: change of the supply's from tick to tick; all three are noticed only.
-    ``pair_m_s2``: parallel axes may not differ by more on average over ``pair_s``. What
-    they differ by at once, against their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` (of x and y:
-    1.3 rad/s^2 over the distance of the two; z: 6 rad/s^2 about the instrument) plus PAIR_SPREADS times their spread.
+    ``outlier_V`` limits the second difference of an accelerometer's readings, ``magnetometer_outlier_V`` that of the
+    magnetometer's (10 ms apart), ``supply_step_V`` the change of the supply's reading from tick to tick; a reading
+    beyond these three is noticed only.
+    ``pair_m_s2``: parallel axes may not differ by more than this on average over ``pair_s``. A sudden difference,
+    relative to their mean over ``pair_memory_s``, is noticed from ``pair_step_m_s2`` on (x and y: 1.3 rad/s^2 over the
+    distance of the two; z: 6 rad/s^2 about the instrument) plus PAIR_SPREADS times their spread.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,14 +68,15 @@ TICK_S = 0.001
 SPREAD_S = 1.0
 PAIR_SPREADS = 6.0
 TOGETHER_V = 0.0008
-"""A supply that sags by 1 % bends every axis by 1 to 2 mV within two scans; noise bends each its way, 0.4 mV rms."""
+"""Second difference from which an input counts as stepping together with others. A supply that sags by 1 % bends every
+axis by 1 to 2 mV within two scans; noise bends each its own way, by 0.4 mV rms."""
 TOGETHER_TICKS = 100
-SQUARE = 0.5  # sine between two levers
+SQUARE = 0.5  # smallest sine of the angle between two levers that can be solved for
 PAIR_PLACES = np.array([(i, j) for i, j, _ in PAIRS])
 
 
 class Implausible(IntEnum):
-    """What is wrong with an input."""
+    """Names the fault of an input."""
 
     NONE = 0
     RAIL = 1
@@ -106,7 +109,7 @@ def check_counts(
     hi: int,
     stuck: int,
 ) -> int:
-    """16 * channel + Implausible of the first impossible input, else 0; only the first ``noisy`` can be stuck.
+    """Return 16 * channel + Implausible of the first impossible input, else 0. Only the first ``noisy`` can be stuck.
 
     ``last``, ``same`` (n,) are the state: the last counts (``same[0] < 0`` before the first scan) and how often they
     have come in a row. ``steps``: ticks since the last scan that was seen. ``slope`` (n,): last change or NO_SLOPE.
@@ -149,8 +152,9 @@ def check_counts(
 
 
 def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) combinations of the pairs' differences to watch: each as it is, but the pair with the shortest lever
-    without the turns across the instrument that the two others tell. ``positions_m``, ``axes`` (6, 3): order of AXES.
+    """Return the (3, 3) combinations of the pairs' differences to watch. Each pair is watched as it is, but from the
+    pair with the shortest lever the turns across the instrument that the other two measure are subtracted.
+    ``positions_m``, ``axes`` (6, 3): order of AXES.
 
     A difference is (r_i - r_j) x s . alpha (ERRATA, section 5: cluster); alpha along z, the instrument, is taken for 0.
     """
@@ -180,7 +184,8 @@ def check_pairs(
     memory: float,
     spread_memory: float,
 ) -> int:
-    """Number (from 1) of a pair that disagrees for good, minus the number of one that has come apart, else 0."""
+    """Return the number (from 1) of a pair that disagrees permanently, minus the number of a pair that has come apart
+    suddenly, else 0."""
     n = window.shape[0]
     row = looks % n
     found = 0
@@ -205,7 +210,8 @@ def check_pairs(
 
 
 class PairState(NamedTuple):
-    """``window`` (n, 3): the last differences, in a ring; over them ``sums``, ``usual`` and ``spread`` (3,)."""
+    """Holds the state of ``check_pairs``. ``window`` (n, 3): ring of the last differences; ``sums`` (3,): their sums;
+    ``usual`` and ``spread`` (3,): slow means of the differences and of their distance from ``usual``."""
 
     window: NDArray[np.float64]
     sums: NDArray[np.float64]
@@ -214,7 +220,7 @@ class PairState(NamedTuple):
 
 
 class ScanCheck:
-    """Looks at every scan, before it is believed.
+    """Checks every scan before it is used.
 
     ``columns``: places in a scan of the ``sensors`` accelerometer axes (AXES order), then of the supply and the
     temperature where they are wired; ``labels`` names them for people; ``mix``: see ``turns_of_pairs``.
@@ -231,7 +237,7 @@ class ScanCheck:
         mix: NDArray[np.float64] | None = None,
     ) -> None:
         self.channel = -1
-        """Which input the last finding was of."""
+        """Index of the input that the last finding is about, -1 before."""
         self._ignored: list[int] = []
         self._sensors = sensors
         self._supply = sensors if len(columns) > sensors else None
@@ -257,7 +263,7 @@ class ScanCheck:
         self._load_kernels()
 
     def _load_kernels(self) -> None:
-        """Compile or load now, not when the first scan is there; changes nothing."""
+        """Compile or load the kernels before the first scan arrives. The state does not change."""
         last, same, slope, odd = (state.copy() for state in (self._last, self._same, self._slope, self._odd))
         check_counts(
             self._counts, self._sensors, last, same, slope, odd, self._together.copy(), 1, self._jump, self._outlier,
@@ -271,7 +277,7 @@ class ScanCheck:
         )  # fmt: skip
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
-        """Counts of scan ``tick``: empty, or what is wrong, in words."""
+        """Check the counts of scan ``tick``. Return an empty string, or a message that says what is wrong."""
         steps = tick - self._tick if self._tick >= 0 else 1
         self._tick = tick
         np.take(row, self._order, out=self._counts)
@@ -293,7 +299,7 @@ class ScanCheck:
         return f"{self._labels[channel]} {WORDS[Implausible(finding)].format(n=self.limits.stuck_ticks)}"
 
     def ignore(self, channel: int) -> None:
-        """Whatever ``channel`` reads from now on: it counts as healthy."""
+        """Treat ``channel`` as healthy from now on, whatever it reads."""
         self._ignored.append(channel)
         self._last[channel], self._slope[channel] = self._quiet(self._tick), NO_SLOPE
 
@@ -302,11 +308,13 @@ class ScanCheck:
 
     @property
     def stepped_together(self) -> bool:
-        """Not long ago nearly all axes bent the same way at once, as they do when their supply steps."""
+        """True if, within the last ``TOGETHER_TICKS``, nearly all axes bent the same way at once, as they do when their
+        supply steps."""
         return bool(self._together[0] <= TOGETHER_TICKS)
 
     def odd(self) -> str:
-        """Which input has been out of line since the last call: nothing that ends a run, but somebody should know."""
+        """Return a message about an input that was out of line since the last call, or an empty string. Such a reading
+        does not end a run."""
         if self._pair_told:
             i, j, axis = PAIRS[self._pair_told - 1]
             self._pair_told = 0
@@ -321,10 +329,11 @@ class ScanCheck:
         return f"{self._labels[worst]} read a value out of line with its neighbours"
 
     def pairs(self, frame: NDArray[np.float64]) -> str:
-        """Difference of parallel axes, every tick: empty, or which two disagree for good; see also ``odd``.
+        """Check the difference of parallel axes, every tick. Return an empty string, or a message that names two axes
+        that disagree permanently; ``odd`` reports sudden differences.
 
-        The mean over 0.1 s leaves out most of a tremor. What they have differed by for seconds is calibration, or was
-        there before; a new difference is a drift or a blow.
+        The mean over 0.1 s leaves out most of a tremor. A difference that has lasted for seconds comes from
+        calibration, or was there before; a new difference is a drift or a blow.
         """
         state, limits = self._pairs, self.limits
         found = check_pairs(

@@ -1,7 +1,7 @@
-"""What a failing accelerometer axis means: with six axes the end of the run, with more it is left out.
+"""Handles a failing accelerometer axis: with six axes it ends the run, with more axes it is left out.
 
-Joins the detectors of single inputs (``plausibility``) and of contradiction (``parity``) to the stage that can do
-without an axis (``sensing/leave_out``).
+This module joins the detectors of single inputs (``plausibility``) and of contradiction (``parity``) to the stage that
+can do without an axis (``sensing/leave_out``).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ UNBELIEVED = FrameStatus.INVALID | FrameStatus.STALE | FrameStatus.ALIGNING
 
 
 class Redundancy:
-    """``labels`` names the axes. An axis is left out only while the outputs may move: a self-test refuses it."""
+    """Decides whether to leave out an axis or to end the run. ``labels`` names the axes. An axis is left out only while
+    the outputs may move; in a self-test a failing axis is reported instead."""
 
     def __init__(
         self, stages: Stages, check: ScanCheck, supervisor: Supervisor, incidents: Incidents, labels: tuple[str, ...]
@@ -35,7 +36,7 @@ class Redundancy:
 
     @property
     def there(self) -> bool:
-        """Whether there were more than six axes to begin with."""
+        """True if there were more than six axes to begin with."""
         return self._parity is not None
 
     def _parities(self) -> int:
@@ -45,7 +46,8 @@ class Redundancy:
         return self._sensing.params["null"][0]
 
     def impossible(self, channel: int, text: str) -> str:
-        """An input read something impossible: ``text`` to trip for, or empty when sensing goes on without it."""
+        """Handle an input that read something impossible. Return ``text``, the reason to trip, or an empty string when
+        sensing goes on without the axis."""
         axes = len(self._sensing.config.channels)
         if self._parity is None or channel >= axes or not self._parities() or not self._supervisor.may_move:
             return text
@@ -53,7 +55,7 @@ class Redundancy:
         return ""
 
     def agree(self, frame: NDArray[np.float64]) -> str:
-        """Every tick, after the step: empty, or why the run must end."""
+        """Check the parity every tick, after the step. Return an empty string, or the reason why the run must end."""
         parity = self._parity
         if parity is None or not self._parities() or int(frame[STATUS]) & UNBELIEVED:
             return ""

@@ -1,4 +1,4 @@
-"""The same stages over a recording: recorded inputs in, estimates and commands out, compared bit for bit."""
+"""Runs the same stages over the recorded inputs and compares estimates and commands with the recording bit for bit."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from firmware_py.recording.replay import ReplayReport, replay
 
 _NAMES = LAYOUT.scalar_names()
 OUTPUT_COLUMNS = _NAMES[VOLTS:]
-"""What a replay must find again. It is given the rest, commands chosen by hand, and the bits that the loop set."""
+"""Columns that a replay must reproduce. It is given the other columns, the commands chosen by hand, and the status bits
+that the loop set."""
 LATER_COLUMNS = _NAMES[ACCELEROMETER_MORE : PARITY + len(PARITIES)]
-"""Recordings made before these columns were there are compared in the others."""
+"""Columns that older recordings lack. Such a recording is compared in its other columns."""
 
 
 def recorded_configs(recording: Recording) -> StageConfigs:
-    """The configuration that the run was made with. ``RecordingError`` when the recording has none."""
+    """Return the configuration that the run was made with. Raises ``RecordingError`` when the recording has none."""
     text = recording.metadata.get("stages")
     if not isinstance(text, str):
         raise RecordingError(f"{recording.path}: no stage configuration in its metadata; only runs can be replayed")
@@ -36,7 +37,7 @@ def recorded_configs(recording: Recording) -> StageConfigs:
 
 
 def replay_recording(recording: Recording) -> ReplayReport:
-    """Run the recorded configuration over the recorded inputs."""
+    """Run the recorded configuration over the recorded inputs and return how the outputs compare."""
     stages = Stages(recorded_configs(recording))
     stages.warm_up(batch=True)
     known = [i for i, name in enumerate(_NAMES) if name in recording.names or name not in LATER_COLUMNS]

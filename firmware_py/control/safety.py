@@ -20,13 +20,13 @@ from hal.contracts import AnalogOutput
 from hal.errors import HalError, I2cNack
 
 RAMP_TICKS = 20
-"""Neutral within 20 ms of the decision; the amplifier's ramp is shorter, so that steps can be tried again."""
+"""Ticks from the decision to neutral: 20 ms. The amplifier's own ramp is shorter, so that steps can be retried."""
 ATTEMPTS = 3
-"""Attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of the time of a transfer."""
+"""Largest number of attempts at a ramp step within one tick. A refusal (NACK) takes a tenth of a transfer's time."""
 
 
 class State(IntEnum):
-    """What the outputs may do. The numbers go into telemetry and recordings."""
+    """Names what the outputs may do. The numbers go into telemetry and recordings."""
 
     BOOT = 0
     SELF_TEST = 1
@@ -39,7 +39,7 @@ class State(IntEnum):
 
     @property
     def words(self) -> str:
-        """For people; the ramp of a hold is part of the hold."""
+        """Return the state's name for display. The ramp of a hold counts as part of the hold."""
         return "hold" if self is State.HOLD_RAMP else self.name.lower().replace("_", " ")
 
 
@@ -49,7 +49,7 @@ Supply_V = Annotated[float, Field(ge=0.0, le=10.0)]
 
 
 class SafetyLimits(BaseModel):
-    """The limits beyond which the outputs leave their work.
+    """Sets the limits beyond which the outputs leave normal operation.
 
     ``stale_ms``: the DAQ may be silent for so long. ``temperature_C`` and ``supply_V``: the lowest and the highest
     reading. ``saturated_ms``: an axis may stay at its limit for so long.
@@ -94,7 +94,7 @@ class SafetyLimits(BaseModel):
 
 @dataclass(frozen=True)
 class Trip:
-    """Why and when the outputs were taken to their safe state. ``cause``: where the cause is."""
+    """Records why and when the outputs were taken to their safe state. ``cause``: class of the cause."""
 
     finding: Finding
     reason: str
@@ -104,14 +104,14 @@ class Trip:
 
     @property
     def normal(self) -> bool:
-        """The end of an ordinary run."""
+        """True for the end of an ordinary run."""
         return self.finding.value.normal
 
 
 @dataclass
 class Hold:
-    """One hold. ``t_ns``: when it was decided, bench clock; ``end_ns``: when the outputs were free again or the run
-    was ended, ``None`` while it lasts."""
+    """Records one hold. ``t_ns``: time of the decision, bench clock; ``end_ns``: time at which the outputs were free
+    again or the run was ended, ``None`` while the hold lasts."""
 
     finding: Finding
     reason: str
@@ -133,20 +133,20 @@ class Supervisor:
         self.safe_reached = False
         self.ramp_failure = ""
         self.was_late = False
-        """Neutral was reached, but only when the ramp had been tried again beyond its time."""
+        """True if neutral was reached only by retries after the ramp's time was over."""
         self.holds: list[Hold] = []
         self.warnings: dict[str, int] = {"jerk": 0, "drift": 0}
-        """How often each was reported: what the run's report shows beside the reason of its end."""
+        """Counts how often each warning was reported. The run's report shows it beside the reason of the run's end."""
 
     @property
     def may_move(self) -> bool:
-        """Only this lets a command through."""
+        """True while commands may be sent. Nothing else lets a command through."""
         return self.state is State.RUNNING
 
     @property
     def must_not_wait(self) -> bool:
-        """A ramp that somebody or something asked for runs on the host clock: the loop would wait for scans, and they
-        may be what broke. Only the planned end of a run is recorded to its last step."""
+        """True if the ramp must run on the host clock: the loop would wait for scans, and they may be what broke. Only
+        the planned end of a run waits for scans, so that it is recorded to its last step."""
         trip = self.trip_cause
         if self.state is not State.SAFE_RAMP or trip is None:
             return False
@@ -154,12 +154,12 @@ class Supervisor:
 
     @property
     def is_retrying(self) -> bool:
-        """The ramp has failed within its time, and is tried again until it succeeds or is given up."""
+        """True while a ramp that failed within its time is retried, until it succeeds or is given up."""
         return self.state is State.SAFE_RAMP and self._ramp_ticks >= 2 * RAMP_TICKS
 
     @property
     def is_holding(self) -> bool:
-        """On the way to neutral, or there, until a hold ends."""
+        """True during a hold, on the way to neutral and at neutral."""
         return self.state in (State.HOLD_RAMP, State.HOLD)
 
     def begin_self_test(self) -> None:
@@ -167,7 +167,7 @@ class Supervisor:
             self.state = State.SELF_TEST
 
     def begin_sensing(self) -> None:
-        """A run that looks and never arms: for poses by hand, for sensors that nobody has calibrated yet."""
+        """Begin a run that senses and never arms, for poses by hand and for sensors that are not calibrated yet."""
         if self.state is State.BOOT:
             self.state = State.SENSING_ONLY
 
@@ -178,20 +178,21 @@ class Supervisor:
             self.state = State.RUNNING
 
     def hold(self, finding: Finding, reason: str, *, tick: int, t_ns: int) -> None:
-        """Leave work for neutral, to come back; nothing but running can be held."""
+        """Begin a ramp to neutral from which the run can resume. Has no effect unless the state is RUNNING."""
         if self.state is State.RUNNING:
             self.holds.append(Hold(finding, reason, tick, t_ns, finding.value.cause))
             self._ramp_ticks = 0
             self.state = State.HOLD_RAMP
 
     def resume(self) -> None:
-        """Arm the amplifier again (it reads neutral back) and allow motion. After an error it still holds."""
+        """Arm the amplifier again (it reads neutral back) and allow motion. If arming raises, the hold continues."""
         if self.state is State.HOLD:
             self._amplifier.arm()
             self.state = State.RUNNING
 
     def trip(self, finding: Finding, reason: str, *, tick: int, t_ns: int, cause: CauseClass | None = None) -> None:
-        """Decide for the safe state; later reasons do not replace the first. ``cause``: of a hold that is given up."""
+        """Decide for the safe state; later reasons do not replace the first. ``cause`` replaces the finding's own class
+        of cause when a hold leads to the end of the run."""
         if self.trip_cause is not None:
             return
         self.trip_cause = Trip(finding, reason, tick, t_ns, finding.value.cause if cause is None else cause)
@@ -202,11 +203,11 @@ class Supervisor:
         self.state = State.SAFE_RAMP
 
     def warn(self, what: str) -> None:
-        """Something is not as it should be and does not end the run."""
+        """Count a warning ``what``, which does not end the run."""
         self.warnings[what] = self.warnings.get(what, 0) + 1
 
     def step(self, *, may_retry: bool = False) -> bool:
-        """One tick of the ramp; True once neutral is reached or has to be given up.
+        """Run one tick of the ramp. Return True in the safe state: neutral was reached or had to be given up.
 
         A transfer that is refused is tried again at once, one that fails otherwise on the next tick. When twice the
         ramp's time is over, a hold becomes the end of the run; the ramp is given up unless it ``may_retry``. Then the
@@ -234,7 +235,7 @@ class Supervisor:
         return self.state is State.SAFE
 
     def _be_late(self, may_retry: bool) -> None:
-        """Neutral was not confirmed in time. A hold without it is none: its finding becomes the end of the run."""
+        """Handle a ramp that did not confirm neutral in time. A hold needs neutral, so its reason ends the run."""
         self.ramp_failure = self.ramp_failure or "the amplifier did not report neutral in time"
         if self.state is State.HOLD_RAMP:
             hold = self.holds[-1]

@@ -1,6 +1,6 @@
-"""The stages with their numbers and their memory, and the one compiled call that runs them (``firmware_py.chain``).
+"""Holds the stages with their parameters and state, and the compiled call that runs them (``firmware_py.chain``).
 
-One implementation for the live loop and for replay: whoever fills the frame's input columns gets the same
+The live loop and replay use this one implementation: whoever fills the frame's input columns gets the same
 estimates and commands.
 """
 
@@ -30,19 +30,20 @@ Frame = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class StageConfigs:
-    """Everything that the stages compute with; kept in recordings, so that a replay is the same firmware."""
+    """Holds everything that the stages compute with. Recordings keep it, so that a replay runs the same firmware."""
 
     sensing: SensingConfig
     tremor: TremorConfig
     actuation: ActuationConfig
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain JSON values."""
+        """Return the configurations as plain JSON values."""
         return {name: getattr(self, name).model_dump(mode="json") for name in ("sensing", "tremor", "actuation")}
 
     @classmethod
     def from_dict(cls, tables: Mapping[str, Mapping[str, Any]], where: str) -> StageConfigs:
-        """From the tables of a bench or the metadata of a recording. ``BenchError`` names the wrong key."""
+        """Build from the tables of a bench or the metadata of a recording. Raises ``BenchError`` naming the wrong
+        key."""
         tremor = TremorConfig.from_dict(tables.get("tremor", {}), where=f"{where}: firmware.tremor")
         actuation = ActuationConfig.from_dict(tables.get("actuation", {}), where=f"{where}: firmware.actuation")
         if tremor.loop_delay_s < actuation.preview_s:
@@ -57,7 +58,7 @@ class StageConfigs:
 
 
 class Stages:
-    """The stages with their state and the frame that they fill."""
+    """Holds the stages with their state and the frame that they fill."""
 
     def __init__(self, configs: StageConfigs) -> None:
         self.configs = configs
@@ -66,7 +67,7 @@ class Stages:
         self.detectors = Detectors(configs.tremor.detectors, configs.tremor.tick_hz)
         self.actuation = Actuation(configs.actuation)
         self.memory = self._gathered()
-        """The frame and all that the stages know, in one record (``chain.memory_dtype``), which keeps its place."""
+        """Holds the frame and all that the stages know in one record (``chain.memory_dtype``), which is never moved."""
         self.frame: Frame = self.memory["frame"][0]
         self.command_V: Frame = self.frame[COMMAND : COMMAND + 3]
 
@@ -74,7 +75,7 @@ class Stages:
         return self.sensing, self.tremor, self.detectors, self.actuation
 
     def _gathered(self) -> Record:
-        """Each stage's state and parameters become views of one record."""
+        """Return one record and make each stage's state and parameters views of it."""
         stages = self._stages()
         memory = np.zeros(1, memory_dtype([(stage.state.dtype, stage.params.dtype) for stage in stages]))
         for name, stage in zip(PARTS, stages, strict=True):
@@ -86,34 +87,35 @@ class Stages:
 
     @property
     def arguments(self) -> tuple[Record, ...]:
-        """State and parameters of every stage, in the order of ``chain.PARTS``."""
+        """Return state and parameters of every stage, in the order of ``chain.PARTS``."""
         return tuple(part for stage in self._stages() for part in (stage.state, stage.params))
 
     def step(self) -> None:
-        """One tick on ``frame``, whose input columns and ``GIVEN_BITS`` of the status are set."""
+        """Run one tick on ``frame``, whose input columns and ``GIVEN_BITS`` of the status are set."""
         step_kernel(self.memory)
 
     def run(self, rows: Frame) -> None:
-        """Ticks ``rows`` (n, Layout.size), C order, in place: the same numbers as n steps, the memory goes on."""
+        """Run the ticks ``rows`` (n, Layout.size), C order, in place. The numbers are those of n steps; the state
+        carries on."""
         run_kernel(rows, self.memory)
 
     def command(self) -> None:
-        """The tick's step shall compute a command: this is the newest scan and the outputs may move."""
+        """Make the tick's step compute a command, because this is the newest scan and the outputs may move."""
         self.frame[STATUS] = int(self.frame[STATUS]) | COMMANDED
 
     def follow(self, command_V: Frame) -> None:
-        """The tick's step shall follow ``command_V`` (3,), chosen by hand."""
+        """Make the tick's step follow ``command_V`` (3,), chosen by hand."""
         self.command_V[:] = command_V
         self.frame[STATUS] = int(self.frame[STATUS]) | MANUAL
 
     def hold(self, told_V: Sequence[float]) -> None:
-        """The tick's step shall follow ``told_V`` (3,), the way to neutral and the rest there: a hold."""
+        """Make the tick's step follow ``told_V`` (3,), the outputs of a hold on the way to neutral and at neutral."""
         self.command_V[:] = told_V
         self.frame[STATUS] = int(self.frame[STATUS]) | HELD
 
     def warm_up(self, *, batch: bool = False) -> None:
-        """Compile or load the kernels of ``step``, then forget what that did: a cold start takes a minute, a tick may
-        not. ``batch``: those of ``run`` as well, which only replay needs."""
+        """Compile or load the kernels of ``step``, then reset the state. A cold start takes a minute, which a tick may
+        not. ``batch`` includes the kernels of ``run``, which only replay needs."""
         self.step()
         if batch:
             self.run(np.zeros((1, LAYOUT.size)))
@@ -131,7 +133,7 @@ class Stages:
         self.reset()
 
     def reset(self) -> None:
-        """As before the first sample."""
+        """Restore the state before the first sample."""
         for stage in self._stages():
             stage.reset()
         self.frame[:] = 0.0

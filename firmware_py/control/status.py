@@ -1,4 +1,4 @@
-"""What the loop shows while it runs: a few numbers for the eye, the histograms for the page. Looks, changes nothing."""
+"""Reads what the loop shows while it runs: a few numbers for the terminal, the histograms for the page."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from hal.contracts import Clock
 
 
 class LoopStatus:
-    """Of a loop's parts. ``for_page``: the numbers that only the bench page shows are there, too."""
+    """Reads the status of a loop's parts and changes nothing. ``for_page`` adds the numbers that only the bench page
+    shows."""
 
     def __init__(
         self,
@@ -39,15 +40,15 @@ class LoopStatus:
         self._for_page = for_page
 
     def amplitude_um(self) -> list[float]:
-        """Of the tremor, x, y, z."""
+        """Return the tremor's amplitude along x, y, z."""
         return [1e6 * float(v) for v in self._frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
 
     def histograms(self) -> dict[str, DurationHistogram]:
-        """Every live histogram, sample to command first."""
+        """Return every live histogram, sample to command first."""
         return {"sample to command": self._counts.latency, **self._scheduler.histograms()}
 
     def numbers(self) -> dict[str, object]:
-        """As JSON values, under the names of the bench page."""
+        """Return the status as JSON values, under the names of the bench page."""
         frame = self._frame
         latency = self._counts.latency.distribution()
         return {

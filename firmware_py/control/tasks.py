@@ -1,6 +1,6 @@
-"""The instrument's task table: what runs in which tick, in which order, within which budget.
+"""Builds the instrument's task table: what runs in which tick, in which order, within which budget.
 
-How often a device is polled is the bench file's (``drivers.polling``); in which ticks that happens is found here, so
+The bench file sets how often a device is polled (``drivers.polling``); this module finds the ticks for it, so
 that as few slow transfers as possible share a tick. A budget is the time that the wires take plus an allowance for the
 processor; ``[firmware.budget_us]`` overrides it by the task's name.
 """
@@ -35,7 +35,8 @@ ALLOWANCE_US: Mapping[str, float] = {
 100 us for a transfer are 1.4 to 3 times the median of a driver and its emulated device together (35 to 70 us on the
 two-core machine of the benchmarks, column ``cpu`` of a run in virtual time)."""
 MAY_WAIT_TICKS = 3
-"""For what shares the bus with the outputs, and for telemetry: rather these a little late than the next command."""
+"""Ticks for which telemetry, and tasks that share the bus with the outputs, may be deferred: they may be a little
+late, the next command may not."""
 
 LONGEST_US = 1e5  # the period of the slowest tick
 
@@ -44,7 +45,7 @@ Work = Callable[[TickInfo], object]
 
 @dataclass(frozen=True)
 class Works:
-    """The work behind each name; ``None``: this bench has no device for it."""
+    """Holds the function of each task. ``None`` means that this bench has no device for it."""
 
     sense: Work
     estimate: Work
@@ -58,9 +59,10 @@ class Works:
 
 
 def budgets_us(bus_us: Mapping[str, float], overrides: Mapping[str, float]) -> dict[str, float]:
-    """Budget of each task, us: ``bus_us``, its time on the wires, and its allowance, or what ``overrides`` says.
+    """Return the budget of each task, us: the sum of ``bus_us`` (its time on the wires) and its allowance, or its
+    override.
 
-    Raises ``BenchError`` for an override of no task, or one that is not a positive number.
+    Raises ``BenchError`` for an override of an unknown task, or one outside 1 to ``LONGEST_US``.
     """
     for name, value in overrides.items():
         if name not in ALLOWANCE_US:
@@ -78,7 +80,8 @@ def task_table(
     polling: Polling,
     bus_us: Mapping[str, float],
 ) -> list[TaskSpec]:
-    """Sense, estimate, actuate in every tick, then what is due less often; what may wait comes last.
+    """Return the tasks: sense, estimate, actuate and publish in every tick, then what is due less often. Tasks that may
+    wait come last.
 
     ``budget_us`` overrides budgets by name, ``bus_us`` is the time that a task's transaction takes on the wires.
     """
@@ -126,7 +129,7 @@ def _hyperperiod(all_polls: list[Polls]) -> int:
 
 
 def _emptiest(load_us: NDArray[np.float64], polls: Polls, start: int) -> tuple[int, ...]:
-    """The ticks for ``polls`` that carry the least already; of equal ones the first from ``start`` on."""
+    """Return the ticks for ``polls`` that carry the smallest load; of equal ones the first from ``start`` on."""
 
     def fullest(first: int) -> float:
         return max(float(load_us[tick :: polls.divider].max()) for tick in polls.ticks(first))

@@ -1,4 +1,4 @@
-"""The watch over a run: the self-test before arming, and at 100 Hz everything that no task sees by itself."""
+"""Watches over a run: performs the self-test before arming, and checks at 100 Hz everything that no task sees."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
 ROOM_MS = 100.0
-"""How long temperature or supply may be outside: they are smoothed, and change slowly."""
+"""Time for which temperature or supply may be outside their limits. Both are smoothed, and change slowly."""
 
 
 class Watch:
@@ -39,7 +39,8 @@ class Watch:
         self._incidents = incidents
 
     def supervise(self, info: TickInfo) -> None:
-        """Task: readings that are impossible for a while, the room, the stop button."""
+        """Run the supervising task: check for invalid or saturated readings, temperature, supply, guardian and stop
+        button."""
         frame, limits, incidents = self._frame, self._config.safety, self._incidents
         status = int(frame[STATUS])
         t_ns = info.due_ns
@@ -74,7 +75,8 @@ class Watch:
             incidents.report(Finding.BUTTON_SILENT, device=telemetry.name)
 
     def _look_after_the_guardian(self) -> None:
-        """Heartbeats go both ways: outputs do not move without a guardian that would take them to neutral."""
+        """Report a lost guardian. Heartbeats go both ways: outputs do not move without a guardian that would take them
+        to neutral."""
         care, supervisor = self._devices.guardian, self._supervisor
         if care is None or not (supervisor.may_move or supervisor.is_holding or supervisor.state is State.SELF_TEST):
             return
@@ -93,8 +95,8 @@ class Watch:
             self._incidents.report(Finding.GUARDIAN_FAILED, error=error)
 
     def verify_output(self, info: TickInfo) -> None:
-        """Task, 100 Hz, or 300 without a monitor: the amplifier must hold what it was told. A DAC that restarted or
-        misheard does not."""
+        """Run the read-back task (100 Hz, 300 Hz without a monitor): the amplifier must hold the value it was sent. A
+        DAC that restarted or received a wrong value does not."""
         assert self._devices.verify_output is not None
         if not self._supervisor.may_move:
             return
@@ -106,7 +108,8 @@ class Watch:
             self._incidents.report_error(finding_of_output(error), name, error)
 
     def _report_difference(self, what: str) -> None:
-        """A stall of this process looks like that, too: the guardian has moved the outputs meanwhile."""
+        """Report that the outputs differ from the command. After a stall of this process they differ because the
+        guardian has moved them; then that is reported instead."""
         care, name = self._devices.guardian, self._devices.amplifier.name
         if care is not None and care.heart.taken_ns:
             self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
@@ -114,7 +117,8 @@ class Watch:
             self._incidents.report(Finding.OUTPUT_DIFFERS, device=name, what=what)
 
     def monitor_output(self, info: TickInfo) -> None:
-        """Task, 400 Hz: what arrives at the stacks must be what was told, also at neutral in a hold."""
+        """Run the monitor's task (400 Hz): the voltage at the stacks must match the command, also at neutral in a
+        hold."""
         monitor = self._devices.monitor
         assert monitor is not None
         if not (self._supervisor.may_move or self._supervisor.state is State.HOLD):
@@ -132,7 +136,7 @@ class Watch:
         self._incidents.bad_for(Finding.MONITOR_DEAF, deaf, info.due_ns, limit_ms, error=reason)
 
     def waiting_for(self) -> list[str]:
-        """What is not as it must be before outputs are armed, for the first time or after a hold."""
+        """Return the conditions that prevent arming, for the first time or after a hold."""
         status = int(self._frame[STATUS])
         telemetry = self._devices.telemetry
         return [
@@ -147,8 +151,8 @@ class Watch:
         ]
 
     def self_test_passed(self, watched_ms: float, since_start_ms: float) -> bool:
-        """Sensors have been watched for ``watched_ms`` without interruption and are sane; trips when that takes too
-        long. An interruption names itself in ``Holds.waits_for``."""
+        """Return True once the sensors were good for ``watch_ms`` without interruption. Trips when that takes longer
+        than ``limit_ms`` since the start. ``Holds.waits_for`` names an interruption."""
         limits = self._config.self_test
         waiting = self.waiting_for()
         if not waiting and watched_ms >= limits.watch_ms:

@@ -1,4 +1,4 @@
-"""From a bench description to opened, probed devices: the only place that joins drivers to buses."""
+"""Opens and probes the devices of a bench description. It is the only place that joins drivers to buses."""
 
 from __future__ import annotations
 
@@ -44,11 +44,11 @@ from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
 
 ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))
-"""Devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
+"""Lists devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
 
 
 class Daq(AnalogInputScan, Protocol):
-    """A scanning DAQ whose digital outputs fire the magnetometer's strap."""
+    """Describes a scanning DAQ whose digital outputs fire the magnetometer's strap."""
 
     name: str
 
@@ -60,13 +60,13 @@ NOT_POLLED = Polling()
 
 @dataclass
 class Devices:
-    """The instrument's devices, configured and not yet running. ``identities`` is what each probe found.
+    """Holds the instrument's devices, configured and not yet running. ``identities`` is what each probe found.
 
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
-    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian``: the care for
-    the guardian beside the firmware, where there is one. ``polling``: how often what is asked; ``bus_us``: what a
-    transaction of each task takes on the wires.
+    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian`` looks after the
+    guardian process beside the firmware, where there is one. ``polling``: polling rate of each device; ``bus_us``:
+    time that a transaction of each task takes on the wires, us.
     """
 
     daq: Daq
@@ -145,7 +145,7 @@ def open_devices(bench: OpenBench) -> Devices:
     )
     sensing = sensing_table(options, scan.channels, scan.rate_hz, scan.lsb_V[0], where)
     if magnetometer is not None:
-        # set and reset pulses tell the bridge's offset of today; the DAQ takes no commands while it scans
+        # set and reset pulses reveal the bridge's present offset; the DAQ takes no commands while it scans
         for _ in magnetometer.measure_offset():
             wait_s(bench.clock, 0.001)
         sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
@@ -162,7 +162,7 @@ def open_devices(bench: OpenBench) -> Devices:
 
 
 def bus_plan(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, dict[str, float]]:
-    """How often each device is polled, and what one transaction of each task takes on the wires, us."""
+    """Return the polling rates of the devices, and the time one transaction of each task takes on the wires, us."""
     polling, _ = polling_of(description, options)
     uses = bus_uses(description, options, polling)
     return polling, {use.task: use.bus_us for use in uses if use.task}
@@ -196,7 +196,7 @@ def _bus(spec: DeviceSpec) -> str:
 
 
 class _CanBuses:
-    """Several drivers on one CAN bus: each sees its own frames, and the host has one heartbeat."""
+    """Lets several drivers share one CAN bus: each sees its own frames, and the host has one heartbeat."""
 
     def __init__(self, bench: OpenBench) -> None:
         self._bench = bench
@@ -218,7 +218,7 @@ Identify = Callable[[], str]
 
 
 def open_daq(bench: OpenBench, name: str, options: DaqOptions) -> tuple[Daq, Identify]:
-    """The DAQ ``name``, nothing sent yet, and what asks who it is."""
+    """Return the DAQ ``name``, to which nothing has been sent yet, and the function that identifies it."""
     if isinstance(options, NiDaqOptions):
         from hal.backends.nidaqmx_ai import NidaqmxScan  # the package and its driver are optional
 
@@ -259,7 +259,7 @@ def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tup
 
 
 def _axes(options: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """The six of the instrument, then those of further accelerometers in the order of their names."""
+    """Return the six axes of the instrument, then those of further accelerometers in the order of their names."""
     first = {device for device, _ in ACCELEROMETERS}
     others = sorted(name for name, o in options.items() if isinstance(o, Adxl203Options) and name not in first)
     return (*ACCELEROMETERS, *((name, axis) for name in others for axis in sorted(options[name].channels)))
@@ -268,12 +268,13 @@ def _axes(options: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 def sensing_table(
     options: Mapping[str, Any], channels: Sequence[int], rate_hz: float, lsb_V: float, where: str
 ) -> dict[str, Any]:
-    """Which column of a scan of ``channels`` carries which sensor: what the wiring decides of [firmware.sensing]."""
+    """Return the part of [firmware.sensing] that the wiring decides: which column of a scan of ``channels`` carries
+    which sensor. Raises ``BenchError`` for a missing sensor."""
     position = {channel: column for column, channel in enumerate(channels)}
     try:
         axes = _axes(options)
         accelerometers = [position[options[device].channels[axis]] for device, axis in axes]
-        more = len(axes) > len(ACCELEROMETERS)  # then inputs are short: supply and temperature may be missing
+        more = len(axes) > len(ACCELEROMETERS)  # then inputs are scarce: supply and temperature may be missing
         supply, temperature = (
             None if more and name not in options else position[options[name].channel]
             for name in ("supply", "temperature")
