@@ -75,7 +75,10 @@ def load(path: Path | str) -> Recording:
     columns = read_columns(data_path, names)
     n = columns[names[0]].size
     if n < MIN_SAMPLES:
-        raise RecordingError(f"{data_path}: {n} samples; at least {MIN_SAMPLES} are needed to tell anything")
+        raise RecordingError(
+            f"{data_path}: {n} samples; at least {MIN_SAMPLES} are needed to tell physics from noise;"
+            f" record longer, or as long at {np.ceil(MIN_SAMPLES / n):g} times the rate"
+        )
     for name, values in columns.items():
         bad = ~np.isfinite(values)
         if bad.any():

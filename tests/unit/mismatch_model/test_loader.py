@@ -150,7 +150,7 @@ BAD: list[tuple[str, Callable[[Path], None], str]] = [
     ("short line", _line(5, "0.004,1"), "line 6: 2 values, the header names 4"),
     ("time backwards", _timed(20, "0.001"), r"time column 't_s' runs backwards at sample 19"),
     ("time gap", _timed(80, "9.000"), r"time column 't_s' jumps by .* at sample 79"),
-    ("too short", lambda f: write(f, data=rows(20)) and None, "20 samples; at least 50"),
+    ("too short", lambda f: write(f, data=rows(20)) and None, "20 samples; at least 50 .* 3 times the rate"),
     ("dead output", lambda f: write(f, data=[r.replace(r.split(",")[2], "7") if i else r for i, r in enumerate(rows())])
         and None, "never changes from"),
     ("input is output", _same_numbers, "hold the same numbers"),
