@@ -87,7 +87,7 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
     limit = (sum(now.values()) - gone) / len(now)
     thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
     fitted = fit(
-        problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-4, hopeless=limit,
+        problem, model, candidate.starts, stride=thin, iterations=20, tolerance=1e-3, hopeless=limit,
         keep=current, touched=touched,
     )  # fmt: skip
     comparison = compare(problem, current, fitted)
