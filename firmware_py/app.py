@@ -20,6 +20,7 @@ import numpy as np
 
 from firmware_py.control.config import load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
+from firmware_py.control.safety import RAMP_TICKS
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
 from firmware_py.endoscope.wiring import is_endoscope
@@ -179,8 +180,10 @@ def make_outcome(
     elif supervisor.ramp_failure:
         reason += f"; neutral NOT confirmed ({supervisor.ramp_failure}): switch the amplifier off"
     late_ms = None
-    if trip is not None and reached_ns and reached and (supervisor.was_late or not supervisor.safe_reached):
-        late_ms = (reached_ns - trip.t_ns) * 1e-6
+    on_time = supervisor.safe_reached and not supervisor.was_late
+    took_ms = (reached_ns - trip.t_ns) * 1e-6 if trip is not None and reached_ns and reached else 0.0
+    if took_ms > 0.0 and not (on_time and took_ms <= 1e3 * (RAMP_TICKS + 1) / opened.file.description.clock.tick_hz):
+        late_ms = took_ms
         reason += f"; neutral was confirmed only after {late_ms:.0f} ms"
     return {
         "format": 1,
@@ -224,7 +227,7 @@ def make_outcome(
             "reason": reason,
             "finding": trip.finding.name.lower() if trip is not None else None,
             "class": trip.cause.value if trip is not None else None,
-            "normal": trip is not None and trip.normal and reached and late_ms is None,
+            "normal": trip is not None and trip.normal and reached and on_time,
             "tick": trip.tick if trip is not None else -1,
             "asked_ns": loop.asked_safe_ns,
             "reached_ns": reached_ns,

@@ -193,7 +193,9 @@ def main(arguments: list[str]) -> int:
 
 def describe(report: dict[str, Any]) -> str:
     """A report in words."""
-    why = {"died": "the firmware died", "silent": "the loop stood still"}.get(report["why"], "nothing to do")
+    if report["taken_ns"] is None:
+        return "the firmware died with its outputs at neutral; the guardian had nothing to do"
+    why = {"died": "the firmware died", "silent": "the loop stood still"}[report["why"]]
     if report["firmware_ended"]:
         why += " in the middle of a command, so its process was ended"
     if not report["exclusive"]:

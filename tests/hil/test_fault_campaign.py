@@ -9,6 +9,7 @@ import pytest
 from tests.conftest import DEFAULT_BENCH
 from tools.faults.campaign import FaultRow, totals
 from tools.faults.catalogue import faults
+from tools.faults.phases import SELF_TEST
 from tools.faults.points import POINTS, write_bench
 from tools.faults.trial import observe_running, observe_start
 
@@ -63,3 +64,22 @@ def test_a_bench_with_a_broken_sensor_does_not_start(tmp_path: Path):
     o = observe_start(bench, "steady", fault, 1)
     assert o.answer == "refused"
     assert "acc1.z (DAQ input 1)" in o.message
+
+
+def test_a_ramp_that_took_longer_than_promised_is_not_reported_as_on_time(tmp_path: Path):
+    """Every transfer of the ramp has a wrong bit, too: neutral is late, and the report says so."""
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    fault = next(f for f in faults() if f.name == "output bus: a bit wrong in every transfer")
+    (o,) = observe_running(bench, "typical", [fault], 133569468)
+    assert o.neutral_ms is not None
+    assert o.neutral_ms > 21.0
+    assert not o.false_neutral
+    assert "neutral was confirmed only after 2" in o.message
+
+
+def test_a_firmware_that_dies_with_its_outputs_at_neutral_leaves_them_there(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    fault = next(f for f in faults() if f.name == "host: firmware killed (kill -9)")
+    (o,) = observe_running(bench, "typical", [fault], 1, SELF_TEST)
+    assert (o.confirmed, o.false_neutral, o.rough) == (True, False, 0)
+    assert "died with its outputs at neutral" in o.message

@@ -140,6 +140,10 @@ def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
     """Sums over the campaign; the goals are those of the reliability page."""
     runs = [o for row in rows for o in row.observations]
     moving = [o for row in rows if not row.fault.is_pair for o in row.observations if o.moved_ms is not None]
+    ours = [
+        o for row in rows if not row.fault.is_pair and row.fault.expected != "cannot be seen"
+        for o in row.observations if o.moved_ms is not None
+    ]  # fmt: skip
     return {
         "faults": len({row.fault.name for row in rows if not row.fault.is_pair}),
         "pairs": len({row.fault.name for row in rows if row.fault.is_pair}),
@@ -148,6 +152,8 @@ def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
         "as_expected": sum(row.as_expected for row in rows),
         "moving_the_tip_5_um": len(moving),
         "of_these_known_within_20_ms": sum(not moved_unseen(o) for o in moving),
+        "ours_moving_the_tip_5_um": len(ours),
+        "ours_known_within_20_ms": sum(not moved_unseen(o) for o in ours),
         "unsafe_outputs": sum(row.unsafe for row in rows),
         "jumps_of_the_fault": sum(o.rough for row in rows if row.fault.own_output for o in row.observations),
         "uncounted_samples": sum(o.uncounted for o in runs),

@@ -8,6 +8,7 @@ from tools.faults.fault import Expected, Fault, InWorld, Kill, OnBus, OnHost, Ou
 
 DAC, ADC = 0x0C, 0x48
 DAQ = ("daq", "acc", "DAQ input")
+PIEZO = ("piezo", "0x0c")
 NO_SUM = "the DI-4108 protocol has no checksum; an error below the jump limit looks like motion"
 ONE_BYTE = (
     "each wrong command stands for 1 ms; registers are read back at 100 Hz, outputs measured at 400 Hz; with "
@@ -119,17 +120,17 @@ def sensors() -> tuple[Fault, ...]:
 def output_bus() -> tuple[Fault, ...]:
     def piezo(name: str, expected: str, *, why: str = "", watch_s: float = 0.15, **plan: float) -> Fault:
         how, own = OnBus("i2c0", plan, only=DAC), "write_corruption" in plan
-        return Fault(f"output bus: {name}", how, expected, ("piezo",), watch_s, own_output=own, effect=4, why=why)  # type: ignore[arg-type]
+        return Fault(f"output bus: {name}", how, expected, PIEZO, watch_s, own_output=own, effect=4, why=why)  # type: ignore[arg-type]
 
     deaf, stuck = InWorld("nack", "piezo", "ack", 0.002), InWorld("stuck", "i2c0", "free", 0.005)
     return (
-        Fault("output bus: DAC refuses its address", InWorld("nack", "piezo"), "safe state", ("piezo",)),
-        Fault("output bus: DAC refuses data", InWorld("nack_data", "piezo"), "safe state", ("piezo",)),
-        Fault("output bus: DAC deaf for 2 ms", deaf, "resumes", ("piezo",), RESUMES_S),
+        Fault("output bus: DAC refuses its address", InWorld("nack", "piezo"), "safe state", PIEZO),
+        Fault("output bus: DAC refuses data", InWorld("nack_data", "piezo"), "safe state", PIEZO),
+        Fault("output bus: DAC deaf for 2 ms", deaf, "resumes", PIEZO, RESUMES_S),
         Fault("output bus: SDA stuck", InWorld("stuck", "i2c0"), "safe state", ("piezo", "i2c", "SDA")),
         Fault("output bus: SDA stuck for 5 ms", stuck, "resumes", ("SDA",), RESUMES_S),
-        Fault("output bus: DAC restarts", InWorld("brown_out", "piezo"), "safe state", ("piezo",), own_output=True),
-        Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", ("piezo",)),
+        Fault("output bus: DAC restarts", InWorld("brown_out", "piezo"), "safe state", PIEZO, own_output=True),
+        Fault("output bus: DAC holds its outputs", InWorld("freeze", "piezo"), "safe state", PIEZO),
         piezo("one transfer in a hundred refused", "holds", watch_s=0.6, nack=0.01),
         piezo("half of the transfers lost", "holds", loss=0.5),
         piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0, why=ONE_BYTE),
@@ -140,7 +141,7 @@ def output_bus() -> tuple[Fault, ...]:
         piezo("silence", "safe state", silent_after_s=0.0),
         piezo("adapter unplugged", "safe state", disconnect_after_s=0.0),
         Fault("output bus: no DAC at start", InWorld("nack", "piezo"), "refused", ("piezo", "0x0c"), at_start=True),
-        Fault("output bus: DAC holds at start", InWorld("freeze", "piezo"), "refused", ("piezo",), at_start=True),
+        Fault("output bus: DAC holds at start", InWorld("freeze", "piezo"), "refused", PIEZO, at_start=True),
     )
 
 

@@ -13,12 +13,14 @@ HEAD = """# Reliability: what breaks, what the instrument does
 
 Made by `{command}`, firmware revision {revision}. The emulated bench in virtual time: {faults} kinds of fault at
 {points} operating points ({names}), {runs} runs. Each fault strikes at a random instant of five phases of a run:
-self-test, learning (0.8 to 2 s), steady (2 to 12 s), in a hold, in the ramp of a run that ends; or it is there when the
-bench is opened ("at start"). Beside them {pairs} pairs: the second fault strikes up to 0.1 s after the first.
+self-test, learning (0.8 to 2 s), steady (2 to 12 s), in a hold, in the ramp of a run that ends; or it is there when
+the bench is opened ("at start"). Beside them {pairs} pairs: the second fault strikes up to 0.1 s after the first.
 
 | figure | goal | measured |
 |---|---|---|
-| runs that moved the tip more than 5 um and were known of within 20 ms of that | all | {known} of {moving} |
+| runs that moved the tip more than 5 um and were known of within 20 ms of that | - | {known} of {moving} |
+| of these, faults that this bench cannot tell in that time ("cannot be seen" below) | - | {known_blind} of {blind} |
+| of these, faults that it can | all | {known_ours} of {ours} |
 | unsafe outputs | 0 | {unsafe_outputs} |
 | jumps of outputs that the fault itself makes (restarted DAC, bits flipped on I2C) | - | {jumps_of_the_fault} |
 | samples that nobody counted | 0 | {uncounted_samples} |
@@ -184,6 +186,10 @@ def markdown(
         phases="\n".join(_phases(rows)),
         unexpected="\n".join(_unexpected(rows)) or "None.",
         known=total["of_these_known_within_20_ms"],
+        known_ours=total["ours_known_within_20_ms"],
+        ours=total["ours_moving_the_tip_5_um"],
+        known_blind=total["of_these_known_within_20_ms"] - total["ours_known_within_20_ms"],
+        blind=total["moving_the_tip_5_um"] - total["ours_moving_the_tip_5_um"],
         moving=total["moving_the_tip_5_um"],
         unseen="\n".join(_unseen(single)) or "Nothing.",
         rows="\n".join(_line(row) for row in single),

@@ -19,7 +19,8 @@ class Phase:
     """The phase begins between ``from_s`` and ``to_s`` of bench time, and the fault strikes up to ``within_s`` later.
 
     ``prelude`` is what begins the phase. ``works``: the outputs follow commands when the fault strikes, so that the
-    tip's distance from the same run without the fault is the fault's doing.
+    tip's distance from the same run without the fault is the fault's doing. ``longer_s``: faults are watched for so
+    much longer, until the outputs work or are refused.
     """
 
     name: str
@@ -28,6 +29,7 @@ class Phase:
     prelude: How | Stop | None = None
     within_s: float = 0.0
     works: bool = False
+    longer_s: float = 0.0
 
     def instants_ns(self, seed: int) -> tuple[int, int]:
         """When the prelude and the fault strike: the same for all faults of one seed."""
@@ -36,20 +38,18 @@ class Phase:
         return round(begin_s * 1e9), round((begin_s + self.within_s * float(later)) * 1e9)
 
 
-SELF_TEST = Phase("self-test", 0.02, 0.5)
+SELF_TEST = Phase("self-test", 0.02, 0.5, longer_s=1.0)
 LEARNING = Phase("learning", 0.8, 2.0, works=True)
 STEADY = Phase("steady", 2.0, 12.0, works=True)
-HOLD = Phase("hold", 2.0, 3.0, prelude=InWorld("overflow", "daq"), within_s=0.2)
+HOLD = Phase("hold", 2.0, 3.0, prelude=InWorld("overflow", "daq"), within_s=0.2, longer_s=0.4)
 RAMP = Phase("ramp", 2.0, 3.0, prelude=Stop(), within_s=0.018)
 START = Phase("start", 0.0, 0.0)
 """The fault is there before the devices are opened."""
 PHASES = (SELF_TEST, LEARNING, STEADY, HOLD, RAMP)
-RUN_BEGINS_S = 0.7
-"""A run that is struck in its self-test is watched for so much longer, until its outputs work or are refused."""
 
 ALSO: dict[Expected, frozenset[str]] = {
     "harmless": frozenset({"none"}),
-    "cannot be seen": frozenset({"none"}),
+    "cannot be seen": frozenset({"none", "noticed"}),
     "holds": frozenset({"resumes"}),  # a fault that comes and goes may let the outputs resume until it comes again
 }
 QUIET = frozenset({"none", "noticed", "resumes", "holds", "refused"})

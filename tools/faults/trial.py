@@ -26,7 +26,7 @@ from hal.errors import HalError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
 from tools.faults.fault import Both, Fault, How, InWorld, Kill, OnBus, OnHost, OutOfMemory
 from tools.faults.judge import Observation, Seen, judge
-from tools.faults.phases import RUN_BEGINS_S, SELF_TEST, START, STEADY, Phase, Stop
+from tools.faults.phases import SELF_TEST, START, STEADY, Phase, Stop
 
 Sabotaged = FaultSerial | FaultI2c | FaultCan
 
@@ -94,7 +94,7 @@ class FarBench:
         self.clock.burn_ns(round(watch_s * 1e9))
         asked = self.processes.guardian_report
         report = asked() if asked is not None else {}
-        reached = bool(report.get("neutral_ns"))
+        reached = bool(report.get("neutral_ns")) or (bool(report) and report["taken_ns"] is None)
         outcome: dict[str, Any] = {
             "armed_ns": 0,
             "safe_ns": report.get("taken_ns") or self.clock.now_ns(),
@@ -140,7 +140,6 @@ def observe_running(
     """Each of ``faults`` strikes the same run at the same instant of ``phase``."""
     far = FarBench()
     begin_ns, at_ns = phase.instants_ns(seed)
-    longer_s = RUN_BEGINS_S if phase is SELF_TEST else 0.0
     answers: list[Any] = []
     me = _Child()
     shifting = [fault for fault in faults if fault.redraws] if phase.works else []
@@ -162,7 +161,9 @@ def observe_running(
                     far.strike(fault.how, seed)
                 if "firmware" in far.processes.dead:
                     me.answer(far.after_death(at_ns, watch_s))
-                far.clock.at(at_ns + round((watch_s + longer_s) * 1e9), lambda _: signal.raise_signal(signal.SIGINT))
+                far.clock.at(
+                    at_ns + round((watch_s + phase.longer_s) * 1e9), lambda _: signal.raise_signal(signal.SIGINT)
+                )
                 return
         raise _AllStruck
 
