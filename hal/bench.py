@@ -205,7 +205,8 @@ def _duplicates(claims: Iterable[tuple[tuple[str | None, int | None], str]]) -> 
 
 
 class EmulatedWorld(Protocol):
-    """What an emulation provider returns: the far ends of the ``sim://`` buses, and the physical truth."""
+    """The object that an emulation provider returns. It holds the far ends of the ``sim://`` buses and the physical
+    truth."""
 
     def endpoint(self, bus: str) -> str | Port:
         """A URI for the ordinary adapters (own process, real time) or a port object (virtual time)."""
@@ -215,12 +216,14 @@ class EmulatedWorld(Protocol):
     def stop(self) -> None: ...
 
     def stalled_ms(self, now_ns: int, within_ms: float) -> float:
-        """How long the emulation stands still at bench time ``now_ns``, or stood still up to ``within_ms`` ago, because
-        its host did; 0 if it did not. What it says late is no fault of a device."""
+        """Return the duration of a stall of the emulation, in ms; 0 if there was none.
+
+        A stall counts that lasts at bench time ``now_ns`` or ended at most ``within_ms`` before it. It is caused by
+        the host, so an answer that arrives late because of it is no fault of a device."""
         ...
 
     def stalls(self) -> tuple[int, float]:
-        """How often the emulation stood still, and for how many ms at the longest."""
+        """Return the number of stalls of the emulation and the duration of the longest one in ms."""
         ...
 
     def truth(self) -> dict[str, NDArray[np.float64] | NDArray[np.int64]]: ...
@@ -231,8 +234,10 @@ Provider = Callable[..., EmulatedWorld]
 
 @dataclass
 class Processes:
-    """In virtual time all processes of a bench are one: which of them a fault test has killed, and what the guardian
-    reports. ``dead`` may name "firmware", "guardian" (until another one is started) and "new guardians"."""
+    """State of the simulated processes of a bench in virtual time, where all of them run in one process.
+
+    ``dead`` names those that a fault test has killed: "firmware", "guardian" (until another one is started) and "new
+    guardians". ``guardian_report`` returns what the guardian reports."""
 
     dead: set[str] = field(default_factory=set[str])
     guardian_report: Callable[[], dict[str, Any]] | None = None

@@ -1,4 +1,4 @@
-"""How this program starts itself in further processes: our packages, whatever folder the user stands in."""
+"""Start this program in child processes, which import our packages whatever the current folder is."""
 
 from __future__ import annotations
 

@@ -54,7 +54,7 @@ class VirtualClock:
         self._order += 1
 
     def next_event_ns(self) -> int | None:
-        """When the next callback is due, ``None`` without one."""
+        """Return the time at which the next callback is due, or ``None`` if none is scheduled."""
         return self._due[0][0] if self._due else None
 
     def advance_to(self, t_ns: int) -> None:
@@ -80,8 +80,9 @@ class VirtualClock:
 
 @dataclass(frozen=True)
 class PaceReport:
-    """How a paced clock and the host got along: emulated and wall-clock seconds, and pauses of at least ``STALL_NS``
-    in which the host did not run this thread."""
+    """Holds the emulated and wall-clock seconds of a paced clock, and the number and the longest of its stalls.
+
+    A stall is a pause of at least ``STALL_NS`` in which the host did not run this thread."""
 
     emulated_s: float
     wall_s: float

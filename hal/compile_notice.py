@@ -30,18 +30,18 @@ class CompileNotice(event.Listener):
         self._next_s = PATIENCE_S
 
     def listen(self) -> None:
-        """From now on and for the life of the process."""
+        """Start to listen to numba's compile events; this lasts for the life of the process."""
         event.register("numba:compile", self)
 
     def on_start(self, event: Any) -> None:
-        """A kernel is begun."""
+        """Record that numba begins to compile a kernel."""
         if self._depth == 0:
             self._began_s = self._now_s()
         self._depth += 1
         self._tell()
 
     def on_end(self, event: Any) -> None:
-        """A kernel is done."""
+        """Record that numba has compiled a kernel."""
         self._done += 1
         self._tell()
         self._depth -= 1

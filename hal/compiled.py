@@ -1,4 +1,4 @@
-"""How kernels are compiled: numba, cached on disk under a fingerprint of every source that a kernel can see.
+"""Compile kernels with numba and cache them on disk under a fingerprint of every source that a kernel can see.
 
 Numba's own cache looks only at the file that a function is written in; a kernel that calls another file's
 kernel, or folds in its constants, would be served stale after an edit there. The fingerprint here covers the
@@ -89,12 +89,12 @@ def source_fingerprint(file: Path, root: Path = ROOT) -> str:
 
 
 def user_cache() -> Path:
-    """Where this user's compiled kernels and filter designs are kept; every clone shares it."""
+    """Return the folder of this user's compiled kernels and filter designs, which all clones share."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "micron-bench"
 
 
 def cache_folder(file: Path) -> Path:
-    """Where the compiled kernels of this version of ``file`` are kept."""
+    """Return the folder of the compiled kernels of this version of ``file``."""
     return user_cache() / f"kernels-{source_fingerprint(file)}"
 
 

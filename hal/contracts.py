@@ -136,12 +136,12 @@ class AnalogOutput(Protocol):
 
     @property
     def commands_sent(self) -> int:
-        """``write`` calls whose values left for the device; a slow one may pass some over for newer ones."""
+        """Return the number of ``write`` calls whose values were sent; a slow device may skip some for newer ones."""
         ...
 
     @property
     def told_V(self) -> Sequence[float]:
-        """What the device was told last, by ``write`` or on the way to its safe state."""
+        """Return the set points in V sent to the device last, by ``write`` or by the ramp to its safe state."""
         ...
 
     def arm(self) -> None:
@@ -156,11 +156,11 @@ class AnalogOutput(Protocol):
         ...
 
     def safe_step(self) -> bool:
-        """One tick of the ramp to ``safe_V``; True once there. Works armed or not, and disarms."""
+        """Make one step of the ramp to ``safe_V``; return True once it is reached. Works armed or not, and disarms."""
         ...
 
     def readback_V(self) -> Float64Array:
-        """What the device itself says its outputs are, in V."""
+        """Return the outputs that the device itself reports, in V."""
         ...
 
     def close(self) -> None:

@@ -11,7 +11,7 @@ from enum import Enum
 
 
 class ErrorKind(Enum):
-    """What went wrong, independent of device and backend."""
+    """Kind of an error, independent of device and backend."""
 
     CONFIG = "config"
     NOT_FOUND = "not found"

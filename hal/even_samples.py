@@ -15,7 +15,9 @@ SMOOTH_S = 2.0  # a crystal does not change its rate within this; a transport ji
 
 
 def stamp_share(stamps_s: Array, values: Array) -> float:
-    """How much of the time stamps' scatter is real: 1 if samples were taken then, 0 if evenly and stamped late.
+    """Return the share of the time stamps' scatter that is real.
+
+    The share is 1 if the samples were taken at their stamps, 0 if they were taken evenly and stamped late.
 
     Between two samples a signal changes by slope x elapsed time. The slope is taken over three steps, so the change
     over the middle step regressed on slope x (deviation of that step from the mean) is 1 for true stamps, 0 for an

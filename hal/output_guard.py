@@ -1,4 +1,4 @@
-"""What every analog output shares: clip, limit the slew, refuse what is not finite, ramp to the safe state.
+"""Protection that every analog output shares: clipping, slew limit, refusal of non-finite values, ramp to safe state.
 
 Plain arithmetic on a few floats: a numpy expression on three values costs more than the loop.
 """

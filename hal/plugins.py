@@ -1,4 +1,4 @@
-"""What other installed packages add to this one: entry points by group, loaded when they are used.
+"""Find the plugins of other installed packages: entry points by group, loaded when they are used.
 
 A package declares ``[project.entry-points."micron.GROUP"]`` with ``name = "module:object"``; nothing here is edited.
 Our own names come first: a package cannot replace what is built in.

@@ -1,12 +1,12 @@
-"""When was scan k taken? The device clock counts scans, the host sees them arrive late and unevenly.
+"""Estimate when scan k was taken. The device clock counts scans; the host sees them arrive late and unevenly.
 
 The earliest arrivals carry the least transport delay, so the line through them is the device clock on the
 host's time base (the idea of NTP's minimum filter). What remains is the constant minimum delay of the
 transport: a scan is stamped late by that much, never early.
 
-A clock that steps shows as arrivals that are all off the line, most of them by the same. A host that is busy is late by
-this and that; a transport that has become slower by the same every time cannot be told from a step, nor can a step
-of a tenth of a period from what arrivals vary by.
+After a step of the clock all arrivals are off the line, most of them by the same amount; those of a busy host are late
+by varying amounts. A constant increase of the transport delay cannot be distinguished from a step, and a step of a
+tenth of a period cannot be distinguished from the jitter of the arrivals.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class ScanTimeline:
 
     @property
     def skew_ppm(self) -> float:
-        """How much slower (positive) the device clock runs than the bench clock."""
+        """Return the frequency error of the device clock in ppm; positive if it runs slower than the bench clock."""
         return self._skew_ns / self.dt_ns * 1e6
 
     def stamp(self, n: int, arrival_ns: int) -> tuple[int, int, int]:
@@ -97,7 +97,7 @@ class ScanTimeline:
         return t_last_ns - int((n - 1) * self.dt_ns), first_seq, lost
 
     def due_by(self, now_ns: int) -> int:
-        """How many scans the device should have taken by ``now_ns`` that have not been stamped yet."""
+        """Return the number of scans that the device should have taken by ``now_ns`` and that are not stamped yet."""
         if self._arrivals == 0:
             return 0
         last_ns = self._origin_ns + (self._next - 1) * self.dt_ns + self._offset_ns

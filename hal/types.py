@@ -7,7 +7,7 @@ from enum import Enum, IntFlag
 
 
 class TimeSource(Enum):
-    """Which clock stamped a sample."""
+    """The clock that stamped a sample."""
 
     DEVICE_CLOCK = "device clock"
     KERNEL = "kernel"
@@ -49,7 +49,7 @@ class ScanConfig:
 
 @dataclass(frozen=True, slots=True)
 class ScanInfo:
-    """What the device really does: rate, full scale and step per channel, FIFO depth in scans."""
+    """Holds the settings that a DAQ really uses: rate, full scale and step per channel, FIFO depth in scans."""
 
     rate_hz: float
     channels: tuple[int, ...]
@@ -61,10 +61,10 @@ class ScanInfo:
 
 @dataclass(slots=True)
 class ScanBlock:
-    """What ``read_scans`` delivered.
+    """Describes the scans that one call of ``read_scans`` delivered.
 
-    ``n`` scans, the first taken at ``t0_ns`` (bench clock) with device sequence number ``seq0``, ``dt_ns``
-    apart; ``lost`` scans are known to be missing before the first one.
+    It delivered ``n`` scans that were taken ``dt_ns`` apart, the first at ``t0_ns`` (bench clock) with the device
+    sequence number ``seq0``; ``lost`` scans are known to be missing before the first one.
     """
 
     n: int
@@ -126,7 +126,7 @@ class OutputLimit:
 
 @dataclass(frozen=True, slots=True)
 class PortInfo:
-    """What an adapter is, for reports: ``emulated`` is information for people, never a branch in code."""
+    """Describes an adapter in reports. ``emulated`` is information for people; no code branches on it."""
 
     uri: str
     description: str

@@ -1,4 +1,4 @@
-"""How many bits a transaction occupies on its wire, for the load of a bus and for the time budget of a task.
+"""Count the bits that a transaction occupies on its wire, for the load of a bus and for the time budget of a task.
 
 Sources: UM10204 (NXP, rev. 7) section 3.1 for I2C; ISO 11898-1 for CAN frames and Davis et al. 2007, eq. 2, for the
 bound of their stuff bits. Clock stretching, rise times and an adapter's gaps between bytes are not counted.

@@ -1,4 +1,4 @@
-"""What every I2C adapter refuses before it touches the wire."""
+"""Checks that every I2C adapter makes on its arguments before it touches the wire."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From a URI to an open port. The URI is the only place that says which adapter, and so whether it is real."""
+"""Open a port from its URI. Only the URI says which adapter is used, and so whether the hardware is real."""
 
 from __future__ import annotations
 

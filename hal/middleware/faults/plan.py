@@ -1,7 +1,7 @@
-"""What is to go wrong on a port, when, and what really did.
+"""Fault plans of a port: which faults are injected and when, and counts of those that were.
 
-Deterministic: same seed, same plan, same traffic, same faults. What is received suffers loss and corruption;
-silence takes both directions; a delay holds up the caller, as a slow link does.
+Faults are deterministic: the same seed, plan and traffic give the same faults. Loss and corruption apply to received
+data; silence applies to both directions; a delay blocks the caller, as a slow link does.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ class FaultPlan:
 
 @dataclass(slots=True)
 class FaultCounts:
-    """What was really done. ``silenced`` counts bytes, transfers or frames that silence swallowed."""
+    """Holds the counts of the faults that were injected.
+
+    ``silenced`` counts the bytes, transfers or frames that silence suppressed."""
 
     lost: int = 0
     corrupted: int = 0
@@ -64,7 +66,7 @@ class FaultCounts:
 
     @property
     def any(self) -> bool:
-        """Whether anything was done at all."""
+        """Return True if any fault was injected."""
         return self != FaultCounts()
 
 
@@ -111,7 +113,7 @@ class Injector:
         self.counts.corrupted += 1
 
     def due(self, rate_hz: float, done: int) -> int:
-        """How many of the events of ``rate_hz`` are due that have not been ``done``."""
+        """Return the number of events at ``rate_hz`` that are due by now, less the ``done`` ones."""
         if rate_hz <= 0.0 or not self.active():
             return 0
         return max(0, int((self.now_s() - self.plan.from_s) * rate_hz) - done)
