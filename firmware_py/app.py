@@ -1,4 +1,4 @@
-"""The firmware as a program: open the bench, run the loop, report what happened.
+"""Runs the firmware as a program: it opens the bench, runs the loop and reports what happened.
 
 ``run_in_process`` is the whole of it; ``python -m firmware_py.app REQUEST.json`` is the same in a process of
 its own, for real time, with status lines on standard output that are dropped rather than waited for.
@@ -148,7 +148,7 @@ def _recorder(
 
 
 def recording_metadata(bench: BenchFile, configs: StageConfigs, opened: OpenBench) -> dict[str, str]:
-    """What a recording says of the run that it is of."""
+    """Return the metadata that a recording keeps about its run."""
     return {
         "bench": bench.text,
         "bench_name": bench.description.name,
@@ -168,7 +168,7 @@ def make_outcome(
     recording: RecordingSummary | None,
     guardian: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """The part of the run's JSON that the firmware itself knows. ``guardian``: the guardian's last report."""
+    """Return the part of the run's JSON that the firmware itself knows. ``guardian``: the guardian's last report."""
     snapshot = loop.scheduler.snapshot()
     supervisor, counts = loop.supervisor, loop.counts
     trip = supervisor.trip_cause
@@ -252,7 +252,7 @@ def make_outcome(
 
 
 def _die_with_parent() -> None:
-    """SIGTERM to this process when the one that started it dies: the loop then ramps to neutral."""
+    """Make the kernel send SIGTERM to this process when its parent dies: the loop then ramps to neutral."""
     with contextlib.suppress(AttributeError, OSError):
         ctypes.CDLL(None).prctl(1, signal.SIGTERM, 0, 0, 0)
 
@@ -270,7 +270,7 @@ def _status_pipe() -> StatusSink:
 
 
 def main(arguments: list[str]) -> int:
-    """``python -m firmware_py.app REQUEST.json``: writes ``outcome.json`` beside the request."""
+    """Run ``python -m firmware_py.app REQUEST.json``, which writes ``outcome.json`` beside the request."""
     _die_with_parent()
     table = json.loads(Path(arguments[0]).read_text())
     runtime_dir = Path(table.pop("runtime_dir"))

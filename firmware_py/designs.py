@@ -1,4 +1,4 @@
-"""Filters that scipy.signal designs, kept on disk: importing it takes longer than all else that a start does.
+"""Keeps filters designed by scipy.signal on disk, because importing it takes longer than the rest of a start.
 
 The first start on a machine calls scipy; later ones read the same bits from a file named by what was asked and by the
 version of scipy. A file that cannot be read or written costs time, never the design.
@@ -25,7 +25,7 @@ Array = NDArray[Any]
 
 
 def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
-    """What ``scipy.signal.FUNCTION`` returns, as a tuple of arrays; arguments are numbers, words and arrays."""
+    """Return what ``scipy.signal.FUNCTION`` returns, as a tuple of arrays. Arguments: numbers, strings, arrays."""
     plain = [_plain(argument) for argument in arguments], {name: _plain(value) for name, value in options.items()}
     asked = json.dumps([function, _scipy_version(), *plain], sort_keys=True)
     file = user_cache() / "designs" / f"{hashlib.sha256(asked.encode()).hexdigest()[:24]}.json"

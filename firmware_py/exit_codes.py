@@ -8,7 +8,7 @@ from hal.errors import BenchError, DeviceNotFound, HalError, OpenFailed
 
 
 class Exit(IntEnum):
-    """What a program ended with."""
+    """Names the exit statuses of a program."""
 
     DONE = 0
     FAILED = 1
@@ -20,7 +20,7 @@ class Exit(IntEnum):
 
 
 def exit_code_of(error: HalError) -> Exit:
-    """The exit code that an error stands for."""
+    """Return the exit code that an error stands for."""
     match error:
         case BenchError():
             return Exit.BAD_INPUT

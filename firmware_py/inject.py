@@ -1,4 +1,4 @@
-"""Faults on purpose on any bench, also a real one (``micron run --inject``), guarded by how much they may disturb it.
+"""Injects faults into any bench, also a real one (``micron run --inject``), within a limit on how much they disturb it.
 
 The scale is that of the hardware tests: 0 reads, 1 configures, 2 small output, 3 full range, 4 motion. On a real bus
 nothing is injected without a limit that somebody has named.
@@ -30,14 +30,14 @@ SENSING_DRIVERS = frozenset(
     }
     | {"mpu6050", "bmx055", "lsm6ds3"}
 )
-"""Whoever is not known to sense only may move something."""
+"""Drivers known to sense only. A device with any other driver may move something."""
 SENSING, MOTION = 1, 4
 PROBABILITIES = (
     "loss", "corruption", "write_corruption", "duplication", "reorder", "truncation", "delay", "nack",
 )  # fmt: skip
 KEYS = tuple(f.name for f in fields(FaultPlan))
 FOR_EVER = ("for_s", "silent_for_s", "reconnect_after_s")
-"""Times that may be inf."""
+"""Keys whose times may be inf."""
 ONLY_ON = {
     "nack": ("i2c",),
     "write_corruption": ("i2c",),
@@ -47,7 +47,7 @@ ONLY_ON = {
     "babble_hz": ("can",),
     "error_frames_hz": ("can",),
 }
-"""Kinds of bus on which a key does anything; the others do on all."""
+"""Kinds of bus on which a key has an effect. Keys that are not listed have one on every kind."""
 FORM = "write --inject BUS:KEY=VALUE[,KEY=VALUE], or BUS@0x0C:KEY=VALUE for one I2C device"
 
 Wrap = Callable[[str, Port, Clock], Port]
@@ -55,7 +55,8 @@ Wrap = Callable[[str, Port, Clock], Port]
 
 @dataclass(frozen=True)
 class Injection:
-    """``plan`` on the port of ``bus``; ``only``: one I2C address. Times of the plan count from opening the bench."""
+    """Applies ``plan`` to the port of ``bus``; ``only``: one I2C address. The plan's times count from opening the
+    bench."""
 
     bus: str
     plan: FaultPlan
@@ -97,7 +98,7 @@ def _number(text: str, key: str, value: str) -> float:
 
 
 def effect_of(description: BenchDescription, injection: Injection) -> int:
-    """How much the fault may disturb: motion where outputs may be commanded over the bus, else reading."""
+    """Return how much the fault may disturb: motion where outputs may be commanded over the bus, else sensing only."""
     moves = any(
         device.driver not in SENSING_DRIVERS
         and device.bus == injection.bus
@@ -108,7 +109,7 @@ def effect_of(description: BenchDescription, injection: Injection) -> int:
 
 
 def check_injections(bench: BenchFile, injections: Sequence[Injection], max_effect: int | None) -> None:
-    """Raises ``BenchError`` for a fault that would do nothing (no such bus, device, or key on such a bus; a second plan
+    """Raise ``BenchError`` for a fault that would do nothing (no such bus, device, or key on such a bus; a second plan
     for a bus), and for a real bus that may not be disturbed so much."""
     description = bench.description
     for k, injection in enumerate(injections):

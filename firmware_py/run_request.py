@@ -1,4 +1,4 @@
-"""What to run, whichever instrument it is: the request, the bench opened for it, and how the loop is scheduled."""
+"""Handles a request to run either instrument: the request itself, the bench opened for it, the loop's scheduling."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ LOOP_PRIORITY = 80
 
 @dataclass(frozen=True)
 class RunRequest:
-    """What to run. ``hand_file`` may carry a part (``FILE#id``), which is why it is text."""
+    """Describes a run. ``hand_file`` may carry a part (``FILE#id``), which is why it is text."""
 
     bench: Path
     seconds: float
     pace: Pace | None = None
-    """How bench time passes; None: paced where every bus is emulated, else real time."""
+    """Pace at which bench time passes. None: paced where every bus is emulated, else real time."""
     hand_file: str | None = None
     hand_scale: float | None = None
     record: Path | None = None
@@ -37,24 +37,25 @@ class RunRequest:
     live_fds: tuple[int, int] | None = None
     """Memory and control socket of ``firmware_py.live``, inherited from the bench page's server."""
     stale_ms: float | None = None
-    """Another limit for missing or belated scans than the bench file's."""
+    """Overrides the bench file's limit for missing or belated scans."""
     policy: bool = True
-    """In real time: ask for a real-time policy, locked memory and no collector; without, for comparison only."""
+    """Asks, in real time, for a real-time policy, locked memory and no garbage collector. False is for comparison
+    only."""
     sense_only: bool = False
-    """Nothing is armed; readings that would end a run are noticed."""
+    """Runs without arming the outputs. Readings that would end a run are only noticed."""
     method: str | None = None
-    """Another tremor estimator than the bench file's."""
+    """Overrides the bench file's tremor estimator."""
     truth_s: float | None = None
-    """How much truth an emulated world keeps; None: all of it."""
+    """Length of the truth that an emulated world keeps. None: all of it."""
     clock_start_ns: int = 0
-    """Where the virtual clock begins: marks of time are crossed without waiting for them."""
+    """Start of the virtual clock. A late start crosses marks of time without waiting for them."""
     inject: tuple[str, ...] = ()
     """Faults on buses (``firmware_py.inject``)."""
     max_effect: int | None = None
-    """How much these may disturb a real bench."""
+    """Limit on how much the injected faults may disturb a real bench (scale of ``firmware_py.inject``)."""
 
     def to_json(self, runtime_dir: Path) -> str:
-        """For the firmware's own process."""
+        """Return the request as JSON for the firmware's own process."""
         table = {k: str(v) if isinstance(v, Path) else v for k, v in asdict(self).items()}
         return json.dumps({**table, "runtime_dir": str(runtime_dir)})
 
@@ -66,9 +67,9 @@ def open_requested(
     runtime_dir: Path | None,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
 ) -> Iterator[OpenBench]:
-    """The bench opened as the request says; without ``runtime_dir`` in a folder of its own.
+    """Open the bench as the request says; without ``runtime_dir`` in a folder of its own.
 
-    ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
+    Raises ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
     """
     check_devices(bench.description, str(bench.path))
     with contextlib.ExitStack() as stack:
@@ -89,7 +90,7 @@ def open_requested(
 
 
 def truth_of(opened: OpenBench) -> dict[str, Any] | None:
-    """Stops the emulated world; its truth, or None where nothing is emulated or the world died."""
+    """Stop the emulated world. Return its truth, or None where nothing is emulated or the world died."""
     if opened.world is None:
         return None
     opened.world.stop()
@@ -100,7 +101,7 @@ def truth_of(opened: OpenBench) -> dict[str, Any] | None:
 
 @contextlib.contextmanager
 def scheduling(request: RunRequest, opened: OpenBench) -> Iterator[RealtimeReport]:
-    """Real-time settings for the length of the block, in real time and unless the request does without."""
+    """Apply real-time settings for the length of the block, in real time and unless the request does without."""
     if isinstance(opened.clock, PacedClock):
         opened.clock.begin()
     if opened.virtual or not request.policy:
@@ -130,7 +131,7 @@ def count_interrupts() -> Iterator[Callable[[], int]]:
 
 
 def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
-    """Which real-time settings the loop ran with, in words."""
+    """Return the real-time settings that the loop ran with, in words."""
     if virtual:
         return "virtual time"
     if not report.settings:
@@ -139,7 +140,7 @@ def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
 
 
 def describe_host(opened: OpenBench, gaps: HostGaps | None = None) -> dict[str, Any]:
-    """How the host kept up with the run, as JSON values: the pace, and how often and how long the host stood still.
+    """Return how the host kept up with the run, as JSON values: pace, number of stalls, and longest stall.
 
     In real time these are the stalls of the loop (``gaps``) and of the emulated world, whichever is worse.
     """

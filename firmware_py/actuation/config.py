@@ -1,4 +1,4 @@
-"""What the actuation stage needs to know: [firmware.actuation] of the bench, piezo calibration."""
+"""Defines the actuation stage's configuration: [firmware.actuation] of the bench, and the piezo calibration."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=16)]
 
 
 class StackConfig(BaseModel):
-    """Modified Prandtl-Ishlinskii model of one stack, 000 (7.9): weights in um per V, thresholds in V and um.
+    """Holds the modified Prandtl-Ishlinskii model of one stack, 000 (7.9): weights in um per V, thresholds in V and um.
 
     The default is a P-885.50 by its data sheet shape: 15 um at 100 V on the first way up, a small-signal slope
     of 70 % of that. ``micron calibrate piezo`` replaces it by the stack's own.
@@ -77,7 +77,7 @@ class StackConfig(BaseModel):
 
 
 class ActuationConfig(BaseModel):
-    """Manipulator geometry, stacks, limits and how compensation comes on."""
+    """Sets the manipulator's geometry, the stacks, the limits and how compensation fades in."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -93,7 +93,8 @@ class ActuationConfig(BaseModel):
     mounting: tuple[tuple[float, float, float], ...] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
     yield_s: Positive = 2.0
-    """How long a peak is remembered that makes slow motion yield to tremor (firmware_py/actuation/yielding.py)."""
+    """Time for which the peaks that make slow motion yield to tremor are remembered
+    (firmware_py/actuation/yielding.py)."""
 
     low_V: float = 0.0
     high_V: float = 100.0
@@ -104,7 +105,7 @@ class ActuationConfig(BaseModel):
     """Taps on the wanted stroke of each stack, newest first: inverse of its lag and resonance; one list for all or
     three. ``micron calibrate piezo`` writes them."""
     preview_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0
-    """From a demand to the stroke that it is for; part of the predictor's horizon ([firmware.tremor]
+    """Time from a demand to the stroke that it is for. It is part of the predictor's horizon ([firmware.tremor]
     loop_delay_s), which must reach at least this far."""
 
     @field_validator("lever_gain", mode="before")
@@ -133,5 +134,5 @@ class ActuationConfig(BaseModel):
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.actuation]") -> ActuationConfig:
-        """Checked configuration; ``BenchError`` names the wrong key."""
+        """Return the checked configuration. Raises ``BenchError`` naming the wrong key."""
         return validate_table(cls, table, where)

@@ -1,4 +1,4 @@
-"""Limits of voltage and slew; what they hold back is reported, never silent."""
+"""Limits voltage and slew. What the limits hold back is always reported."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ def limit_voltage(wanted_V: float, low_V: float, high_V: float) -> float:
 
 @kernel
 def limit_slew(wanted_V: float, previous_V: float, step_V: float) -> float:
-    """``wanted_V``, but no further from ``previous_V`` than ``step_V``."""
+    """Return ``wanted_V``, limited to at most ``step_V`` from ``previous_V``."""
     return max(previous_V - step_V, min(previous_V + step_V, wanted_V))

@@ -1,4 +1,4 @@
-"""Nearest reachable tip position: what is commanded when the wanted one is beyond the strokes."""
+"""Finds the nearest reachable tip position, which is commanded when the wanted one is beyond the strokes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ REACH_PASSES = 4
 
 @kernel
 def inside(strokes: Array, low: Array, high: Array) -> bool:
-    """Whether every stroke (m from neutral) is in its range; one that is not finite is not."""
+    """Return True if every stroke (m from neutral) is in its range. A stroke that is not finite is outside."""
     good = True
     for i in range(3):
         good = good and low[i] <= strokes[i] <= high[i]
@@ -27,10 +27,10 @@ def inside(strokes: Array, low: Array, high: Array) -> bool:
 
 @kernel
 def box_least_squares(h: Array, g: Array, low: Array, high: Array, out: Array) -> None:
-    """``out`` (3,): least of x.h.x / 2 - g.x over low <= x <= high, for ``h`` (3, 3) positive definite.
+    """Set ``out`` (3,) to the minimizer of x.h.x / 2 - g.x over low <= x <= high, for ``h`` (3, 3) positive definite.
 
-    All 27 faces of the box are tried: three unknowns are too few for anything cleverer. The least is unique, so
-    the answer moves continuously with the data.
+    All 27 faces of the box are tried: three unknowns are too few for anything cleverer. The minimizer is unique, so
+    it moves continuously with the data.
     """
     best = np.inf
     x = scratch(3)

@@ -93,7 +93,7 @@ def actuate_state_dtype(n_plays: int, n_creep: int) -> np.dtype[Any]:
 
 
 def geometry_of(config: ActuationConfig) -> Record:
-    """The kinematics' numbers (dtype ``GEOMETRY``)."""
+    """Return the kinematics' parameters (dtype ``GEOMETRY``)."""
     geometry = new_record(
         GEOMETRY,
         circle_m=config.ball_circle_m,
@@ -106,7 +106,7 @@ def geometry_of(config: ActuationConfig) -> Record:
 
 
 def actuate_params(config: ActuationConfig) -> Record:
-    """All numbers of the stage."""
+    """Return all parameters of the stage."""
     sizes = sizes_of(*config.stacks)
     params = new_record(
         actuate_dtype(*sizes),
@@ -145,7 +145,7 @@ def actuate_params(config: ActuationConfig) -> Record:
 
 
 def actuate_state(config: ActuationConfig, params: Record) -> Record:
-    """At neutral, as after the amplifier's first rise from 0 V."""
+    """Return the state at neutral, as it is after the amplifier's first rise from 0 V."""
     plays, _, creep = sizes_of(*config.stacks)
     state = new_record(actuate_state_dtype(plays, creep), command_V=config.neutral_V)
     for i in range(3):
@@ -157,7 +157,8 @@ def actuate_state(config: ActuationConfig, params: Record) -> Record:
 def command_stack(
     target: float, plays: Array, creep: Array, slopes: Array, last_target: float, last_V: float, i: int, param: Record
 ) -> tuple[float, int]:
-    """Drive V of stack ``i`` for the stroke ``target`` (m from neutral), limited, and the Clip bits that took.
+    """Return the limited drive V of stack ``i`` for the stroke ``target`` (m from neutral), and the Clip bits of the
+    limits that acted.
 
     Moves ``plays`` and ``creep`` by what is commanded, so that after a limit the model still knows the stack.
     """
@@ -235,7 +236,7 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
 
 @kernel
 def rest_kernel(states: Record) -> None:
-    """After ``follow_kernel``: the stroke that hysteresis has left at neutral is kept, and fades as compensation fades
+    """Keep, after ``follow_kernel``, the stroke that hysteresis has left at neutral. It fades as compensation fades
     in, so that the first command after a hold is neutral itself."""
     state = states[0]
     for i in range(3):
@@ -256,9 +257,9 @@ class Actuation:
 
     @property
     def limited(self) -> dict[str, int]:
-        """Ticks since the last reset in which the command ran into each limit."""
+        """Return the number of ticks since the last reset in which the command ran into each limit."""
         return dict(zip(LIMITS, map(int, self.state["limited"][0]), strict=True))
 
     def reset(self) -> None:
-        """At neutral, compensation off, counts at zero; to be called after the amplifier itself has gone to neutral."""
+        """Restore the state at neutral: compensation off, counts at zero. The amplifier must be at neutral already."""
         copy_record(self.state, actuate_state(self.config, self.params))

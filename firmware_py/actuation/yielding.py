@@ -1,4 +1,4 @@
-"""Who gives way when the stroke does not suffice: motion outside the core tremor band, slowly and before the end.
+"""Lets motion outside the core tremor band yield, slowly and early, where the stroke does not suffice for all.
 
 A clipped slow swing has harmonics in the very band that matters. So what is wanted is split into the core (what the
 estimator says of 8 to 12 Hz) and the rest; the rest is scaled so that, beside the core's recent peaks, its own recent
@@ -32,7 +32,8 @@ LEAST_ROOM = 0.1  # of a stroke's half range whatever the core takes, of that ro
 
 @kernel
 def yield_rest(stroke: Array, core: Array, low: Array, high: Array, keep: float, state: Record) -> bool:
-    """``stroke`` (3,) m becomes ``core`` (3,) + what is let through of the rest; whether anything was held back.
+    """Replace ``stroke`` (3,) m by ``core`` (3,) plus the share of the rest that is let through. Return True if
+    anything was held back.
 
     ``low``, ``high`` (3,): ends of the strokes from neutral; ``keep``: what is kept of a peak per tick.
     """

@@ -1,4 +1,4 @@
-"""An endoscope bench as a program: open it, run the loop, say what happened. Called by ``firmware_py.app``."""
+"""Runs an endoscope bench: opens it, runs the loop and reports what happened. ``firmware_py.app`` calls it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,8 @@ def run_request(
     *,
     own_process: bool = False,
 ) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """What ``firmware_py.app.run_in_process`` does, for an endoscope bench."""
+    """Run an endoscope bench in this process, as ``firmware_py.app.run_in_process`` runs an instrument. Return the
+    outcome (JSON values) and the truth of an emulated world."""
     config = load_endoscope_config(bench)  # before a device is touched
     with open_requested(request, bench, runtime_dir, wrap) as opened:
         if on_open is not None:
@@ -62,7 +63,7 @@ def run_endoscope(
     until_done: bool = False,
     own_process: bool = False,
 ) -> tuple[EndoscopeLoop, dict[str, Any]]:
-    """Run on an opened bench; the loop (finished) and the outcome for JSON. ``config`` overrides the bench's.
+    """Run on an opened bench. Return the finished loop and the outcome for JSON. ``config`` overrides the bench's.
 
     Raises ``HalError`` when the devices cannot be opened; what goes wrong later is in ``safe_state``.
     """
@@ -119,7 +120,7 @@ def make_outcome(
     identities: dict[str, str],
     recording: RecordingSummary | None,
 ) -> dict[str, Any]:
-    """The run's JSON as far as the firmware knows it."""
+    """Return the run's JSON as far as the firmware knows it."""
     snapshot = loop.scheduler.snapshot()
     ran_s = ((loop.ended_ns or loop.started_ns) - loop.started_ns) * 1e-9
     state = loop.game.state()

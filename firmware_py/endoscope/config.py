@@ -11,10 +11,11 @@ from hal.validation import validate_table
 
 
 class EndoscopeConfig(BaseModel):
-    """``steered_by`` names the device whose turning moves the view; empty: the motion card, else the first sensor.
+    """Holds the checked [firmware] table of an endoscope bench. ``steered_by`` names the device whose turning moves the
+    view; empty: the motion card, else the first sensor.
 
-    ``initial_s``: the start attitude of every activation is the mean of so long (002, section 6.2: less than 0.1 s).
-    ``silent_ms``: after so long without a sample the view is held and the run ends.
+    ``initial_s``: the start attitude of every activation is the mean over this time (002, section 6.2: less than
+    0.1 s). ``silent_ms``: after this time without a sample the view is held and the run ends.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -27,5 +28,5 @@ class EndoscopeConfig(BaseModel):
 
 
 def load_endoscope_config(bench: BenchFile) -> EndoscopeConfig:
-    """Raises ``BenchError`` naming file and key."""
+    """Return the checked configuration of the bench. Raises ``BenchError`` naming file and key."""
     return validate_table(EndoscopeConfig, bench.description.firmware, f"{bench.path}: firmware")

@@ -1,4 +1,4 @@
-"""From the motion card's angles to the camera's field of view: document 002 (Erat 2018), section 6.2.
+"""Maps the motion card's angles to the camera's field of view: document 002 (Erat 2018), section 6.2.
 
 The field of view is a square on the screen: centre (x, y) and side ``size``, pixels, y downwards. Angles are the card's
 roll psi and pitch theta in degrees. Status 0: nothing moves; 1: psi and theta move x and y; 2: psi changes the size.
@@ -69,7 +69,8 @@ class EndoscopeControl:
         return self._status
 
     def step(self, psi_deg: float, theta_deg: float, status: int, dt_s: float) -> View:
-        """One sample that the spike filter let through, ``dt_s`` after the last one. ``ValueError`` for bad input."""
+        """Process one sample that the spike filter let through, ``dt_s`` after the last one, and return the view.
+        Raises ``ValueError`` for bad input."""
         if status not in (INACTIVE, MOVE, ZOOM):
             raise ValueError(f"card status {status} is not 0, 1 or 2")
         if not (math.isfinite(psi_deg) and math.isfinite(theta_deg) and dt_s >= 0.0):
@@ -98,7 +99,8 @@ class EndoscopeControl:
         self.activations += status != INACTIVE
 
     def _place(self, dx: float, dy: float) -> tuple[View, tuple[float, float]]:
-        """Where the view is after a displacement, inside the screen, and the displacement that was left of it."""
+        """Return the view after a displacement, kept inside the screen, and the part of the displacement that took
+        effect."""
         c, start = self.config, self._from
         if self._status == ZOOM:
             size = min(max(start.size + dx, c.smallest_px), c.largest_px)

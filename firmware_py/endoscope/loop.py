@@ -1,6 +1,6 @@
-"""The endoscope's loop: samples in, attitude, field of view out; host clock, one pass a tick.
+"""Runs the endoscope's loop on the host clock: one pass per tick turns samples into attitude and field of view.
 
-Order within a tick: read and fuse each sensor that is due (the card gives all that has arrived), steer, publish, watch.
+A tick reads and fuses each sensor that is due (the card gives all that has arrived), steers, publishes, and watches.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ FRAME += [("psi", "deg"), ("theta", "deg"), ("view_x", "px"), ("view_y", "px"), 
 
 
 class Recorder(Protocol):
-    """Where finished frames go; never blocks, counts what it drops."""
+    """Receives finished frames and events. It never blocks, and counts what it drops."""
 
     def push(self, row: NDArray[np.float64]) -> bool: ...
     def event(self, event: dict[str, object]) -> bool: ...
@@ -46,7 +46,7 @@ class Recorder(Protocol):
 
 @dataclass
 class Track:
-    """One sensor's attitude. ``used`` samples went into it, ``seen`` is the number of the newest sample."""
+    """Tracks one sensor's attitude. ``used`` samples went into it, ``seen`` is the number of the newest sample."""
 
     sensor: Sensor
     fusion: Fusion
@@ -61,7 +61,7 @@ class Track:
     """Time and quaternion ten times a second, the newest half hour."""
 
     def forget(self) -> None:
-        """A card has sent since it was opened: what has arrived is not of this run."""
+        """Discard what a card has sent since it was opened, because it does not belong to this run."""
         while self.sensor.card is not None:
             self.sensor.read()
             if self.sensor.sample.seq == self.seen:
@@ -269,7 +269,7 @@ class EndoscopeLoop:
             yield False
 
     def status(self) -> dict[str, Any]:
-        """A few numbers for the eye."""
+        """Report a few numbers for display."""
         state = self.game.state()
         return {
             "t_s": (self._clock.now_ns() - self.started_ns) * 1e-9,

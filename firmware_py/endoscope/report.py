@@ -1,4 +1,4 @@
-"""What the targeting experiment writes down for each user: elapsed time, clicks, rotations (002, sections 6.1, 6.3)."""
+"""Builds the targeting experiment's report for each user: elapsed time, clicks, rotations (002, sections 6.1, 6.3)."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from firmware_py.endoscope.targets import TargetGame
 
 
 def experiment(game: TargetGame) -> dict[str, Any]:
-    """Settings, totals and one row per target reached. Angles in degrees, times in seconds, sizes in pixels.
+    """Return settings, totals and one row per target reached. Angles in degrees, times in seconds, sizes in pixels.
 
     ``mean_rotation_deg``: mean over all activations of the largest |psi| and |theta| of each, as Figure 6.9 has it.
     """
@@ -48,7 +48,7 @@ def _mean_rotation(rotations: Sequence[tuple[float, float]]) -> tuple[float, flo
 
 
 def report_csv(user: str, result: dict[str, Any]) -> str:
-    """The report file of one user: a header of settings as comments, then a row per target."""
+    """Return the report file of one user: a header of settings as comments, then a row per target."""
     head = [f"# user {' '.join(user.split())}"]
     head += [f"# {key} {result[key]}" for key in ("mapping", "gain", "response_s", "tolerance_px", "seed", "done")]
     head += [f"# elapsed_s {result['elapsed_s']:.2f}", f"# clicks {result['clicks']}"]

@@ -24,7 +24,7 @@ from drivers.motion_card_protocol import ActivationButton, SpikeFilter
 from firmware_py.endoscope.control import INACTIVE, ControlConfig, EndoscopeControl, View
 
 LONGEST_STEP_S = 0.1
-"""A page that was hidden must not move the view by what it missed."""
+"""Longest time step that is used: a page that was hidden must not move the view by what it missed."""
 
 
 class GameConfig(BaseModel):
@@ -55,19 +55,19 @@ class GameConfig(BaseModel):
 
 @dataclass(frozen=True, slots=True)
 class TargetResult:
-    """How one target was reached. Rotations are the extremes of psi and theta within activations, degrees."""
+    """Records how one target was reached. Rotations are the extremes of psi and theta within activations, degrees."""
 
     elapsed_s: float
     clicks: int
     psi_deg: tuple[float, float]
     theta_deg: tuple[float, float]
     rotations_deg: tuple[tuple[float, float], ...]
-    """For every activation the largest |psi| and |theta| since its start."""
+    """Largest |psi| and |theta| of every activation since its start, degrees."""
 
 
 @dataclass(frozen=True, slots=True)
 class GameState:
-    """All that a screen needs. ``elapsed_s`` counts from the first activation; ``target`` is None when done."""
+    """Holds all that a screen needs. ``elapsed_s`` counts from the first activation; ``target`` is None when done."""
 
     view: View
     target: View | None
@@ -82,7 +82,7 @@ class GameState:
     done: bool
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """Return the state as JSON values."""
         return asdict(self)
 
 
@@ -133,7 +133,7 @@ class TargetGame:
         return self._go(pointer, status, t, use=use)
 
     def state(self) -> GameState:
-        """As after the last step."""
+        """Return the state after the last step."""
         view, target = self.control.view, self._target
         off = (0.0, 0.0, 0.0)
         if target is not None:

@@ -1,4 +1,4 @@
-"""From a bench description to opened inertial sensors: chips on I2C and the motion card, one face for all."""
+"""Opens the inertial sensors of a bench description, chips on I2C and the motion card, behind one interface."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ CARDS = ("motion_card", "ble_motion_card")
 
 
 def is_endoscope(description: BenchDescription) -> bool:
-    """Whether a bench declares inertial sensors or a motion card and nothing that moves an instrument."""
+    """Return True if a bench declares inertial sensors or a motion card, and neither a DAQ nor a piezo output."""
     return bool(description.devices_with(*IMU_OPTIONS, *CARDS)) and not description.devices_with(
         "di4108", "nidaqmx", "dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"
     )
 
 
 class Card(Protocol):
-    """A motion card over wire or air."""
+    """Describes a motion card over wire or radio."""
 
     name: str
 
@@ -45,7 +45,7 @@ class Card(Protocol):
 
 @dataclass
 class Sensor:
-    """One source of inertial samples. ``imu`` is the chip's driver, ``card`` the card's; one of them is there."""
+    """Holds one source of inertial samples. ``imu`` is the chip's driver, ``card`` the card's; one of them is set."""
 
     name: str
     rate_hz: float
@@ -74,7 +74,7 @@ class Sensor:
 
 @dataclass
 class Sensors:
-    """All of a bench, probed and configured, not yet started. ``identities`` is what each probe found."""
+    """Holds all sensors of a bench, probed and configured, not yet started. ``identities`` is what each probe found."""
 
     by_name: dict[str, Sensor]
     identities: dict[str, str]

@@ -1,4 +1,5 @@
-"""The firmware's end of its link to the bench page: shows frames and histograms, hears short orders, never waits."""
+"""Holds the firmware's end of its link to the bench page: it shows frames and histograms, receives short orders, and
+never waits."""
 
 from __future__ import annotations
 
@@ -12,12 +13,13 @@ from firmware_py.live.memory import HISTOGRAMS, LiveMemory
 from firmware_py.scheduler.histogram import DurationHistogram
 
 MAX_ORDERS = 4
-"""Taken at most per call: what an eager sender costs a tick is bounded."""
+"""Largest number of orders taken per call, which bounds what an eager sender costs a tick."""
 _MAX_BYTES = 1024
 
 
 class LiveLink:
-    """``memory_fd`` is mapped, ``control_fd`` is one end of a SOCK_SEQPACKET pair; both belong to this object."""
+    """Links the firmware to the bench page. ``memory_fd`` is mapped, ``control_fd`` is one end of a SOCK_SEQPACKET
+    pair; both belong to this object."""
 
     def __init__(self, memory_fd: int, control_fd: int) -> None:
         self._memory = LiveMemory(memory_fd)
@@ -27,7 +29,7 @@ class LiveLink:
         self.publish = self._memory.push
 
     def orders(self) -> Iterator[dict[str, Any]]:
-        """What has arrived: JSON objects with a text under ``order``; anything else is dropped."""
+        """Yield the orders that have arrived: JSON objects with a text under ``order``. Anything else is dropped."""
         for _ in range(MAX_ORDERS):
             if self._hung_up:
                 return
@@ -46,7 +48,7 @@ class LiveLink:
                     yield order
 
     def show(self, histograms: Callable[[], dict[str, DurationHistogram]]) -> Generator[bool, None, None]:
-        """A background task: one histogram a step, round and round, in the order of ``histograms()``."""
+        """Run the background task that copies one histogram per step, in turn, in the order of ``histograms()``."""
         shown = list(histograms().values())[:HISTOGRAMS]
         while True:
             for index, histogram in enumerate(shown):

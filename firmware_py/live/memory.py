@@ -1,9 +1,9 @@
-"""Shared memory from the loop to whoever looks: the newest rows, overwritten in turn, and the timing histograms.
+"""Shares memory between the loop and its readers: the newest rows, overwritten in turn, and the timing histograms.
 
-Unlike the recorder's ring nobody has to keep up: the writer never looks at readers, a reader that was too slow
-finds out and says how many rows it missed. Memory ordering as in ``firmware_py.recording.ring`` (x86-64): the row is
-stored before the head, so whoever sees the head sees the row; a reader looks at the head again after copying and
-throws away what may have been overwritten meanwhile.
+Unlike with the recorder's ring, no reader has to keep up: the writer never looks at readers, and a reader that was too
+slow detects it and reports how many rows it missed. Memory ordering is that of ``firmware_py.recording.ring`` (x86-64):
+the row is stored before the head, so whoever sees the head sees the row; a reader looks at the head again after copying
+and discards what may have been overwritten meanwhile.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class LiveMemory:
 
     @classmethod
     def create(cls, n_columns: int, capacity: int = 8192) -> LiveMemory:
-        """New memory for ``capacity`` rows; pass ``fd`` on to the firmware."""
+        """Create memory for ``capacity`` rows. Pass its ``fd`` on to the firmware."""
         if n_columns < 1 or capacity <= _GUARD_ROWS:
             raise ValueError(
                 f"live memory needs columns and more than {_GUARD_ROWS} rows, not {capacity} x {n_columns}"
@@ -80,11 +80,11 @@ class LiveMemory:
 
     @property
     def head(self) -> int:
-        """How many rows were ever pushed."""
+        """Return the number of rows pushed so far."""
         return self._words[_HEAD]
 
     def read(self, since: int) -> LiveRows:
-        """Rows from number ``since`` on, as far as they are still there."""
+        """Return the rows from number ``since`` on, as far as they are still there."""
         head = self._words[_HEAD]
         first = max(since, head - self.capacity + _GUARD_ROWS, 0)
         numbers = np.arange(first, head)
@@ -96,7 +96,7 @@ class LiveMemory:
         return LiveRows(first, values, max(0, first - since))
 
     def histogram(self, index: int) -> DurationHistogram:
-        """A copy of the histogram at place ``index``; counts may be a few behind each other."""
+        """Return a copy of the histogram at place ``index``. Its counts may be a few behind each other."""
         return DurationHistogram.from_state(self._histograms[index])
 
     def distribution(self, index: int) -> Distribution:

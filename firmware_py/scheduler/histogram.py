@@ -1,4 +1,4 @@
-"""A log2 histogram of durations: integer operations only, no allocation after construction."""
+"""Provides a log2 histogram of durations that uses integer operations only and allocates nothing after construction."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def bucket_bounds_ns(index: int) -> tuple[int, int]:
 
 @dataclass(frozen=True, slots=True)
 class Distribution:
-    """What a histogram says, in us. Quantiles are good to 3.2 %; mean, smallest and largest are exact.
+    """Holds a histogram's statistics, in us. Quantiles are accurate to 3.2 %; mean, smallest and largest are exact.
 
     ``max_tick`` is the tick of the largest value. All zero (and ``max_tick`` -1) when ``n`` is 0.
     """
@@ -77,12 +77,12 @@ class DurationHistogram:
 
     @property
     def n(self) -> int:
-        """How many values were counted."""
+        """Return the number of counted values."""
         return sum(self._counts)
 
     @property
     def max_ns(self) -> int:
-        """The largest value; 0 when nothing was counted."""
+        """Return the largest value, 0 when nothing was counted."""
         return max(0, self._max_ns)
 
     def add(self, value_ns: int, tick: int) -> None:
@@ -104,17 +104,17 @@ class DurationHistogram:
             self._min_ns = value_ns
 
     def counts(self) -> np.ndarray:
-        """A copy of the bucket counts, int64."""
+        """Return a copy of the bucket counts, int64."""
         return np.frombuffer(self._counts, dtype=np.int64).copy()
 
     def copy_state_to(self, words: np.ndarray) -> None:
-        """All of it into int64 ``words[STATE_WORDS]``, for another process to read."""
+        """Copy the whole state into int64 ``words[STATE_WORDS]``, for another process to read."""
         words[:4] = self._min_ns % (1 << 63), self._max_ns, self._total_ns, self.max_tick
         words[4:] = self._counts
 
     @classmethod
     def from_state(cls, words: np.ndarray) -> DurationHistogram:
-        """The histogram that ``copy_state_to`` wrote."""
+        """Return the histogram that ``copy_state_to`` wrote."""
         histogram = cls()
         histogram._counts = array("q", words[4:].tobytes())
         lowest, histogram._max_ns, histogram._total_ns, histogram.max_tick = (int(w) for w in words[:4])
@@ -122,7 +122,7 @@ class DurationHistogram:
         return histogram
 
     def quantile_ns(self, q: float) -> float:
-        """The value below which a share ``q`` of the counted values lies; 0 when nothing was counted."""
+        """Return the value below which a share ``q`` of the counted values lies, 0 when nothing was counted."""
         cumulated = np.cumsum(self.counts())
         return self._quantile_ns(q, cumulated) if cumulated[-1] else 0.0
 
@@ -136,7 +136,7 @@ class DurationHistogram:
         return min(max(value_ns, float(self._min_ns)), float(self._max_ns))
 
     def distribution(self) -> Distribution:
-        """Percentiles and extremes; changes nothing."""
+        """Return percentiles and extremes; the histogram does not change."""
         cumulated = np.cumsum(self.counts())
         n = int(cumulated[-1])
         if n == 0:

@@ -19,7 +19,7 @@ _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
 
 @dataclass(frozen=True, slots=True)
 class RealtimeConfig:
-    """What to ask for; ``None`` or False leaves a setting alone.
+    """Sets which real-time settings to ask for. ``None`` or False leaves a setting alone.
 
     ``priority`` is SCHED_FIFO's 1..99 (the policy is not inherited by child processes), ``cpu`` the
     processor to stay on. Child processes started while pinned inherit the pinning: start them before.
@@ -34,7 +34,7 @@ class RealtimeConfig:
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """One setting: whether it took, and if not why."""
+    """Reports one setting: whether it took effect, and if not, why."""
 
     name: str
     wanted: str
@@ -44,7 +44,7 @@ class Setting:
 
 @dataclass(slots=True)
 class RealtimeReport:
-    """All settings asked for, in order."""
+    """Holds all settings asked for, in order."""
 
     settings: list[Setting] = field(default_factory=list)
 

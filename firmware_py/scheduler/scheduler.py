@@ -20,11 +20,12 @@ from firmware_py.scheduler.ticker import Ticks
 from hal.contracts import Clock
 
 LATEST_END = 1.15
-"""Of a period, from when the tick was due: a task that may wait does so if it could end later."""
+"""Latest allowed end of a tick, as a fraction of the period after its due time. A deferrable task that could end later
+is deferred."""
 
 
 class _LiveTask:
-    """A task with its counters."""
+    """Holds a task with its counters."""
 
     __slots__ = (
         "budget_ns", "catch_up", "cpu", "cpu_in", "deadline_ns", "duration", "errors", "fn", "ignored_runs",
@@ -53,13 +54,13 @@ class _LiveTask:
             histogram.clear()
 
     def releases(self, first: int, stop: int) -> int:
-        """How often the task is due in the ticks first .. stop-1."""
+        """Return how often the task is due in the ticks first .. stop-1."""
         divider, phase = self.spec.divider, self.spec.phase
         return (stop - 1 - phase) // divider - (first - 1 - phase) // divider
 
 
 class _Ignored:
-    """Counters of one announced one-off."""
+    """Holds the counters of one announced one-off."""
 
     __slots__ = ("overruns", "skipped_ticks", "slips", "ticks", "worst_lateness_ns", "worst_tick_ns")
 
@@ -134,7 +135,7 @@ class Scheduler:
         return info
 
     def _with_waiting(self, due: tuple[_LiveTask, ...]) -> tuple[_LiveTask, ...]:
-        """What was put off comes last; a task that is due again meanwhile runs once."""
+        """Return the due tasks followed by the deferred ones. A deferred task that is due again runs once."""
         waiting, self._waiting = self._waiting, []
         for task in waiting:
             if task in due:
@@ -142,7 +143,7 @@ class Scheduler:
         return (*due, *(task for task in waiting if task not in due))
 
     def _put_off(self, task: _LiveTask, due_ns: int) -> bool:
-        """Whether ``task``, which may wait, must."""
+        """Defer the deferrable ``task`` if it could end too late and has patience left. Return True if deferred."""
         if task.waited >= task.may_wait or self._now_ns() + task.budget_ns <= due_ns + self._done_by_ns:
             task.waited = 0
             return False
@@ -160,14 +161,14 @@ class Scheduler:
         return info
 
     def run(self, ticks: Ticks) -> TickInfo:
-        """What a ``Ticker`` delivered: catch up through the older ticks, then run the newest in full."""
+        """Run the ticks that a ``Ticker`` delivered: catch up through the older ones, then run the newest in full."""
         newest = ticks.n - 1
         for i in range(newest):
             self.catch_up(ticks.due_ns + i * ticks.dt_ns, ticks.k0 + i)
         return self.tick(ticks.due_ns + newest * ticks.dt_ns, ticks.k0 + newest)
 
     def run_slack(self, until_ns: int) -> int:
-        """Run background steps that fit before ``until_ns`` (when the next tick is due); how many ran."""
+        """Run background steps that fit before ``until_ns`` (when the next tick is due); return how many ran."""
         return self._slack.run(until_ns, -1 if self._last_scan is None else self._last_scan)
 
     def _advance_scan(self, k: int) -> int:
@@ -252,12 +253,12 @@ class Scheduler:
 
     @property
     def skipped_ticks(self) -> int:
-        """Ticks that never ran since the last ``reset``."""
+        """Return the number of ticks that never ran since the last ``reset``."""
         return self._skipped_ticks
 
     @property
     def worst_tick_ns(self) -> int:
-        """Longest tick since the last ``reset``."""
+        """Return the duration of the longest tick since the last ``reset``."""
         return self._tick_duration.max_ns
 
     # -- statistics --------------------------------------------------------------------------------------
@@ -268,12 +269,12 @@ class Scheduler:
         self._ignoring = [reason] * ticks + self._ignoring
 
     def histograms(self) -> dict[str, DurationHistogram]:
-        """The live histograms by name: ``tick``, ``lateness``, and the duration of each task."""
+        """Return the live histograms by name: ``tick``, ``lateness``, and the duration of each task."""
         durations = {task.spec.name: task.duration for task in self._tasks}
         return {"tick": self._tick_duration, "lateness": self._tick_lateness, **durations}
 
     def task_counts(self) -> dict[str, list[float]]:
-        """For each task: rate in Hz, budget in us, runs, overruns, slips, skipped."""
+        """Return a list for each task: rate in Hz, budget in us, runs, overruns, slips, skipped."""
         return {
             task.spec.name: [
                 1e9 / self.period_ns / task.spec.divider,
@@ -287,7 +288,7 @@ class Scheduler:
         }
 
     def snapshot(self) -> SchedulerSnapshot:
-        """All counters and percentiles since the last ``reset``; changes nothing."""
+        """Return all counters and percentiles since the last ``reset``, and leave them unchanged."""
         tick_hz = 1e9 / self.period_ns
         return SchedulerSnapshot(
             period_us=self.period_ns / 1000,

@@ -1,4 +1,4 @@
-"""What the scheduler counted, as values that no longer change."""
+"""Defines snapshots of the scheduler's counters, whose values no longer change."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from firmware_py.scheduler.histogram import Distribution
 
 @dataclass(frozen=True, slots=True)
 class TaskSnapshot:
-    """One task since the last ``reset``.
+    """Holds the statistics of one task since the last ``reset``.
 
     ``skipped``: releases that never ran; ``put_off``: how often it had to wait a tick; ``overruns``: runs longer than
     the budget; ``slips``: runs that ended after the deadline; ``errors``: runs that raised. ``ignored_runs`` belong to
@@ -55,7 +55,7 @@ class TaskSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class BackgroundSnapshot:
-    """One background task: ``overruns`` are steps longer than the declared worst step."""
+    """Holds the statistics of one background task. ``overruns`` are steps longer than the declared worst step."""
 
     name: str
     worst_step_us: float
@@ -78,7 +78,7 @@ class BackgroundSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class IgnoredSnapshot:
-    """Ticks of an announced one-off (``ignore_next``): apart, but not hidden."""
+    """Counts the ticks of an announced one-off (``ignore_next``) apart, but does not hide them."""
 
     reason: str
     ticks: int
@@ -101,7 +101,7 @@ class IgnoredSnapshot:
 
 @dataclass(frozen=True, slots=True)
 class SchedulerSnapshot:
-    """The whole scheduler since the last ``reset``.
+    """Holds the statistics of the whole scheduler since the last ``reset``.
 
     ``ticks`` ran for all tasks, ``caught_up`` ran late for the ``catch_up`` tasks only, ``skipped_ticks`` never
     ran. ``tick_duration.max_tick`` is the number of the worst tick, ``tick_lateness.max_tick`` of the latest.
@@ -118,14 +118,14 @@ class SchedulerSnapshot:
     ignored: tuple[IgnoredSnapshot, ...] = field(default=())
 
     def task(self, name: str) -> TaskSnapshot:
-        """The task of that name; ``KeyError`` when there is none."""
+        """Return the task of that name. Raises ``KeyError`` when there is none."""
         for task in self.tasks:
             if task.name == name:
                 return task
         raise KeyError(name)
 
     def as_dict(self) -> dict[str, object]:
-        """JSON-ready; ``["tasks"]`` is the ``tasks`` object of the ``micron run`` JSON."""
+        """Return JSON values; ``["tasks"]`` is the ``tasks`` object of the ``micron run`` JSON."""
         return {
             "period_us": self.period_us,
             "ticks": self.ticks,

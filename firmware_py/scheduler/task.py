@@ -1,4 +1,4 @@
-"""What a task promises, and what it is told when it runs."""
+"""Defines what a task promises, and what it receives when it runs."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from hal.errors import BenchError
 
 
 class TickInfo(NamedTuple):
-    """Handed to every task. ``skipped`` ticks before this one were not run for this kind of task.
+    """Tells a task about its tick. ``skipped`` ticks before this one were not run for this kind of task.
 
     The time that an estimator must bridge is ``(1 + skipped)`` tick periods. ``due_ns`` is when the tick (or
     its scan) was due, ``started_ns`` when the scheduler began with it; both on the bench clock.
@@ -24,7 +24,7 @@ class TickInfo(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class TaskSpec:
-    """A task of the table: runs at the ticks k with ``k % divider == phase``, in increasing ``order``.
+    """Describes a task of the table, which runs at the ticks k with ``k % divider == phase``, in increasing ``order``.
 
     ``budget_us`` is the longest run it promises, ``deadline_us`` when it must be done, counted from the due
     time of the tick. ``catch_up``: runs for every scan of a block that arrived late, not only for the newest
@@ -72,7 +72,7 @@ class TaskSpec:
 
 @dataclass(frozen=True, slots=True)
 class BackgroundSpec:
-    """Work for the slack: ``make()`` returns a generator that does one short step per ``next``.
+    """Describes work for the slack: ``make()`` returns a generator that does one short step per ``next``.
 
     It yields True when more work waits and False when it has nothing to do until the next tick.
     ``worst_step_us`` is the longest step it promises; a step is begun only if that fits before the next tick.

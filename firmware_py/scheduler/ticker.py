@@ -1,7 +1,7 @@
-"""Where ticks come from: the DAQ's scans (device clock), or the host clock.
+"""Delivers ticks from the DAQ's scans (device clock) or from the host clock.
 
-Policy for scans that arrived late in one block: the ``catch_up`` tasks (sense) run for every scan, so that filters
-see all data; everything else (estimate, actuate) runs once, for the newest. See ``Scheduler.run``.
+For scans that arrived late in one block, the ``catch_up`` tasks run for every scan, so that filters
+see all data; everything else runs once, for the newest. See ``Scheduler.run``.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class ScanTicker:
         self.rebased = 0
 
     def wait(self) -> Ticks:
-        """The next block of scans, or a host tick when the device stays silent. Errors of ``read`` pass."""
+        """Return the next block of scans, or a host tick when the device stays silent. Errors of ``read`` propagate."""
         if self._last_due_ns is None:
             self._last_due_ns = self._clock.now_ns()
         patience_ns = self._period_ns if self._silent else self._silent_after_ns
@@ -90,7 +90,7 @@ class ScanTicker:
                 return self._host_tick(self._last_due_ns)
 
     def tick_without_scan(self) -> Ticks:
-        """A host tick now: reading failed, and supervision goes on without waiting."""
+        """Return a host tick now, because reading failed and supervision goes on without waiting."""
         now_ns = self._clock.now_ns()
         return self._host_tick(now_ns - self._period_ns if self._last_due_ns is None else self._last_due_ns)
 
