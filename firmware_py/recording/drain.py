@@ -1,4 +1,4 @@
-"""The recorder process: empties the rings into the file. Started by ``recorder.RecorderProcess``.
+"""Runs the recorder process, which empties the rings into the file. ``recorder.RecorderProcess`` starts it.
 
 A block is closed after 100 rows, at a gap in the row numbers, or 0.12 s after its first row; so when the recorder
 itself is killed, less than 0.2 s of rows are lost. When the firmware dies, what it pushed is still in the rings and
@@ -40,7 +40,7 @@ _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 
 class RecorderState(IntEnum):
-    """What the recorder says about itself in the row ring."""
+    """Names the state that the recorder reports in the row ring."""
 
     STARTING = 0
     RECORDING = 1
@@ -51,7 +51,7 @@ class RecorderState(IntEnum):
 
 
 class _Control:
-    """Lines from the firmware on standard input; its end; SIGTERM."""
+    """Receives lines from the firmware on standard input, the end of that input, and SIGTERM."""
 
     def __init__(self, fd: int) -> None:
         self._fd = fd
@@ -64,7 +64,7 @@ class _Control:
         self.terminated = True
 
     def wait(self, timeout_s: float) -> dict[str, Any] | None:
-        """The next line within ``timeout_s``, if there is one."""
+        """Return the next line if one arrives within ``timeout_s``."""
         if b"\n" not in self._pending and not self.closed and readable(self._fd, timeout_s):
             data = os.read(self._fd, 1 << 16)
             self.closed = not data
@@ -76,7 +76,7 @@ class _Control:
         return json.loads(line)
 
     def wait_line(self) -> dict[str, Any] | None:
-        """The next line, however long it takes; None when there will be none."""
+        """Return the next line, however long it takes, or None when there will be none."""
         while not self.closed:
             line = self.wait(1.0)
             if line is not None:
@@ -150,7 +150,7 @@ class Drain:
         self._rows.report(self._writer.rows, RecorderState.RECORDING)
 
     def totals(self, ended: str) -> dict[str, Any]:
-        """The ``end`` record: what the firmware offered, what was refused, why the recording ended."""
+        """Return the ``end`` record: what the firmware offered, what was refused, why the recording ended."""
         return {
             "ended": ended,
             "rows_pushed": self._rows.pushed,
@@ -215,7 +215,7 @@ def main(arguments: list[str]) -> int:
 
 
 def _rows_in(path: Path) -> int:
-    """How many rows a reader finds in a file that another program has changed."""
+    """Return the number of rows that a reader finds in a file that another program has changed."""
     try:
         return Recording(path).n_rows
     except RecordingError:
@@ -223,7 +223,7 @@ def _rows_in(path: Path) -> int:
 
 
 def _run(control: _Control, drain: Drain, writer: RecordingWriter) -> tuple[str, Any]:
-    """Record until told to stop; why it ended, and the final statistics if there are any."""
+    """Record until told to stop. Return why it ended, and the final statistics if there are any."""
     synced_s = time.monotonic()
     while True:
         busy = drain.step(time.monotonic())
@@ -256,7 +256,7 @@ class _Reserve:
 
 
 def readable(fd: int, timeout_s: float) -> bool:
-    """Whether ``fd`` has something to read (or has ended) within ``timeout_s``."""
+    """Return True if ``fd`` has something to read (or has ended) within ``timeout_s``."""
     return bool(select.select([fd], [], [], max(0.0, timeout_s))[0])
 
 

@@ -1,4 +1,4 @@
-"""What can be wrong with a recording."""
+"""Defines the errors of a recording and of the recorder."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from hal.errors import BenchError
 
 
 class RecordingError(BenchError):
-    """Not a recording, not this kind of recording, or a file that cannot be written (exit status 2)."""
+    """Reports a file that is not a recording, not of this kind, or cannot be written (exit status 2)."""
 
 
 class RecorderFailed(RecordingError):

@@ -1,4 +1,4 @@
-"""Recordings for other programs: csv, npz, parquet, and the recording folder of the mismatch contract.
+"""Exports recordings for other programs: csv, npz, parquet, and the recording folder of the mismatch contract.
 
 Everything streams block by block; a failed export leaves nothing behind.
 """
@@ -28,7 +28,7 @@ _FLAGS_UNIT = "bits"
 
 @dataclass(frozen=True, slots=True)
 class ExportReport:
-    """What was written; ``notes`` say what was left out and why."""
+    """Describes the written file or folder. ``notes`` say what was left out and why."""
 
     path: Path
     format: str
@@ -41,7 +41,7 @@ def export(recording: Recording, out: Path, format: str | None = None, *, overwr
     """Write ``recording`` as ``csv``, ``npz``, ``parquet`` or ``folder`` (None: what the name of ``out`` says,
     without a suffix the folder). Columns keep their names, values every bit.
 
-    ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there.
+    Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there.
     """
     writers: dict[str, Callable[[Recording, Path], None]] = {"csv": _csv, "npz": _npz, "parquet": _parquet}
     chosen = format or out.suffix.removeprefix(".") or "folder"

@@ -1,4 +1,4 @@
-"""All of a result or nothing of it: written under a temporary name, renamed when complete."""
+"""Writes a result completely or not at all: it has a temporary name and is renamed when complete."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 
 def refuse_existing(path: Path, *, overwrite: bool) -> None:
-    """``RecordingError`` when ``path`` is there and may not be replaced, or is being recorded."""
+    """Raise ``RecordingError`` when ``path`` is there and may not be replaced, or is being recorded."""
     if path.exists() and not (overwrite and path.is_file()):
         raise RecordingError(f"{path} exists already: choose another name or remove it")
     if is_being_recorded(path):
@@ -65,7 +65,7 @@ def lock(fd: int, path: Path) -> None:
 
 
 def is_being_recorded(path: Path) -> bool:
-    """Whether a recorder holds the lock of ``path``."""
+    """Return True if a recorder holds the lock of ``path``."""
     try:
         fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except OSError:

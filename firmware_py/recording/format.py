@@ -1,4 +1,4 @@
-"""The recording format: an MCAP file whose messages are blocks of ticks and events. See docs/recording-format.md.
+"""Defines the recording format: an MCAP file whose messages are blocks of ticks and events (docs/recording-format.md).
 
 A block is column-major and byte-shuffled (all lowest bytes of all values first, as in HDF5's shuffle filter), which
 makes zstd twice as effective on slowly changing float64; measured in design/ecosystem.md section 3.
@@ -71,7 +71,7 @@ def check_columns(columns: Sequence[tuple[str, str]]) -> tuple[ColumnInfo, ...]:
 
 
 def layout_text(columns: Sequence[ColumnInfo]) -> str:
-    """The layout as it is stored in the file."""
+    """Return the layout as it is stored in the file."""
     return json.dumps([{"name": c.name, "unit": c.unit} for c in columns], separators=(",", ":"), ensure_ascii=False)
 
 
@@ -117,12 +117,12 @@ def _nesting(text: str) -> int:
 
 
 def layout_crc(columns: Sequence[ColumnInfo]) -> int:
-    """What ties a block to its layout."""
+    """Return the CRC-32 of the layout's text, which ties a block to its layout."""
     return zlib.crc32(layout_text(columns).encode())
 
 
 def ticks_schema(columns: Sequence[ColumnInfo]) -> bytes:
-    """JSON schema of a decoded block, with the layout under ``x-layout``."""
+    """Return the JSON schema of a decoded block, with the layout under ``x-layout``."""
     return json.dumps(
         {
             "title": TICKS_SCHEMA,
@@ -144,7 +144,7 @@ def ticks_schema(columns: Sequence[ColumnInfo]) -> bytes:
 
 
 def events_schema() -> bytes:
-    """JSON schema of an event."""
+    """Return the JSON schema of an event."""
     return json.dumps(
         {
             "title": EVENTS_SCHEMA,

@@ -1,4 +1,4 @@
-"""What a recording should hold and what it does hold."""
+"""Compares what a recording holds with what it should hold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ class RowGap(NamedTuple):
 
 
 class TickGap(NamedTuple):
-    """The instrument itself saw no scans between these ticks (lost or skipped): not a fault of the recording."""
+    """Describes ticks between which the instrument itself saw no scans (lost or skipped). The recording is not at
+    fault."""
 
     after: int
     before: int
@@ -53,13 +54,13 @@ class Health:
 
     @property
     def lost(self) -> bool:
-        """Whether rows, events or the end of the recording are missing."""
+        """True if rows, events or the end of the recording are missing, or may be."""
         return bool(
             self.missing_rows or self.missing_events or self.expected_rows is None or self.damage or not self.finished
         )
 
     def lines(self) -> list[str]:
-        """For people: what is there, then what is missing."""
+        """Return lines of text for display: what is there, then what is missing."""
         lines = [f"{self.path}: {self.rows} ticks, {self.events} events, {self.size_bytes} bytes"]
         if self.last_tick is not None:
             at = f" at t = {self.last_time_s:.3f} s" if self.last_time_s is not None else ""
@@ -95,7 +96,7 @@ class Health:
         return lines
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """Return the report as JSON values."""
         return {
             "path": str(self.path),
             "size_bytes": self.size_bytes,

@@ -316,7 +316,7 @@ class Recording:
 
 
 def _check_end(value: object) -> dict[str, Any]:
-    """The recorder's last words. ``RecordingError`` when they are not what a recorder says."""
+    """Return the recorder's ``end`` record. Raises ``RecordingError`` when it is not what a recorder writes."""
     if not isinstance(value, dict) or not isinstance(value.get("ended", ""), str):
         raise RecordingError("the record is not the last words of a recorder")
     for key in ("rows_pushed", "rows_dropped", "rows_written", "events_pushed", "events_dropped"):
@@ -354,7 +354,7 @@ class _DamageList:
 
 
 class _Places:
-    """Where every block is: chunk, place in the chunk, first row, number of rows, CRC-32 of the message."""
+    """Stores the place of every block: chunk, place in the chunk, first row, number of rows, CRC-32 of the message."""
 
     def __init__(self) -> None:
         self._raw = array("q")
@@ -393,12 +393,12 @@ class _Places:
         return self._chunk[changes].tolist()
 
     def row_numbers(self) -> IndexArray:
-        """Number of every row, ``[n_rows]``."""
+        """Return the number of every row, ``[n_rows]``."""
         starts = np.cumsum(self.n) - self.n
         return np.arange(self.n_rows) + np.repeat(self.row0 - starts, self.n)
 
     def gaps(self, expected: int | None) -> tuple[tuple[RowGap, ...], int]:
-        """The first gaps, and how many rows are missing in all."""
+        """Return the first gaps, and how many rows are missing in all."""
         ends = np.concatenate(([0], self.row0 + self.n))
         starts = np.concatenate((self.row0, [max(ends[-1], expected or 0)]))
         missing = starts - ends
@@ -408,7 +408,7 @@ class _Places:
 
 @dataclass(frozen=True, slots=True)
 class _Ticks:
-    """What the tick numbers of a file say."""
+    """Holds the result of checking the tick numbers of a file: first and last tick, and the gaps."""
 
     first: int | None
     last: int | None
@@ -447,8 +447,8 @@ class _TickCheck:
         )
 
     def result(self, order: IndexArray, row0: IndexArray, n: IndexArray) -> _Ticks:
-        """Over the blocks ``order``, which begin at ``row0`` and hold ``n`` rows; across missing rows nothing is
-        said."""
+        """Return the result over the blocks ``order``, which begin at ``row0`` and hold ``n`` rows. Nothing is
+        concluded across missing rows."""
         first, last, inside = np.frombuffer(self._edges, dtype=np.int64).reshape(-1, 3)[order].T
         sound = first >= 0
         joined = sound[1:] & sound[:-1] & (row0[1:] == row0[:-1] + n[:-1])

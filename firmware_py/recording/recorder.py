@@ -1,4 +1,5 @@
-"""The firmware's side of the recorder: a process of its own, fed through shared memory, that never delays the loop."""
+"""Runs the firmware's side of the recorder, a process of its own that shared memory feeds and that never delays the
+loop."""
 
 from __future__ import annotations
 
@@ -29,7 +30,7 @@ _PAUSE_S = 0.0005
 
 @dataclass(frozen=True, slots=True)
 class RecorderStats:
-    """How the recorder is doing. ``waiting`` rows are in the ring, ``written`` ones in the file."""
+    """Holds the recorder's counters and state. ``waiting`` rows are in the ring, ``written`` ones in the file."""
 
     pushed: int
     dropped: int
@@ -42,7 +43,7 @@ class RecorderStats:
 
 @dataclass(frozen=True, slots=True)
 class RecordingSummary:
-    """What became of a recording. ``ticks`` rows are in the file, ``dropped`` were pushed and are not.
+    """Summarizes a finished recording. ``ticks`` rows are in the file, ``dropped`` were pushed and are not.
 
     ``exit_code`` is the recorder's (``firmware_py.exit_codes``), negative for a signal; ``problem`` says in words
     what went wrong.
@@ -129,7 +130,7 @@ class RecorderProcess:
 
     @property
     def pid(self) -> int:
-        """Process number of the recorder."""
+        """Return the process id of the recorder."""
         return self._process.pid
 
     def push(self, row: NDArray[np.float64]) -> bool:
@@ -144,7 +145,7 @@ class RecorderProcess:
         return self._events.push(json.dumps(fmt.plain(event)).encode())
 
     def stats(self) -> RecorderStats:
-        """Counters, read from shared memory."""
+        """Return the counters, read from shared memory."""
         return RecorderStats(
             pushed=self._rows.pushed,
             dropped=self._rows.dropped,

@@ -31,12 +31,12 @@ class RecoverReport:
         return Exit.DATA_LOST if self.health.lost else Exit.DONE
 
     def lines(self) -> list[str]:
-        """For people."""
+        """Return lines of text for display."""
         verdict = "something is missing" if self.health.lost else "nothing is missing"
         return [*self.health.lines(), f"{self.out}: {self.rows} ticks, {self.events} events; {verdict}"]
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-ready."""
+        """Return the report as JSON values."""
         return {
             "path": str(self.path),
             "out": str(self.out),

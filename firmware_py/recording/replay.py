@@ -27,7 +27,7 @@ class ReplayBlock(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Mismatch:
-    """The first value that is not the recorded one."""
+    """Describes the first value that differs from the recorded one."""
 
     row: int
     column: str
@@ -49,7 +49,7 @@ class ReplayReport:
         return self.mismatching_rows == 0
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON-ready; values as exact hexadecimal text besides the numbers."""
+        """Return JSON values, with exact hexadecimal text besides the numbers."""
         first = None
         if self.first is not None:
             first = {

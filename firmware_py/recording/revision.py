@@ -1,4 +1,4 @@
-"""Which source made a recording."""
+"""Finds the source revision that makes a recording."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 
 
 def git_revision(root: Path = _ROOT) -> str:
-    """The commit of the working tree at ``root``, ``-dirty`` when it was changed; ``unknown`` without git."""
+    """Return the commit of the working tree at ``root``, ``-dirty`` when it was changed; ``unknown`` without git."""
     try:
         done = subprocess.run(
             ["git", "describe", "--always", "--dirty", "--abbrev=40", "--exclude", "*"],

@@ -1,6 +1,6 @@
-"""Shared-memory rings from one producer process to one consumer process; the producer never waits.
+"""Provides shared-memory rings from one producer process to one consumer process. The producer never waits.
 
-Memory: an anonymous file (memfd) that both processes map. It has no name, so nothing is left behind however the
+Both processes map an anonymous file (memfd). It has no name, so nothing is left behind however the
 processes end, and what was pushed survives the death of the producer.
 
 Ordering: one writer and one reader, and every shared counter is an aligned 8 byte word written by one side only,
@@ -120,7 +120,7 @@ class RowRing:
         return True
 
     def full(self) -> bool:
-        """Whether the next ``push`` would be refused."""
+        """Return True if the next ``push`` would be refused."""
         return self._head - self._words[_TAIL] >= self.capacity
 
     def pop(self, max_rows: int) -> tuple[Int64Array, Float64Array]:
@@ -134,32 +134,32 @@ class RowRing:
         return numbers, rows
 
     def waiting(self) -> int:
-        """Rows pushed and not yet taken."""
+        """Return the number of rows pushed and not yet taken."""
         return self._words[_HEAD] - self._words[_TAIL]
 
     @property
     def pushed(self) -> int:
-        """Rows offered, refused ones included."""
+        """Return the number of rows offered, refused ones included."""
         return self._words[_HEAD] + self._words[_DROPPED]
 
     @property
     def dropped(self) -> int:
-        """Rows refused because the ring was full."""
+        """Return the number of rows refused because the ring was full."""
         return self._words[_DROPPED]
 
     def report(self, written: int, state: int) -> None:
-        """For the consumer: say how many rows are safe, and its state."""
+        """Report, as the consumer, how many rows are in the file, and its state."""
         self._words[_WRITTEN] = written
         self._words[_STATE] = state
 
     @property
     def written(self) -> int:
-        """Rows that the consumer says are in the file."""
+        """Return the number of rows that the consumer says are in the file."""
         return self._words[_WRITTEN]
 
     @property
     def state(self) -> int:
-        """What the consumer said last."""
+        """Return the state that the consumer reported last."""
         return self._words[_STATE]
 
     def close(self) -> None:
@@ -203,7 +203,7 @@ class EventRing:
         return True
 
     def pop(self) -> tuple[int, bytes] | None:
-        """The oldest event and its number; None when there is none."""
+        """Return the oldest event and its number, or None when there is none."""
         tail = self._words[_TAIL]
         if self._words[_HEAD] == tail:
             return None
@@ -225,12 +225,12 @@ class EventRing:
 
     @property
     def pushed(self) -> int:
-        """Events offered, refused ones included."""
+        """Return the number of events offered, refused ones included."""
         return self._words[_EVENTS] + self._words[_DROPPED]
 
     @property
     def dropped(self) -> int:
-        """Events refused because the ring was full."""
+        """Return the number of events refused because the ring was full."""
         return self._words[_DROPPED]
 
     def close(self) -> None:

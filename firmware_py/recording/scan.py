@@ -85,7 +85,7 @@ class Damage:
 
 @dataclass(frozen=True, slots=True)
 class Finished:
-    """The file ends as a finished one does."""
+    """Reports that the file ends as a finished one does."""
 
 
 Item = ChunkRecord | MetadataRecord | Damage | Finished
@@ -191,7 +191,7 @@ class Scanner:
         self._loose_from, self._loose = 0, 0
 
     def items(self) -> Iterator[Item]:
-        """The usable parts, in order."""
+        """Yield the usable parts, in order."""
         self._file.seek(0)
         if self._file.read(len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             what = "is empty" if self.size == 0 else "does not begin like an MCAP file"
@@ -251,7 +251,7 @@ class Scanner:
         return None, end
 
     def _is_chunk_head(self, offset: int, length: int) -> bool:
-        """Whether the lengths in the chunk record at ``offset`` agree with one another."""
+        """Return True if the lengths in the chunk record at ``offset`` agree with one another."""
         self._file.seek(offset + _FRAME.size)
         head = self._file.read(_CHUNK_HEAD.size + _MOST_NAME_BYTES + _U64.size)
         if len(head) < _CHUNK_HEAD.size:
@@ -264,7 +264,7 @@ class Scanner:
         return length == name_stop + _U64.size + packed_length
 
     def _find_chunk(self, offset: int) -> tuple[Item, int]:
-        """The framing is lost at ``offset``: find the next sound chunk, or call the rest torn."""
+        """Find the next sound chunk after the framing is lost at ``offset``, or call the rest torn."""
         position = offset + 1
         step = 1 << 10  # grows, so that a search costs no more than the distance to what it finds
         while position < self.size:

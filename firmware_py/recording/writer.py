@@ -66,7 +66,7 @@ class _Output:
         return self._position
 
     def flush(self) -> None:
-        """Nothing is held back."""
+        """Do nothing, because nothing is buffered."""
 
     def check(self) -> None:
         """Raise ``FileDisturbed`` when another program has deleted, replaced, cut or written the file."""
@@ -84,7 +84,7 @@ class _Output:
 
     @property
     def moved(self) -> bool:
-        """Whether the file is whole, but no longer under its name."""
+        """True if the file is no longer under its name; ``check`` tells whether it is whole."""
         try:
             there = os.stat(self._path)
         except OSError:
@@ -93,7 +93,7 @@ class _Output:
         return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
 
     def keep(self) -> None:
-        """What has been written so far is whole."""
+        """Mark what has been written so far as whole."""
         self.good_end = self._position
 
     def back_to_good(self) -> None:
@@ -131,7 +131,7 @@ class RecordingWriter:
         self._now_ns = 0
         self.rows = self.blocks = self.events = 0
         self.moved = False
-        """Known after ``finish``: the file is whole, but another program has given it another name."""
+        """True, after ``finish``, if the file is whole, but another program has given it another name."""
         self._output = _Output(path, overwrite)
         self._mcap = Writer(
             self._output,  # type: ignore[arg-type]  # it uses write, tell and flush only
@@ -231,7 +231,7 @@ class RecordingWriter:
         return self._output.good_end
 
     def _last_words(self, end: Mapping[str, Any]) -> dict[str, Any]:
-        """With the names of the texts, so that a reader notices a lost one."""
+        """Return ``end`` with the names of the texts added, so that a reader notices a lost one."""
         return {**end, "metadata": self._metadata_names}
 
     def _time_ns(self, row: Float64Array) -> int:

@@ -1,4 +1,4 @@
-"""From the sensors' noise and the hand to the covariances of the attitude filters."""
+"""Computes the covariances of the attitude filters from the sensors' noise and the hand's motion."""
 
 from __future__ import annotations
 
@@ -48,10 +48,11 @@ def heading_density(config: SensingConfig) -> float:
 
 
 def quiet_point(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Where on the body (3,) m the solved specific force has the least noise, and its densities (3, 3) there.
+    """Return the point of the body (3,) m where the solved specific force has the least noise, and the noise densities
+    (3, 3) there.
 
-    At the origin the noise of alpha leans on f through its lever, and a filter that takes the two for independent would
-    believe it. With f(r) = f + alpha x r the trace of the covariance is quadratic in r.
+    At the origin the noise of alpha correlates with f through its lever, and a filter that takes the two for
+    independent would believe it. With f(r) = f + alpha x r the trace of the covariance is quadratic in r.
     """
     p = motion_densities(config)
     crosses = np.array([np.cross(axis, np.eye(3)).T for axis in np.eye(3)])  # crosses[i] @ v = e_i x v

@@ -1,4 +1,4 @@
-"""What the sensing stage needs to know of the instrument: [firmware.sensing] of the bench, sensor calibration."""
+"""Defines the sensing stage's configuration: [firmware.sensing] of the bench, and the sensor calibration."""
 
 from __future__ import annotations
 

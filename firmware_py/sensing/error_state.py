@@ -328,7 +328,7 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
 
 @kernel
 def _resting(state: Record, params: Record, force: NDArray[np.float64], dt: float) -> bool:
-    """Whether rate and force have stayed at their slow means for ``rest_s``."""
+    """Return True if rate and force have stayed at their slow means for ``rest_s``."""
     e = state.error_state
     smoothing = min(1.0, dt / REST_SMOOTHING_S)
     away_rate = 0.0

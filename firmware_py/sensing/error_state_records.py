@@ -1,4 +1,4 @@
-"""What the error-state filter is given and what it remembers; ``error_state.py`` says what the errors are."""
+"""Defines the records of the error-state filter's parameters and state. ``error_state.py`` defines the errors."""
 
 from __future__ import annotations
 

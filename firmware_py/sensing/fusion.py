@@ -37,7 +37,7 @@ NATIVE = {
 
 
 class FusionConfig(BaseModel):
-    """Which filter and its numbers; defaults are those that document 002 prints as its choice (sections 3.3, 3.4)."""
+    """Selects the filter and its parameters. The defaults are document 002's printed choice (sections 3.3, 3.4)."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -164,7 +164,7 @@ class Fusion:
 
 
 def _north(east_north_up: Array) -> Array:
-    """From a world with x to east to one with x to north: minus 90 degrees about up."""
+    """Convert a quaternion from a world with x to east to one with x to north: minus 90 degrees about up."""
     w, x, y, z = east_north_up
     h = np.sqrt(0.5)
     return np.array([h * (w + z), h * (x + y), h * (y - x), h * (z - w)])

@@ -1,7 +1,7 @@
-"""What ``micron noise --json`` found, as the part of [firmware.sensing] that the attitude filters' covariances use.
+"""Converts the JSON of ``micron noise`` into the part of [firmware.sensing] that the filters' covariances use.
 
-Columns by name: ``accelerometer_1x`` ... in m/s^2; ``magnetometer_x`` ... in uT may be absent. N becomes the
-white noise of an axis; flicker, random walk and ramp together its drift over 100 s.
+Columns are found by name: ``accelerometer_1x`` ... in m/s^2; ``magnetometer_x`` ... in uT may be absent. N becomes the
+white noise of an axis; flicker, random walk and ramp together become its drift over 100 s.
 """
 
 from __future__ import annotations

@@ -156,7 +156,7 @@ def _smooth_up(state: Record, param: Record, up: NDArray[np.float64]) -> None:
 
 @kernel
 def _redundancy(state: Record, param: Record, frame: NDArray[np.float64]) -> None:
-    """What the axes beyond six contradict goes into the frame."""
+    """Write the parity residuals of the axes beyond six into the frame."""
     n = len(state.readings)
     slope, left, by_rate = scratch_matrix(MOST_AXES, 3)[:n], scratch(N_PARITIES), scratch_matrix(N_PARITIES, 3)
     parity(state.readings, state.attitude.rate, param.kinematics, param.null, slope, left, by_rate)
@@ -250,5 +250,5 @@ class Sensing:
         return leave_out(axis, usual, self.params, self.config)
 
     def reset(self) -> None:
-        """As before the first sample."""
+        """Restore the state before the first sample."""
         copy_record(self.state, sense_state(len(self.config.channels)))

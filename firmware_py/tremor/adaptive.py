@@ -158,7 +158,7 @@ def bank_add(bank: Array, sample: float, params: Record) -> None:
 
 @kernel
 def adaptive_predict(state: Record, params: Record) -> None:
-    """To the next tick: what the last one brought is learned from, the bank runs on with a predicted sample."""
+    """Advance to the next tick: learn from the last tick's data, and run the bank on with a predicted sample."""
     if state.running:
         _learn(state, params)
     state.running = 1

@@ -101,7 +101,7 @@ def bank_of(config: AdaptiveConfig, tick_hz: float) -> Bank:
 
 
 def sensor_response(config: TremorConfig, hz: Array) -> Complex:
-    """From displacement to sample: RC filter, and -w^2 for an accelerometer."""
+    """Return the response from displacement to sample: the RC filter, and -w^2 for an accelerometer."""
     w = 2.0 * pi * hz
     cutoff = config.filter_cutoff_rad_s
     low_pass = 1.0 / (1.0 + (1j * w / cutoff if isfinite(cutoff) else 0j * w))
@@ -196,7 +196,7 @@ def _drift(config: TremorConfig, hz: Array) -> Array:
 
 
 def block_response(hz: Array, block_ticks: int, tick_hz: float) -> Complex:
-    """Of the mean over a block, timed at its last sample."""
+    """Return the frequency response of the mean over a block, timed at its last sample."""
     lag = np.exp(-1j * pi * hz * (block_ticks - 1) / tick_hz)
     return _complex(lag * np.sinc(hz * block_ticks / tick_hz) / np.sinc(hz / tick_hz))
 

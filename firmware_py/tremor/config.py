@@ -1,4 +1,4 @@
-"""What the tremor stage needs to know: [firmware.tremor] of the bench."""
+"""Defines the tremor stage's configuration: [firmware.tremor] of the bench."""
 
 from __future__ import annotations
 
@@ -222,10 +222,10 @@ class TremorConfig(_Table):
 
     @property
     def behind_prefilter(self) -> bool:
-        """Whether the Fourier methods fit band-passed samples."""
+        """True if the Fourier methods fit band-passed samples."""
         return self.sees == "displacement" and not self.isolated
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.tremor]") -> TremorConfig:
-        """Checked configuration; ``BenchError`` names the wrong key."""
+        """Return the checked configuration. Raises ``BenchError`` naming the wrong key."""
         return validate_table(cls, table, where)

@@ -1,4 +1,4 @@
-"""What the jerk and drift detectors need to know: [firmware.tremor.detectors] of the bench."""
+"""Defines the jerk and drift detectors' configuration: [firmware.tremor.detectors] of the bench."""
 
 from __future__ import annotations
 

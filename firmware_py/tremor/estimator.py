@@ -290,7 +290,7 @@ class Estimator:
         self.state = estimator_state(self.params)
 
     def reset(self) -> None:
-        """As before the first sample."""
+        """Restore the state before the first sample."""
         copy_record(self.state, estimator_state(self.params))
 
     def step(self, sample: Array) -> Estimate:

@@ -33,7 +33,7 @@ OWN_STATE = np.dtype([("memory", "f8", (AXES, STATE)), ("out", "f8", (AXES, 2))]
 
 @dataclass(frozen=True)
 class OwnEstimator:
-    """What the entry point names.
+    """Describes an estimator of another package, which the entry point names.
 
     ``design(config)``: up to ``NUMBERS`` numbers from the configuration, its own options are ``config.own``.
     ``step(memory, numbers, sample, have, out)``: one tick of one axis, written for numba. ``memory`` (STATE,) is
@@ -88,4 +88,4 @@ def _own_step(typing: Any, address: Any, memory: Any, numbers: Any, sample: Any,
 
 
 own_step: Callable[..., None] = intrinsic(_own_step)
-"""For kernels: call the function at an address with memory, numbers, sample, have, out; arrays as addresses."""
+"""Lets kernels call the function at an address with memory, numbers, sample, have, out; arrays as addresses."""

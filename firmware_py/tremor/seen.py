@@ -1,4 +1,4 @@
-"""From what the sensor shows back to displacement, at one frequency: amplitude and phase known and undone.
+"""Converts what the sensor shows back to displacement at one frequency, by undoing the known amplitude and phase.
 
 A sensor sees the tip's displacement (or its second derivative) through the RC filter. At one frequency both are a
 complex factor; its inverse, turned on by the phase that passes in the loop's delay, takes the weights of a Fourier

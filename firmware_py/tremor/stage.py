@@ -92,5 +92,5 @@ class Tremor:
         estimate_kernel(frame, self.state, self.params)
 
     def reset(self) -> None:
-        """As before the first sample."""
+        """Restore the state before the first sample."""
         copy_record(self.state, estimator_state(self.params))
