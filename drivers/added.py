@@ -17,22 +17,24 @@ Input = Callable[[int], float]
 
 
 class Sensor(Protocol):
-    """What ``AddedDriver.open`` gives for a sensor. Nothing is on the bus before ``probe``."""
+    """The sensor that ``AddedDriver.open`` returns. It sends nothing on the bus before ``probe``."""
 
     def probe(self) -> str:
-        """Who answers; ``WrongDevice`` for a stranger. An analog sensor says what it is taken for."""
+        """Return the identity of the device; raises ``WrongDevice`` if another device answers.
+
+        An analog sensor cannot identify itself, so the text says which sensor it is assumed to be."""
         ...
 
     def channels(self) -> Sequence[ChannelInfo]: ...
 
     def read(self) -> Sequence[float]:
-        """One value per channel, in its unit."""
+        """Read one value per channel, in the unit of that channel."""
         ...
 
 
 @dataclass(frozen=True)
 class Site:
-    """Where a device of an opened bench is. ``options`` are its checked keys."""
+    """Describes one device of an opened bench and its place. ``options`` are its checked keys."""
 
     name: str
     spec: DeviceSpec
@@ -43,12 +45,12 @@ class Site:
 
 @dataclass(frozen=True)
 class AddedDriver:
-    """What the entry point names.
+    """Describes a driver of another package; the package's entry point names an object of this type.
 
-    ``open(site)`` gives a ``Sensor``; where ``options`` is a ``DaqOptions``, it gives a DAQ: an ``AnalogInputScan``
-    with ``name``, ``probe`` and ``write_digital``. ``needs``: the key without which the device hangs nowhere.
-    ``inputs(options)``: what it takes of its DAQ. ``bits_per_s(options)``: what it takes of its bus, 9 bits an I2C
-    byte, 10 a serial one.
+    ``open(site)`` returns a ``Sensor``; where ``options`` is a ``DaqOptions``, it returns a DAQ: an
+    ``AnalogInputScan`` with ``name``, ``probe`` and ``write_digital``. ``needs`` is the key that connects the device
+    and is required. ``inputs(options)`` returns the DAQ inputs that the device uses. ``bits_per_s(options)`` returns
+    the load on its bus in bit/s, with 9 bits for an I2C byte and 10 for a serial one.
     """
 
     options: type[Options]
@@ -59,7 +61,7 @@ class AddedDriver:
 
     @property
     def scans(self) -> bool:
-        """Whether this is a DAQ."""
+        """Return True if the device is a DAQ."""
         return issubclass(self.options, DaqOptions)
 
 

@@ -24,7 +24,7 @@ GROSS = 8.0
 
 
 class Window(NamedTuple):
-    """When a conversion begins at the earliest and at the latest (bench ns), and its longest and shortest time."""
+    """Bounds a conversion: its earliest and latest start (bench ns), and its longest and shortest duration (ns)."""
 
     earliest_ns: int
     latest_ns: int
@@ -117,12 +117,14 @@ class AmplifierMonitor:
         return self._judge(output, window, value_V * self._ratio)
 
     def forget(self) -> None:
-        """Give up the conversion under way: what it saw is not to be compared."""
+        """Discard the conversion in progress, so that its result is not compared."""
         self._adc.pending = None
         self._suspected = [False] * len(self._channels)
 
     def window(self) -> Window:
-        """Of the conversion under way: it began while its order was on the bus, or woke up after it."""
+        """Return the window of the conversion in progress.
+
+        It started while its order was on the bus, or at most ``WAKE_UP_NS`` later because the ADC had to wake up."""
         return Window(self._ordered_ns, self._started_ns + WAKE_UP_NS, self._longest_ns, self._shortest_ns)
 
     def _following(self) -> int:

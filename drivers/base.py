@@ -27,7 +27,9 @@ def wait_s(clock: Clock, seconds: float) -> None:
 
 
 def next_due_ns(due_ns: int, now_ns: int, period_ns: int) -> int:
-    """When something periodic that was due at ``due_ns`` and is done now is due again: in phase, but never a
-    volley after a pause."""
+    """Return the next due time of a periodic action that was due at ``due_ns`` and is done now.
+
+    The action keeps its phase, unless it is late by a period or more: then it is due one period from now, so that
+    missed actions are not made up for in a burst."""
     following_ns = due_ns + period_ns
     return following_ns if following_ns > now_ns else now_ns + period_ns

@@ -1,4 +1,4 @@
-"""What each device asks of its bus: the transactions that its driver declares, at the rates of the firmware's tasks.
+"""Compute each device's load on its bus from the transactions that its driver declares and the firmware's task rates.
 
 An I2C bus gives ``speed_hz`` bits a second, a serial line ``baud``, a CAN bus ``bitrate`` with the worst case of stuff
 bits. A bus is refused that is asked for more than ``MOST`` of its time: what is left has to carry retries, the reads of
@@ -82,7 +82,7 @@ def bus_uses(description: BenchDescription, options: Mapping[str, Any], polling:
 
 
 def bits_per_s(bus: SerialSpec | I2cSpec | CanSpec) -> int:
-    """What the bus can carry."""
+    """Return the capacity of the bus in bit/s."""
     match bus:
         case I2cSpec():
             return bus.speed_hz
@@ -121,7 +121,9 @@ def overloads(description: BenchDescription, uses: list[BusUse]) -> list[str]:
 
 
 def _remedies(description: BenchDescription, name: str, here: list[BusUse]) -> Iterator[str]:
-    """What brings the load of bus ``name`` under ``MOST``, or helps; ``here`` are its uses, the largest first."""
+    """Yield changes that bring the load of bus ``name`` below ``MOST`` or reduce it.
+
+    ``here`` holds the uses of the bus, the largest first."""
     bus = description.bus[name]
     share = sum(use.share for use in here)
     match bus:

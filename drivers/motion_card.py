@@ -54,7 +54,9 @@ class CardQueue:
         return len(self._waiting)
 
     def put(self, readings: Sequence[CardReading], arrival_ns: int) -> None:
-        """What arrived together at ``arrival_ns`` was taken one period apart, the last one just now."""
+        """Queue readings that arrived together at ``arrival_ns``.
+
+        They are stamped one period apart, the last one with ``arrival_ns``."""
         for i, reading in enumerate(readings):
             self._waiting.append((arrival_ns - (len(readings) - 1 - i) * self._period_ns, reading))
         while len(self._waiting) > QUEUE_LIMIT:
@@ -62,7 +64,7 @@ class CardQueue:
             self._dropped += 1
 
     def take(self, out: ImuSample) -> Status:
-        """The oldest reading into ``out``; ``STALE`` when there is none."""
+        """Move the oldest reading into ``out``; returns ``STALE`` if there is none."""
         status = Status.STALE
         out.lost = 0
         if self._waiting:
@@ -98,7 +100,7 @@ class CardQueue:
 
 
 class QueuedCard:
-    """What a card shows of its queue, over wire or air."""
+    """Base of the motion card drivers: the access to a card's queue that serial and BLE cards share."""
 
     def __init__(self, name: str, rate_hz: float, fields: Fields, *, spike_filter: bool) -> None:
         self.name = name
@@ -106,7 +108,7 @@ class QueuedCard:
 
     @property
     def card_status(self) -> int:
-        """0 inactive, 1 rotate, 2 zoom: of the sample read last."""
+        """Return the status in the sample read last: 0 inactive, 1 rotate, 2 zoom."""
         return self._queue.card_status
 
     @property
@@ -129,7 +131,7 @@ class QueuedCard:
         return self._queue.spikes.held if self._queue.spikes else 0
 
     def waiting(self) -> int:
-        """How many readings have arrived that ``read`` has not given out."""
+        """Return the number of readings that have arrived and that ``read`` has not returned."""
         return len(self._queue)
 
     def channels(self) -> Sequence[ChannelInfo]:

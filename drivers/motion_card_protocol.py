@@ -140,10 +140,10 @@ class LineParser:
 
 
 class ActivationButton:
-    """From the switch to the card's status (section 6.2).
+    """Derives the card's status from its switch (section 6.2).
 
-    Short press: 0 becomes 1; 1 and 2 become 0. Long press, from exactly 0.5 s on: 2, from whatever was before,
-    at the moment the half second is over, not at the release. ``presses`` counts both kinds.
+    A short press changes status 0 to 1, and 1 or 2 to 0. A long press, of 0.5 s or more, changes any status to 2 at
+    the moment when the 0.5 s are over, not at the release. ``presses`` counts both kinds.
     """
 
     def __init__(self) -> None:
@@ -153,7 +153,7 @@ class ActivationButton:
         self._long = False
 
     def update(self, pressed: bool, t_ns: int) -> int:
-        """State of the switch at ``t_ns``; returns the status."""
+        """Take the state of the switch at ``t_ns``; returns the status."""
         if self._since_ns is None:
             if pressed:
                 self._since_ns = t_ns

@@ -1,4 +1,4 @@
-"""What the checked entries of a bench file are made of."""
+"""Base classes of the checked entries of a bench file."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ class Options(BaseModel):
 
 
 class DaqOptions(Options):
-    """What every DAQ's entry says; a driver may narrow it. ``channels`` in the order of a scan."""
+    """Holds the keys of every DAQ's entry; a driver may narrow them. ``channels`` are in the order of a scan."""
 
     rate_hz: float = Field(gt=0)
     channels: tuple[int, ...] = Field(min_length=1)
@@ -24,7 +24,7 @@ class DaqOptions(Options):
 
 
 class OutputOptions(Options):
-    """What every analog output's entry says: limits of the volts at the stack, with the neutral position in between."""
+    """Checks the keys of every analog output's entry: the neutral voltage at the stack lies between its limits."""
 
     @model_validator(mode="after")
     def _neutral_is_between(self) -> OutputOptions:

@@ -1,6 +1,6 @@
-"""How often the instrument's tasks use their devices: whole ticks, from the rates of the bench file.
+"""Compute how often the instrument's tasks use their devices, in whole ticks, from the rates of the bench file.
 
-The firmware's task table and the load of the buses are both made from this, so that neither can say something else.
+The firmware's task table and the load of the buses are both derived from this, so that they cannot differ.
 A rate that the ticks do not give is refused with the nearest rates that they do give.
 """
 
@@ -39,7 +39,7 @@ class Polls:
         return tick_hz * self.count / self.divider
 
     def ticks(self, first: int) -> tuple[int, ...]:
-        """The ticks of a frame in which a poll is due when the first of them is due in tick ``first``."""
+        """Return the ticks of a frame in which a poll is due if the first poll is due in tick ``first``."""
         return tuple((first + k * self.divider // self.count) % self.divider for k in range(self.count))
 
     @property
@@ -57,7 +57,7 @@ MONITOR = Polls(5, 2)
 
 @dataclass(frozen=True)
 class Polling:
-    """What each task of the instrument does how often; ``None``: this bench has no device for it."""
+    """Holds the polling rate of each task of the instrument; ``None`` if this bench has no device for the task."""
 
     magnetometer: Polls | None = None
     monitor: Polls | None = None

@@ -1,4 +1,4 @@
-"""What each driver's entry in a bench file may say, and the arithmetic that a bench must obey.
+"""Check each driver's entry in a bench file, and the arithmetic constraints that a bench must satisfy.
 
 ``hal.bench`` has checked references and addresses; here the drivers' own keys, channel claims, rates and the
 time that each bus has per second are checked, so that an impossible bench is refused before it is opened.

@@ -39,7 +39,7 @@ class ScanByScan(ABC):
     def stop(self) -> None: ...
 
     def line(self, timeout_s: float) -> bytes | None:
-        """The next line without its end, ``None`` after ``timeout_s``; what came of it stays for the next call."""
+        """Return the next line without its end, or ``None`` after ``timeout_s``; a partial line stays buffered."""
         limit_ns = self._clock.now_ns() + round(timeout_s * 1e9)
         while b"\n" not in self._text:
             left_s = max(0.0, (limit_ns - self._clock.now_ns()) * 1e-9)
@@ -51,7 +51,7 @@ class ScanByScan(ABC):
         return line.rstrip(b"\r")
 
     def forget_input(self) -> None:
-        """What has arrived and is not read yet."""
+        """Discard the input that has arrived and is not read yet."""
         self._port.drain_input()
         self._text = b""
 

@@ -13,7 +13,7 @@ import cantools.database
 
 
 class DbcMessage(Protocol):
-    """What we use of a cantools message."""
+    """The part of a cantools message that the drivers use."""
 
     frame_id: int
     length: int

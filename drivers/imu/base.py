@@ -1,6 +1,6 @@
-"""What every inertial sensor of the bench looks like, whatever chip it is.
+"""The common interface of all inertial sensors of the bench, whatever chip they are.
 
-SI units: m/s^2 (specific force, +g on an axis that points up), rad/s (right-hand rule), degC, T. Ranges are
+Units are SI: m/s^2 (specific force, +g on an axis that points up), rad/s (right-hand rule), degC, T. Ranges are
 chosen by the data sheets' names (2 g, 250 deg/s), because a chip has a handful of them and no others.
 """
 
@@ -41,7 +41,9 @@ class PowerMode(Enum):
 
 @dataclass(frozen=True, slots=True)
 class ImuSetup:
-    """What the chip really does. Steps are per count; bandwidths are the -3 dB ones of the data sheet."""
+    """Holds the settings that the chip really uses.
+
+    Steps are per count; bandwidths are the -3 dB bandwidths of the data sheet."""
 
     rate_hz: float
     accel_range_g: float
@@ -73,7 +75,7 @@ class ImuSample:
 
 
 class ImuBlock:
-    """What one emptying of a FIFO delivered: ``n`` rows, oldest first, ``dt_ns`` apart from ``t0_ns`` on."""
+    """Holds the samples of one FIFO read: ``n`` rows, oldest first, taken ``dt_ns`` apart from ``t0_ns`` on."""
 
     def __init__(self, capacity: int = 512) -> None:
         self.accel_mps2: Float64Array = np.full((capacity, 3), np.nan)
@@ -92,7 +94,7 @@ class ImuBlock:
 
 @dataclass(frozen=True, slots=True)
 class ImuOffsets:
-    """What the chip adds to its readings (so minus the error found), in m/s^2 and rad/s."""
+    """Holds the offsets that the chip adds to its readings (the negative of the error found), in m/s^2 and rad/s."""
 
     accel_mps2: Triple = (0.0, 0.0, 0.0)
     gyro_rad_s: Triple = (0.0, 0.0, 0.0)

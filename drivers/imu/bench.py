@@ -161,7 +161,7 @@ def _strap(pin: str, name: str, address: int) -> str:
 
 
 def transactions(option: ImuOptions, name: str) -> list[tuple[str, int, float]]:
-    """What one sensor's driver repeats: its name, bits on the wire, times per second."""
+    """List the periodic transactions of one sensor's driver as (name, bits on the wire, times per second)."""
     match option:
         case Mpu6050Options():
             per_sample, per_drain, per_frame, frames_hz = (

@@ -375,7 +375,9 @@ class Bmx055:
 def _setup(
     rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None, name: str
 ) -> tuple[ImuSetup, tuple[int, int, int, int]]:
-    """What will be, and the codes of accelerometer range and bandwidth, gyro range and bandwidth."""
+    """Return the settings that the chip will use and the register codes for them.
+
+    The codes are those of accelerometer range and bandwidth and of gyro range and bandwidth, in this order."""
     accel_range = pick_range(accel_range_g, m.ACCEL_CODES, "accel_range_g", name)
     gyro_range = pick_range(gyro_range_dps, m.GYRO_CODES, "gyro_range_dps", name)
     gyro_hz, _ = pick_rate(rate_hz, dict.fromkeys(m.GYRO_FILTERS, 0), name)

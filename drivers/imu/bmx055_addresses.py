@@ -1,4 +1,7 @@
-"""Which three I2C addresses the straps of one BMX055 can give. Source: BST-BMX055-DS000 rev 1.1, "I2C interface"."""
+"""List the sets of three I2C addresses that the straps of one BMX055 can select.
+
+Source: BST-BMX055-DS000 rev 1.1, "I2C interface".
+"""
 
 from __future__ import annotations
 

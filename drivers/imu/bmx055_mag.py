@@ -1,4 +1,4 @@
-"""From the counts of the BMX055's magnetometer to tesla: each die has trim values and a Hall resistance.
+"""Convert the counts of the BMX055's magnetometer to tesla with the trim values and Hall resistance of the die.
 
 Source: Bosch BMM050 API, to which BST-BMX055-DS000 refers ("Magnetic field data temperature compensation").
 """
@@ -37,7 +37,7 @@ class MagTrim:
 
     @staticmethod
     def decode(block: bytes) -> MagTrim:
-        """From the 21 bytes from register 0x5D on."""
+        """Decode the trim values from the 21 bytes that begin at register 0x5D."""
         x1, y1, z4, x2, y2, z2, z1, xyz1, z3, xy2, xy1 = struct.unpack("<bb3xhbb2xhHHhbB", block)
         return MagTrim(x1, y1, x2, y2, z1, z2, z3, z4, xy1, xy2, xyz1 & 0x7FFF)
 

@@ -248,7 +248,7 @@ def celsius(raw: int) -> float:
 def _setup(
     rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None, name: str
 ) -> tuple[ImuSetup, tuple[int, int]]:
-    """What will be, and ``CTRL1_XL``, ``CTRL2_G`` for it."""
+    """Return the settings that the chip will use and the values of ``CTRL1_XL`` and ``CTRL2_G`` for them."""
     accel = pick_range(accel_range_g, m.ACCEL_CODES, "accel_range_g", name)
     gyro = pick_range(gyro_range_dps, m.GYRO_CODES, "gyro_range_dps", name)
     actual_hz, rate = pick_rate(rate_hz, m.RATES, name)

@@ -289,7 +289,7 @@ def factory_trim(registers: bytes) -> list[float]:
 def _setup(
     rate_hz: float, accel_range_g: float, gyro_range_dps: float, bandwidth_hz: float | None, name: str
 ) -> tuple[ImuSetup, tuple[int, int, int, int]]:
-    """What will be, and the bytes of ``SMPLRT_DIV`` .. ``ACCEL_CONFIG`` for it."""
+    """Return the settings that the chip will use and the bytes of ``SMPLRT_DIV`` .. ``ACCEL_CONFIG`` for them."""
     accel = pick_range(accel_range_g, m.ACCEL_CODES, "accel_range_g", name)
     gyro = pick_range(gyro_range_dps, m.GYRO_CODES, "gyro_range_dps", name)
     divider = math.floor(BASE_RATE_HZ / rate_hz + 1e-6) - 1 if rate_hz > 0 else -1
