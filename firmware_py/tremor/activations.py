@@ -1,4 +1,4 @@
-"""The transfer functions of the cascade network's hidden units (000, 5.3.2), and their slopes."""
+"""Provides the transfer functions of the cascade network's hidden units (000, 5.3.2), and their slopes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ SIGMOID, GAUSSIAN, SINE, BESSEL = range(4)
 
 @kernel
 def bessel_j0(x: float) -> float:
-    """J0 to 5e-8 (Abramowitz and Stegun 9.4.1, 9.4.3)."""
+    """Return the Bessel function J0, accurate to 5e-8 (Abramowitz and Stegun 9.4.1, 9.4.3)."""
     a = abs(x)
     if a <= 3.0:
         t = (a / 3.0) ** 2
@@ -34,7 +34,7 @@ def bessel_j0(x: float) -> float:
 
 @kernel
 def bessel_j1(x: float) -> float:
-    """J1 to 1e-7 (Abramowitz and Stegun 9.4.4, 9.4.6); the slope of J0 is -J1."""
+    """Return the Bessel function J1, accurate to 1e-7 (Abramowitz and Stegun 9.4.4, 9.4.6). The slope of J0 is -J1."""
     a = abs(x)
     if a <= 3.0:
         t = (a / 3.0) ** 2
@@ -61,7 +61,7 @@ def bessel_j1(x: float) -> float:
 
 @kernel
 def activation(kind: int, s: float) -> float:
-    """Output of a hidden unit with net input ``s``; the sigmoid is the symmetric one."""
+    """Return the output of a hidden unit with net input ``s``. The sigmoid is the symmetric one."""
     if kind == SIGMOID:
         return tanh(s)
     if kind == GAUSSIAN:
@@ -73,7 +73,7 @@ def activation(kind: int, s: float) -> float:
 
 @kernel
 def slope(kind: int, s: float) -> float:
-    """d(activation)/ds."""
+    """Return the derivative of ``activation`` with respect to ``s``."""
     if kind == SIGMOID:
         t = tanh(s)
         return 1.0 - t * t

@@ -1,4 +1,4 @@
-"""The adaptive filter: the causal linear filter that would have served this hand best, worked out as it moves.
+"""Learns, as the hand moves, the causal linear filter that would have served this hand best.
 
 Some 0.4 s after the fact the tremor is known well, from samples before and after (``adaptive_design``). Regressing it
 on the filter bank's states of then gives the filter that predicts it from the past alone: least squares with
@@ -94,7 +94,7 @@ def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
 
 
 def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) -> Record:
-    """The kernels' numbers."""
+    """Return the kernels' parameters."""
     d = design or design_adaptive(config)
     a = config.adaptive
     block_s = d.block_ticks / config.tick_hz
@@ -128,13 +128,13 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
 
 
 def adaptive_state(design: AdaptiveDesign) -> Record:
-    """The prior hands' filters, nothing seen."""
+    """Return the state before the first sample, which holds the prior hands' filters."""
     return new_record(adaptive_state_dtype(design), filter=np.tile(design.start, (AXES, 1, 1, 1)))
 
 
 @kernel
 def bank_turn(bank: Array, params: Record) -> None:
-    """One tick of the bank without its input; ``bank`` (m,)."""
+    """Advance ``bank`` (m,) by one tick without its input."""
     n = len(params.pole_re)
     for r in range(n):
         re, im = bank[2 * r], bank[2 * r + 1]
@@ -147,7 +147,7 @@ def bank_turn(bank: Array, params: Record) -> None:
 
 @kernel
 def bank_add(bank: Array, sample: float, params: Record) -> None:
-    """Input of one tick, after ``bank_turn``."""
+    """Add the input of one tick to the bank, after ``bank_turn``."""
     n = len(params.pole_re)
     for r in range(n):
         bank[2 * r] += params.pole_gain[r] * sample
@@ -175,14 +175,14 @@ def adaptive_predict(state: Record, params: Record) -> None:
 
 @kernel
 def adaptive_correct(state: Record, axis: int, sample: float, params: Record) -> None:
-    """The tick's own sample in place of the predicted one."""
+    """Replace the predicted sample by the tick's own sample."""
     bank_add(state.bank[axis], sample - state.pending[axis], params)
     state.pending[axis] = sample
 
 
 @kernel
 def adaptive_output(state: Record, axis: int, output: int) -> float:
-    """Tremor m: ``output`` 0 now, 1 over the loop's delay, 2 of that the core band's part."""
+    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay; 2: the core band's part of 1."""
     calm, burst = 0.0, 0.0
     bank = state.bank[axis]
     for j in range(len(bank)):

@@ -1,4 +1,4 @@
-"""Numbers of the adaptive filter that are known before the first sample: bank, target, and the prior in spectra.
+"""Designs the parameters of the adaptive filter that are known before the first sample: bank, target, prior spectra.
 
 Features are the states of a bank of fixed filters on the samples. With the prior hand (tremor, voluntary motion,
 sensor noise and drift as spectra) their covariance and its cross-covariance with the tremor ahead are integrals over
@@ -109,7 +109,7 @@ def sensor_response(config: TremorConfig, hz: Array) -> Complex:
 
 
 def sensor_noise(config: TremorConfig, hz: Array) -> Array:
-    """One-sided density of the sensor's noise in a sample, in the sample's unit squared per Hz."""
+    """Return the one-sided density of the sensor's noise in a sample, in the sample's unit squared per Hz."""
     a, per_sample = config.adaptive, 2.0 / config.tick_hz
     if config.sees == "displacement":
         return np.full(len(hz), a.reading_noise_m**2 * per_sample)
@@ -152,7 +152,7 @@ def spectra(config: TremorConfig) -> _Spectra:
 
 
 def band(hz: Array, edges_hz: tuple[float, float, float, float]) -> Array:
-    """0 up to the first edge, 1 from the second to the third, 0 from the fourth on; raised cosines between."""
+    """Return 0 up to the first edge, 1 from the second to the third, 0 from the fourth on, raised cosines between."""
     low, full, fall, none = edges_hz
     inside = np.clip((hz - low) / (full - low), 0.0, 1.0) * np.clip((none - hz) / (none - fall), 0.0, 1.0)
     return np.asarray(0.5 - 0.5 * np.cos(pi * inside))
@@ -187,7 +187,7 @@ def target_taps(
 
 
 def _drift(config: TremorConfig, hz: Array) -> Array:
-    """Density of what is left of gravity and bias, in the sample's unit squared per Hz; a displacement has none."""
+    """Return the density of residual gravity and bias, in the sample's unit squared per Hz; 0 for a displacement."""
     a = config.adaptive
     if config.sees == "displacement":
         return np.zeros(len(hz))
@@ -202,7 +202,7 @@ def block_response(hz: Array, block_ticks: int, tick_hz: float) -> Complex:
 
 
 def solve_scaled(matrix: Array, right: Array) -> Array:
-    """Positive definite system whose unknowns differ in size: (k, m) for ``right`` (k, m)."""
+    """Solve a positive definite system whose unknowns differ in size. Return (k, m) for ``right`` (k, m)."""
     scale = 1.0 / np.sqrt(np.diag(matrix))
     scaled = matrix * scale[:, None] * scale[None, :] + 1e-9 * np.eye(len(matrix))
     return np.asarray(np.linalg.solve(scaled, (right * scale).T).T * scale)
@@ -223,7 +223,7 @@ def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
 
 
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
-    """Everything that follows from ``config``."""
+    """Return everything that follows from ``config``."""
     a = config.adaptive
     bank = bank_of(a, config.tick_hz)
     block = max(1, round(a.block_s * config.tick_hz))

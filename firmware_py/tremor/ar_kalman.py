@@ -1,4 +1,4 @@
-"""Autoregressive multi-step predictor behind the band-pass, its coefficients tracked by a Kalman filter.
+"""Predicts several steps ahead with an autoregressive model behind the band-pass, tracked by a Kalman filter.
 
 The band-passed displacement lags the tip by the phase of all filters before it (RC, integrators, band-pass). Here the
 predictor reaches over that lag and over the loop's delay at once: present coefficients are found by predicting the
@@ -45,7 +45,7 @@ def chain_gain_and_lag(config: TremorConfig) -> tuple[float, float]:
 
 
 def horizons(config: TremorConfig) -> tuple[int, int]:
-    """Ticks to predict: over the filters' lag, and over lag and loop delay."""
+    """Return the ticks to predict over the filters' lag, and over lag and loop delay."""
     _, lag_s = chain_gain_and_lag(config)
     return round(lag_s * config.tick_hz), round((lag_s + config.loop_delay_s) * config.tick_hz)
 
@@ -80,7 +80,7 @@ def ar_state_dtype(config: TremorConfig) -> np.dtype[Any]:
 
 
 def ar_params(config: TremorConfig) -> Record:
-    """The kernels' numbers."""
+    """Return the kernels' parameters."""
     gain, _ = chain_gain_and_lag(config)
     return new_record(
         AR,
@@ -95,13 +95,13 @@ def ar_params(config: TremorConfig) -> Record:
 
 
 def ar_state(config: TremorConfig) -> Record:
-    """Nothing seen; the first guess of each predictor is zero."""
+    """Return the state before the first sample. The first guess of each predictor is zero."""
     return new_record(ar_state_dtype(config), covariance=np.eye(config.ar.order))
 
 
 @kernel
 def ar_coast(state: Record) -> None:
-    """A tick without a sample: the last prediction of the present stands in for it."""
+    """Advance one tick without a sample. The last prediction of the present stands in for it."""
     ring = state.past.shape[1]
     before = state.at
     state.at = (before + 1) % ring
@@ -111,7 +111,7 @@ def ar_coast(state: Record) -> None:
 
 @kernel
 def ar_correct(state: Record, axis: int, sample: float, params: Record) -> None:
-    """The present tick's sample, after ``ar_coast``: filters, then both predictors learn."""
+    """Process the present tick's sample, after ``ar_coast``: run the filters, then let both predictors learn."""
     x = prefilter_step(sample, state.memory[axis], params.sections)
     state.past[axis, state.at] = x
     state.power[axis] += params.smoothing * (x * x - state.power[axis])
@@ -150,7 +150,7 @@ def _regressor(state: Record, axis: int, back: int, spacing: int) -> None:
 
 @kernel
 def ar_output(state: Record, axis: int, output: int, params: Record) -> float:
-    """Tremor m: ``output`` 0 now, 1 over the loop's delay."""
+    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay."""
     _regressor(state, axis, 0, params.spacing)
     total = 0.0
     for i in range(len(state.regressor)):

@@ -1,6 +1,6 @@
-"""Band-limited multiple Fourier linear combiner: a comb of frequencies over the tremor band (Veluvolu, Ang 2011).
+"""Implements the band-limited multiple Fourier linear combiner, a comb over the tremor band (Veluvolu, Ang 2011).
 
-Three ways to the weights: LMS (BMFLC); LMS that forgets over a memory window while its band follows the tremor
+Three methods adapt the weights: LMS (BMFLC); LMS that forgets over a memory window while its band follows the tremor
 (E-BMFLC); a Kalman filter with weights as random walk (BMFLC-KF), whose gain depends on the regressors alone and so is
 the same for all axes. Each frequency's sensor factor is known, so the weights give displacement now and ahead.
 """
@@ -26,7 +26,7 @@ FOLLOW_TICKS = 50  # the band of E-BMFLC moves this often
 
 
 def comb_size(config: TremorConfig) -> int:
-    """Frequencies in the comb."""
+    """Return the number of frequencies in the comb."""
     return int((config.bmflc.high_hz - config.bmflc.low_hz) / config.bmflc.step_hz + 1.0 + 1e-9)
 
 
@@ -66,7 +66,7 @@ def bmflc_state_dtype(size: int) -> np.dtype[Any]:
 
 
 def bmflc_params(config: TremorConfig) -> Record:
-    """The kernels' numbers for ``config.method``."""
+    """Return the kernels' parameters for ``config.method``."""
     c = config.bmflc
     size = comb_size(config)
     moves = config.method == "ebmflc"
@@ -87,7 +87,7 @@ def bmflc_params(config: TremorConfig) -> Record:
 
 
 def bmflc_state(config: TremorConfig) -> Record:
-    """No amplitude, band as configured, weights unknown."""
+    """Return the state before the first sample: no amplitude, the configured band, unknown weights."""
     size = comb_size(config)
     return new_record(bmflc_state_dtype(size), phasor=1.0, covariance=100.0 * np.eye(2 * size + 1))
 
@@ -111,7 +111,7 @@ def _tune(state: Record, axis: int, params: Record) -> None:
 
 @kernel
 def bmflc_predict(state: Record, params: Record) -> None:
-    """One tick of time: phases run on, weights walk."""
+    """Advance one tick: the phases run on, and the weights walk."""
     size = len(params.omega)
     if state.ticks == 0:
         for i in range(AXES):
@@ -132,7 +132,7 @@ def bmflc_predict(state: Record, params: Record) -> None:
 
 @kernel
 def _follow(state: Record, axis: int, params: Record) -> None:
-    """The band's middle goes towards the centroid of the weights' power, within half its width."""
+    """Move the band's middle towards the centroid of the weights' power, within half its width."""
     size = len(params.omega)
     total, moment = 0.0, 0.0
     for r in range(size):
@@ -150,7 +150,7 @@ def _follow(state: Record, axis: int, params: Record) -> None:
 
 @kernel
 def bmflc_correct(state: Record, samples: Array, params: Record) -> None:
-    """``samples`` (3,) of the present tick."""
+    """Process the ``samples`` (3,) of the present tick."""
     size = len(params.omega)
     x = state.regressor
     for i in range(AXES):
@@ -196,7 +196,7 @@ def _kalman_gain(state: Record) -> None:
 
 @kernel
 def bmflc_output(state: Record, axis: int, output: int) -> float:
-    """Tremor m: ``output`` 0 now, 1 over the loop's delay."""
+    """Return the tremor, m. ``output`` 0: now; 1: over the loop's delay."""
     total = 0.0
     for r in range(state.phasor.shape[1]):
         weight = state.weights[axis, 2 * r + 1] - 1j * state.weights[axis, 2 * r]

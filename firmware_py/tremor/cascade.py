@@ -1,4 +1,4 @@
-"""Cascade neural network that tells voluntary from erroneous motion (000, 5.3): what runs in the tick.
+"""Runs, in the tick, the cascade neural network that tells voluntary from erroneous motion (000, 5.3).
 
 Inputs are a bias and a window of the measured path, newest sample first, ``spacing`` samples apart; every hidden unit
 sees them and all hidden units before it; the output is linear in all of these. Trained by ``micron tremor train``.
@@ -84,7 +84,7 @@ def cascade_state_dtype(window: int, spacing: int, units: int) -> np.dtype[Any]:
 
 
 def cascade_params(network: CascadeNetwork) -> Record:
-    """The kernel's numbers."""
+    """Return the kernel's parameters."""
     units = len(network.kinds)
     hidden = network.hidden if units else np.zeros((1, 1 + network.window))
     return new_record(
@@ -102,7 +102,7 @@ def cascade_params(network: CascadeNetwork) -> Record:
 
 
 def cascade_state(network: CascadeNetwork) -> Record:
-    """Before the first sample."""
+    """Return the state before the first sample."""
     return new_record(cascade_state_dtype(network.window, network.spacing, len(network.kinds)))
 
 
@@ -123,7 +123,7 @@ def cascade_output(features: Array, hidden: Array, kinds: NDArray[np.int64], uni
 
 @kernel
 def cascade_kernel(position: float, state: Record, param: Record) -> float:
-    """Erroneous part of ``position`` (m) now; 0 until the window has filled. Nothing is allocated."""
+    """Return the erroneous part of ``position`` (m) now, 0 until the window has filled. Nothing is allocated."""
     size = len(state.ring)
     state.at = (state.at + 1) % size
     state.ring[state.at] = position
@@ -146,13 +146,13 @@ def cascade_kernel(position: float, state: Record, param: Record) -> float:
 
 @kernel
 def cascade_run(positions: Array, states: Record, params: Record, errors: Array) -> None:
-    """``cascade_kernel`` over ``positions`` (n,) into ``errors`` (n,)."""
+    """Run ``cascade_kernel`` over ``positions`` (n,) and write ``errors`` (n,)."""
     for i in range(len(positions)):
         errors[i] = cascade_kernel(positions[i], states[0], params[0])
 
 
 class Cascade:
-    """A network with its state, for one axis."""
+    """Holds a network with its state, for one axis."""
 
     def __init__(self, network: CascadeNetwork) -> None:
         self.network = network
@@ -160,7 +160,7 @@ class Cascade:
         self.state = cascade_state(network)
 
     def run(self, positions: Sequence[float] | Array) -> Array:
-        """Erroneous part (n,) of a path (n,), m; the state goes on from call to call."""
+        """Return the erroneous part (n,) of a path (n,), m. The state carries on from call to call."""
         path = np.ascontiguousarray(positions, dtype=np.float64)
         errors = np.zeros(len(path))
         cascade_run(path, self.state, self.params, errors)

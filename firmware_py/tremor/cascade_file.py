@@ -1,4 +1,4 @@
-"""Weights of a cascade network on disk: JSON, versioned, checked on the way in."""
+"""Reads and writes the weights of a cascade network as versioned JSON, which is checked when read."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class _File(BaseModel):
 
 
 def network_text(network: CascadeNetwork) -> str:
-    """The file's text. Hidden weights as triangles: each unit's own inputs only."""
+    """Return the file's text. Hidden weights are stored as triangles: each unit's own inputs only."""
     first = 1 + network.window
     table: dict[str, Any] = {
         "format": 1,
@@ -54,7 +54,7 @@ def network_text(network: CascadeNetwork) -> str:
 
 
 def load_network(path: Path) -> CascadeNetwork:
-    """The network of a weights file. Raises BenchError: what, where, what to do."""
+    """Return the network of a weights file. Raises ``BenchError``: what, where, what to do."""
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

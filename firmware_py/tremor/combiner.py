@@ -1,4 +1,4 @@
-"""FLC, WFLC and WFLC-FLC: displacement now and ahead, by turning the weights.
+"""Computes displacement now and ahead by FLC, WFLC and WFLC-FLC, by turning the weights.
 
 The WFLC sees the band-passed samples and gives frequency and phase; the FLC fits sine and cosine of that phase. For an
 accelerometer it fits the raw samples (with a bias weight in place of a high-pass, so it adds no phase): voluntary
@@ -45,7 +45,7 @@ COMBINER_STATE = np.dtype(
 
 
 def combiner_params(config: TremorConfig) -> Record:
-    """The kernels' numbers (dtype ``COMBINER``)."""
+    """Return the kernels' parameters (dtype ``COMBINER``)."""
     return new_record(
         COMBINER,
         wflc=wflc_params(config.wflc, config.tick_hz),
@@ -59,14 +59,14 @@ def combiner_params(config: TremorConfig) -> Record:
 
 
 def combiner_state(config: TremorConfig) -> Record:
-    """Start frequency, no amplitude."""
+    """Return the state before the first sample: start frequency, no amplitude."""
     wflc = new_record(WFLC_STATE, omega=2.0 * pi * config.wflc.start_hz / config.tick_hz, miss=1.0)
     return new_record(COMBINER_STATE, wflc=wflc)
 
 
 @kernel
 def combiner_step(sample: float, state: Record, params: Record) -> None:
-    """One sample, behind the RC filter."""
+    """Process one sample, taken behind the RC filter."""
     in_band = prefilter_step(sample, state.memory, params.sections)
     wflc_step(in_band, state.wflc, params.wflc)
     state.fixed_phase = (state.fixed_phase + params.wflc.start) % (2.0 * pi)
@@ -77,14 +77,14 @@ def combiner_step(sample: float, state: Record, params: Record) -> None:
 
 @kernel
 def combiner_coast(state: Record, params: Record) -> None:
-    """One tick without a sample: the phase runs on."""
+    """Advance one tick without a sample. The phase runs on."""
     state.wflc.phase += state.wflc.omega
     state.fixed_phase += params.wflc.start
 
 
 @kernel
 def combiner_displacement(state: Record, params: Record, ahead_s: float) -> float:
-    """Tremor displacement m at ``ahead_s`` after the last sample: Re[(cosine - j sine) e^(j phase) undo]."""
+    """Return the tremor displacement (m) ``ahead_s`` after the last sample: Re[(cosine - j sine) e^(j phase) undo]."""
     omega, phase = state.wflc.omega, state.wflc.phase
     sine, cosine = state.weights[0], state.weights[1]
     filtered = params.behind_prefilter != 0

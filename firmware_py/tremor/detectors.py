@@ -1,4 +1,4 @@
-"""Jerk (myoclonus) and drift, detected on the acceleration of the tip and told to the supervisor.
+"""Detects jerk (myoclonus) and drift on the acceleration of the tip and reports them to the supervisor.
 
 Jerk: between voluntary motion and tremor (below 1 Hz, above 8 Hz) and beyond tremor a quiet hand does little. In both
 bands each axis is divided by its own smoothed rms; the sum of squares is then chi-squared with three degrees of freedom
@@ -55,7 +55,7 @@ DETECT_STATE = np.dtype(
 
 
 def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
-    """The kernel's numbers."""
+    """Return the kernel's parameters."""
     sections = np.stack(
         [
             design(
@@ -82,7 +82,7 @@ def detect_params(config: DetectorConfig, tick_hz: float) -> Record:
 
 @kernel
 def detect_step(x: NDArray[np.float64], state: Record, param: Record) -> int:
-    """One sample of acceleration (3,), m/s^2; the bits ``JERK`` and ``DRIFT`` that are up now.
+    """Process one sample of acceleration (3,), m/s^2, and return the bits ``JERK`` and ``DRIFT`` that are set now.
 
     The background is the running mean over what has come until ``settle`` ticks, then smoothed; no jerk before that.
     """
@@ -143,13 +143,13 @@ def detect_kernel(frame: NDArray[np.float64], states: Record, params: Record) ->
 
 @kernel
 def detect_run(samples: NDArray[np.float64], states: Record, params: Record, bits: NDArray[np.int64]) -> None:
-    """``detect_step`` over samples (n, 3) into ``bits`` (n,)."""
+    """Run ``detect_step`` over samples (n, 3) and write ``bits`` (n,)."""
     for i in range(len(samples)):
         bits[i] = detect_step(samples[i], states[0], params[0])
 
 
 class Detectors:
-    """Both detectors with their state."""
+    """Holds both detectors with their state."""
 
     def __init__(self, config: DetectorConfig, tick_hz: float) -> None:
         self.config = config
@@ -160,7 +160,7 @@ class Detectors:
         detect_kernel(frame, self.state, self.params)
 
     def run(self, samples: NDArray[np.float64]) -> NDArray[np.int64]:
-        """Bits (n,) over accelerations (n, 3); the state goes on."""
+        """Return the bits (n,) for accelerations (n, 3). The state carries on."""
         bits = np.zeros(len(samples), dtype=np.int64)
         detect_run(np.ascontiguousarray(samples, dtype=np.float64), self.state, self.params, bits)
         return bits

@@ -1,6 +1,6 @@
-"""One interface to every tremor estimator: ``step(sample) -> now, ahead, frequency, amplitude, confidence``.
+"""Offers one interface to every tremor estimator: ``step(sample) -> now, ahead, frequency, amplitude, confidence``.
 
-Three axes at a time, compiled, nothing allocated in a step. The WFLC runs under every method: it measures the
+A compiled step processes three axes at a time and allocates nothing. The WFLC runs under every method: it measures the
 frequency. Confidence is the same for all: 1 minus the relative size of what earlier predictions missed; a method that
 lives on the WFLC's frequency has none while the WFLC is not locked.
 """
@@ -156,13 +156,13 @@ def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
 
 
 def estimator_state(params: Record) -> Record:
-    """Before the first sample."""
+    """Return the state before the first sample."""
     return np.array(params["fresh"])
 
 
 @kernel
 def _foreign(state: Record, i: int, have: bool, param: Record) -> None:
-    """One tick of an estimator from another package."""
+    """Run one tick of an estimator from another package."""
     memory, numbers, out = state.own.memory[i], param.own.numbers, state.own.out[i]
     own_step(param.own.address, memory.ctypes.data, numbers.ctypes.data, state.samples[i], int(have), out.ctypes.data)
 
@@ -190,7 +190,7 @@ def estimator_ticks(state: Record, steps: int, coast: bool, param: Record) -> No
 
 @kernel
 def estimator_samples(state: Record, param: Record) -> None:
-    """The present tick's ``state.samples``."""
+    """Process the present tick's ``state.samples``."""
     for i in range(AXES):
         sample = state.samples[i]
         combiner_step(sample, state.combiner[i], param.combiner)
@@ -315,7 +315,7 @@ class Estimator:
 
 
 def unfiltered(config: TremorConfig) -> TremorConfig:
-    """``config`` for a displacement sensor without a filter."""
+    """Return ``config`` for a displacement sensor without a filter."""
     method = "adaptive" if config.method == "kalman" else config.method
     return config.model_copy(update={"sees": "displacement", "filter_cutoff_rad_s": inf, "method": method})
 

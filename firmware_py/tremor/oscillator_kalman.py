@@ -1,4 +1,4 @@
-"""Tremor by a stationary Kalman filter that knows the sensor's RC filter.
+"""Estimates tremor by a stationary Kalman filter whose model includes the sensor's RC filter.
 
 Model per axis, continuous time: tremor displacement x = sum of modes; each mode is an oscillator driven by a
 second, equal oscillator, which is driven by white noise. One oscillator alone would leave white noise in the
@@ -60,7 +60,7 @@ def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Ma
 
 
 def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
-    """Exact transition and noise covariance over ``dt`` (Van Loan 1978)."""
+    """Return the exact transition and noise covariance over ``dt`` (Van Loan 1978)."""
     n = len(a)
     block = np.zeros((2 * n, 2 * n))
     block[:n, :n] = -a
@@ -72,7 +72,7 @@ def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
 
 
 def design_oscillators(config: TremorConfig) -> OscillatorModel:
-    """The stationary filter for ``config``; raises LinAlgError when the Riccati equation has no solution."""
+    """Return the stationary filter for ``config``. Raises LinAlgError when the Riccati equation has no solution."""
     k = config.kalman
     m = len(k.frequencies_hz)
     n = ORDER * m + 2
@@ -127,7 +127,7 @@ def kalman_dtype(n_modes: int) -> np.dtype[Any]:
 
 
 def kalman_params(config: TremorConfig) -> Record:
-    """The kernel's numbers (dtype ``kalman_dtype``)."""
+    """Return the kernel's parameters (dtype ``kalman_dtype``)."""
     model = design_oscillators(config)
     blocks = [model.transition[ORDER * i : ORDER * (i + 1), ORDER * i : ORDER * (i + 1)] for i in range(model.n_modes)]
     return new_record(

@@ -1,4 +1,4 @@
-"""The tremor stage: acceleration of the tip -> tremor now, tremor over the loop's delay, frequency, confidence."""
+"""Runs the tremor stage: acceleration of the tip -> tremor now, tremor over the loop's delay, frequency, confidence."""
 
 from __future__ import annotations
 

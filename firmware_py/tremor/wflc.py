@@ -1,4 +1,4 @@
-"""Weighted-frequency Fourier linear combiner (000 (5.6)-(5.10), ERRATA 51-56): tracks the tremor's frequency.
+"""Tracks the tremor's frequency by a weighted-frequency Fourier linear combiner (000 (5.6)-(5.10), ERRATA 51-56).
 
 The input is divided by the square root of its own smoothed power, so the gains hold for 5 um and for 500 um.
 Frequency is limited to the band, amplitude weights leak a little towards zero. It is locked while the combiner explains
@@ -39,7 +39,7 @@ WFLC_STATE = np.dtype(
 
 
 def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
-    """The kernel's numbers (dtype ``WFLC``)."""
+    """Return the kernel's parameters (dtype ``WFLC``)."""
     per_sample = 2.0 * pi / tick_hz
     return new_record(
         WFLC,
@@ -55,7 +55,7 @@ def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
 
 @kernel
 def wflc_step(signal: float, state: Record, params: Record) -> None:
-    """One sample of the band-passed signal, any unit: advances phase, weights and frequency.
+    """Process one sample of the band-passed signal, any unit: advance phase, weights and frequency.
 
     The frequency step follows -d(error^2)/d(omega) with the phase as a running sum (ERRATA 53).
     """
