@@ -78,16 +78,17 @@ class IdealRow:
 def ideal_changes(noise: bool) -> dict[str, Any]:
     """What makes a bench ideal, for ``write_variant``."""
     emulation: dict[str, Any] = dict(PERFECT_EMULATION)
-    tremor: dict[str, Any] = {"loop_delay_s": LOOP_DELAY_S}
+    # the bound pays nothing for what its filter passes above the band, so neither does the filter beside it
+    adaptive: dict[str, Any] = {"quiet": 0.0}
     if not noise:
         emulation = merged(emulation, {"sensors": {"noise_ug_per_rtHz": 0.0}})
         # the estimator takes the sensors' noise out of what it learns, so it must know that there is none
-        tremor["adaptive"] = {"sensor_noise_m_s2_rtHz": QUIET_M_S2_RTHZ}
+        adaptive["sensor_noise_m_s2_rtHz"] = QUIET_M_S2_RTHZ
     firmware = {
         "calibration": [],
         "sensing": {"positions_m": POSITIONS_M},
         "actuation": {"stacks": [LINE, LINE, LINE]},
-        "tremor": tremor,
+        "tremor": {"loop_delay_s": LOOP_DELAY_S, "adaptive": adaptive},
     }
     return {"emulation": emulation, "firmware": firmware}
 
