@@ -13,10 +13,11 @@ from sim_devices.plant.body_motion import BodyMotion
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a device may know of the world: truth at bench times in ns, its entry in the bench file, a seed.
+    """Holds all that an emulated device may know of the world: the truth at bench times in ns, its entry, a seed.
 
-    ``motion`` of the body, with the temperature; ``analog_V`` all voltages at the DAQ's inputs; ``switch(bits, t_ns)``
-    sets the DAQ's digital outputs, which fire the magnetometer's strap.
+    ``entry`` is the device's entry in the bench file. ``motion`` returns the motion of the body, with the temperature;
+    ``analog_V`` returns all voltages at the DAQ's inputs; ``switch(bits, t_ns)`` sets the DAQ's digital outputs, which
+    fire the magnetometer's strap.
     """
 
     name: str
@@ -30,10 +31,10 @@ class Surroundings:
 
 @dataclass(frozen=True)
 class AddedDevice:
-    """What the entry point names.
+    """Describes an emulated device of another package; the package's entry point names an object of this type.
 
-    ``make(surroundings)`` gives the wire face that its bus asks for (``devices.faces``); for a device on a DAQ it gives
-    functions from bench time in ns to volts, by input.
+    ``make(surroundings)`` returns the wire face that its bus requires (``devices.faces``); for a device on a DAQ it
+    returns functions from bench time in ns to volts, by input.
     """
 
     make: Callable[[Surroundings], Any]

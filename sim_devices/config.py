@@ -1,4 +1,4 @@
-"""What the ``[emulation]`` table of a bench may say: one unit of the instrument, its hand and its room.
+"""Configuration of the ``[emulation]`` table of a bench: one unit of the instrument, its hand and its room.
 
 Every value has a default, so ``provider``, ``unit`` and ``seed`` alone describe a complete instrument. Spreads are
 standard deviations from which the seed draws one physical unit: the same seed is the same unit everywhere

@@ -19,7 +19,7 @@ _BYTES = 64
 
 
 class Lateness:
-    """The world's side: ``turn`` in every turn of its loop."""
+    """Records the stalls of the world in a shared file; the world calls ``turn`` in every turn of its loop."""
 
     def __init__(self, folder: Path) -> None:
         path = folder / NAME
@@ -28,7 +28,7 @@ class Lateness:
             self._words = memoryview(mmap.mmap(file.fileno(), _BYTES)).cast("q")
 
     def turn(self, now_ns: int) -> None:
-        """The world is awake at ``now_ns``."""
+        """Record that the world is awake at ``now_ns``, and a stall if it was late."""
         words = self._words
         late_ns = now_ns - words[_TURN] - ALLOWED_NS if words[_TURN] else 0
         if late_ns >= STALL_NS:
@@ -39,14 +39,16 @@ class Lateness:
 
 
 class LatenessView:
-    """The firmware's side."""
+    """Reads the stalls of the world in the firmware's process."""
 
     def __init__(self, folder: Path) -> None:
         with (folder / NAME).open("rb") as file:
             self._words = memoryview(mmap.mmap(file.fileno(), _BYTES, access=mmap.ACCESS_READ)).cast("q")
 
     def stalled_ms(self, now_ns: int, within_ms: float) -> float:
-        """How long the world stands still now, or stood still up to at most ``within_ms`` ago; 0 if it did not."""
+        """Return the duration in ms of a stall of the world at ``now_ns`` or up to ``within_ms`` before.
+
+        Returns 0 if there is none."""
         words = self._words
         if not words[_TURN]:
             return 0.0
@@ -57,7 +59,7 @@ class LatenessView:
 
     @property
     def stalls(self) -> int:
-        """How often the world stood still."""
+        """Return the number of stalls of the world."""
         return self._words[_COUNT]
 
     @property

@@ -160,7 +160,9 @@ class WorldProcess:
         return []
 
     def _be_there_at(self, deadline_ns: int) -> None:
-        """What comes at ``deadline_ns`` is worked out before; then it is only said. Nobody is heard meanwhile."""
+        """Compute the events of ``deadline_ns`` in advance, wait for that time, then only send their results.
+
+        No request is read in the meantime."""
         for server in self._i2c.values():
             server.hold()
         self.world.advance_to(deadline_ns)

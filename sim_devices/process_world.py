@@ -67,7 +67,7 @@ class ProcessWorld:
 
     @property
     def pid(self) -> int:
-        """Of the world's process, for tests that kill it."""
+        """Return the process id of the world's process, for tests that kill it."""
         return self._process.pid
 
     def endpoint(self, bus: str) -> str:
@@ -97,11 +97,13 @@ class ProcessWorld:
             return {name: data[name] for name in data.files}
 
     def stalled_ms(self, now_ns: int, within_ms: float) -> float:
-        """How long the world's process stands still now, or stood still up to ``within_ms`` ago; 0 for a dead one."""
+        """Return the duration in ms of a stall of the world's process at ``now_ns`` or up to ``within_ms`` before.
+
+        Returns 0 if there is none, or if the process is dead."""
         return self._lateness.stalled_ms(now_ns, within_ms) if self.alive() else 0.0
 
     def stalls(self) -> tuple[int, float]:
-        """How often the world's process stood still, and for how many ms at the longest."""
+        """Return the number of stalls of the world's process and the duration of the longest one in ms."""
         return self._lateness.stalls, self._lateness.longest_ms
 
     def statistics(self) -> dict[str, float]:

@@ -1,7 +1,7 @@
-"""What can go wrong between the plant and its devices: sensors, their wires and supply, amplifier channels.
+"""Faults between the plant and its devices: sensors, their wires and supply, amplifier channels.
 
-Volts pass through here on their way to the DAQ, demands on their way to the amplifier. Nothing is injected: nothing
-changes.
+Volts pass through here on their way to the DAQ, demands on their way to the amplifier. While no fault is injected,
+they pass unchanged.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class WiringFaults:
         return self._driven_V(channel)
 
     def inputs(self, volts: Volts, t_ns: int) -> Volts:
-        """(8,) what arrives at the DAQ; ``volts`` itself where nothing is wrong."""
+        """Return the voltages (8,) that arrive at the DAQ; this is ``volts`` itself if no sensor has a fault."""
         if not self._sensors:
             self._last_V = volts
             return volts
@@ -93,7 +93,7 @@ class WiringFaults:
         return out
 
     def demand(self, channel: int, volts: float) -> float:
-        """What the stack of ``channel`` sees when ``volts`` are asked for."""
+        """Record the demand ``volts`` on ``channel``; return the demand in V that takes effect on its stack."""
         self._demand_V[channel] = volts
         if self.on_demand is not None:
             self.on_demand(channel, volts)

@@ -45,7 +45,7 @@ Truth = dict[str, NDArray[np.float64] | NDArray[np.int64]]
 
 
 class Plant(Protocol):
-    """What the world needs of ``sim_devices.plant.instrument.Instrument``. Times are plant time in ns."""
+    """The part of ``sim_devices.plant.instrument.Instrument`` that the world uses. Times are plant time in ns."""
 
     @property
     def analog_V(self) -> Volts: ...
@@ -91,7 +91,7 @@ class World:
     # ------------------------------------------------------------------ time
 
     def next_event_ns(self) -> int | None:
-        """When some device acts by itself next."""
+        """Return the time at which a device acts by itself next, or ``None`` if no device will."""
         nearest: int | None = None
         for face in self._timed:
             due = face.next_event_ns()
@@ -317,7 +317,7 @@ class World:
         self._rest_at(node.output_V)
 
     def _rest_at(self, demand_V: Sequence[float]) -> None:
-        """What the device puts out at power-up is what the amplifier starts from."""
+        """Start the amplifier from ``demand_V``, the output of the device at power-up."""
         for channel in range(3):
             self.plant.set_demand_V(channel, demand_V[channel], 0)
 

@@ -10,7 +10,7 @@ class ActingFace:
     due_ns: int | None = None
 
     def act(self, t_ns: int) -> None:
-        """What it does at ``due_ns``, which is now; sets the next one."""
+        """Do the action that is due at ``t_ns``, and set ``due_ns`` to the time of the next one."""
 
     def next_event_ns(self) -> int | None:
         return None if self.frozen else self.due_ns

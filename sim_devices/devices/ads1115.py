@@ -127,7 +127,7 @@ class Ads1115:
         self._looked = 1
 
     def _look_ns(self) -> int | None:
-        """When the input is looked at next; the last time is the end of the conversion."""
+        """Return the time at which the input is sampled next; the last sample is at the end of the conversion."""
         if self._due_ns is None or self._looked >= self._looks:
             return self._due_ns
         return self._begun_ns + self._looked * self._part_ns

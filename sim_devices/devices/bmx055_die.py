@@ -1,4 +1,4 @@
-"""What the accelerometer and the gyroscope die of a BMX055 have in common: power, reset, shadowing, FIFO, NVM.
+"""Functions that the accelerometer and gyroscope dies of a BMX055 share: power, reset, shadowing, FIFO, NVM.
 
 Source: BMX055 data sheet BST-BMX055-DS000 rev. 1.3.
 
@@ -27,7 +27,7 @@ NVM_PROGRAM_NS = 10_000_000
 
 @dataclass(frozen=True)
 class DieFacts:
-    """What differs between the dies by number only."""
+    """Holds the constants in which the dies differ."""
 
     start_up_ns: int
     unlatched_ns: int

@@ -45,7 +45,7 @@ NOT_FOUND = "command not found"
 
 @dataclass
 class Di4108Settings:
-    """What commands have set; the values are those after power-up."""
+    """Holds the settings that commands change; the defaults are the values after power-up."""
 
     packet_code: int = 0
     ascii_output: bool = False
@@ -116,7 +116,9 @@ class Di4108:
                     self._command.clear()
 
     def take(self, max_bytes: int) -> bytes:
-        """What the host reads next, at most ``max_bytes``; while scanning in full packets only (page 21)."""
+        """Remove and return the bytes that the host reads next, at most ``max_bytes``; none while the device is frozen.
+
+        While scanning, output is queued in full packets only (page 21)."""
         if self.frozen or not self._out:
             return b""
         data = bytes(self._out[:max_bytes])

@@ -152,7 +152,7 @@ class E727:
     # ------------------------------------------------------------------ truth face
 
     def position_um(self, axis: int) -> float:
-        """What the controller's sensor reads, in um."""
+        """Return the position of ``axis`` that the controller's sensor measures, in um."""
         if self._measure_um is not None:
             return self._measure_um(axis, self._now_ns)
         return self.output_V[axis] * NOMINAL_UM_PER_V

@@ -1,8 +1,8 @@
-"""What a transport needs to know of an emulated device's wire side.
+"""Interfaces between an emulated device and the transport that carries it.
 
 A wire face is sans-IO: bytes, register transactions or frames go in and come out, time is an argument, nothing
 waits. Times are bench-clock nanoseconds and never run backwards. ``next_event_ns`` says when the device will do
-something by itself; whoever carries the face calls ``advance_to`` then, not earlier and, if late, once for all.
+something by itself; the transport calls ``advance_to`` then, not earlier, and if it is late, once for all events.
 """
 
 from __future__ import annotations

@@ -122,7 +122,7 @@ class MotionCard:
 
     @property
     def battery_percent(self) -> float:
-        """True charge; settable."""
+        """Return the true charge in percent; it can be set."""
         used = (self._now_ns - self._start_ns) / HOUR_NS * CURRENT_MA / BATTERY_MAH * 100.0
         return max(0.0, self._charge - used)
 
@@ -132,7 +132,7 @@ class MotionCard:
 
     @property
     def battery_level(self) -> int:
-        """What the battery service (0x180F) publishes, brought up to date each 30 minutes."""
+        """Return the charge in percent that the battery service (0x180F) publishes, updated every 30 minutes."""
         since_ns = (self._now_ns - self._start_ns) % BATTERY_PERIOD_NS
         return min(100, round(self.battery_percent + since_ns / HOUR_NS * CURRENT_MA / BATTERY_MAH * 100.0))
 

@@ -270,7 +270,7 @@ class Mpu6050(RegisterFace):
             self._to_fifo(self._fifo_frame(words), t_ns)
 
     def _fifo_frame(self, words: list[bytes]) -> bytes:
-        """What FIFO_EN selects, in the order of the registers (RM 4.12)."""
+        """Build the FIFO frame of the words that FIFO_EN selects, in the order of the registers (RM 4.12)."""
         enabled = self.registers[FIFO_EN]
         frame = b"".join(words[0:3]) if enabled & 0x08 else b""
         for bit, i in ((0x80, 3), (0x40, 4), (0x20, 5), (0x10, 6)):
@@ -279,7 +279,7 @@ class Mpu6050(RegisterFace):
         return frame
 
     def _to_fifo(self, data: bytes, t_ns: int) -> None:
-        """When full the oldest bytes are lost (RM 4.31)."""
+        """Append ``data`` to the FIFO; a full FIFO loses its oldest bytes (RM 4.31)."""
         self.fifo.extend(data)
         if len(self.fifo) > FIFO_BYTES:
             self.overflows += 1

@@ -1,7 +1,7 @@
-"""What register-mapped I2C sensors share: pointer, auto-increment, one instant per byte, sample clocks, outputs.
+"""Base of register-mapped I2C sensors: pointer, auto-increment, one instant per byte, sample clocks, outputs.
 
 Source: UM10204 (I2C-bus specification) sec. 3.1.10: a write segment starts with the register number, a read segment
-goes on from there. A byte that is read was fetched when its own nine clocks began, so a burst takes time and may
+continues from there. A byte that is read was fetched when its own nine clocks began, so a burst takes time and may
 straddle an update; a device that guards against that does so itself.
 
 Model limits

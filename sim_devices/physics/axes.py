@@ -1,4 +1,4 @@
-"""What other axes do to one axis: misalignment, quadratic bias, varying sensitivity, soft iron."""
+"""Effects of the other axes on one axis: misalignment, quadratic bias, varying sensitivity, soft iron."""
 
 from __future__ import annotations
 

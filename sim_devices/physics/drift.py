@@ -80,9 +80,11 @@ def _walk_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def growth(residual: Array, keep: np.ndarray, short: int = 64, long: int = 16) -> float:
-    """How the mean square difference of neighbouring block means grows from blocks of n / ``short`` to n / ``long``: by
-    the ratio of the lengths (4) for a walk, its inverse for noise that forgets within a block, its square for what is
-    smooth, near 1 for noise that forgets within n/60. 0 where nothing can be said.
+    """Return the growth of the mean square difference of adjacent block means from short blocks to long ones.
+
+    The blocks have n / ``short`` and n / ``long`` samples. The growth is the ratio of the lengths (4) for a random
+    walk, its inverse for noise whose correlation time is below a block, its square for a smooth signal, and near 1 for
+    noise that decorrelates within n/60. It is 0 where it cannot be computed.
     """
     n = residual.size
     total = np.concatenate([[0.0], np.cumsum(np.where(keep, residual, 0.0))])

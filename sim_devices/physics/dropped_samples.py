@@ -80,11 +80,12 @@ MOST_SLOW = 12  # events that a signal without bends within a window can vouch f
 
 
 def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], float, float]:
-    """Where a record lost or repeats samples, by the cheapest path of shifts over windows.
+    """Find the samples at which a record lost or repeats samples, by the cheapest path of shifts over windows.
 
-    (samples, total shift from there on, share of the error explained, sum of squares left). First with the mean of
-    every window left to slower effects; of a signal that hardly bends within a window nothing is left then, so once
-    more with the level of the whole record alone, which is taken when it explains far more with a few events.
+    Returns (samples, total shift from there on, share of the error explained, sum of squares left). The first search
+    leaves the mean of every window to slower effects. A signal that hardly bends within a window has nothing left
+    then, so a second search removes the level of the whole record only; its result is used if it explains far more
+    with a few events.
     """
     found = _path_of_shifts(model, measured, True)
     slow = _path_of_shifts(model, measured, False)
@@ -95,7 +96,7 @@ def find_drops(model: Array, measured: Array) -> tuple[list[int], list[int], flo
 
 
 def _squares_left(model: Array, measured: Array, at: Sequence[int], total: Sequence[int]) -> float:
-    """Sum of squares that a shifted model leaves when its gain and level are free."""
+    """Return the residual sum of squares of a shifted model whose gain and level are fitted."""
     moved = shift_by(model, np.array(at, np.int64), np.array(total, np.int64))
     a, b = moved - moved.mean(), measured - measured.mean()
     return float(b @ b) - float(a @ b) ** 2 / max(float(a @ a), 1e-300)

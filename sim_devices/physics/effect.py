@@ -1,4 +1,4 @@
-"""What an effect is: one piece of physics that a simulator may lack, as a pure forward model.
+"""Definition of an effect: one piece of physics that a simulator may lack, as a pure forward model.
 
 The mismatch engine proposes these, fits their parameters inside the simulator, and puts the accepted ones
 into a corrected twin. One effect per vocabulary name of the contract (recordings-and-mismatch.md, section 3);
@@ -67,7 +67,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Context:
-    """What a forward model may look at besides the signal that it changes.
+    """Holds the data that a forward model may use besides the signal that it changes.
 
     ``t`` seconds since the start of the whole recording (n,), so that warm-up keeps its age in a held-out
     block; ``dt`` its step. ``signals``: every recorded input and context signal by the twin's name (n,), in
@@ -103,7 +103,7 @@ class Context:
         return np.ones(self.t.size, np.bool_) if self.mask is None else self.mask
 
     def to_output(self, change: Array) -> Array:
-        """What a change (n,) of the signal does to the output, to first order."""
+        """Return the change (n,) of the output that a change (n,) of the signal causes, to first order."""
         return change if self.through is None else self.through(change)
 
 
@@ -230,5 +230,5 @@ class Effect:
 
     @property
     def form(self) -> tuple[str, str, str]:
-        """What tells one shape of an effect from another."""
+        """Return the key that distinguishes one shape of an effect from another: (name, kind, equation)."""
         return self.name, self.kind, self.equation

@@ -1,4 +1,4 @@
-"""What recorded conditions do to a reading: temperature, supply voltage, actuator current."""
+"""Effects of recorded conditions on a reading: temperature, supply voltage, actuator current."""
 
 from __future__ import annotations
 

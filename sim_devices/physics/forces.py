@@ -79,8 +79,10 @@ def flow_of(x, row):
 
 
 def base_moves(x: Array, ctx: Context) -> list[Array]:
-    """How an output (n,) moves, to first order, when offset, spring, drag and inertia of its equation of motion change:
-    what base parameters that a missing force has bent leave, beside that force. ``x`` (n,) the recorded position.
+    """Return the first-order changes (n,) of an output when the parameters of its equation of motion change.
+
+    The parameters are offset, spring, drag and inertia. A fit that lacks a force biases them, and the residual then
+    holds these changes besides that force. ``x`` (n,) is the recorded position.
     """
     drives = [ctx.signals[s] for s in ("force", "torque") if s in ctx.signals]
     inside = (np.ones(x.size), x, np.gradient(x, ctx.dt), *drives)

@@ -135,7 +135,7 @@ MASING = ("stops", "dahl", "dahl_stops")
 
 
 def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
-    """Whether x (n,) turns at two levels only where it may be looked at: then minor loops are nowhere to be seen."""
+    """Return True if x (n,) turns at only two levels where ``keep`` is set, so that it shows no minor loops."""
     span = float(np.ptp(x[keep])) if keep.any() else 0.0
     if span == 0.0:
         return False
@@ -209,7 +209,7 @@ def columns(
 
 
 def slips_once(lo: float, hi: float, rest: float) -> bool:
-    """Whether a record that begins at ``rest`` makes the widest elements slip; else they are only a gain."""
+    """Return True if a record that begins at ``rest`` makes the widest elements slip; else they are only a gain."""
     return max(hi - rest, rest - lo) > WIDE[0] * 0.5 * (hi - lo)
 
 
@@ -285,7 +285,7 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 
 
 def way_before(settings: Settings) -> float | None:
-    """Where x had been before the record, when its memory shows that."""
+    """Return the value that x had before the record, or ``None`` if the memory of the hysteresis does not show it."""
     return settings["before"][0] if "before" in settings else None
 
 

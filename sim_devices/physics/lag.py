@@ -49,7 +49,7 @@ def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 
 
 def _target(residual: Array, ctx: Context, x: Array) -> Array:
-    """What the output should be: its recording, or the model plus its residual."""
+    """Return the output to be reached: its recording, or else the model plus its residual."""
     return ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
 
 

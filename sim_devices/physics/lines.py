@@ -96,7 +96,7 @@ def mean_turn(z: NDArray[Any], whole: NDArray[np.bool_]) -> float:
 
 
 def _settle(residual: Array, ctx: Context, f0: float, harmonics: int) -> Settings:
-    """How many knots the amplitude and phase need: as coarse as their wander allows."""
+    """Choose the settings of a line; its knots of amplitude and phase are as few as their wander allows."""
     span = ctx.dt * ctx.t.size
     width = max(10 / f0, span / 200)
     knots = 1

@@ -80,7 +80,7 @@ CENTRIPETAL_ACCELERATION = Effect(
 
 
 def _position_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
-    """Whether the displacement shows with its centripetal part: what explains the residual better."""
+    """Decide if the displacement includes its centripetal part: it does if that explains the residual better."""
     axis, r = _place(ctx)
     w = rates(ctx)
     k = thin(ctx.keep, 20_000)

@@ -17,7 +17,7 @@ MOST_STEPS = 6
 
 @kernel
 def best_split(total, count):
-    """Where two levels fit best: (index, gain in sum of squares) for block sums and counts."""
+    """Find the split at which two levels fit best: (index, gain in sum of squares) for block sums and counts."""
     n = total.size
     s = 0.0
     c = 0.0
@@ -250,7 +250,9 @@ def _edge_parts(settings: Settings) -> Parts:
 
 
 def _edge_test(x: Array, residual: Array, ctx: Context) -> Signature:
-    """So many outliers that all stand above every other one, and that all stay, of noise with heavy tails."""
+    """Test edges against heavy-tailed noise.
+
+    The p value estimates the chance that noise has as many outliers that exceed all others and that all persist."""
     cuts, above = edges(residual, ctx)
     if not cuts:
         return Signature(1.0, 0.0, "no edge")

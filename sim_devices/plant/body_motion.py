@@ -1,4 +1,4 @@
-"""What a sensor on a rigid body can feel at one instant, and where it sits on that body."""
+"""Motion of a rigid body at one instant, as a sensor on it measures it, and the sensor's place on that body."""
 
 from __future__ import annotations
 
@@ -65,13 +65,13 @@ def _felt(f, w, alpha, position, origin, turn, felt, turned):
 
 @dataclass(frozen=True)
 class Mount:
-    """Where a sensor sits: ``position_m`` (3,) in the body frame, ``turn`` (3, 3) maps sensor to body axes."""
+    """Place of a sensor: ``position_m`` (3,) is in the body frame, ``turn`` (3, 3) maps sensor to body axes."""
 
     position_m: Array = field(default_factory=_zeros)
     turn: Array = field(default_factory=lambda: np.eye(3))
 
     def felt(self, motion: BodyMotion) -> tuple[Array, Array]:
-        """Specific force (3,) m/s^2 and rate (3,) rad/s along the sensor's axes.
+        """Return the specific force (3,) in m/s^2 and the rate (3,) in rad/s along the sensor's axes.
 
         f = f0 + alpha x r + omega x (omega x r), r from the point where f0 is felt to the sensor.
         """

@@ -226,7 +226,7 @@ class Imu:
         _triad_step(*vectors, 0.0, np.zeros((4, 3)), np.zeros(6), (0.0, 0.0, 1.0, 0.0, 1.0, 0.0), np.empty(3))
 
     def temperature_C(self, t_ns: int) -> float:
-        """Of the die, as its own sensor sees it."""
+        """Return the temperature of the die in degC, as its own sensor measures it."""
         return self._look(t_ns)[2] + self.temperature_offset_K
 
     def _look(self, t_ns: int) -> tuple[Array, Array, float, BodyMotion]:

@@ -81,7 +81,7 @@ class Instrument:
 
     @property
     def now_ns(self) -> int:
-        """How far the world has come."""
+        """Return the plant time in ns that the simulation has reached."""
         return self._t_ns
 
     def advance_to(self, t_ns: int) -> None:
@@ -158,7 +158,9 @@ class Instrument:
         self._slow[:] = 0.0
 
     def motion(self) -> BodyMotion:
-        """Of the body at the last step; the specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""
+        """Return the motion of the body at the last time step.
+
+        The specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""
         p, s = self._plant[0], self._state[0]
         attitude = s["attitude"].copy()
         force = (s["pose"][12:15] + np.array([0.0, 0.0, p["gravity"]])) @ attitude

@@ -44,7 +44,7 @@ INTERFEROMETER_RMS_UM = 0.07
 RATE_HZ = 1000.0
 STEPS_HZ = 8000.0
 STEPS_SHARE = 0.05
-"""Of the amplitude: small steps, which the amplifier's slew limit does not slow down."""
+"""Amplitude of profile "steps" as a fraction of the demanded one: the amplifier's slew limit does not slow it down."""
 
 
 class LabError(BenchError):
@@ -66,7 +66,7 @@ def drive_stack(params, state, volts, temperature_C, steps_per_sample, stroke, t
 
 
 def sample_rate_hz(profile: str) -> float:
-    """Of the demand and of the interferometer."""
+    """Return the sample rate of the demand and of the interferometer in Hz."""
     return STEPS_HZ if profile == "steps" else RATE_HZ
 
 

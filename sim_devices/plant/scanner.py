@@ -1,8 +1,8 @@
-"""What the endoscope bench moves: a small body that rests, turns on a table, falls, is led through poses or is held.
+"""The body of the endoscope bench: it rests, turns on a table, falls, is led through poses or is held.
 
-The scenarios are functions of time, so nothing depends on how often anybody looks; but for "led", where somebody
-outside says now and then how the body turns. World frame: z up, x to magnetic
-north. The body's origin is where the specific force is felt; sensors elsewhere follow through their ``Mount``.
+The scenarios are functions of time, so the motion does not depend on how often it is sampled. The exception is "led",
+where a caller sets the rotation of the body from time to time. World frame: z up, x to magnetic north. The specific
+force is that at the body's origin; the ``Mount`` of a sensor gives the force elsewhere.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Scanner:
     # ------------------------------------------------------------------ the motion itself
 
     def motion_at(self, t_ns: int) -> BodyMotion:
-        """At plant time ``t_ns``; any time, in any order."""
+        """Return the motion of the body at plant time ``t_ns``; times may be asked for in any order."""
         t_s = t_ns * 1e-9
         angles, rates, accelerations, a = self._paths[self._config.scenario](t_s)
         c, omega, alpha = np.empty((3, 3)), np.empty(3), np.empty(3)
@@ -158,9 +158,10 @@ class Scanner:
         return angles, np.zeros(3), np.zeros(3), np.zeros(3)
 
     def lead(self, t_ns: int, angles: Array, rates: Array, accelerations: Array) -> None:
-        """From plant time ``t_ns`` on: roll, pitch, yaw in rad and their derivatives, carried on as a parabola.
+        """Set the rotation of the body from plant time ``t_ns`` on: roll, pitch, yaw in rad and their derivatives.
 
-        After 50 ms without another word the body stands still. Times must not run backwards.
+        The angles are extrapolated as a parabola; the body stands still from 50 ms after ``t_ns`` until the next call.
+        Raises ``ValueError`` if ``t_ns`` is before that of the last call.
         """
         if t_ns < self._led_ns[-1]:
             raise ValueError(f"led at {t_ns} ns after {self._led_ns[-1]} ns: time runs forwards")

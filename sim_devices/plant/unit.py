@@ -1,4 +1,4 @@
-"""From the configuration and a seed to one physical instrument, as the plain arrays that the kernel runs on."""
+"""Draw one physical instrument from the configuration and a seed, as the plain arrays that the kernel runs on."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ def build_unit(config: EmulationConfig, seed: int) -> Unit:
 
 
 def start_temperature_C(config: EmulationConfig) -> float:
-    """Of the sensor board and the stacks when the run starts."""
+    """Return the temperature in degC of the sensor board and the stacks at the start of the run."""
     e = config.environment
     return e.ambient_C + e.warm_up_K * (1.0 - math.exp(-e.on_since_s / e.warm_up_s))
 
 
 def plant_arrays(config: EmulationConfig, unit: Unit, frame: NDArray[np.float64]) -> tuple[NDArray, NDArray]:
-    """One-row structured arrays PLANT and STATE, at rest at neutral. ``frame`` (3, 3): attitude of the hand."""
+    """Return one-row structured arrays PLANT and STATE, at rest at neutral. ``frame`` (3, 3): attitude of the hand."""
     plant, state = np.zeros(1, PLANT), np.zeros(1, STATE)
     p, s = plant[0], state[0]
     for i, stack in enumerate(unit.stacks):

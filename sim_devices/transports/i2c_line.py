@@ -15,7 +15,7 @@ from sim_devices.devices.faces import I2cFace
 
 
 class I2cStatus(IntEnum):
-    """How a transfer ended; the numbers go over the socket."""
+    """Result of a transfer; the numbers are sent over the socket."""
 
     OK = 0
     ADDRESS_NACK = 1

@@ -74,7 +74,9 @@ class I2cSocketServer:
             self._drop(fileno)
 
     def reply_ns(self) -> int | None:
-        """When the transfer under way is over: nobody needs to wake for its single segments."""
+        """Return the time at which the transfer in progress ends, or ``None`` if there is none.
+
+        The loop can sleep until then, because the single segments need no action at their own times."""
         return self._reply_ns if self._active is not None else None
 
     def next_event_ns(self) -> int | None:
