@@ -1,4 +1,4 @@
-"""Volts to physical quantities: accelerometer axes, supply, temperature, magnetometer.
+"""Converts volts to physical quantities: accelerometer axes, supply, temperature, magnetometer.
 
 The ADXL-203 is ratiometric (data sheet, "Ratiometricity"): bias and scale follow the supply. Its outputs sit
 behind the RC filter and the supply reading does not, so the supply passes the same filter here before it
@@ -69,13 +69,13 @@ def calibration_dtype(n: int) -> np.dtype[Any]:
 
 
 def reading_names(axes: int) -> tuple[str, ...]:
-    """Names of the calibrated readings, as recordings have them."""
+    """Return the names of the calibrated readings, as recordings have them."""
     names = (*(f"accelerometer_{a}" for a in AXES), *(f"accelerometer_more_{a}" for a in MORE_AXES))
     return names[:axes]
 
 
 def calibration_params(config: SensingConfig) -> Record:
-    """The kernels' numbers (``calibration_dtype``) from the configuration."""
+    """Return the kernels' parameters (``calibration_dtype``) from the configuration."""
     g = config.gravity_m_s2
     dt = 1.0 / config.tick_hz
     magnetometer_scale = np.array(config.magnetometer_scale_V_per_uT)
@@ -167,7 +167,7 @@ def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64
 
 @kernel
 def calibrate_magnetometer(frame: NDArray[np.float64], params: Record) -> bool:
-    """Fill the magnetometer columns from its volts; False (and nothing written) when they are not finite."""
+    """Fill the magnetometer columns from its volts. Return False, and write nothing, when they are not finite."""
     for i in range(3):
         if not np.isfinite(frame[MAGNETOMETER_RAW + i]):
             return False

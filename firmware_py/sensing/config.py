@@ -18,7 +18,7 @@ Input = Annotated[int, Field(ge=0, le=7)]
 Axis = Annotated[int, Field(ge=0, le=7)]
 FARTHEST_M = 1.0  # nobody holds a longer instrument
 LEAST_AXES, MOST_AXES = 6, 8
-"""Six unknowns; the converter has eight inputs."""
+"""Numbers of axes: there are six unknowns, and the converter has eight inputs."""
 PER_AXIS = (
     "noise_ug_per_rtHz",
     "axis_drift_m_s2",
@@ -34,7 +34,7 @@ PER_AXIS = (
 Positive = Annotated[float, Field(gt=0.0)]
 STANDARD_GRAVITY = 9.80665
 DRIFT_S = 100.0
-"""Over which a slow drift is stated."""
+"""Time over which a slow drift is stated."""
 UNIT_AXES: tuple[Vector, ...] = (
     (1.0, 0.0, 0.0),
     (0.0, 0.0, 1.0),
@@ -46,9 +46,10 @@ UNIT_AXES: tuple[Vector, ...] = (
 
 
 class SensingConfig(BaseModel):
-    """Sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34)), then more.
+    """Sets sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34)), then more.
 
-    Seven or eight axes: ``channels``, ``positions_m`` and ``axes`` name them; supply and temperature give up inputs.
+    With seven or eight axes, ``channels``, ``positions_m`` and ``axes`` name them; supply and temperature give up
+    inputs.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -171,21 +172,21 @@ class SensingConfig(BaseModel):
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any], where: str = "[firmware.sensing]") -> SensingConfig:
-        """Checked configuration; ``BenchError`` names the wrong key."""
+        """Return the checked configuration. Raises ``BenchError`` naming the wrong key."""
         return validate_table(cls, table, where)
 
     @property
     def cutoff_rad_s(self) -> float:
-        """Corner of the RC filter behind every accelerometer axis (15.07 Hz, ERRATA 27)."""
+        """Return the corner of the RC filter behind every accelerometer axis (15.07 Hz, ERRATA 27)."""
         return 1.0 / (self.filter_ohm * self.filter_farad)
 
     def axis_positions(self) -> NDArray[np.float64]:
-        """Position of each axis, shape (N, 3), m."""
+        """Return the position of each axis, shape (N, 3), m."""
         places = np.array(self.positions_m)
         return np.repeat(places, len(self.channels) // len(places), axis=0)
 
     def observation(self) -> NDArray[np.float64]:
-        """The N x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""
+        """Return the N x 6 matrix from (f, alpha) to readings; see ``kinematics.observation_matrix``."""
         from firmware_py.sensing.kinematics import observation_matrix
 
         return observation_matrix(self.axis_positions(), np.array(self.axes))

@@ -1,4 +1,4 @@
-"""Multiplicative error-state Kalman filter of attitude, rate and velocity; any source of the rate's change.
+"""Estimates attitude, rate and velocity by a multiplicative error-state Kalman filter, for any source of alpha.
 
 The rate comes as angular acceleration alpha: solved from accelerometers, or the difference of a gyroscope's samples
 (the error of the rate is then the gyroscope's bias). Errors, world frame unless said: turn theta (3,), rate (3, body),
@@ -42,7 +42,7 @@ HELD_AFTER_S = 0.2
 
 @kernel
 def start_errors(state: Record, params: Record, field_size: float, field_dip: float) -> None:
-    """Covariance of a filter that has just been aligned."""
+    """Set the covariance and the start values of a filter that has just been aligned."""
     e = state.error_state
     p = e.covariance
     p[:, :] = 0.0
@@ -85,7 +85,8 @@ def propagate_errors(
     rate: NDArray[np.float64],
     dt: float,
 ) -> None:
-    """P <- F P F^T + Q over ``dt`` s; ``c`` = C_WB, ``up`` (3,) = C f. F is sparse, its products are written out."""
+    """Propagate P <- F P F^T + Q over ``dt`` s; ``c`` = C_WB, ``up`` (3,) = C f. F is sparse, so its products are
+    written out."""
     p, w = e.covariance, e.work
     fade = exp(-dt / params.disturbance_s)
     # row by row, so that the inner loops run along memory
@@ -133,7 +134,7 @@ def propagate_errors(
 def correct(
     state: Record, first: int, second: int, residual: float, variance: float, gate: float, gain: NDArray[np.float64]
 ) -> bool:
-    """One scalar measurement of error ``first`` (minus error ``second``, if >= 0); Joseph form.
+    """Process one scalar measurement of error ``first`` (minus error ``second``, if >= 0), in Joseph form.
 
     ``gain`` (ERRORS,) gathers the correction, which the caller applies with ``apply_correction``. False when the
     residual, what ``gain`` already explains taken off, is beyond ``gate`` standard deviations.
@@ -197,7 +198,7 @@ def error_state_step(
     fresh: bool,
     dt: float,
 ) -> None:
-    """One step of ``dt`` s: ``force`` (3,) m/s^2 and ``alpha`` (3,) rad/s^2 in the body frame, ``field`` if ``fresh``.
+    """Run one step of ``dt`` s with ``force`` (3,) m/s^2, ``alpha`` (3,) rad/s^2, body frame; ``field`` if ``fresh``.
 
     Updates quaternion, matrix, rate and bias in ``state``.
     """

@@ -1,4 +1,4 @@
-"""Attitude of an inertial sensor with a gyroscope: choose a filter, feed samples or a recording (002, chapter 3)."""
+"""Estimates the attitude of an inertial sensor with a gyroscope, by one of several filters (002, chapter 3)."""
 
 from __future__ import annotations
 
@@ -43,15 +43,15 @@ class FusionConfig(BaseModel):
 
     method: Method = "mahony"
     tau_s: float = Field(default=0.1, gt=0.0)
-    """Complementary filter."""
+    """Time constant of the complementary filter."""
     beta: float = Field(default=0.03, ge=0.0)
-    """Madgwick, rad/s."""
+    """Gain of Madgwick's filter, rad/s."""
     field_scale: float = Field(default=1.0, gt=0.0, le=1.0)
     """Madgwick with a magnetometer: 1 is the paper, 0.5 what the widely used C code of 2011 computes by an oversight
     (its predicted field is half as long as the measured one, so the magnetometer counts half)."""
     kp: float = Field(default=1.4, ge=0.0)
     ki: float = Field(default=0.002, ge=0.0)
-    """Mahony, 1/s and 1/s^2."""
+    """Integral gain of Mahony's filter, 1/s^2. ``kp`` is the proportional gain, 1/s."""
     align_s: float = Field(default=0.1, ge=0.0, le=10.0)
     """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
 

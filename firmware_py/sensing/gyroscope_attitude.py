@@ -1,6 +1,6 @@
-"""All attitude filters driven by a gyroscope: a whole recording in one compiled call.
+"""Runs every attitude filter that a gyroscope drives over a whole recording in one compiled call.
 
-The Kalman filters here; those of document 002, live too, in ``fusion``.
+This module holds the Kalman filters; ``fusion`` holds those of document 002, which also run live.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Six (or more) single-axis accelerometers on a rigid body -> specific force and angular acceleration.
+"""Solves for specific force and angular acceleration of a rigid body with six or more single-axis accelerometers.
 
 Axis i at r_i with unit direction s_i reads y_i = s_i.(f + alpha x r_i + omega x (omega x r_i)), f the specific
 force at the origin (000 (2.3) with ERRATA 2, 13, 30). With omega known this is linear in (f, alpha): all axes
@@ -24,7 +24,7 @@ def kinematics_dtype(n: int) -> np.dtype[Any]:
 
 
 def observation_matrix(positions: NDArray[np.float64], axes: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(N, 6) matrix from (f, alpha) to readings at omega = 0: rows (s_i, r_i x s_i)."""
+    """Return the (N, 6) matrix from (f, alpha) to readings at omega = 0: rows (s_i, r_i x s_i)."""
     return np.hstack([axes, np.cross(positions, axes)])
 
 

@@ -1,4 +1,4 @@
-"""The sensing stage without one of its axes: the same arrays, other numbers in them."""
+"""Lets the sensing stage run without one of its axes, by changing numbers in its existing arrays."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def leave_out(axis: int, usual: NDArray[np.float64], params: Record, config: Sen
 
 
 def tip_noise(solve: NDArray[np.float64], noise: NDArray[np.float64], tip_m: NDArray[np.float64]) -> float:
-    """Root of the summed variances of f + alpha x tip, m/s^2."""
+    """Return the square root of the summed variances of f + alpha x tip, m/s^2."""
     x, y, z = tip_m
     cross = np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])  # alpha x r = cross @ alpha
     return float(np.linalg.norm((solve[:3] + cross @ solve[3:]) * noise))

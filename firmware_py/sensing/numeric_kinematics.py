@@ -82,7 +82,7 @@ def solve_numeric(
 
 @kernel
 def fold_row(row: NDArray[np.float64], value: float, triangle: NDArray[np.float64], right: NDArray[np.float64]) -> None:
-    """One more equation ``row`` (6,) . x = ``value`` into the least squares kept as ``triangle`` (6, 6) x = ``right``.
+    """Add the equation ``row`` (6,) . x = ``value`` to the least squares kept as ``triangle`` (6, 6) x = ``right``.
 
     Givens rotations: as accurate as QR, whatever N is, without an array of its size (normal equations would square the
     condition). ``row`` is used up.

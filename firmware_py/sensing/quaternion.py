@@ -1,4 +1,4 @@
-"""Quaternions, scalar first, Hamilton, body to world (ERRATA, section 5)."""
+"""Provides operations on quaternions: scalar first, Hamilton, body to world (ERRATA, section 5)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.compiled import kernel
 
 @kernel
 def multiply(p: NDArray[np.float64], q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """``out`` = p x q (Hamilton); ``out`` must be another array."""
+    """Set ``out`` to p x q (Hamilton). ``out`` must be another array."""
     out[0] = p[0] * q[0] - p[1] * q[1] - p[2] * q[2] - p[3] * q[3]
     out[1] = p[0] * q[1] + p[1] * q[0] + p[2] * q[3] - p[3] * q[2]
     out[2] = p[0] * q[2] - p[1] * q[3] + p[2] * q[0] + p[3] * q[1]
@@ -47,7 +47,7 @@ def rotate_by(q: NDArray[np.float64], x: float, y: float, z: float) -> None:
 
 @kernel
 def to_matrix(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """``out`` (3, 3) = C_WB, 000 (2.13)."""
+    """Set ``out`` (3, 3) to C_WB, 000 (2.13)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     out[0, 0] = w * w + x * x - y * y - z * z
     out[0, 1] = 2.0 * (x * y - w * z)
@@ -62,7 +62,7 @@ def to_matrix(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
 
 @kernel
 def from_matrix(c: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """``out`` (4,) from C_WB (3, 3), by its largest component, so that it is safe at all angles (ERRATA 45)."""
+    """Set ``out`` (4,) from C_WB (3, 3), by its largest component, so that it is safe at all angles (ERRATA 45)."""
     trace = c[0, 0] + c[1, 1] + c[2, 2]
     largest = 0
     best = trace

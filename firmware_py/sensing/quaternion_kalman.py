@@ -1,4 +1,4 @@
-"""Augmented-state quaternion Kalman filter: x = [q, b], b the error of the rate (000 sec. 4.4, 001; ERRATA 36-48).
+"""Runs a quaternion Kalman filter with state x = [q, b], b the error of the rate (000 sec. 4.4, 001; ERRATA 36-48).
 
 The bias-corrected rate stands in the transition of q; F = [[Phi_Q, -T/2 Phi_Q Q~], [0, I]] carries P (ERRATA 38, 39).
 The measurement is TRIAD's quaternion with Shuster's covariance; that has rank three, so the same again along q
@@ -36,7 +36,7 @@ QUATERNION_KALMAN_STATE = np.dtype([("covariance", "f8", (7, 7)), ("field_size",
 
 @kernel
 def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """``out`` (4, 3): Q~ with Q~ B = q x (0, B) (000 (4.13), ERRATA 37)."""
+    """Set ``out`` (4, 3) to Q~, which satisfies Q~ B = q x (0, B) (000 (4.13), ERRATA 37)."""
     out[0, 0], out[0, 1], out[0, 2] = -q[1], -q[2], -q[3]
     out[1, 0], out[1, 1], out[1, 2] = q[0], -q[3], q[2]
     out[2, 0], out[2, 1], out[2, 2] = q[3], q[0], -q[1]
@@ -45,7 +45,7 @@ def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
 
 @kernel
 def start_quaternion_kalman(state: Record, params: Record, field_size: float) -> None:
-    """Covariance after alignment."""
+    """Set the covariance and the start values after alignment."""
     k = state.quaternion_kalman
     q = np.empty((4, 3))
     tilde(state.quaternion, q)
@@ -70,7 +70,7 @@ def quaternion_kalman_step(
     field: NDArray[np.float64],
     dt: float,
 ) -> None:
-    """One step of ``dt`` s; arguments as ``error_state_step``, ``field`` the last one known (body frame)."""
+    """Run one step of ``dt`` s; arguments as ``error_state_step``, ``field`` the last one known (body frame)."""
     k = state.quaternion_kalman
     turn = np.empty(3)
     for i in range(3):

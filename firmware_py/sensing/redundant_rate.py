@@ -1,4 +1,4 @@
-"""Rate of a tumbling body from more than six accelerometer axes, held by their own centripetal part.
+"""Estimates a tumbling body's rate from more than six accelerometer axes, held by their own centripetal part.
 
 With six axes the rate is an integral of alpha, and alpha needs the rate for its centripetal part: an error grows as
 exp(k |omega| t), k about the ratio of the largest to the smallest lever. A hand (below 1 rad/s) hardly shows it, at 3

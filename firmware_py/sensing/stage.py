@@ -1,4 +1,4 @@
-"""The sensing stage: raw counts -> readings -> motion -> attitude -> acceleration and displacement of the tip."""
+"""Runs the sensing stage: raw counts -> readings -> motion -> attitude -> acceleration and displacement of the tip."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ def sense_state_dtype(n: int) -> np.dtype[Any]:
 
 
 def sense_params(config: SensingConfig) -> Record:
-    """All numbers of the stage (``sense_dtype``)."""
+    """Return all parameters of the stage (``sense_dtype``)."""
     places, axes, n = config.axis_positions(), np.array(config.axes), len(config.channels)
     # rms of a sample behind the RC: density times the root of its noise bandwidth, a quarter of the corner in rad/s
     noise = 1e-6 * STANDARD_GRAVITY * np.array(config.noise_ug_per_rtHz) * (0.25 * config.cutoff_rad_s) ** 0.5
@@ -121,7 +121,7 @@ def sense_params(config: SensingConfig) -> Record:
 
 
 def sense_state(axes: int) -> Record:
-    """Before the first sample (``sense_state_dtype``)."""
+    """Return the state before the first sample (``sense_state_dtype``)."""
     state = new_record(sense_state_dtype(axes), smoothed=np.nan, last_tick=np.nan)
     restart(attributes(state)[0].attitude)
     return state
@@ -129,7 +129,7 @@ def sense_state(axes: int) -> Record:
 
 @kernel
 def _plausible(rate: NDArray[np.float64]) -> bool:
-    """No hand turns faster; written so that nan is not plausible either."""
+    """Return True if a hand can turn that fast. The comparison is written so that nan is not plausible either."""
     return rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2 < MAX_RATE_RAD_S**2
 
 
@@ -242,7 +242,7 @@ class Sensing:
 
     @property
     def fallbacks(self) -> int:
-        """Ticks so far in which the numeric kinematics did not converge and the analytic one stood in."""
+        """Return the number of ticks in which the numeric kinematics did not converge and the analytic one stood in."""
         return int(np.atleast_1d(self.state)["fallbacks"][0])
 
     def leave_out(self, axis: int, usual: NDArray[np.float64]) -> float:

@@ -1,4 +1,4 @@
-"""Acceleration of the tip with gravity removed, and its displacement in the tremor band with known phase.
+"""Computes the tip's acceleration without gravity, and its displacement in the tremor band with known phase.
 
 Displacement is the acceleration through s^2 / (s^2 + 2 d w s + w^2)^2 with w = 2 pi 2 Hz: a double integral above
 the corner that forgets bias (zero at s = 0) and drift. What that and the RC filter do to amplitude and phase at
@@ -35,7 +35,7 @@ def translation_params(config: SensingConfig) -> Record:
 
 
 def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray[np.float64]:
-    """Two biquads (2, 5) from m/s^2 to m: the first takes out bias, the second integrates twice."""
+    """Return two biquads (2, 5) from m/s^2 to m: the first takes out bias, the second integrates twice."""
     w = 2.0 * pi * corner_hz
     poles = w * np.array([-DAMPING + 1j * (1 - DAMPING**2) ** 0.5, -DAMPING - 1j * (1 - DAMPING**2) ** 0.5])
     rows = []
@@ -49,7 +49,7 @@ def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray
 def displacement_response(
     frequency_hz: NDArray[np.float64], tick_hz: float, cutoff_rad_s: float
 ) -> NDArray[np.complex128]:
-    """Complex gain from true tip displacement to the ``tip_displacement`` column, RC filter included."""
+    """Return the complex gain from true tip displacement to the ``tip_displacement`` column, RC filter included."""
     s = 2j * pi * np.asarray(frequency_hz, dtype=np.float64)
     z = np.exp(s / tick_hz)
     gain = s**2 * cutoff_rad_s / (s + cutoff_rad_s)

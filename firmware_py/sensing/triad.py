@@ -1,4 +1,4 @@
-"""Attitude from two directions: up (specific force at rest) and magnetic north (000 (2.22)-(2.25), ERRATA 2, 9)."""
+"""Computes attitude from up (specific force at rest) and magnetic north (000 (2.22)-(2.25), ERRATA 2, 9)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hal.compiled import kernel
 
 @kernel
 def triad(force: NDArray[np.float64], field: NDArray[np.float64], out: NDArray[np.float64]) -> bool:
-    """``out`` (3, 3) = C_WB with world z along ``force`` (up) and world x along the horizontal part of ``field``.
+    """Set ``out`` (3, 3) to C_WB with world z along ``force`` (up) and world x along ``field``'s horizontal part.
 
     Both vectors in the body frame, any unit. Without a usable field (zero or along ``force``) the body axis
     that is most horizontal takes its place, and the result is False.
