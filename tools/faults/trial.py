@@ -188,7 +188,7 @@ def observe_running(
         pass
     except BaseException as error:
         if me.is_child:
-            me.answer(Refused(str(error)) if isinstance(error, HalError) and phase is SELF_TEST else error)
+            me.answer(Refused(str(error)) if isinstance(error, HalError) and phase == SELF_TEST else error)
         raise
     else:
         if not me.is_child:
