@@ -20,7 +20,7 @@ from hal.contracts import Clock, Float64Array
 from hal.output_guard import OutputGuard
 
 GROSS = 8.0
-"""Times the tolerance: no noise and no mistake of a model, believed at once."""
+"""Deviation, as a multiple of the tolerance, that one reading proves: neither noise nor a model error is as large."""
 
 
 class Window(NamedTuple):
@@ -33,11 +33,11 @@ class Window(NamedTuple):
 
 
 LEARN = 60
-"""Readings of an output before what is usual counts as known; its memory is four times as long."""
+"""Number of readings of an output before its usual deviation counts as known; the memory is four times as long."""
 
 
 class Usual:
-    """Straight line through what one output has lately differed by from the middle of what was expected."""
+    """Fits a straight line to the recent differences of one output from the middle of its expected range."""
 
     def __init__(self) -> None:
         self.count = 0

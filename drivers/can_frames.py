@@ -1,4 +1,4 @@
-"""Parts that the CAN drivers share: the checksum of set points and the heartbeat of this host."""
+"""Parts that the CAN drivers share: the checksum of setpoints and the heartbeat of this host."""
 
 from __future__ import annotations
 

@@ -15,13 +15,13 @@ from hal.errors import ErrorKind, SafetyTrip
 from hal.types import OutputLimit
 
 RAMP_STEPS = 16
-"""Of a millisecond each; four of the twenty until neutral are left for transfers that have to be tried again."""
+"""Number of ramp steps (1 ms each). It leaves 4 of the 20 ms until neutral for transfers that must be repeated."""
 
 TOLD = 16
 
 
 class Told(NamedTuple):
-    """One command: it took force between the two times (bench clock, ns), where the driver says no better."""
+    """Describes a sent command. It took effect between its two times (bench clock, ns) if the driver says no better."""
 
     offered_ns: int
     sent_ns: int
@@ -51,7 +51,7 @@ class OutputGuard:
         self.next_V = list(self.last_V)
         self.armed = False
         self.told: deque[Told] = deque(maxlen=TOLD)
-        """What was sent, the newest last: for who compares outputs with commands."""
+        """Holds the commands that were sent, the newest last, for comparison with the measured outputs."""
         self.writes = 0
         self.clipped = 0
         self.slew_limited = 0

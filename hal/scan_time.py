@@ -14,13 +14,15 @@ from __future__ import annotations
 from collections import deque
 
 SHIFT = 0.15
-"""Of a period (USB is polled every 125 us): arrivals that are off the line by so much are no jitter if they all are,"""
+"""Distance of an arrival from the line that may indicate a clock step, as a fraction of the period.
+
+USB is polled every 125 us, so arrivals that are all off the line by this much are not explained by jitter."""
 SHIFT_ARRIVALS = 12
-"""so many in a row (the loop's tasks repeat after 10 ticks),"""
+"""Number of successive arrivals that must be off the line; it exceeds the 10 ticks after which the tasks repeat."""
 SHIFT_ALIKE = 8
-"""of which so many are"""
+"""Number of those arrivals that must agree within ``SHIFT_SPREAD``."""
 SHIFT_SPREAD = 0.05
-"""of a period alike, which those of a busy host are not."""
+"""Largest spread of agreeing arrivals above the least late one, as a fraction of the period; a busy host has more."""
 
 
 class ScanTimeline:
@@ -49,7 +51,7 @@ class ScanTimeline:
 
     @property
     def shifted(self) -> bool:
-        """The last arrivals were all off the line, and most of them alike."""
+        """Return True if the last arrivals were all off the line, most of them by the same amount."""
         if len(self._off) < SHIFT_ARRIVALS:
             return False
         near_ns = min(self._off) + SHIFT_SPREAD * self.dt_ns

@@ -25,7 +25,7 @@ OUR_FOLDERS = ("benches", "examples", "tests")
 """Folders of a source tree whose files came with the program itself."""
 
 Act = Literal["run", "name"]
-"""What is decided: a program may run, or a file may be named from outside its folder."""
+"""Action that a decision allows: a program may run, or a file may be named from outside its folder."""
 
 
 class NotTrusted(BenchError):

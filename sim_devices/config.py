@@ -228,14 +228,14 @@ class EnvironmentConfig(_Table):
     """Rise of the sensor board above ambient (000 Fig. 3.11: steady after about 7 h)."""
     warm_up_s: Positive = 6300.0
     on_since_s: NotNegative = 900.0
-    """How long the instrument has been switched on when the run starts."""
+    """Time for which the instrument has been switched on when the run starts."""
 
 
 class ImuConfig(_Table):
     """``[emulation.imu.DEVICE]``: how the IMU of that name is mounted, and how good a specimen it is."""
 
     position_mm: Vector = (0.0, 0.0, 0.0)
-    """In the body frame; on the instrument, from the base of the back suite."""
+    """Position in the body frame; on the instrument it is measured from the base of the back suite."""
     turn_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw of the sensor's axes in the body."""
     errors: NotNegative = 1.0
@@ -247,15 +247,16 @@ class DaqConfig(_Table):
     """``[emulation.daq]``."""
 
     fifo_samples: Annotated[int, Field(ge=64)] = 1024
-    """What a DI-4108 keeps for a host that does not read: 128 ms of eight channels at 1 kHz. Deeper than the part: for
-    a test machine that takes the processor away for longer than that."""
+    """Number of samples that a DI-4108 keeps for a host that does not read: 128 ms of eight channels at 1 kHz.
+
+    A value above that of the real part serves a test machine that suspends the process for longer than that."""
 
 
 class MoreAxis(_Table):
     """``[[emulation.more_axes]]``: an accelerometer axis beyond the six, in place of supply or temperature."""
 
     input: Literal[6, 7]
-    """Of the DAQ."""
+    """Input of the DAQ."""
     position_mm: Vector
     direction: Vector
     bias_V: float = 0.0
@@ -266,7 +267,7 @@ class EndoscopeConfig(_Table):
     """``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
 
     scenario: Literal["rest", "turntable", "fall", "poses", "hand", "led"] = "hand"
-    """"led": somebody outside moves it (``Scanner.lead``)."""
+    """Motion of the body. With "led", a caller moves it (``Scanner.lead``)."""
     attitude_deg: Vector = (0.0, 0.0, 0.0)
     """Roll, pitch, yaw at the start."""
 
@@ -274,7 +275,7 @@ class EndoscopeConfig(_Table):
     start_s: NotNegative = 1.0
     ramp_s: NotNegative = 0.5
     radius_m: NotNegative = 0.0
-    """Of the turntable, from its axis to the body's origin along the world's x at the start."""
+    """Radius of the turntable, from its axis to the body's origin along the world's x at the start."""
 
     fall_at_s: NotNegative = 1.0
     fall_m: Positive = 1.0
@@ -300,11 +301,13 @@ class EmulationConfig(_Table):
 
     provider: str = "sim_devices.register:provider"
     unit: Annotated[int, Field(ge=0)] = 1
-    """Which physical instrument: its sensors' and stacks' own errors. Calibration files belong to one unit."""
+    """Number of the physical instrument, which selects the individual errors of its sensors and stacks.
+
+    Calibration files belong to one unit."""
     seed: Annotated[int, Field(ge=0)] = 1
-    """The hand, and everything that is noise."""
+    """Seed of the hand's motion and of all noise."""
     truth_s: Positive | None = None
-    """How much of the physical truth is kept, at least; None: all of it."""
+    """Duration of the physical truth that is kept at least; ``None`` keeps all of it."""
     hand: HandConfig = HandConfig()
     instrument: InstrumentConfig = InstrumentConfig()
     sensors: SensorConfig = SensorConfig()

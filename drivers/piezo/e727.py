@@ -28,7 +28,7 @@ EPSILON_V = 1e-4  # four decimals are sent
 COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
 """Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
 ERROR_BYTES = len("ERR?\n")
-"""What ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
+"""Bytes that ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
 
 
 class E727:

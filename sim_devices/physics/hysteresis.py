@@ -227,7 +227,7 @@ def width_of(form: str, wide_too: bool = False) -> int:
 
 
 NEED = 0.93
-"""What a form with more columns, or a history, must bring the sum of squares down to."""
+"""Largest ratio of sums of squares at which a form with more columns, or a history, is preferred."""
 BEFORE = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
 """Ways before a record that are tried, in its range."""
 

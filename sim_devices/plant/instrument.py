@@ -158,7 +158,7 @@ class Instrument:
         self._slow[:] = 0.0
 
     def motion(self) -> BodyMotion:
-        """Return the motion of the body at the last time step.
+        """Return the motion of the body at the last step.
 
         The specific force is that at the neutral tip (``InstrumentConfig.tip_mm``)."""
         p, s = self._plant[0], self._state[0]

@@ -37,7 +37,7 @@ class I2cLine:
         self.busy_ns = 0
         self.taken = False
         self.busy_until_ns = 0
-        """For who carries transfers of several masters: whether one is under way, and when its segment ends."""
+        """Bench time in ns at which the current segment ends; ``taken`` is True while a transfer is in progress."""
         self._bit_ns = 1e9 / speed_hz
 
     def attach(self, address: int, face: I2cFace) -> None:
@@ -46,7 +46,7 @@ class I2cLine:
         self.faces[address] = face
 
     def duration_ns(self, ops: Sequence[I2cOp]) -> int:
-        """Bus time of a transfer that nobody refuses."""
+        """Return the bus time in ns of a transfer that every device acknowledges."""
         bits = 1 + sum(10 + 9 * (len(op.data) if isinstance(op, I2cWrite) else op.n) for op in ops)
         return int(bits * self._bit_ns)
 
