@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 from collections.abc import Sequence
+from itertools import takewhile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,6 +19,7 @@ from hal.trust import allow_name
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
+from tools.interrupt import is_stopped
 from tools.output import Outputs, check_writable, write_json, write_text_atomic
 from tools.stamp import revision_and_day
 from tools.terminal import task_name
@@ -47,7 +49,8 @@ def faults(
 
     Each fault strikes in every phase of a run: self-test, learning, steady, hold and ramp.
 
-    Exit status 1 when an output was unsafe, a sample uncounted, a message wrong or an answer not as expected.
+    After Ctrl-C what is done is printed and goes into --json, not into --out. Exit status 1 when an output was unsafe,
+    a sample uncounted, a message wrong or an answer not as expected.
 
     Example: micron faults --seeds 5 --pairs 300 --out docs/reliability.md
     """
@@ -72,7 +75,7 @@ def faults(
             _emulated(file, chosen)
         with Progress(task_name(), BarColumn(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting", total=len(POINTS) * seeds * (len(PHASES) + 1) * len(benches))
-            rows, *others_rows = (
+            campaigns = (
                 run_campaign(
                     file,
                     chosen,
@@ -85,11 +88,13 @@ def faults(
                 )
                 for file, chosen in benches
             )
-            besides = [Beside(f"{f}", text, more) for (f, text), more in zip(others, others_rows, strict=True)]
-            bounds = drift_bounds(path, rows) if out is not None else []
+            rows = next(campaigns)
+            others_rows = [] if is_stopped() else list(takewhile(lambda _: not is_stopped(), campaigns))
+            besides = [Beside(f"{f}", text, more) for (f, text), more in zip(others, others_rows, strict=False)]
+            bounds = drift_bounds(path, rows) if out is not None and not is_stopped() else []
         total = totals(rows)
         outputs = Outputs()
-        if out is not None:
+        if out is not None and not is_stopped():
             asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
             command = f"micron faults --seeds {seeds} --seed {seed} --pairs {pairs}{asked} --out {out}"
             with outputs.part("page"):

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import json
 import re
 import shutil
-import signal
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -20,12 +18,14 @@ from typing import Any
 import numpy as np
 
 from hal.bench import load_bench
+from hal.children import begin_as_worker
 from tools.faults.fault import Fault
 from tools.faults.judge import ENDED_WELL, Observation
 from tools.faults.pairs import draw_pairs
 from tools.faults.phases import LEARNING, PHASES, START, STEADY, Phase, accepted_answers
 from tools.faults.points import POINTS, Point, write_bench
 from tools.faults.trial import observe_running, observe_start
+from tools.interrupt import keep_what_is_there, need_some
 
 NUMBERS = re.compile(r"-?\d+\.\d+")
 DECIDED = ("safe state", "holds", "resumes")
@@ -177,7 +177,8 @@ def run_campaign(
     """Every fault at every point in every phase with every seed, in virtual time, in ``jobs`` processes; after them
     the rows of ``n_pairs`` pairs of faults, which are drawn from the first seed. Deterministic.
 
-    ``keep``: a folder in which what is done is kept; a campaign that was stopped goes on from there. Kept results of
+    After Ctrl-C the rows hold what is there; KeyboardInterrupt if that is nothing. ``keep``: a folder in which what is
+    done is kept; a campaign that was stopped goes on from there. Kept results of
     another ``revision``, bench or choice of faults are not used.
     """
     if has_redundancy(bench):
@@ -204,11 +205,14 @@ def run_campaign(
         trials = [trial for trial in planned if kept.read(trial) is None]
         done = [observations for trial in planned if (observations := kept.read(trial)) is not None]
         found: dict[tuple[str, str], list[Observation]] = {}
-        for observations in chain(done, (kept.write(trial, answer) for trial, answer in _in_parallel(trials, jobs))):
-            first = observations[0]
-            progress(f"{first.point} hand, {first.phase}, seed {first.seed}")
-            for o in observations:
-                found.setdefault((o.fault, o.point), []).append(o)
+        with keep_what_is_there():
+            answers = (kept.write(trial, answer) for trial, answer in _in_parallel(trials, jobs))
+            for observations in chain(done, answers):
+                first = observations[0]
+                progress(f"{first.point} hand, {first.phase}, seed {first.seed}")
+                for o in observations:
+                    found.setdefault((o.fault, o.point), []).append(o)
+        need_some(found)
         return [
             FaultRow(fault, point.name, tuple(sorted(rows, key=lambda o: (o.seed, o.phase))))
             for fault in (*faults, *chain(*pairs))
@@ -279,17 +283,12 @@ def _in_parallel(trials: Sequence[Trial], jobs: int) -> Iterator[tuple[Trial, li
     if jobs <= 1:
         yield from map(_observe, trials)
         return
-    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=_die_with_parent) as pool:
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn"), initializer=begin_as_worker) as pool:
         waiting: set[Future[tuple[Trial, list[Observation]]]] = {pool.submit(_observe, trial) for trial in trials}
         while waiting:
             done, waiting = wait(waiting, return_when=FIRST_COMPLETED)
             for future in done:
                 yield future.result()
-
-
-def _die_with_parent() -> None:
-    """A campaign that is killed leaves no workers behind: they would wait for work for ever."""
-    ctypes.CDLL(None).prctl(1, signal.SIGKILL, 0, 0, 0)  # PR_SET_PDEATHSIG
 
 
 def _spread(times_ms: Sequence[float | None]) -> dict[str, float | None]:
