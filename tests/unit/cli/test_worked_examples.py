@@ -127,6 +127,7 @@ MADE: dict[str, Callable[[], object]] = {
     "read": lambda: shutil.copy(CHIP / "bench.toml", "lab.toml"),
     "soak": pages,
     "tremor report": pages,
+    "trust": lambda: recorded_stack("recordings/from-a-stranger"),
 }
 
 
