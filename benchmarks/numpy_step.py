@@ -266,7 +266,8 @@ class NumpyStep:
         count, n0 = a.count[axis, level], q.prior_blocks[level]
         known = a.power[axis, level] + n0 * q.weighted_power[level] - q.noise_power * count
         power = max(known / (count + n0), q.least_power)
-        matrix = n0 * (power * q.tremor[level] + q.rest)
+        counts = sum((1.0 if other == axis else q.share) * a.count[other, level] for other in range(3))
+        matrix = n0 * (power * q.tremor[level] + q.rest) + (n0 + counts) * q.quiet
         right = n0 * power * q.cross[level]
         for other in range(3):
             rows, seen = a.count[other, level], a.power[other, level]

@@ -384,8 +384,11 @@ static void solve(Adaptive *s, int axis, int l, const Filter *p)
     double(*x)[sizeof(((Filter *)0)->onward) / sizeof(double)] = s->solution;
     double power = (s->power[axis][l] + n0 * p->weighted_power[l] - p->noise_power * count) / (count + n0);
     if (power < p->least_power) power = p->least_power;
+    double all = n0;
+    for (int other = 0; other < 3; other++) all += (other == axis ? 1.0 : p->share) * s->count[other][l];
     for (int i = 0; i < BANK; i++) {
-        for (int j = 0; j <= i; j++) a[i][j] = n0 * (power * p->tremor[l][i][j] + p->rest[i][j]);
+        for (int j = 0; j <= i; j++)
+            a[i][j] = n0 * (power * p->tremor[l][i][j] + p->rest[i][j]) + all * p->quiet[i][j];
         for (int o = 0; o < OUTPUTS; o++) x[o][i] = n0 * power * p->cross[l][o][i];
     }
     for (int other = 0; other < 3; other++) {

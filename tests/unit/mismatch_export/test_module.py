@@ -6,15 +6,20 @@ earlier or later).
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hal import plugins
+from hal.trust import trust_package
 from sim_devices.physics import hysteresis
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
@@ -210,21 +215,25 @@ def test_every_form_of_hysteresis(form: int, before: float | None, wide: float) 
     same(corrected(rec, [replace(place, settings={**settings, "wide": (wide,)})]))
 
 
+LEVER = '''"""A user's twin: nothing of its inside is known."""
+
+import numpy as np
+
+
 class Lever:
-    """A user's twin: nothing of its inside is known."""
-
-    value = "lever_arm:Lever"
-
-    def load(self) -> type:
-        return Lever
-
-    def simulate(self, inputs: dict[str, Array], parameters: dict[str, Any]) -> dict[str, Array]:
-        return {"lift": parameters["offset"] + parameters["arm"] * np.sin(parameters["rad_per_V"] * inputs["drive"])}
+    def simulate(self, inputs, parameters):
+        angle = parameters["rad_per_V"] * inputs["drive"]
+        return {"lift": parameters["offset"] + parameters["arm"] * np.sin(angle)}
+'''
 
 
-def test_a_program_of_the_users_is_wrapped(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_program_of_the_users_is_wrapped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """Effects around it are written out; the program itself is imported, or given as ``base``."""
-    kinds = {"lever": Lever()}
+    (tmp_path / "lever_arm.py").write_text(LEVER)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    trust_package("lever_arm:Lever")
+    kinds = {"lever": EntryPoint("lever", "lever_arm:Lever", plugins.TWINS)}
     monkeypatch.setattr("tools.mismatch.twins.core.user_kinds", lambda: kinds)
     monkeypatch.setattr("tools.mismatch.export.module.user_kinds", lambda: kinds)
     given = {"arm": 3.0, "rad_per_V": 0.4, "offset": 0.1}
@@ -234,7 +243,7 @@ def test_a_program_of_the_users_is_wrapped(monkeypatch: pytest.MonkeyPatch) -> N
     assert "from lever_arm import Lever" in text
     space: dict[str, Any] = {}
     exec(compile(text, "twin.py", "exec"), space)
-    found = space["simulate"](dict(rec.signals), base=Lever().simulate)["lift"]
+    found = space["simulate"](dict(rec.signals), base=importlib.import_module("lever_arm").Lever().simulate)["lift"]
     wanted = whole_run(rec, twin.model, twin.theta)["lift"]
     np.testing.assert_allclose(found, wanted, rtol=0, atol=1e-9)
 
