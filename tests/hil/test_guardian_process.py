@@ -184,7 +184,7 @@ def guardians_of(run: Run) -> list[int]:
     return children_of(run.process.pid, b"guardian.process")
 
 
-@pytest.mark.parametrize("blow", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("blow", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_a_guardian_that_is_lost_is_replaced_and_the_new_one_guards(run: Run, blow: signal.Signals) -> None:
     """The run holds and resumes; then the firmware is killed as well, and the new guardian takes the outputs."""
     run.wait_until_moving(0.1)
@@ -201,6 +201,7 @@ def test_a_guardian_that_is_lost_is_replaced_and_the_new_one_guards(run: Run, bl
     kill_and_wait_for_neutral(run)
 
 
+@pytest.mark.slow
 def test_the_result_tells_of_the_lost_guardian(run: Run, tmp_path: Path) -> None:
     run.wait_until_moving(0.1)
     os.kill(guardians_of(run)[0], signal.SIGKILL)
@@ -237,6 +238,7 @@ def test_a_bus_that_hangs_for_more_than_half_a_second_is_opened_anew_and_brought
         np.testing.assert_allclose(truth["amplifier_V"][-1], NEUTRAL_V, atol=0.01)
 
 
+@pytest.mark.slow  # 16 s: it waits until nobody can answer any more
 def test_a_world_that_is_killed_before_an_interrupt_leaves_an_outcome_that_says_so(run: Run) -> None:
     """Interrupts end the tries of ten seconds, and whatever part of its end the run is in, it leaves an outcome."""
     run.wait_until_moving(0.1)
