@@ -1,5 +1,6 @@
 """Options of the hardware tests: which bench, and how much they may disturb it."""
 
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -50,6 +51,18 @@ def state_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_STATE_HOME", str(folder))
         yield folder
+
+
+@pytest.fixture(autouse=True)
+def signal_handlers() -> Iterator[None]:
+    """Put the handlers of SIGINT and SIGTERM back after each test: processes that later ones start inherit a signal
+    that is ignored, and could not be ended."""
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.getsignal(number) for number in numbers]
+    yield
+    for number, handler in zip(numbers, before, strict=True):
+        if handler is not None:  # one that Python did not install cannot be put back
+            signal.signal(number, handler)
 
 
 @pytest.fixture(scope="session")

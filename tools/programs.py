@@ -1,4 +1,4 @@
-"""Which programs and which outside files a folder, a recording, a twin file or a bench names. Nothing of them runs."""
+"""Find the programs and outside files that a folder, recording, twin file or bench names. None of them is run."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Program:
 
     @property
     def is_trusted(self) -> bool:
-        """Whether it may run already."""
+        """True when the user has let it run already."""
         if self.file is None:
             return is_trusted_package(self.target)
         return is_ours(self.file) or is_decided("run", digest_of(self.file.read_bytes()))
@@ -56,7 +56,7 @@ class OutsideFile:
 
     @property
     def is_trusted(self) -> bool:
-        """Whether it may be named already."""
+        """True when the user has let it be named already."""
         return is_ours(self.file) or is_decided("name", str(self.file))
 
     def trust(self) -> None:

@@ -15,19 +15,19 @@ from hal.errors import SafetyTrip
 from hal.types import OutputLimit
 
 GIVE_BACK_NS = 200_000_000
-"""So long the guardian may take to give the outputs back at neutral, of which it watches over them for 50 ms."""
+"""Time limit for the guardian to give the outputs back at neutral; it watches over them for 50 ms of it."""
 FRESH_NS = 10_000_000
 """A sign of life of the guardian, which gives one every millisecond, counts for so long."""
 STEP_S = 0.001
 BACK_NS = 60_000_000
-"""So long the guardian may take for its ramp after the bus has come back: its next try comes up to 10 ms later, over a
-bus on which others wait as well."""
+"""Time limit for the guardian's ramp after the bus has come back. Its next try comes up to 10 ms later, over a bus on
+which others wait as well."""
 LOOK_NS = 4_000_000
-"""Between two looks at the outputs, at the end of the guardian's time: outputs that move are its ramp."""
+"""Time between two looks at the outputs at the end of the guardian's time. Outputs that move are its ramp."""
 SLOW_NS = 5_000_000
 """A read-back that takes longer had to wait for the bus."""
 PATIENCE_NS = 22_000_000
-"""So long the guardian may take for its ramp before the firmware ends it and ramps itself."""
+"""Time limit for the guardian's ramp; after it the firmware ends the guardian and ramps itself."""
 
 
 class GuardedAmplifier:

@@ -108,7 +108,7 @@ class GuardianCare:
         return not self._lost and self._keeper.is_alive()
 
     def describe(self) -> dict[str, object]:
-        """What the run's result says of the guardian, as JSON values."""
+        """Return the entry of the guardian in the result of a run, as JSON values."""
         watching = self._is_watching() if self._was_watching is None else self._was_watching
         return {"watching": watching, "replaced": self.replaced}
 

@@ -1,4 +1,4 @@
-"""What the guardian does, one step a millisecond: watch the heartbeat, and when it is gone ramp to neutral.
+"""The guardian watches the heartbeat, one step a millisecond, and ramps the outputs to neutral when it is gone.
 
 Before it moves anything it makes sure that the firmware does not (``gate.py`` has the firmware's half): either no
 command is going out, or the one that was going out has arrived, or the firmware's process is dead.
@@ -17,11 +17,11 @@ from hal.errors import HalError, I2cNack
 
 STEP_NS = 1_000_000
 HOLD_NS = 50_000_000
-"""A command that the firmware had under way may still arrive after the ramp: so long it is looked for and undone."""
+"""Time after the ramp in which a command that the firmware had under way is looked for and undone."""
 RETRY_S = 10.0
-"""How long the ramp is tried again while the bus or the amplifier does not answer."""
+"""Time for which the ramp is retried while the bus or the amplifier does not answer."""
 EAGER_NS = 40_000_000
-"""So long every step tries again what failed; after that the pauses double, up to ``LONGEST_PAUSE_NS``."""
+"""Time for which every step retries what failed; after it the pauses double, up to ``LONGEST_PAUSE_NS``."""
 LONGEST_PAUSE_NS = 10_000_000
 CLAIM_NS = 5_000_000
 """A command that has been going out for so long will not arrive by itself: its process is ended."""
@@ -67,7 +67,7 @@ class Guardian:
         self.problem = ""
         self.ended = False
         self.exclusive = True
-        """Whether no command of the firmware can have come after the outputs were taken."""
+        """True when no command of the firmware can have come after the outputs were taken."""
         self._last: dict[str, Any] | None = None
         self._end = end
         self._heart = heart
@@ -96,8 +96,8 @@ class Guardian:
         self.state = State.DONE
 
     def report(self) -> dict[str, Any]:
-        """What happened, JSON values; times on the bench clock in ns, ``None``: did not happen. Of several times that
-        the outputs were taken, the last one."""
+        """Return what happened, as JSON values. Times are those of the bench clock in ns; ``None``: it did not happen.
+        Where the outputs were taken several times, the report is of the last one."""
         taking = self._taking() if self._heart.taken_ns or self._last is None else self._last
         return {
             "format": 1,

@@ -16,7 +16,7 @@ _SOMEBODY, _REPEATS = 1 << 48, 1 << 49
 
 
 class Phase(IntEnum):
-    """What the firmware says of the outputs: at rest, being armed (only a death counts), moving with every beat, or
+    """The firmware's word about the outputs: at rest, being armed (only a death counts), moving with every beat, or
     not its own any more."""
 
     IDLE = 0

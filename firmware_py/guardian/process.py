@@ -35,7 +35,7 @@ from hal.errors import HalError, OpenFailed
 PRIORITY = 85  # above the loop: it does almost nothing, but must do it while the loop is stuck
 START_S = 30.0
 END_S = 5.0
-"""How much longer than its tries the guardian may take to end."""
+"""Time that the guardian may take to end beyond its retries."""
 END_POLL_S = 0.002
 REPORT = "guardian.json"
 STARTED = "guardian.started"

@@ -1,4 +1,4 @@
-"""Which bench gets a guardian, and how: a process in real time, callbacks of the clock in virtual time."""
+"""Start the guardian of a bench: a process in real time, callbacks of the clock in virtual time."""
 
 from __future__ import annotations
 

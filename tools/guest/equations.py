@@ -24,7 +24,7 @@ _ONE = {
 }  # fmt: skip
 _TWO = {"min": MIN, "max": MAX, "atan2": ATAN2, "arctan2": ATAN2, "minimum": MIN, "maximum": MAX, "pow": POW}
 FUNCTIONS = (*_ONE, *_TWO, "where", "clip")
-"""What an equation may call."""
+"""Functions that an equation may call."""
 MOST_OPERATIONS = 2000
 
 

@@ -37,7 +37,7 @@ class GuestDied(InputError):
 
 @dataclass(frozen=True)
 class Limits:
-    """What a guest may use. ``seconds`` is per request, ``seconds_per_sample`` is added for each sample of a run."""
+    """The limits of a guest. ``seconds`` is per request, ``seconds_per_sample`` is added for each sample of a run."""
 
     memory_bytes: int = 2 << 30
     seconds: float = 60.0

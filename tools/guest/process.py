@@ -49,7 +49,7 @@ def loaded_module(path: str, source: str) -> types.ModuleType:
 
 
 class Guest:
-    """What the host has opened: one program per process."""
+    """The program that the host has opened; there is one per process."""
 
     def __init__(self) -> None:
         self._run: Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]] | None = None
