@@ -92,7 +92,7 @@ class FaultRow:
 
     @property
     def known_by(self) -> str:
-        """What said so first, in the words most often used (numbers left out); empty: nothing."""
+        """Return what said so first, in the words most often used (numbers left out); empty: nothing."""
         said = [NUMBERS.sub("#", o.known_by) for o in self.observations if o.known_by]
         return max(sorted(set(said)), key=said.count) if said else ""
 
@@ -270,7 +270,7 @@ class _Kept:
 
 
 def has_redundancy(bench: Path) -> bool:
-    """Whether the instrument of ``bench`` has more than six accelerometer axes."""
+    """Return whether the instrument of ``bench`` has more than six accelerometer axes."""
     devices = load_bench(bench).description.devices_with("adxl203").values()
     return sum(len(device.options().get("channels", ())) for device in devices) > 6
 

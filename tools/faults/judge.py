@@ -72,7 +72,7 @@ class Observation:
 
     @property
     def answer(self) -> str:
-        """What the instrument did."""
+        """Return what the instrument did."""
         if self.refused:
             return "refused"
         if self.tripped_ms is not None:
@@ -88,7 +88,7 @@ class Observation:
 
     @property
     def known_by(self) -> str:
-        """What was said first."""
+        """Return what was said first."""
         decided = [t for t in (self.tripped_ms, self.held_ms) if t is not None]
         if self.noticed_ms is not None and (not decided or self.noticed_ms < min(decided)):
             return self.noticed

@@ -66,7 +66,7 @@ class LongRun:
         return max((abs(p - middle) / middle for p in part), default=0.0)
 
     def problems(self) -> list[str]:
-        """What a run must not show, in words."""
+        """Return what a run must not show, in words."""
         found: list[str] = []
         if self.growth_MB > GROWTH_MB:
             found.append(f"memory grew by {self.growth_MB:.1f} MB")

@@ -182,7 +182,7 @@ def run_on_dask(jobs: Sequence[Job], address: str, work: Work = diagnose_one) ->
 
 
 def to_json(folder: Path, rows: Sequence[Row]) -> dict[str, Any]:
-    """What ``diagnose FOLDER --json`` writes."""
+    """Return what ``diagnose FOLDER --json`` writes."""
     return {
         "format": 1,
         "folder": str(folder),

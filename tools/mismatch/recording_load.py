@@ -291,7 +291,7 @@ def _unit(at: str, value: object, allowed: tuple[str, ...], signal: str, notes: 
 
 
 def _together(where: str, kind: str, channels: list[_Channel]) -> None:
-    """What one channel demands of the others."""
+    """Return what one channel demands of the others."""
     inputs = {c.signal for c in channels if c.role == "input"}
     outputs = {c.signal: c for c in channels if c.role == "output"}
     if kind in ("accelerometer", "magnetometer"):

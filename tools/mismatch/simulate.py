@@ -90,7 +90,7 @@ class Model:
         return len(self.twin.parameters)
 
     def slices(self, k: int) -> tuple[slice, slice]:
-        """Where the nonlinear parameters and the weights of placed effect ``k`` sit in theta."""
+        """Return where the nonlinear parameters and the weights of placed effect ``k`` sit in theta."""
         return self._slices[k]
 
     def together(self, outputs: Sequence[str]) -> tuple[str, ...]:
@@ -220,7 +220,7 @@ class Model:
 
     @cached_property
     def key(self) -> tuple[object, ...]:
-        """What tells this model from another of the same twin."""
+        """Return what tells this model from another of the same twin."""
         return tuple((*p.effect.form, p.site, p.target, p.outputs, _frozen(p.settings)) for p in self.placed)
 
     @cached_property
@@ -342,7 +342,7 @@ class Model:
         return x.plus({b.start + i: columns[:, i] for i in range(columns.shape[1])}, key)
 
     def _find_linear(self) -> set[int]:
-        """Which parameters stay linear, found by one pass over a short made-up stretch."""
+        """Return which parameters stay linear, found by one pass over a short made-up stretch."""
         n = 64
         t = np.asarray(np.arange(n) * 1e-2, np.float64)
         wave: Array = np.sin(2 * np.pi * t / t[-1])
@@ -366,7 +366,7 @@ class Model:
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
-    """What an effect sees on this run."""
+    """Return what an effect sees on this run."""
     return Context(
         run.t,
         run.dt,

@@ -140,7 +140,7 @@ def _symbol(symbol: str, text: str) -> tuple[Dimension, float, float]:
 
 
 def same_dimension(a: str, b: str) -> bool:
-    """Whether values in ``a`` can be converted to ``b``."""
+    """Return whether values in ``a`` can be converted to ``b``."""
     return parse(a).dimension == parse(b).dimension
 
 

@@ -128,7 +128,7 @@ def table_7_3() -> list[Row]:
 
 
 def other_choices() -> list[str]:
-    """What the tables would say had the choices fallen otherwise: preview, taps, zero."""
+    """Return what the tables would say had the choices fallen otherwise: preview, taps, zero."""
     from tools.reproduce.actuation_hand import tremor_paths
 
     sets: dict[str, list[np.ndarray]] = {

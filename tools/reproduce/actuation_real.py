@@ -20,7 +20,7 @@ def _rms(e: NDArray[np.float64]) -> float:
 
 
 def real_stack() -> list[Row]:
-    """What the model cannot predict is what its inverse would leave; the stage cannot be driven from here."""
+    """Return what the model cannot predict is what its inverse would leave; the stage cannot be driven from here."""
     folder = data_folder() / "piezo_micromanipulator_dbo"
     if not (folder / "train.toml").is_file():
         return []

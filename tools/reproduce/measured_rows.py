@@ -52,7 +52,7 @@ class Scored:
 
     @property
     def verdict(self) -> str:
-        """What the engine said of the fit part, or that it failed."""
+        """Return what the engine said of the fit part, or that it failed."""
         return "error" if self.error else str(self.report.get("verdict", "error"))
 
 
@@ -82,7 +82,7 @@ def rows_of(done: Scored) -> list[Row]:
 
 
 def explained(done: Scored) -> str:
-    """What is left on the test, by the engine's own analysis."""
+    """Return what is left on the test, by the engine's own analysis."""
     if not done.left:
         return "what is left on the test follows nothing that was recorded"
     return "what is left on the test follows " + ", ".join(f"{a} ({b}: {100 * c:.0f} %)" for a, b, c in done.left)

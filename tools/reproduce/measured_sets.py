@@ -30,7 +30,7 @@ class Goal:
     relative_to_given: bool = False
 
     def names_meet(self, names: list[str]) -> bool:
-        """Whether these are the right names: one of each group that is needed, and none that is not allowed."""
+        """Return whether these are the right names: one of each group that is needed, and none that is not allowed."""
         found = set(names)
         everything = {n for group in self.needed for n in group} | set(self.allowed)
         return all(found & set(group) for group in self.needed) and (not self.needed or found <= everything)

@@ -9,7 +9,7 @@ from typing import Any
 
 
 def data_folder() -> Path:
-    """Where the public recordings are."""
+    """Return where the public recordings are."""
     given = os.environ.get("MICRON_DATA")
     return Path(given) if given else Path(__file__).resolve().parents[3] / "shared" / "data"
 

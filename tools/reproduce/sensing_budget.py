@@ -90,7 +90,7 @@ def variant(on: set[str]) -> EmulationConfig:
 
 
 def calibrated_config(config: EmulationConfig) -> SensingConfig:
-    """What the firmware knows after a tumble of this unit."""
+    """Return what the firmware knows after a tumble of this unit."""
     places = tuple(tuple(v * 1e-3 for v in p) for p in config.instrument.positions_mm)
     table = identify(measure_tumble(config, 100, 5.0)[0]).table
     return SensingConfig.model_validate(

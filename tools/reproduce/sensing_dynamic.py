@@ -251,7 +251,7 @@ WHY_HEADING = (
 
 
 def _why_tilt(result: SceneResult, late: slice) -> str:
-    """How much of the tilt stands still; noise alone has a row of its own."""
+    """Return how much of the tilt stands still; noise alone has a row of its own."""
     estimate = Rotation.from_quat(np.roll(result["quaternion"][late], -1, axis=1))
     true = Rotation.from_quat(np.roll(result["true_quaternion"][late], -1, axis=1))
     lean = (estimate * true.inv()).as_rotvec(degrees=True)[:, :2]

@@ -72,7 +72,7 @@ def placement_tables() -> list[Row]:
 
 
 def _row_sums(placement: Placement, dt_s: float) -> np.ndarray:
-    """What the printed figures are: (2.52)'s row sums with a variance of 1 mm^2/s^4 (ERRATA 19), deg/s."""
+    """Return what the printed figures are: (2.52)'s row sums with a variance of 1 mm^2/s^4 (ERRATA 19), deg/s."""
     return np.sqrt(np.abs(rate_covariance_linear(placement, 1e-3, dt_s).sum(axis=1))) * DEG
 
 

@@ -179,7 +179,7 @@ def _tasks() -> list[Row]:
 
 
 def table() -> Table:
-    """What ``micron reproduce tremor`` prints."""
+    """Return what ``micron reproduce tremor`` prints."""
     notes = ["residual and reduction: rms over all axes from 5 s on; the first 5 s are adaptation"]
     if not DATA.is_dir():
         notes.append(f"{DATA} is not there: rows on recorded hands are left out")

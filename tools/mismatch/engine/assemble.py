@@ -46,7 +46,7 @@ Array = NDArray[np.float64]
 
 
 def base_shifts(raw: Fit, base: Fit, fitted: Fit, cov: Array) -> list[BaseShift]:
-    """How far the missing effects had pulled the base parameters."""
+    """Return how far the missing effects had pulled the base parameters."""
     shifts: list[BaseShift] = []
     for i in range(base.model.n_base):
         p = base.model.parameters[i]

@@ -31,7 +31,7 @@ def constant_channels(signals: Mapping[str, Array]) -> list[str]:
 
 
 def clipped_samples(y: Array) -> tuple[int, int]:
-    """How many samples sit in runs of three or more at the exact lowest and highest value."""
+    """Return how many samples sit in runs of three or more at the exact lowest and highest value."""
 
     def runs(level: float) -> int:
         at = np.concatenate(([0], (y == level).astype(int), [0]))
@@ -78,7 +78,7 @@ def messages(
     drives: Mapping[str, str],
     dt: float,
 ) -> list[str]:
-    """What a bench engineer should look at before blaming physics. ``simulated``: the twin as given (n,)."""
+    """Return what a bench engineer should look at before blaming physics. ``simulated``: the twin as given (n,)."""
     out: list[str] = []
     for s in constant_channels({**inputs, **outputs, **context}):
         out.append(f"{s} never changes: is it connected?")

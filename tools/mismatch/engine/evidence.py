@@ -36,7 +36,7 @@ class Doubt:
 
 
 def holds_zero(p: ParameterValue) -> bool:
-    """Whether the 95 % interval contains zero (an interval that is not finite does)."""
+    """Return whether the 95 % interval contains zero (an interval that is not finite does)."""
     lo, hi = p.ci95
     return not (np.isfinite(lo) and np.isfinite(hi)) or lo <= 0.0 <= hi
 

@@ -38,12 +38,12 @@ def own_form(names: Iterable[str]) -> float:
 
 
 def key_of(p: Placed) -> tuple[str, ...]:
-    """What tells one candidate from another."""
+    """Return what tells one candidate from another."""
     return (*p.effect.form, p.site, p.target)
 
 
 def in_disguise(trial: Trial) -> bool:
-    """Whether a report figure of the fitted effect is beyond what its physics can be."""
+    """Return whether a report figure of the fitted effect is beyond what its physics can be."""
     return trial.fitted is not None and beyond_limits(trial.fitted, trial.placed)
 
 
@@ -52,12 +52,12 @@ FLEXIBLE = ("hysteresis", "rate_dependent_hysteresis", "creep")
 
 
 def possible(fitted: Fit) -> bool:
-    """Whether a model came out and every effect of it has figures that its physics can have."""
+    """Return whether a model came out and every effect of it has figures that its physics can have."""
     return fitted.ok and not any(beyond_limits(fitted, p) for p in fitted.model.placed)
 
 
 def definite(candidate: Candidate) -> bool:
-    """Whether an effect says something by few numbers, or by events of which its own test is sure."""
+    """Return whether an effect says something by few numbers, or by events of which its own test is sure."""
     sure = candidate.placed.effect.name in EXACT and candidate.tested and candidate.p_value < CLEAR_P
     return sure or freedom(candidate.placed) <= SPECIFIC
 

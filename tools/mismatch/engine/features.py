@@ -97,7 +97,7 @@ def standard(x: Array) -> Array:
 
 
 def alike(a: Array, b: Array) -> bool:
-    """Whether two standardised signals (n,) are one but for a trifle (correlation beyond 0.99)."""
+    """Return whether two standardised signals (n,) are one but for a trifle (correlation beyond 0.99)."""
     return abs(float(np.mean(a * b))) > 0.99
 
 

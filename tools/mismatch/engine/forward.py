@@ -248,5 +248,5 @@ def candidates(good: Sequence[Trial]) -> list[Trial]:
 
 
 def _left(rival: Trial, best: Trial) -> float:
-    """What a rival leaves on the outputs that both serve."""
+    """Return what a rival leaves on the outputs that both serve."""
     return sum(rival.misfits[o] for o in best.placed.outputs if o in rival.placed.outputs)

@@ -36,7 +36,7 @@ def said_hold(recording: Recording) -> str:
 
 
 def holdable(problem: Problem) -> bool:
-    """Whether the twin's answer depends on what its inputs do between the samples."""
+    """Return whether the twin's answer depends on what its inputs do between the samples."""
     return getattr(problem.twin, "hold", "") == "linear" and not said_hold(problem.recording)
 
 
@@ -55,7 +55,7 @@ def as_held(problem: Problem) -> Problem:
 
 
 def infer_hold(problem: Problem, base: Fit) -> Hold:
-    """Which hold the data show. ``base``: the twin with its parameters re-fitted, inputs linear.
+    """Return which hold the data show. ``base``: the twin with its parameters re-fitted, inputs linear.
 
     Parameters that were fitted with the wrong hold have bent to it. Where the share lies nearer to held, it is
     estimated once more from parameters that were fitted with held inputs, and that estimate counts.

@@ -39,7 +39,7 @@ def thinned(problem: Problem, fitted: Fit, output: str, limit: int = 40000) -> t
 
 
 def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence], float]:
-    """What the residual of one output follows, strongest first, and the p-value that history adds nothing.
+    """Return what the residual of one output follows, strongest first, and the p-value that history adds nothing.
 
     Both its mean and its size are looked at: bursts have no mean that follows, but a size that does.
     """
@@ -60,7 +60,7 @@ def follow(problem: Problem, fitted: Fit, output: str) -> tuple[list[Dependence]
 
 
 def follow_size(problem: Problem, fitted: Fit, output: str) -> list[Dependence]:
-    """What the size of the residual follows (its logarithm, floored at the noise), strongest first."""
+    """Return what the size of the residual follows (its logarithm, floored at the noise), strongest first."""
     e, signals, dt = thinned(problem, fitted, output)
     size = np.log(e**2 + (0.5 * problem.sigma(output)) ** 2)
     features = [f for f in features_of(signals, dt, pairs=False) if f.kind in ("value", "rate", "amplitude")]
@@ -142,7 +142,7 @@ def windows(
 
 
 def excess_share(e: Array, noise_rms: float) -> float:
-    """How far a residual stands above its noise: mean square over noise variance."""
+    """Return how far a residual stands above its noise: mean square over noise variance."""
     return float(np.mean(e**2) / noise_rms**2) if noise_rms > 0 else np.inf
 
 

@@ -64,7 +64,7 @@ def one_way(problem: Problem, fitted: Fit, shifts: list[BaseShift]) -> OneWay | 
 
 
 def _offset(problem: Problem, shifts: list[BaseShift]) -> ParameterValue | None:
-    """How far the re-fitted offset of the force is from the one given, in the unit of the force."""
+    """Return how far the re-fitted offset of the force is from the one given, in the unit of the force."""
     by_name = {b.name: b for b in shifts}
     if "offset_per_mass" not in by_name or "inverse_mass" not in by_name:
         return None

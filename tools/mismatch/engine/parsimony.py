@@ -134,7 +134,7 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
 
 
 def freedom(placed: Placed) -> float:
-    """How many numbers an effect brings, those of a family counted as no more than ``FREEDOM``."""
+    """Return how many numbers an effect brings, those of a family counted as no more than ``FREEDOM``."""
     return min(size(placed), FREEDOM.get(placed.effect.name, np.inf))
 
 

@@ -58,7 +58,7 @@ class Projected:
 
     @property
     def usual_count(self) -> float:
-        """How many squares the cost sums."""
+        """Return how many squares the cost sums."""
         return float(sum(u.sum() for u in self.usual.values()))
 
     def reweight(self, residual: dict[str, Array]) -> None:

@@ -34,7 +34,7 @@ def not_tried(twin: Twin) -> str:
 
 
 def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[str, float]) -> bool:
-    """Whether the named effects leave much that may sit where this kind of twin lets nothing be tried."""
+    """Return whether the named effects leave much that may sit where this kind of twin lets nothing be tried."""
     return bool(not_tried(twin)) and any(
         p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics
     )

@@ -36,7 +36,7 @@ OVER_ALL = ("thermal_drift", "random_walk", "step_shift", "clock_skew", "dropped
 
 
 def is_long(recording: Recording, twin: Twin) -> bool:
-    """Whether a search on the whole record takes minutes."""
+    """Return whether a search on the whole record takes minutes."""
     modes = hasattr(twin, "fastest_per_s")
     return recording.n * (len(recording.outputs) if modes else 1) > LONG
 

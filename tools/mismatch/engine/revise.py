@@ -172,7 +172,7 @@ def simplify_pass(
 
 
 def beyond_limits(fitted: Fit, placed: Placed) -> bool:
-    """Whether a report figure of a fitted effect is beyond what its physics can be."""
+    """Return whether a report figure of a fitted effect is beyond what its physics can be."""
     limits, forbidden = placed.effect.limits, placed.effect.forbidden
     if not limits and not forbidden:
         return False
@@ -182,7 +182,7 @@ def beyond_limits(fitted: Fit, placed: Placed) -> bool:
 
 
 def size(placed: Placed) -> int:
-    """How many numbers an effect brings, events read off the data included."""
+    """Return how many numbers an effect brings, events read off the data included."""
     parts = placed.parts
     events = sum(len(placed.settings.get(key, ())) for key in ("at", "shift", "times_s", "starts"))
     return len(parts.nonlinear) + len(parts.weights) + events

@@ -47,7 +47,7 @@ def places(problem: Problem, effects: Iterable[Effect], present: tuple[Placed, .
 
 
 def _same_place(present: Placed, place: Placed) -> bool:
-    """Whether two places move the same outputs, but for forces and flows at different states."""
+    """Return whether two places move the same outputs, but for forces and flows at different states."""
     if present.site == place.site == "feedback":
         return bool(set(present.target.split("+")) & set(place.target.split("+")))
     return bool(set(present.outputs) & set(place.outputs))

@@ -98,7 +98,7 @@ def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, t
 
 
 def freedom(candidate: Candidate) -> int:
-    """How many parameters an effect brings."""
+    """Return how many parameters an effect brings."""
     parts = candidate.placed.parts
     return len(parts.nonlinear) + len(parts.weights)
 
@@ -115,7 +115,7 @@ def vouched(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 
 def hopeful(candidates: Sequence[Candidate], least: int = LEAST_FITS, most: int = MOST_FITS) -> list[bool]:
-    """Which candidates deserve a fit: per output the best by their one-step share, specific effects, flexible
+    """Return which candidates deserve a fit: per output the best by their one-step share, specific effects, flexible
     families (one step flatters these) and events or noise with a test of their own ranked apart (of each ``least``,
     and up to ``most`` that are near the best), and whatever is clear by that test. Forms of one effect take one rank.
     """

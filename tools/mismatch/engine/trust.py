@@ -72,7 +72,7 @@ def fit_loss(problem: Problem, residual: Mapping[str, Array]) -> float:
 
 
 def broken(problem: Problem, given: Mapping[str, Array], theta: Array, residual: Mapping[str, Array]) -> str:
-    """Which of the things that every accepted fit must hold is broken ("" if none), as one sentence.
+    """Return which of the things that every accepted fit must hold is broken ("" if none), as one sentence.
 
     ``given``: the residual of the twin as given. A fit is finite, its simulation stays within reach of the recording,
     and it is no worse on the fitted samples than the twin as given.

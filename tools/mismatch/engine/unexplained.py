@@ -99,7 +99,7 @@ def about(effect: Effect) -> tuple[str, ...]:
 
 
 def context_features(problem: Problem, before: Fit, output: str, names: Iterable[str]) -> tuple[list[Feature], Array]:
-    """What a context signal may do that no effect is about: an offset by a curve of it, and that curve times the
+    """Return what a context signal may do that no effect is about: an offset by a curve of it, and that curve times the
     drive, the plant's motion, or the rate of either. And what these do on their own (n, k): such products hold it too.
     """
     _, signals, dt = thinned(problem, before, output)

@@ -123,7 +123,7 @@ NOT_HELD = 4.0
 
 
 def fit_trouble(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> tuple[str, ...]:
-    """What went wrong in the fit, in words, worst first; empty when the fit holds."""
+    """Return what went wrong in the fit, in words, worst first; empty when the fit holds."""
     out: list[str] = []
     given, alone, final = held_rms(problem, raw), held_rms(problem, base), held_rms(problem, fitted)
     seen = fit_rms(problem, fitted)
@@ -146,13 +146,13 @@ def fit_trouble(problem: Problem, raw: Fit, base: Fit, fitted: Fit) -> tuple[str
 
 
 def at_end(p: Free, value: float) -> bool:
-    """Whether a base parameter sits at a finite end of its range that zero does not explain."""
+    """Return whether a base parameter sits at a finite end of its range that zero does not explain."""
     ends = [b for b in (p.lo, p.hi) if np.isfinite(b) and b != 0.0]
     return any(abs(value - b) <= 1e-6 * max(abs(b), abs(p.scale)) for b in ends)
 
 
 def meaning_of(problem: Problem, left: dict[str, Leftover], trouble: Sequence[str]) -> Meaning:
-    """What an ``unexplained`` means whose residual stands above the noise wherever in its interval that lies."""
+    """Return what an ``unexplained`` means whose residual stands above the noise wherever in its interval that lies."""
     if trouble:
         return "fit_failed"
     twin = problem.twin

@@ -137,7 +137,7 @@ class _Module:
         self._through("output")
 
     def _moved(self, signal: str) -> bool:
-        """Whether lines of the base physics name this input."""
+        """Return whether lines of the base physics name this input."""
         return self.twin.kind != "accelerometer_cluster" or not signal.startswith("angular_rate")
 
     def _static(self) -> None:

@@ -158,7 +158,7 @@ def start_state(run: Any, linear: Any, twin: Corrected, order: int) -> Array:
 
 
 def _said(report: Mapping[str, Any]) -> list[str]:
-    """What the report says of each effect, under its own names and units."""
+    """Return what the report says of each effect, under its own names and units."""
     lines: list[str] = []
     for p in report.get("physics", []):
         values = [

@@ -71,7 +71,7 @@ seed = {unit}
 
 
 def fmu_possible() -> bool:
-    """Whether an FMU can be made and run here: the extra ``fmu``."""
+    """Return whether an FMU can be made and run here: the extra ``fmu``."""
     return all(importlib.util.find_spec(name) is not None for name in ("fmpy", "pythonfmu"))
 
 

@@ -170,7 +170,7 @@ def nulls(
 
 
 def kept(file: Path) -> NullResult:
-    """What a run has kept in its rows file so far, finished or not. ValueError when it is no such file."""
+    """Return what a run has kept in its rows file so far, finished or not. ValueError when it is no such file."""
     try:
         body = json.loads(file.read_text())
         rows = sorted(body["rows"], key=lambda r: r["index"])

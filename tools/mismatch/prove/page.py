@@ -34,7 +34,7 @@ def _share(got: int, of: int) -> str:
 
 
 def _count(p: Mapping[str, Any]) -> str:
-    """How many cases, and of how many when the run was stopped before its end."""
+    """Return how many cases, and of how many when the run was stopped before its end."""
     n = len(p["cases"])
     skipped = p.get("left_out", [])
     without = f" without {', '.join(skipped)}" if skipped else ""

@@ -42,7 +42,7 @@ class ProofResult:
     max_samples: int = MOST_SAMPLES
 
     def to_json(self) -> dict[str, Any]:
-        """What `micron mismatch prove --json` writes."""
+        """Return what `micron mismatch prove --json` writes."""
         return {
             "format": 1,
             "seed": self.seed,

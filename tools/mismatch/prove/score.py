@@ -88,7 +88,7 @@ def fit_figures(
 
 
 def coverage(report: Mapping[str, Any], answer: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Which figures of the answer were reported, and whether their 95 % interval holds the true value."""
+    """Return which figures of the answer were reported, and whether their 95 % interval holds the true value."""
     rows: list[dict[str, Any]] = []
     for truth in answer["effects"]:
         said = [p for p in report.get("physics") or [] if p.get("name") == truth["name"]]

@@ -15,7 +15,7 @@ from tools.mismatch.prove.draw import Case
 
 
 def answer(case: Case) -> dict[str, Any]:
-    """What is known of a case, as plain JSON."""
+    """Return what is known of a case, as plain JSON."""
     return {
         "kind": case.plan.kind,
         "twin": case.plan.twin,

@@ -43,7 +43,7 @@ def _low(text: str) -> str:
 
 
 def mathtext(tex: str) -> str:
-    """What matplotlib's mathtext reads: it knows ``\\geq`` but not ``\\ge``."""
+    """Return what matplotlib's mathtext reads: it knows ``\\geq`` but not ``\\ge``."""
     for short, long in (("ge", "geq"), ("le", "leq"), ("ne", "neq")):
         tex = re.sub(rf"\\{short}(?![A-Za-z])", rf"\\{long}", tex)
     return f"${tex}$"

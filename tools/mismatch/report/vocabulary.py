@@ -91,7 +91,7 @@ def _parameters(effect: Effect) -> tuple[tuple[str, str], ...]:
 
 
 def to_json(found: Sequence[Entry]) -> dict[str, Any]:
-    """What ``micron mismatch physics --json`` writes."""
+    """Return what ``micron mismatch physics --json`` writes."""
     return {
         "format": 1,
         "units": UNITS,

@@ -123,7 +123,7 @@ def windows(location: Location, most: int = 6) -> str:
 
 
 def follows(location: Location) -> str:
-    """What the residual follows, by signal, e.g. 'load (value 49 %, recent history 22 %)'."""
+    """Return what the residual follows, by signal, e.g. 'load (value 49 %, recent history 22 %)'."""
     by: dict[str, list[str]] = {}
     for d in location.depends_on:
         by.setdefault(d.signal, []).append(f"{d.feature} {percent(d.strength)}")
@@ -179,7 +179,7 @@ def floor_of(fit: FitSummary, output: str, factor: float) -> str:
 
 
 def one_way(found: OneWay) -> str:
-    """What a load that moved one way only leaves open, and the reversal that would tell."""
+    """Return what a load that moved one way only leaves open, and the reversal that would tell."""
     way = "forwards" if found.direction > 0 else "backwards"
     said = f"{found.output} only ever moved {way}: dry friction would show as an offset of the force"
     if found.offset is not None:
@@ -200,7 +200,7 @@ _HOLDS = {
 
 
 def hold(report: Report) -> str:
-    """What the inputs do between their samples, in one line; "" for a twin without memory."""
+    """Return what the inputs do between their samples, in one line; "" for a twin without memory."""
     by: dict[str, list[str]] = {}
     for s, h in report.hold.items():
         kind = "held" if h.kind == "zero" else "linear"
@@ -209,7 +209,7 @@ def hold(report: Report) -> str:
 
 
 def meaning(report: Report) -> str:
-    """What the verdict ``unexplained`` means on this recording, as one sentence; "" for the other verdicts."""
+    """Return what the verdict ``unexplained`` means on this recording, as one sentence; "" for the other verdicts."""
     said = MEANINGS.get(report.meaning, "")
     return f"{said}: {'; '.join(report.trouble)}" if report.trouble and said else said
 
@@ -228,7 +228,7 @@ def step_s(report: Report) -> float | None:
 
 
 def before_after(p: PhysicsFound, unit: str) -> str:
-    """What one effect does to the held-out residual of its output."""
+    """Return what one effect does to the held-out residual of its output."""
     factor, unit = scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
     without, within = number(p.residual_rms_before * factor), number(p.residual_rms_after * factor)
     return f"{without} without it, {within} with it ({unit} rms, held out)"

@@ -131,7 +131,7 @@ class Twin(Protocol):
 
     @property
     def counted(self) -> Counted:
-        """What the position of feedback effects counts from where ``feedback_on`` is a velocity."""
+        """Return what the position of feedback effects counts from where ``feedback_on`` is a velocity."""
         ...
 
     def start(self, recording: Recording) -> Array:
@@ -151,7 +151,7 @@ class Twin(Protocol):
         ...
 
     def input_gain(self, signal: str, theta: Array) -> float:
-        """What weights of effects on this input are multiplied by before the base physics; 1.0 where they are
+        """Return what weights of effects on this input are multiplied by before the base physics; 1.0 where they are
         in input units. (A single gain behind the input is a linear parameter only if weights carry it.)"""
         ...
 

@@ -112,7 +112,7 @@ def _si_unit(signal: str) -> str:
 
 
 def _world(recording: Recording) -> tuple[bool, float]:
-    """Whether the bench's own hand moves the instrument, and how long its world had run at the first sample."""
+    """Return whether the bench's own hand moves the instrument, and how long its world had run at the first sample."""
     given = recording.twin.parameters
     where = f"{recording.path}: [twin.parameters]"
     unknown = [k for k in given if k not in names(PARAMETERS["instrument"])]

@@ -198,7 +198,7 @@ def felt_at_most(ad: Array, longest: int) -> int:
 
 
 def forgets(ad: Array, samples: int) -> bool:
-    """Whether no mode integrates or grows within so many samples: each decays, or swings and does not grow."""
+    """Return whether no mode integrates or grows within so many samples: each decays, or swings and does not grow."""
     poles = np.linalg.eigvals(ad)
     size = np.abs(poles)
     swings = (size <= 1.0 + 1e-12) & (np.abs(np.angle(poles)) * samples > 1.0)

@@ -284,7 +284,7 @@ class Mode:
 
     @property
     def order(self) -> int:
-        """How many poles it has."""
+        """Return how many poles it has."""
         return 2 if self.kind == "pair" else 1
 
 
