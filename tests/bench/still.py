@@ -25,6 +25,7 @@ from tests.conftest import DEFAULT_BENCH
 from tools.bench.app import make_app
 from tools.bench.firmware import Choice
 from tools.bench.jobs import Jobs
+from tools.bench.layouts import Layouts
 from tools.bench.routes import more_routes
 from tools.bench.serve import LOOPBACK, access_for, bind, config_for
 from tools.bench.session import Disk, Session
@@ -97,6 +98,7 @@ class StillSession(Session):
 
     def __init__(self, recordings: Path) -> None:
         super().__init__(Choice(DEFAULT_BENCH), recordings)
+        self.layouts = Layouts(recordings.parent / "layouts")  # the bench file is one of the project
         self.orders: list[str] = []
 
     async def start(self, choice: Choice | None = None) -> None:
@@ -156,6 +158,7 @@ class Still:
 
     session: StillSession
     base: str
+    token: str = TOKEN
 
     @property
     def place(self) -> tuple[str, int]:
@@ -165,21 +168,21 @@ class Still:
 
     @property
     def address(self) -> str:
-        return f"{self.base}/#token={TOKEN}"
+        return f"{self.base}/#token={self.token}"
 
 
 @contextmanager
-def still_server(recordings: Path, *, open_reading: bool = True) -> Iterator[Still]:
-    """The page's own routes and guard in a thread of this process, on a free port."""
+def still_server(recordings: Path, *, open_reading: bool = True, token: str = TOKEN, port: int = 0) -> Iterator[Still]:
+    """The page's own routes and guard in a thread of this process, on ``port`` (0: a free one)."""
     fill(recordings)
-    sock = bind(LOOPBACK, 0)
+    sock = bind(LOOPBACK, port)
     port = sock.getsockname()[1]
     ready = threading.Event()
     held: list[Any] = []
 
     async def run() -> None:
         session, jobs = StillSession(recordings), Jobs()
-        access = replace(access_for(LOOPBACK, port, TOKEN), open_reading=open_reading)
+        access = replace(access_for(LOOPBACK, port, token), open_reading=open_reading)
         app = make_app(session, access, more_routes(session, jobs))
         server = uvicorn.Server(config_for(app))
         held.extend((session, server))
@@ -191,7 +194,7 @@ def still_server(recordings: Path, *, open_reading: bool = True) -> Iterator[Sti
     thread.start()
     assert ready.wait(30)
     try:
-        yield Still(held[0], f"http://{LOOPBACK}:{port}")
+        yield Still(held[0], f"http://{LOOPBACK}:{port}", token)
     finally:
         held[1].should_exit = True
         thread.join(30)

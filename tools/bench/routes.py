@@ -17,6 +17,7 @@ from tools.bench.applied import Applied
 from tools.bench.calibrate import calibrate_routes
 from tools.bench.collect import collect_routes
 from tools.bench.jobs import Jobs
+from tools.bench.layouts import layout_routes
 from tools.bench.mismatch import mismatch_routes
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
@@ -31,6 +32,7 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     return [
         *_attitude(session, applied),
         *_targets(session),
+        *layout_routes(session),
         *collect_routes(session, jobs),
         *mismatch_routes(session, jobs, applied),
         *calibrate_routes(session, jobs, applied),

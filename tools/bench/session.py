@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import secrets
 import shutil
 import time
 from collections import deque
@@ -19,6 +20,7 @@ from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
 from tools.bench.firmware import Choice, Firmware
 from tools.bench.history import History
+from tools.bench.layouts import Layouts
 from tools.bench.recorder import RunRecorder
 from tools.bench.shadow import Shadow, make_shadow
 from tools.bench.targets import Targets
@@ -74,6 +76,8 @@ class Session:
     def __init__(self, choice: Choice, recordings: Path) -> None:
         self.choice = choice
         self.home = choice.bench.parent  # where benches to choose from are; copies run from elsewhere
+        self.identity = secrets.token_hex(8)  # tells an open page that the server is another one
+        self.layouts = Layouts(self.home / "layouts")
         self.bench = instrument_bench(choice.bench)
         self.firmware: Firmware | None = None
         self.run = Run()

@@ -222,7 +222,9 @@ class Viewer:
         self._run = session.run_number
         for subscription in self._subscriptions.values():
             subscription.next_bucket = None
-        await self._socket.send_json({"type": "hello", "run": self._run, "may_order": self._may_order})
+        await self._socket.send_json(
+            {"type": "hello", "run": self._run, "may_order": self._may_order, "server": session.identity}
+        )
 
     async def _send_new(self, subscription: Subscription) -> None:
         history, k = self._session.history, subscription.per_bucket

@@ -74,11 +74,15 @@ export function canvas(draw, label) {
   return element;
 }
 
-/** Settings of a view that outlive the page. */
-export function persistent(key, defaults) {
+/** Settings of a view that outlive the page. `allowed`: the values that a setting may have, where they are few. */
+export function persistent(key, defaults, allowed = {}) {
   let saved = {};
   try { saved = JSON.parse(localStorage.getItem(`micron.${key}`) || "{}"); } catch { saved = {}; }
-  const values = { ...defaults, ...saved };
+  const values = { ...structuredClone(defaults) };
+  for (const [name, value] of Object.entries(saved || {})) {
+    const fits = allowed[name] ? allowed[name].includes(value) : typeof value === typeof defaults[name] && Array.isArray(value) === Array.isArray(defaults[name]);
+    if (name in defaults && fits) values[name] = value;
+  }
   values.save = () => localStorage.setItem(`micron.${key}`, JSON.stringify({ ...values, save: undefined }));
   return values;
 }

@@ -18,6 +18,9 @@ export class Link extends EventTarget {
     this.next = 1;
     this.log = [];
     this.wantsCounts = false;
+    this.run = -1;
+    this.server = ""; // which server this is: another one has another history, and perhaps another token
+    this.refused = false; // whether the server does not know the token
     this.connect();
   }
 
@@ -37,12 +40,22 @@ export class Link extends EventTarget {
       if (typeof event.data === "string") this.onText(JSON.parse(event.data));
       else this.onBuckets(event.data);
     };
-    socket.onclose = () => {
+    socket.onclose = (event) => {
       this.connected = false;
+      if (event.code === 4403) this.refused = true;
+      for (const { resolve, buckets } of this.waiting.values()) resolve(buckets); // empty: nobody answers any more
+      this.waiting.clear();
       this.emit("connection");
       setTimeout(() => this.connect(), 500);
     };
     this.socket = socket;
+  }
+
+  /** Another token, for a server that was started again; everything else stays as it is. */
+  useToken(token) {
+    this.token = token;
+    this.refused = false;
+    this.send({ type: "hello", token });
   }
 
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
@@ -95,7 +108,13 @@ export class Link extends EventTarget {
       this.emit("state", message);
     } else if (message.type === "hello") {
       for (const subscription of this.subscriptions.values()) subscription.buckets.clear();
-      this.emit("run", message.run);
+      this.mayOrder = message.may_order;
+      this.refused = Boolean(this.token) && !this.mayOrder;
+      const another = this.server && this.server !== message.server;
+      const same = !another && this.run === message.run; // only the connection, or the token, is another one
+      [this.server, this.run] = [message.server, message.run];
+      this.emit("run", { same });
+      if (another) this.emit("server", message.server);
     } else if (message.type === "game") {
       this.emit("game", message.game);
     } else if (message.type === "shadow") {

@@ -2,6 +2,7 @@
 import { get, post, setToken } from "./api.js";
 import { bytes, duration, h } from "./dom.js";
 import { figure, showHints } from "./figures.js";
+import { layoutPanel } from "./layouts.js";
 import { Link } from "./link.js";
 
 const VIEWS = [
@@ -19,16 +20,23 @@ const VIEWS = [
 const hash = new URLSearchParams(location.hash.slice(1));
 if (hash.has("token")) {
   localStorage.setItem("micron.token", hash.get("token"));
-  history.replaceState(null, "", "#/scope");
+  history.replaceState(null, "", `#/${localStorage.getItem("micron.view") || "scope"}`);
 }
 const token = localStorage.getItem("micron.token") || "";
 setToken(token);
 
 const byId = (id) => document.getElementById(id);
 const link = new Link(token);
-const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; } };
+const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; }, view: () => shown, reload };
 let unmount = null;
 let shown = "";
+
+/** Mount a view again: its settings are others. */
+function reload(name) {
+  shown = "";
+  if (location.hash.slice(2) === name) show(name);
+  else context.navigate(name);
+}
 
 async function show(name) {
   if (!VIEWS.some(([key]) => key === name)) name = "scope";
@@ -44,6 +52,7 @@ async function show(name) {
   document.title = `${VIEWS.find(([key]) => key === name)[1]} · Micron bench`;
   unmount = view.mount(root, context) || null;
   root.dataset.view = name;
+  localStorage.setItem("micron.view", name);
 }
 
 function buildNav() {
@@ -54,6 +63,12 @@ function buildNav() {
     a.append(title, h("kbd", {}, String(i + 1)));
     byId("nav").append(a);
   });
+  const layouts = layoutPanel(link, context);
+  byId("view").after(layouts.element);
+  const button = h("button", { onclick: () => layouts.toggle() });
+  button.innerHTML = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M4 4h16v16H4zM4 10h16M10 10v10"/></svg>';
+  button.append("Layouts");
+  byId("nav").append(button);
   const open = (on) => {
     byId("nav").classList.toggle("open", on);
     byId("menu").setAttribute("aria-expanded", String(on));
@@ -131,7 +146,8 @@ function showAlerts() {
   const age = (performance.now() - link.lastMessage) / 1000;
   if (!link.connected) alerts.unshift({ kind: "error", text: "Connection to the bench server lost. What you see is old. Trying again …" });
   else if (age > 1.5) alerts.unshift({ kind: "error", text: `The bench server has said nothing for ${age.toFixed(0)} s. What you see is old.` });
-  if (link.connected && link.state && !link.mayOrder) {
+  showTokenForm();
+  if (link.connected && link.state && !link.mayOrder && !link.refused) {
     alerts.push({ kind: "info", text: "View only: to control the bench open the address that “micron bench” printed." });
   }
   const text = JSON.stringify(alerts) + link.mayOrder + link.state?.phase;
@@ -143,6 +159,25 @@ function showAlerts() {
       i === 0 && ended && link.connected && link.mayOrder ? h("button", { onclick: () => post("/api/firmware/start").catch(() => {}) }, "Start again") : null,
       alert.order && link.connected && link.mayOrder ? h("button", { onclick: () => link.order(alert.order) }, "Resume") : null)),
   );
+}
+
+/** The server was started again and has another token: it is asked for in words, and everything on the page stays. */
+function showTokenForm() {
+  const form = byId("ask-token");
+  if (form.hidden === !link.refused) return;
+  form.hidden = !link.refused;
+  form.querySelector("label").textContent = "The bench server was started again and has a new token. Paste the address that “micron bench” printed; what is on this page stays.";
+}
+
+function useToken(event) {
+  event.preventDefault();
+  const given = byId("token").value.trim();
+  const token = given.includes("#") ? new URLSearchParams(given.slice(given.indexOf("#") + 1)).get("token") : given;
+  byId("token").value = "";
+  if (!token) return;
+  localStorage.setItem("micron.token", token);
+  setToken(token);
+  link.useToken(token);
 }
 
 function showRecording(state) {
@@ -204,7 +239,10 @@ async function boot() {
   link.on("log", showLog);
   link.on("connection", () => { showPhase(); showAlerts(); });
   setInterval(() => { showPhase(); showAlerts(); }, 500);
-  context.catalogue = (await get("/api/channels")).channels;
+  byId("ask-token").onsubmit = useToken;
+  while (!context.catalogue.length) { // behind --listen an old token is refused until the new one is given
+    try { context.catalogue = (await get("/api/channels")).channels; } catch { await new Promise((done) => setTimeout(done, 1000)); }
+  }
   window.addEventListener("hashchange", () => show(location.hash.slice(2)));
   await show(location.hash.slice(2));
 }

@@ -8,7 +8,7 @@ const REPEAT_MS = 50;
 const CLIP = [[1, "workspace"], [2, "voltage"], [4, "slew"]];
 
 export function mount(root, { link }) {
-  const settings = persistent("actuators", { rate: 20 });
+  const settings = persistent("actuators", { rate: 20 }, { rate: [2, 20, 100] });
   const subscription = link.subscribe(CHANNELS, 8000, 2000);
   let armTimer = 0;
   let jogTimer = 0;

@@ -103,6 +103,10 @@ export function mount(root, { link }) {
       strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0);
     }
   }
+  const offServer = link.on("server", () => { // the filter beside it ran in the server that is gone
+    known = "";
+    if (settings.compare && link.mayOrder) compare(settings.compare);
+  });
   const timer = setInterval(() => {
     if (!q || !reference) return; // a new run has not shown its first sample yet
     const [roll, pitch, yaw] = euler(q);
@@ -113,13 +117,14 @@ export function mount(root, { link }) {
   }, 100);
   const retheme = () => { colours = palette(); strip.build(); };
   window.addEventListener("themechange", retheme);
-  const offRun = link.on("run", () => { q = reference = null; });
+  const offRun = link.on("run", ({ same }) => { if (!same) q = reference = null; });
   draw();
   return () => {
     cancelAnimationFrame(frame);
     clearInterval(timer);
     window.removeEventListener("themechange", retheme);
     offRun();
+    offServer();
     offState();
     link.drop(subscription);
     link.drop(history);

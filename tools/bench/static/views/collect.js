@@ -98,5 +98,6 @@ export function mount(root, { link }) {
     status.textContent = on ? `${state.recording.name}: ${duration(state.recording.seconds)}, ${state.recording.written} ticks written, ${state.recording.dropped} lost` : `${bytes(state.disk.free)} free`;
   });
   refresh();
-  return () => { off(); strip?.destroy(); };
+  const offServer = link.on("server", refresh);
+  return () => { off(); offServer(); strip?.destroy(); };
 }

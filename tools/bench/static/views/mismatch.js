@@ -104,5 +104,6 @@ export function mount(root, { link }) {
   }
 
   refresh().catch(fail);
-  return () => { clearTimeout(timer); clearTimeout(compareTimer); };
+  const offServer = link.on("server", () => refresh().catch(fail));
+  return () => { offServer(); clearTimeout(timer); clearTimeout(compareTimer); };
 }

@@ -2,8 +2,9 @@
 import { css, digits, h, persistent, segments } from "../dom.js";
 import { Strip, times } from "../plot.js";
 import { withUnit } from "../signals.js";
-import { analysis } from "./scope_analysis.js";
+import { TOPS, analysis } from "./scope_analysis.js";
 import { channelPicker } from "./scope_channels.js";
+import { tidy } from "./scope_settings.js";
 import { divisionOf, laneTicks, listTraces, mathsPanel, placeIn, samplesOf, tracePanel } from "./scope_traces.js";
 import { Trigger, triggerControls } from "./scope_trigger.js";
 
@@ -15,14 +16,16 @@ const ANALYSIS_MS = 200;
 const SLACK = 0.3; // further part of the window in which a trigger may be found
 
 export function mount(root, { link, catalogue }) {
-  const settings = persistent("scope.2", {
+  const defaults = {
     channels: catalogue.filter((c) => ["tip_displacement", "command"].includes(c.group)).map((c) => c.name),
     // the tip also wanders, by more than it trembles: without that the tremor is seen
     traces: Object.fromEntries(["x", "y", "z"].map((axis) => [`tip_displacement_${axis}`, { filter: "high" }])),
     maths: [], rows: 2000, side: true, display: "lanes", mode: "time", top: 30, first: "", second: "",
     trigger: { on: true, channel: "tip_displacement_x", level: 0, slope: "up", mode: "auto" },
-  });
+  };
   const known = new Map(catalogue.map((c) => [c.name, c]));
+  const settings = persistent("scope.2", defaults);
+  const unknown = tidy(settings, defaults, known, { windows: WINDOWS.map(([rows]) => rows), modes: MODES.map(([mode]) => mode), tops: TOPS });
   let traces = [];
   let columns = []; // what is subscribed to: channels shown, and what maths and trigger need
   let strips = [];
@@ -111,6 +114,7 @@ export function mount(root, { link, catalogue }) {
     });
     if (!traces.length) plots.replaceChildren(h("p.empty", {}, "No channel is chosen. Tick some in the list of channels."));
     subscribe();
+    if (paused?.over && String(paused.columns) !== String(columns)) resume(); // nobody has the others any more
     if (paused) refetch();
     analysedAt = 0;
     dirty = true;
@@ -134,7 +138,7 @@ export function mount(root, { link, catalogue }) {
     if (!t?.length) return;
     const tEnd = t[t.length - 1];
     const { first, n, perBucket } = subscription.buckets;
-    paused = { tEnd, head: (first + n) * perBucket, view: [-settings.rows / HZ, 0], buckets: snapshot(subscription.buckets) };
+    paused = { tEnd, head: (first + n) * perBucket, view: [-settings.rows / HZ, 0], buckets: snapshot(subscription.buckets), columns };
     pauseButton.textContent = "Go on";
     pauseButton.setAttribute("aria-pressed", "true");
     dirty = true;
@@ -188,7 +192,7 @@ export function mount(root, { link, catalogue }) {
 
   let fetching = false;
   async function refetch() {
-    if (fetching || !paused) return;
+    if (fetching || !paused || paused.over) return;
     fetching = true;
     const [x0, x1] = paused.view;
     const asked = paused;
@@ -197,7 +201,7 @@ export function mount(root, { link, catalogue }) {
     fetching = false;
     if (paused !== asked) return;
     if (wanted !== columns) { refetch(); return; }
-    if (buckets.n) asked.buckets = buckets;
+    if (buckets.n && !asked.over) asked.buckets = buckets;
     dirty = true;
     if (asked.view[0] !== x0 || asked.view[1] !== x1) refetch();
   }
@@ -238,7 +242,7 @@ export function mount(root, { link, catalogue }) {
     const [x0, x1] = paused ? paused.view : held ? trigger.view(settings.rows / HZ) : [-settings.rows / HZ, 0];
     const rateHz = HZ / buckets.perBucket;
     const samples = new Map(traces.map((trace) => [trace, samplesOf(trace, buckets, columns, rateHz)]));
-    triggerBox.say(paused ? "paused" : settings.mode === "time" ? trigger.text() : "");
+    triggerBox.say(paused ? (paused.over ? "paused; this run is over, its picture stays" : "paused") : settings.mode === "time" ? trigger.text() : "");
     modes.show(settings.mode);
     displays.show(settings.display);
     if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused);
@@ -325,7 +329,7 @@ export function mount(root, { link, catalogue }) {
   };
   document.addEventListener("keydown", onKey);
   const offData = link.on("data", (s) => { if (s === subscription && !paused) dirty = true; });
-  const offRun = link.on("run", () => { if (paused) resume(); trigger.rearm(); strips.forEach(({ strip }) => strip.range.reset()); });
+  const offRun = link.on("run", ({ same }) => { if (paused && !same) paused.over = true; trigger.rearm(); strips.forEach(({ strip }) => strip.range.reset()); });
   let frames = link.frames;
   let countedAt = performance.now();
   const timer = setInterval(() => {
@@ -337,6 +341,7 @@ export function mount(root, { link, catalogue }) {
   const retheme = () => { strips.forEach(({ strip }) => strip.build()); dirty = true; };
   window.addEventListener("themechange", retheme);
   rebuild();
+  if (unknown.length) triggerBox.warn(`This layout names channels that this bench does not have: ${unknown.slice(0, 4).join(", ")}${unknown.length > 4 ? ` and ${unknown.length - 4} more` : ""}.`);
   draw();
   window.micron.scope = { 
     get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get cursors() { return cursors; }, trigger, setCursor,

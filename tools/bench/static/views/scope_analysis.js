@@ -3,7 +3,7 @@ import { canvas, colours, css, h } from "../dom.js";
 import { spectrum } from "../fourier.js";
 import { mids, step125, withUnit } from "../signals.js";
 
-const TOPS = [30, 100, 500];
+export const TOPS = [30, 100, 500];
 const COLD = [[13, 22, 38], [31, 73, 110], [24, 130, 130], [120, 190, 90], [250, 230, 90]];
 
 /** Colour of `share` from 0 to 1, dark to bright, as [r, g, b]. */

@@ -69,6 +69,7 @@ export function triggerControls(settings, catalogue, changed) {
   const slopes = segments([["up", "rising"], ["down", "falling"], ["event", "event"]], t.slope, set("slope"), "Slope");
   const modes = segments([["auto", "auto"], ["normal", "normal"], ["single", "single"]], t.mode, set("mode"), "Mode");
   const state = h("span.num.soft", { role: "status" });
+  const warning = h("span.warn-text", { role: "status" });
   slopes.title = "Event: a change of the status bits";
   modes.title = "Auto: goes on without a trigger after 1 s. Normal: waits. Single: stays at the first";
   function show() {
@@ -77,6 +78,6 @@ export function triggerControls(settings, catalogue, changed) {
     for (const element of [channel, level]) element.disabled = !t.on || t.slope === "event";
   }
   show();
-  const element = h("div.toolbar.trigger", {}, h("label", {}, on, h("b", {}, "Trigger")), channel, h("span.soft", {}, "at"), level, unit, slopes, modes, state);
-  return { element, say(text) { if (state.textContent !== text) state.textContent = text; } };
+  const element = h("div.toolbar.trigger", {}, h("label", {}, on, h("b", {}, "Trigger")), channel, h("span.soft", {}, "at"), level, unit, slopes, modes, state, warning);
+  return { element, warn(text) { warning.textContent = text; }, say(text) { if (state.textContent !== text) state.textContent = text; } };
 }

@@ -5,7 +5,7 @@ import { canvas, css, h, persistent, segments } from "../dom.js";
 const STATUS = ["not active: press to move", "moving", "zooming"];
 
 export function mount(root, { link, navigate }) {
-  const settings = persistent("targets", { user: "", mapping: "position", source: "mouse" });
+  const settings = persistent("targets", { user: "", mapping: "position", source: "mouse" }, { mapping: ["position", "speed"], source: ["mouse", "card"] });
   let game = null;
   let pointer = [0, 0];
   let pressed = false;
@@ -122,6 +122,7 @@ export function mount(root, { link, navigate }) {
   const tick = () => { frame = requestAnimationFrame(tick); send(); screen.redraw(); };
   tick();
   listReports().catch(() => {});
+  const offServer = link.on("server", () => listReports().catch(() => {}));
   window.micron.game = () => game;
-  return () => { cancelAnimationFrame(frame); off(); offConnection(); link.send({ type: "game", on: false }); };
+  return () => { cancelAnimationFrame(frame); off(); offConnection(); offServer(); link.send({ type: "game", on: false }); };
 }

@@ -14,7 +14,7 @@ const COMMANDED = 128;
 const MANUAL = 256;
 
 export function mount(root, { link }) {
-  const settings = persistent("tremor", { plane: "xy" });
+  const settings = persistent("tremor", { plane: "xy" }, { plane: ["xy", "xz", "yz"] });
   const fast = link.subscribe(FAST, 4200, 4200);
   const slow = link.subscribe(SLOW, 60000, 900);
   let before = null;
