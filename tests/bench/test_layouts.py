@@ -1,4 +1,4 @@
-"""Layouts of the page: saved with the bench, shared as a file, back after a reload; and a page that outlives its server.
+"""Layouts of the page: saved with the bench, shared as a file, back after a reload; a page that outlives its server.
 
 Over data that stand still (tests/bench/still.py): no firmware, no real time.
 """
