@@ -19,7 +19,7 @@ from sim_devices.physics.dropped_samples import DROPPED_SAMPLES
 from sim_devices.physics.effect import Effect
 from sim_devices.physics.environment import CURRENT_COUPLING, SUPPLY_SENSITIVITY, TEMPERATURE_SENSITIVITY
 from sim_devices.physics.flows import OVERFLOW, SQUARE_ROOT_OUTFLOW
-from sim_devices.physics.friction import COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
+from sim_devices.physics.friction import BOUC_WEN, COULOMB_FRICTION, SMOOTH_SPRING, STRIBECK_FRICTION
 from sim_devices.physics.hysteresis import HYSTERESIS
 from sim_devices.physics.lag import AC_COUPLING, FIRST_ORDER_LAG
 from sim_devices.physics.lines import MAINS_INTERFERENCE, VIBRATION
@@ -36,8 +36,8 @@ from sim_devices.physics.step_shift import STEP_SHIFT
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
 _ALL = (
-    # its smooth spring is friction's bristles over a larger distance
-    replace(HYSTERESIS, variants=(*HYSTERESIS.variants, SMOOTH_SPRING)),
+    # its smooth springs are friction's bristles over a larger distance
+    replace(HYSTERESIS, variants=(*HYSTERESIS.variants, SMOOTH_SPRING, BOUC_WEN)),
     RATE_DEPENDENT_HYSTERESIS,
     CREEP,
     BACKLASH,

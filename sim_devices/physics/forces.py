@@ -11,7 +11,8 @@ import numpy as np
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context
 
-FRICTION = 6  # level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness
+FRICTION = 7
+"""Level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness, lean of a loop."""
 SPRING = 9  # cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
 COGGING = 5  # period, sin1, cos1, sin2, cos2
@@ -37,16 +38,57 @@ def bristle_after(z, v, step_s, row):
     """Deflection of the bristles after ``step_s`` at the speed v: z' = v - sigma |v| z / g(v), exact for constant v.
 
     C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4; g is
-    ``friction_limit`` and sigma ``row[5]``.
+    ``friction_limit`` and sigma ``row[5]``. With a lean (``row[6]``) they are those of ``loop_after``.
     """
     if v == 0.0:
         return z
+    if row[6] != 0.0:
+        return loop_after(z, v * step_s, row[0] / row[5], row[6])
     sign = 1.0 if v > 0.0 else -1.0
     limit = friction_limit(v, sign, row)
     if limit <= 0.0:
         return 0.0
     settled = sign * limit / row[5]
     return settled + (z - settled) * np.exp(-row[5] * abs(v) * step_s / limit)
+
+
+@kernel
+def loop_after(z, move, yielding, lean):
+    """Deflection of a Bouc-Wen element after a ``move`` in one direction: z' = v - (|v| z + lean v |z|) / yielding.
+
+    Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1, beta = 1 / yielding, gamma = lean beta. Exact: it relaxes
+    at one rate towards zero and at another away from it. With lean < -1 it stiffens as it is loaded.
+    """
+    if move == 0.0 or yielding <= 0.0:
+        return z
+    sign = 1.0 if move > 0.0 else -1.0
+    left = abs(move)
+    w = sign * z
+    if w < 0.0:
+        # back to rest first: w' = 1 - b w with the rate b of unloading
+        b = (1.0 - lean) / yielding
+        back = -w if b == 0.0 else np.log1p(-b * w) / b
+        if back >= left:
+            return sign * (w * np.exp(-b * left) - (np.expm1(-b * left) / b if b != 0.0 else -left))
+        left -= back
+        w = 0.0
+    a = (1.0 + lean) / yielding
+    # a loop that stiffens without end has left what a recording shows
+    grow = max(-a * left, -700.0) if a > 0.0 else min(-a * left, 50.0)
+    return sign * (w * np.exp(grow) - (np.expm1(grow) / a if a != 0.0 else -left))
+
+
+@kernel
+def loop_along(x, yielding, lean, starts):
+    """Deflection (n,) of a Bouc-Wen element along the course x (n,), at rest at each start."""
+    out = np.zeros(x.size)
+    at = 0
+    for k in range(x.size):
+        if at < starts.size and k == starts[at]:
+            at += 1
+        elif k > 0:
+            out[k] = loop_after(out[k - 1], x[k] - x[k - 1], yielding, lean)
+    return out
 
 
 @kernel

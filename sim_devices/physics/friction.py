@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.forces import FRICTION
+from sim_devices.physics.forces import FRICTION, base_moves, loop_along
 from sim_devices.physics.hysteresis import dahl
 from sim_devices.physics.statistics import least_squares, smooth, thin
 
@@ -165,6 +166,62 @@ SMOOTH_SPRING = Effect(
     fill=_lugre_fill,
     report=_spring_report,
     vanishes_with=(("force_loop_half_height",),),
+)
+
+LEANS = (-1.3, -0.6, 0.5)
+"""Where a search of the lean begins; at zero the element is the smooth spring."""
+
+
+def _loop_parts(settings: Settings) -> Parts:
+    plain = _spring_parts(settings)
+    return Parts((*plain.nonlinear, Parameter("lean", "1", -2.0, 1.0, scale=0.1)), plain.weights)
+
+
+def _loop_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    bent = loop_along(np.ascontiguousarray(smooth(x, 5)), float(q[0]), float(q[1]), np.array(ctx.starts, np.int64))
+    return (-bent / q[0])[:, None]
+
+
+def _loop_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(FRICTION)
+    row[0], row[5] = w[0], max(w[0], 0.0) / q[0]
+    # zero is the mark of a row without a lean
+    row[6] = float(q[1]) if q[1] != 0.0 else 1e-12
+    return {"friction": row}
+
+
+def _loop_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    k = thin(ctx.keep, 8000)
+    tried: list[tuple[float, float, float]] = []
+    for r in (settings["travel"][0] * np.geomspace(0.05, 0.8, 4)).tolist():
+        for lean in LEANS:
+            column = ctx.to_output(np.ascontiguousarray(_loop_basis(x, ctx, np.array([r, lean]), settings)[:, 0]))[k]
+            lines = [np.ones(k.size), *(c[k] for c in base_moves(x, ctx)[1:3])]
+            misfit = least_squares(np.column_stack([*lines, column]), residual[k])[1]
+            tried.append((misfit if np.isfinite(misfit) else np.inf, r, lean))
+    return tuple((r, lean) for _, r, lean in sorted(tried)[:2])
+
+
+def _loop_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    g = scale or 1.0
+    return (
+        Human("presliding_stiffness", float(p[2] / p[0]) / g, "{in}/{out}"),
+        Human("yield_distance", float(p[0]), "{out}"),
+        Human("lean", float(p[1]), "1"),
+    )
+
+
+BOUC_WEN = replace(
+    SMOOTH_SPRING,
+    summary="one smooth hysteretic element on the position, whose loop may lean (Bouc-Wen)",
+    parts=_loop_parts,
+    equation=r"m\ddot x + c\dot x + k x = F - a z,\; \dot z = \dot x - (|\dot x| z + \lambda \dot x |z|) / r",
+    source="Y. K. Wen, J. Eng. Mech. 102 (1976) 249, eq. 3 with n = 1 (beta = 1/r, gamma = lambda/r)",
+    guess=_loop_guess,
+    basis=_loop_basis,
+    fill=_loop_fill,
+    report=_loop_report,
+    vanishes_with=(("presliding_stiffness",),),
 )
 
 _LUGRE_SOURCE = "C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4"

@@ -48,7 +48,12 @@ TWIN = (
     Key("effects", "list of tables", "effects of a corrected twin; written by 'micron mismatch apply'", "none"),
     Key("file", "file name", "a twin file instead of all the keys above, relative to the recording", "none"),
 )
-HOLD = Key("hold", "linear, zero", "between samples the input runs straight, or is held", "linear")
+HOLD = Key(
+    "hold",
+    "linear, zero, smooth",
+    "between samples the input runs straight, is held, or has nothing above half the rate",
+    "inferred, else linear",
+)
 _PER_OUTPUT = "number, list or table by output"
 _AXES = "number, list or table by output (x, y, z)"
 

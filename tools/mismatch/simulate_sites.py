@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from sim_devices.physics.effect import Effect, Stage
+from sim_devices.physics.effect import STAGES, Effect, Stage
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
@@ -71,6 +71,12 @@ def _stage(twin: Twin, effect: Effect) -> Stage:
     return fitting[0] if fitting else effect.stages[0]
 
 
+def _behind(twin: Twin, effect: Effect, stage: Stage) -> Stage:
+    """The first stage behind the mechanics that an effect may have in a chain, else ``stage``."""
+    late: list[Stage] = [s for s in effect.stages if s in twin.chain and STAGES.index(s) > STAGES.index("mechanics")]
+    return late[0] if late else stage
+
+
 def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[Placed]) -> list[Placed]:
     if _why_not(twin, recording, effect):
         return []
@@ -101,7 +107,9 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         return together + _static(twin, effect, stage, usable, inputs, outputs, bool(present))
     found: list[Placed] = together
     if outputs:
-        found += [Placed(effect, "output", o, stage, (o,)) for o in usable]
+        # behind a plant with states only what does not commute with it tells its place: it sits at the sensor
+        behind = stage if effect.kind == "linear" else _behind(twin, effect, stage)
+        found += [Placed(effect, "output", o, behind, (o,)) for o in usable]
     if inputs and effect.driven:
         if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present:
             # a linear operator commutes with a linear twin of one input

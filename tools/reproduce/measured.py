@@ -121,6 +121,8 @@ def write_part(s: MeasuredSet, folder: Path, descriptor: str, span: tuple[int, i
     folder.mkdir(parents=True, exist_ok=True)
     np.savez(folder / "data.npz", **{k: np.tile(x[a:b], repeat) for k, x in columns.items()})  # pyright: ignore[reportArgumentType]
     head = {k: v for k, v in head.items() if k != "split"} | {"data": "data.npz"}
+    if s.twin is not None:
+        head["twin"] = dict(s.twin)
     (folder / "recording.toml").write_text(toml_text(head))
     return folder / "recording.toml"
 

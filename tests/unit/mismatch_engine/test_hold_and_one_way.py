@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import dlsim, dlti
 
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.exponential import exponential
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
 from tools.mismatch.engine.diagnose import prepared
-from tools.mismatch.engine.hold import delay_is_hold, held, holdable, infer_hold
+from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, with_hold
 from tools.mismatch.engine.one_way import direction, one_way
 from tools.mismatch.engine.report import BaseShift
 from tools.mismatch.engine.revise import added
@@ -16,6 +18,7 @@ from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.select import Selection
 from tools.mismatch.recording import Recording
 from tools.mismatch.report import wording
+from tools.mismatch.twins.linear import between_samples
 
 N = 3000
 
@@ -49,13 +52,45 @@ def test_the_hold_of_an_input_is_read_off_the_data(seed: int, zero: bool) -> Non
     assert found.share == pytest.approx(1.0 if zero else 0.0, abs=0.2)
 
 
+def test_an_input_without_content_above_half_the_rate_is_smooth() -> None:
+    """The same stage in exact steps of a thirtieth of a sample, its force between samples by its Fourier series."""
+    rng = np.random.default_rng(11)
+    sub, period = 30, 1000
+    lines = np.zeros(period // 2 + 1, np.complex128)
+    lines[5:200] = np.exp(2j * np.pi * rng.random(195))
+    force, fine = (np.tile(np.fft.irfft(lines, k * period) * k, 6) for k in (1, sub))
+    a = exponential(np.array([[0.0, 1.0], [-40000.0, -12.0]]) / (RATE * sub))
+    b = (a[:, 0] - [1.0, 0.0]) / -40000.0
+    b = np.array([[b[0]], [b[1]]]) / 0.5
+    ahead = dlti(a, b, np.array([[1.0, 0.0]]), np.zeros((1, 1)))
+    position = np.asarray(dlsim(ahead, fine[:, None])[1])[::sub, 0]
+    believed: dict[str, object] = {"mass": 0.5, "damping": 6.0, "stiffness": 20000.0, "offset_force": 0.0}
+    keep = slice(2 * period, None)
+    noisy = position + rng.normal(0, 1e-3 * np.std(position), position.size)
+    rec = recording("mechanical_axis", {"force": force[keep]}, {"position": noisy[keep]}, believed)
+    problem, _, base = prepared(rec, 0.3, 0, False)
+    found = infer_hold(problem, base)
+    assert (found.kind, found.how) == ("smooth", "inferred")
+    better = prepared(with_hold(rec, "smooth"), 0.3, 0, False)[2]
+    assert np.std(better.residual["position"]) < 0.9 * np.std(base.residual["position"])
+
+
+def test_a_smooth_input_meets_sinusoids_between_its_samples() -> None:
+    n, turn = 400, 2 * np.pi * 0.35
+    at = between_samples(np.sin(turn * np.arange(n)), "smooth")
+    # a double integrator sees the spectrum of the lines: their coefficient at this frequency is that of the sinusoid
+    lines = at * np.sinc(0.35) ** 2
+    assert lines[20:-20] == pytest.approx(np.sin(turn * np.arange(n))[20:-20], abs=1e-3)
+    assert between_samples(np.full(50, 3.0), "smooth") == pytest.approx(np.full(50, 3.0))
+
+
 def test_a_true_delay_of_three_samples_is_no_hold() -> None:
     problem, _, base = prepared(axis(3, zero=False, late=3.0), 0.3, 0, False)
     assert infer_hold(problem, base).kind == "linear"
 
 
 def test_a_declared_hold_is_not_questioned() -> None:
-    problem, _, _ = prepared(held(axis(4, zero=True)), 0.3, 0, False)
+    problem, _, _ = prepared(with_hold(axis(4, zero=True), "zero"), 0.3, 0, False)
     assert not holdable(problem)
     assert problem.twin.to_text(problem.twin.start(problem.recording))["hold"] == "zero"
 

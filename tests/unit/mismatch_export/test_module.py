@@ -110,6 +110,7 @@ TWINS: dict[str, Callable[[], Recording]] = {
     "accelerometer_cluster": cluster,
     "axis position": lambda: axis(("position",)),
     "axis both": lambda: axis(("position", "velocity"), hold="zero"),
+    "axis smooth": lambda: axis(("position",), hold="smooth"),
     "axis velocity": lambda: axis(("velocity",)),
     "axis free": lambda: axis(("velocity",), stiffness=0.0),
     "state_space": state_space,
@@ -117,6 +118,7 @@ TWINS: dict[str, Callable[[], Recording]] = {
     "state_space discrete": lambda: state_space(
         A=[[0.9, 0.1], [-0.2, 0.95]], B=[[0.0], [0.1]], C=[[1.0, 0.0]], discrete=True
     ),
+    "state_space smooth": lambda: state_space(D=[[0.3]], hold="smooth"),
     "state_space several": several,
 }
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from sim_devices.physics.forces import COGGING, FRICTION, SPRING
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING, loop_along
+from sim_devices.physics.hysteresis import dahl
 from tools.mismatch.twins.feedback import run_feedback
 
 NO_SPRING, NONE5, NONE6 = np.zeros(SPRING), np.zeros(COGGING), np.zeros(FRICTION)
@@ -44,6 +45,7 @@ def lugre(u: np.ndarray, dt: float, row: np.ndarray) -> np.ndarray:
     """Position and velocity (n, 2) of a unit mass at rest with friction behind bristles under the force u."""
     ad = np.array([[1.0, dt], [0.0, 1.0]])
     g0, g1 = np.array([dt * dt / 3, dt / 2]), np.array([dt * dt / 6, dt / 2])
+    row = np.pad(row, (0, FRICTION - row.size))
     return run_feedback(
         ad, g0, g1, np.array([1.0, 0.0]), np.array([0.0, 1.0]), u, False, 1, dt, np.zeros((1, 2)),
         np.zeros(1, np.int64), np.array([u.size]), row, NO_SPRING, NONE5, np.zeros(0), np.zeros(0), False,
@@ -79,3 +81,26 @@ def test_presliding_friction_reports_level_and_distance() -> None:
     found = {h.name: h.value for h in bristles.report(np.array([3e-5, 0.6]), {"travel": (0.01,)}, 2.0)}
     assert found["coulomb_forward"] == pytest.approx(0.3)
     assert found["presliding_distance"] == pytest.approx(3e-5)
+
+
+@pytest.mark.parametrize("lean", [-1.4, -1.0, -0.5, 0.0, 0.5])
+def test_a_bouc_wen_element_meets_its_differential_equation(lean: float) -> None:
+    yielding, course = (
+        0.3,
+        np.concatenate([np.linspace(0, 0.5, 40), np.linspace(0.5, -0.4, 70), np.linspace(-0.4, 0, 9)]),
+    )
+    z, fine = np.zeros(course.size), 4000
+    for k, move in enumerate(np.diff(course), 1):
+        step, w = move / fine, z[k - 1]
+        for _ in range(fine):
+            # explicit steps of the equation as published (Wen 1976, eq. 3)
+            w += step - (abs(step) * w + lean * step * abs(w)) / yielding
+        z[k] = w
+    assert loop_along(course, yielding, lean, np.zeros(1, np.int64)) == pytest.approx(z, abs=2e-4)
+
+
+def test_a_loop_without_a_lean_is_the_smooth_spring() -> None:
+    course = np.cumsum(np.random.default_rng(5).normal(size=500)) * 0.05
+    start = np.zeros(1, np.int64)
+    plain = dahl(course - course[0], np.array([0.3]), np.zeros(1), 0.0, start)[:, 0]
+    assert loop_along(course - course[0], 0.3, 0.0, start) == pytest.approx(plain, abs=1e-9)

@@ -16,7 +16,7 @@ from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.evidence import weigh_evidence
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
 from tools.mismatch.engine.forward import Work, forward
-from tools.mismatch.engine.hold import delay_is_hold, held, holdable, infer_hold, said_hold
+from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, said_hold, with_hold
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
@@ -31,6 +31,7 @@ from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.corrected import CorrectedTwin
@@ -180,11 +181,12 @@ def _diagnose(
     hold = None
     if holdable(problem):
         hold = infer_hold(problem, base)
-        if hold.kind == "zero":
-            recording = held(recording)
+        if hold.kind != "linear":
+            recording = with_hold(recording, hold.kind)
             problem, raw, base = prepared(recording, held_out, seed, was_joined)
-    elif said_hold(recording) in ("zero", "linear") and hasattr(problem.twin, "hold"):
-        hold = Hold("zero" if said_hold(recording) == "zero" else "linear", "declared")
+    elif said_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
+        said = said_hold(recording)
+        hold = Hold("zero" if said == "zero" else "smooth" if said == "smooth" else "linear", "declared")
     twin = problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
@@ -221,22 +223,26 @@ def _diagnose(
     if discarded:
         remarks.append(f"{discarded} It was discarded, and nothing is named.")
     official = None
-    if not problem.split.own and twin.restart and not problem.settle:
-        whole = make_split(recording, held_out, seed, True)
-        official = Problem(recording, twin, whole, problem.init, seed, problem.floors)
-        base = over_the_whole(problem, official, base)
-        selection = replace(selection, base=base, fitted=over_the_whole(problem, official, selection.fitted))
+    if twin.restart and not problem.settle:
+        # the exported twin runs through: what adds up over a whole run is fitted in one
+        through = restarting(twin, False) if problem.split.own else twin
+        whole = problem.split if problem.split.own else make_split(recording, held_out, seed, True)
+        course = Problem(recording, through, whole, problem.init, seed, problem.floors)
+        official = None if problem.split.own else course
+        base = over_the_whole(problem, course, base)
+        selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
     return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld, hold)
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:
-    """The model with its parameters fitted once more in the one free run that it is judged by, when that helps there.
+    """The model with its parameters fitted once more in the one free run of ``official``, when that helps there.
 
     Short stretches show which physics is missing; what only adds up over the whole run (an offset of the force under an
     integrator) they leave loose.
     """
-    start = residuals(official, fitted.model, fitted.theta)
-    longer = fit(official, fitted.model, [fitted.theta], iterations=25)
+    through = Model(official.twin, fitted.model.placed)
+    start = residuals(official, through, fitted.theta)
+    longer = fit(official, through, [fitted.theta], iterations=25)
     rows = official.fit_rows
     before, after = (
         sum(float(np.mean((r[o][rows] / problem.sigma(o)) ** 2)) for o in r) for r in (start, longer.residual)

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 
 import numpy as np
+from scipy.stats import norm
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
@@ -35,10 +36,17 @@ class Doubt:
     shown_by: tuple[str, ...]
 
 
-def holds_zero(p: ParameterValue) -> bool:
-    """Return whether the 95 % interval contains zero (an interval that is not finite does)."""
+def holds_zero(p: ParameterValue, among: int = 1) -> bool:
+    """Return whether the interval contains zero that holds at 95 % for ``among`` parameters together (Z. Sidak, J. Am.
+    Stat. Assoc. 62 (1967) 626); an interval that is not finite does.
+
+    The more sizes an effect has, the likelier is one of them away from zero by chance.
+    """
     lo, hi = p.ci95
-    return not (np.isfinite(lo) and np.isfinite(hi)) or lo <= 0.0 <= hi
+    if not (np.isfinite(lo) and np.isfinite(hi)):
+        return True
+    wider = float(norm.isf(0.5 * (1.0 - 0.95 ** (1.0 / among))) / norm.isf(0.025))
+    return p.value - wider * (p.value - lo) <= 0.0 <= p.value + wider * (hi - p.value)
 
 
 def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> list[tuple[str, ...]]:
@@ -46,7 +54,7 @@ def absent_groups(effect: Effect, parameters: Mapping[str, ParameterValue]) -> l
     out: list[tuple[str, ...]] = []
     for patterns in effect.vanishes_with or (("*",),):
         names = tuple(n for n in parameters if any(fnmatchcase(n, q) for q in patterns))
-        if names and all(holds_zero(parameters[n]) for n in names):
+        if names and all(holds_zero(parameters[n], len(names)) for n in names):
             out.append(names)
     return out
 

@@ -19,7 +19,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.score import misfits
 from tools.mismatch.engine.select import Selection
-from tools.mismatch.recording import Recording
+from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.make import make
 
@@ -40,14 +40,14 @@ def holdable(problem: Problem) -> bool:
     return getattr(problem.twin, "hold", "") == "linear" and not said_hold(problem.recording)
 
 
-def held(recording: Recording) -> Recording:
-    """The same recording with its inputs held between the samples."""
-    return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": "zero"}))
+def with_hold(recording: Recording, kind: str) -> Recording:
+    """The same recording with inputs that do this between the samples."""
+    return replace(recording, twin=replace(recording.twin, parameters={**recording.twin.parameters, "hold": kind}))
 
 
-def as_held(problem: Problem) -> Problem:
-    """The same problem with inputs held between the samples."""
-    recording = held(problem.recording)
+def as_held(problem: Problem, kind: str = "zero") -> Problem:
+    """The same problem with inputs that do this between the samples."""
+    recording = with_hold(problem.recording, kind)
     twin = make(recording)
     if hasattr(twin, "restart") and twin.restart != problem.twin.restart:
         twin = replace(twin, restart=problem.twin.restart)  # type: ignore[type-var]
@@ -68,12 +68,31 @@ def infer_hold(problem: Problem, base: Fit) -> Hold:
         share = 1.0 + beyond
     if not np.isfinite(share) or not np.isfinite(spread):
         return Hold("linear", "assumed")
+    if abs(share) < abs(share - 1.0):
+        smooth = _smooth(problem, base)
+        if smooth is not None:
+            return smooth
     ci = (share - 1.96 * spread, share + 1.96 * spread)
     if abs(share - 1.0) < NEAR and share > CLEAR * spread:
         return Hold("zero", "inferred", share, ci)
     if abs(share) < NEAR and 1.0 - share > CLEAR * spread:
         return Hold("linear", "inferred", share, ci)
     return Hold("linear", "assumed", share, ci)
+
+
+def _smooth(problem: Problem, base: Fit) -> Hold | None:
+    """Smooth inputs, where the data ask for all of the difference that they make to straight ones; else None.
+
+    A twin that cannot have them says so with its RecordingError, and is left as it is.
+    """
+    try:
+        other = as_held(problem, "smooth")
+    except RecordingError:
+        return None
+    share, spread = _share(problem, base, problem, other)
+    if not (np.isfinite(share) and np.isfinite(spread)) or not (abs(share - 1.0) < NEAR and share > CLEAR * spread):
+        return None
+    return Hold("smooth", "inferred", share, (share - 1.96 * spread, share + 1.96 * spread))
 
 
 def _share(problem: Problem, fitted: Fit, linear: Problem, zero: Problem) -> tuple[float, float]:

@@ -9,7 +9,7 @@ import numpy as np
 from tools.mismatch.recording import Recording, Split
 from tools.mismatch.twins.base import Twin
 
-LONG = 80_000
+LONG = 40_000
 """Samples (of all outputs, for a twin with modes) above which the search starts on reduced copies."""
 PART = 10_000
 """Samples of a reduced copy of a record that is not longer than ``VERY_LONG``."""

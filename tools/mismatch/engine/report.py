@@ -91,12 +91,12 @@ class Withheld:
 
 @dataclass(frozen=True)
 class Hold:
-    """What the inputs do between their samples: ``kind`` zero (held) or linear; ``how``: declared, inferred, assumed
-    (the data do not tell) or instead_of_delay (a named delay of half a sample was the hold). ``share``: 0 is linear, 1
-    held.
+    """What the inputs do between their samples: ``kind`` zero (held), linear or smooth (nothing above half the sampling
+    rate); ``how``: declared, inferred, assumed (the data do not tell) or instead_of_delay (a named delay of half a
+    sample was the hold). ``share``: 0 is linear, 1 the other that was tried: held, or smooth where that was inferred.
     """
 
-    kind: Literal["zero", "linear"]
+    kind: Literal["zero", "linear", "smooth"]
     how: Literal["declared", "inferred", "assumed", "instead_of_delay"]
     share: float | None = None
     ci95: tuple[float, float] | None = None

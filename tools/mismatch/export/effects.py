@@ -407,12 +407,13 @@ EXPRESSIONS: Mapping[str, Expression] = {
 @dataclass(frozen=True)
 class ForceCode:
     """What one force adds: ``smooth`` (code in position x and velocity v), ``limit`` of dry friction (code in v and
-    sign), ``stiff`` bristles, elastic elements that yield at ``radii`` with ``springs``.
+    sign), ``stiff`` bristles and the ``lean`` of their loop, elastic elements that yield at ``radii`` with ``springs``.
     """
 
     smooth: str = ""
     limit: str = ""
     stiff: str = ""
+    lean: str = ""
     radii: str = ""
     springs: str = ""
 
@@ -427,7 +428,7 @@ def _friction(s: Slot) -> ForceCode:
         limit += f" + {s.at('extra')} * np.exp(-((v / {s.at('stribeck_speed')}) ** 2))"
     smooth = f" - {s.at('viscous_asymmetry')} * abs(v)" if has("viscous_asymmetry") else ""
     bent = next((n for n in ("presliding", "yield_distance") if has(n)), "")
-    return ForceCode(smooth, limit, f"{level} / {s.at(bent)}" if bent else "")
+    return ForceCode(smooth, limit, f"{level} / {s.at(bent)}" if bent else "", s.at("lean") if has("lean") else "")
 
 
 def _spring(s: Slot) -> ForceCode:

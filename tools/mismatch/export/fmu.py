@@ -89,6 +89,11 @@ def write_fmu(twin: Corrected, module: str, out: Path) -> None:
     """
     if isinstance(twin.model.twin, OpaqueTwin):
         raise InputError(f"a {twin.kind} twin is a program of its own; use --out FILE.py, FILE.toml or FILE.csv")
+    if getattr(twin.model.twin, "hold", "") == "smooth":
+        raise InputError(
+            "a smooth input (hold) depends on samples that an FMU has not seen yet; use --out FILE.py, FILE.toml or"
+            " FILE.csv"
+        )
     rec = twin.recording
     contexts = [s for s in rec.context if f'u["{s}"]' in module]
     for s in (*twin.model.twin.inputs, *contexts, *twin.model.twin.outputs):

@@ -219,6 +219,10 @@ class _Module:
                 drive = "drive"
         start = 'np.array(p["start"])'
         forces = [k for k, pl in enumerate(self.model.placed) if pl.site == "feedback"]
+        if hold == "smooth":
+            # what is known of an input ahead of time: no use step by step
+            self.writer.used |= {"smoothed"}
+            hold, drive = "linear", f"smoothed({drive})"
         if forces:
             self._forced(twin, forces, a, b, place, speed, str(hold), start)
             add(f"x = moving({drive})")
@@ -415,6 +419,7 @@ def motion(
     smooth = "".join(c.smooth for c in codes)
     limits = [c.limit for c in codes if c.limit]
     stiff = " + ".join(c.stiff for c in codes if c.stiff)
+    lean = next((c.lean for c in codes if c.lean), "")
     radii = next((c.radii for c in codes if c.radii), "")
     springs = next((c.springs for c in codes if c.springs), "")
     straight = hold == "linear"
@@ -439,7 +444,21 @@ def motion(
         later.append("- stiff * bend(bristle, 0.5 * speed @ (s + z))")
     if limits:
         lines += ["", "def limit(v, sign):", f"    return max({' + '.join(limits)}, 0.0)"]
-    if stiff:
+    if lean:
+        lines += [
+            "",
+            "def bend(z, v):  # Bouc-Wen: z' = v - stiff (|v| z + lean v |z|) / limit, exact for constant v",
+            f"    way, w, lean = abs(v) * {step}, np.sign(v) * z, {lean}",
+            "    back, on = (1 - lean) * stiff / limit(v, 1.0), (1 + lean) * stiff / limit(v, 1.0)",
+            "    if w < 0:",
+            "        rest = np.log1p(-back * w) / back if back else -w",
+            "        if rest >= way:",
+            "            gone = -np.expm1(-back * way) / back if back else way",
+            "            return np.sign(v) * (w * np.exp(-back * way) + gone)",
+            "        way, w = way - rest, 0.0",
+            "    return np.sign(v) * (w * np.exp(-on * way) - (np.expm1(-on * way) / on if on else -way)) if v else z",
+        ]
+    elif stiff:
         lines += [
             "",
             "def bend(z, v):  # LuGre: z' = v - stiff |v| z / limit, exact for constant v",

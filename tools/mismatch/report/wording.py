@@ -203,7 +203,7 @@ def hold(report: Report) -> str:
     """Return what the inputs do between their samples, in one line; "" for a twin without memory."""
     by: dict[str, list[str]] = {}
     for s, h in report.hold.items():
-        kind = "held" if h.kind == "zero" else "linear"
+        kind = "held" if h.kind == "zero" else h.kind
         by.setdefault(f"{kind} between samples ({_HOLDS[h.how]})", []).append(s)
     return "; ".join(f"{', '.join(of)} {said}" for said, of in by.items())
 

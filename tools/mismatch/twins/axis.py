@@ -25,8 +25,10 @@ def axis_twin(recording: Recording) -> DynamicTwin:
                 f" known: {', '.join(_NAMES)}"
             )
     hold = text.get("hold", "linear")
-    if hold not in ("zero", "linear"):
-        raise RecordingError(f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {hold!r}")
+    if hold not in ("zero", "linear", "smooth"):
+        raise RecordingError(
+            f"{recording.path}: [twin.parameters] hold must be 'zero', 'linear' or 'smooth', got {hold!r}"
+        )
     given = {k: _number(recording, k, text.get(k)) for k in _NAMES[:4]}
     if given["mass"] is not None and given["mass"] <= 0:
         raise RecordingError(f"{recording.path}: [twin.parameters] mass must be positive, got {given['mass']}")

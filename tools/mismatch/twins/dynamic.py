@@ -17,6 +17,7 @@ from tools.mismatch.twins.linear import (
     Discrete,
     Hold,
     StartState,
+    between_samples,
     discretise,
     run_output,
     run_pair,
@@ -138,7 +139,7 @@ class DynamicTwin(Head):
 
         def states(u: Array, token: object, k: int) -> Array:
             key = ("states", token, tags[k])
-            return remember(run.memo, key, lambda: _states(d[k], u, run.starts))
+            return remember(run.memo, key, lambda: _states(d[k], between_samples(u, self.hold), run.starts))
 
         def add(j: int, output: str, column: Array) -> None:
             if join:
@@ -207,6 +208,7 @@ class DynamicTwin(Head):
         def carry(change: Array) -> Array:
             u = _once(change)
             y = {o: direct[o] * u for o in outputs}
+            u = _once(between_samples(u, self.hold))
             for o in outputs:
                 for part, (a, b) in zip(d, plant.parts, strict=True):
                     c = rows[o][a:b]
@@ -309,6 +311,7 @@ class DynamicTwin(Head):
         extra: dict[str, Array] = {o: np.zeros(run.t.size) for o in self.outputs}
         normal = self._gain_index(source) >= 0
         direct = u
+        u = between_samples(u, self.hold)
         for j in {link.j for link in self.links if link.source == CONSTANT and link.row != -2}:
             u = u + theta[j]
         for link in self.links:
@@ -342,7 +345,7 @@ class DynamicTwin(Head):
             cv = rows["velocity"]
         starts = np.array(run.starts, np.int64)
         ends = np.array((*run.starts[1:], run.t.size), np.int64)
-        held = self.hold != "linear"
+        held = self.hold in ("zero", "discrete")
         dry = bool(np.any(packed.friction[:3] != 0.0)) and float(cv @ (d.g0 + d.g1)) > 0.0 and packed.friction[5] <= 0.0
 
         def go(x0: Array, drive: Array, first: NDArray[np.int64], stop: NDArray[np.int64]) -> Array:

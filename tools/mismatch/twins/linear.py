@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -13,7 +14,32 @@ from hal.compiled import kernel
 from sim_devices.physics.effect import Array
 from sim_devices.physics.exponential import exponential
 
-Hold = Literal["zero", "linear", "discrete"]
+Hold = Literal["zero", "linear", "smooth", "discrete"]
+"""What an input does between its samples: it is held, runs straight, or has no content above half the sampling rate."""
+
+SIDE_TAPS = 12
+BAND = 0.9
+"""Share of the band below half the sampling rate in which a smooth input is met."""
+
+
+@cache
+def smooth_taps() -> tuple[float, ...]:
+    """The filter (2 ``SIDE_TAPS`` + 1) after which straight lines between samples have the spectrum of the input.
+
+    Lines multiply a spectrum by sinc^2 (A. V. Oppenheim, R. W. Schafer, Discrete-Time Signal Processing, 3rd ed.,
+    section 4.8.3); the taps meet its inverse by least squares over the ``BAND`` and leave a constant as it is.
+    """
+    w = np.linspace(0.0, BAND * np.pi, 1024)
+    waves = 2.0 * (np.cos(np.outer(w, np.arange(1, SIDE_TAPS + 1))) - 1.0)
+    side = np.linalg.lstsq(waves, np.sinc(w / (2 * np.pi)) ** -2 - 1.0, rcond=None)[0]
+    return (*side[::-1].tolist(), 1.0 - 2.0 * float(side.sum()), *side.tolist())
+
+
+def between_samples(u: Array, hold: Hold) -> Array:
+    """The samples (n,) between which an input of this ``hold`` may be taken to run straight or to rest."""
+    if hold != "smooth":
+        return u
+    return np.convolve(np.pad(u, SIDE_TAPS, mode="edge"), smooth_taps(), "valid")
 
 
 @dataclass(frozen=True)
@@ -28,8 +54,8 @@ class Discrete:
 def discretise(a: Array, b: Array, dt: float, hold: Hold) -> Discrete:
     """Exact for an input that is held or runs linearly between samples.
 
-    Van Loan, IEEE Trans. Automatic Control 23 (1978) 395: blocks of one matrix exponential. ``discrete``: a and b
-    are already those of the difference equation.
+    A smooth input has been through ``between_samples`` first. Van Loan, IEEE Trans. Automatic Control 23 (1978) 395:
+    blocks of one matrix exponential. ``discrete``: a and b are already those of the difference equation.
     """
     s = a.shape[0]
     if hold == "discrete":

@@ -213,8 +213,10 @@ def read_matrices(recording: Recording) -> Matrices:
     if a.shape[1] != s:
         raise RecordingError(f"{recording.path}: [twin.parameters] A has shape {a.shape}, it must be square")
     hold = text.get("hold", "linear")
-    if hold not in ("zero", "linear"):
-        raise RecordingError(f"{recording.path}: [twin.parameters] hold must be 'zero' or 'linear', got {hold!r}")
+    if hold not in ("zero", "linear", "smooth"):
+        raise RecordingError(
+            f"{recording.path}: [twin.parameters] hold must be 'zero', 'linear' or 'smooth', got {hold!r}"
+        )
     discrete = text.get("discrete", False)
     if not isinstance(discrete, bool):
         raise RecordingError(f"{recording.path}: [twin.parameters] discrete must be true or false, got {discrete!r}")
