@@ -17,6 +17,7 @@ from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import is_being_recorded
 from firmware_py.recording.format import TIME_COLUMN, load_json
 from firmware_py.recording.reader import Recording
+from tools.bench.hold_spans import HoldSpans
 from tools.bench.jobs import Jobs
 from tools.bench.recorder import SUFFIX, check_name, is_own_file
 from tools.bench.requests import body, clear, text
@@ -92,6 +93,8 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
     high = low.copy()
     t_s = np.zeros(n_buckets)
     row = 0
+    holds = HoldSpans()
+    status = recording.names.index("status") if "status" in recording.names else None
     for block in recording.blocks():
         data = block.data[index]
         n = data.shape[1]
@@ -105,6 +108,9 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
         begun = (row + starts) % k == 0
         t_s[first:stop][begun] = data[-1, starts[begun]]
         row += n
+        if status is not None:
+            holds.follow(block.data[index[-1]], block.data[status])
+    holds.name_by_events(recording.events)
     units = {column.name: column.unit for column in recording.columns}
     return {
         "channels": wanted,
@@ -113,6 +119,7 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
         "low": np.nan_to_num(low).tolist(),
         "high": np.nan_to_num(high).tolist(),
         "health": recording.health.lines(),
+        "holds": holds.as_list(),
         "lost": recording.health.lost,
         "names": list(recording.names),
     }

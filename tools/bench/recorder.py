@@ -98,6 +98,11 @@ class RunRecorder:
         self._sidecar["notes"].append(text)
         self._save()
 
+    def event(self, name: str, reason: str, t_ns: int) -> None:
+        """Write what the firmware did into the running recording, at bench time ``t_ns``."""
+        if self._recorder is not None:
+            self._recorder.event({"event": name, "reason": reason, "t_ns": t_ns})
+
     def trouble(self) -> str:
         """What is wrong with the running recording, in words; empty when nothing is."""
         if self._recorder is None:

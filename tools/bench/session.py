@@ -15,11 +15,12 @@ from typing import Any
 import numpy as np
 
 from firmware_py.endoscope.wiring import is_endoscope
-from firmware_py.frame import LAYOUT
+from firmware_py.frame import LAYOUT, STATUS, TIME
 from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
 from tools.bench.firmware import Choice, Firmware
 from tools.bench.history import History
+from tools.bench.hold_spans import HoldSpans
 from tools.bench.layouts import Layouts
 from tools.bench.recorder import RunRecorder
 from tools.bench.shadow import Shadow, make_shadow
@@ -83,6 +84,7 @@ class Session:
         self.run = Run()
         self.run_number = 0
         self.history = self._new_history()
+        self.holds = HoldSpans()
         self.recorder = RunRecorder(recordings)
         self.targets = Targets(recordings / "targets")
         self.disk = Disk()
@@ -92,6 +94,7 @@ class Session:
         self.missed_rows = 0
         self.frame_ready = asyncio.Event()
         self._row = 0
+        self._held_by = ""
         self._fresh_s = time.monotonic()
         self._lock = asyncio.Lock()
 
@@ -108,6 +111,7 @@ class Session:
             await self._end()
             self.choice, self.bench = choice or self.choice, bench
             self.run, self.history, self._row, self.shadow = Run(), self._new_history(), 0, None
+            self.holds = HoldSpans()
             self.run_number += 1
             run = self.run
             self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
@@ -152,6 +156,8 @@ class Session:
             self.note("info" if run.reached and run.normal else "error", f"safe state: {run.reason}; {how}{took}")
         else:
             run.status = line
+            if run is self.run:
+                self._name_hold(line.get("hold"))
             if run.phase == "starting":
                 run.phase = "running"
 
@@ -166,6 +172,15 @@ class Session:
         else:
             run.phase, run.reason = "failed", failure
             self.note("error", f"the firmware failed: {failure}")
+
+    def _name_hold(self, hold: dict[str, Any] | None) -> None:
+        """Take the cause of a hold from the status; a recording that runs gets it as the firmware's own one does."""
+        before = self._held_by
+        self._held_by = hold["cause"] if hold else ""
+        self.holds.name(self._held_by)
+        if self.recorder.active and bool(before) != bool(hold):
+            name = "hold begins" if hold else "hold ends"
+            self.recorder.event(name, self._held_by or before, self.bench_time_ns())
 
     # -- what people read -----------------------------------------------------------------------------------
 
@@ -234,6 +249,7 @@ class Session:
             "missed_rows": self.missed_rows,
             "stale_s": self.stale_s() if run.phase == "running" else 0.0,
             "alerts": self.alerts(),
+            "holds": self.holds.as_list(),
             "disk": {"free": self.disk.free_bytes, "total": self.disk.total_bytes},
             "shadow": self.shadow.method if self.shadow is not None else "",
             "recording": self.recorder.state(),
@@ -285,6 +301,7 @@ class Session:
             self._row = rows.first + len(rows.values)
             self._fresh_s = time.monotonic()
             self.history.append(rows.values)
+            self.holds.follow(rows.values[:, TIME], rows.values[:, STATUS])
             if self.recorder.active:
                 self.recorder.push(rows)
             if self.shadow is not None:

@@ -21,6 +21,7 @@ export const FIGURES = {
   "at tick": "Number of the tick with the longest run.",
   "held ticks": "Ticks that were left out altogether because the one before had not ended. Normal: 0.",
   reduction: "1 less the ratio of rms after to rms before, last 4 s. By the firmware's own estimate.",
+  bands: "Motion of the tip as the sensors see it (tip_displacement, which leaves slow motion out), without compensation and less what was commanded one loop delay before. Normal: less in 8 to 12 Hz, little more elsewhere.",
   rms: "Root of the mean square of the last 4 s.",
   before: "The estimated tremor, as it would be without compensation.",
   after: "The tremor less what was commanded one loop delay before.",

@@ -32,3 +32,10 @@ export function spectrum(samples, hz) {
   for (let i = 0; i < n / 2; i++) amplitude[i] = (4 * Math.hypot(re[i], im[i])) / n; // Hann: coherent gain 1/2
   return { amplitude, step: hz / n };
 }
+
+/** rms of what a spectrum holds from `low` to below `high` Hz; the mean is not in it. */
+export function bandRms({ amplitude, step }, low, high) {
+  let sum = 0;
+  for (let k = Math.max(1, Math.ceil(low / step)); k < amplitude.length && k * step < high; k++) sum += amplitude[k] ** 2;
+  return Math.sqrt(sum / 3); // Hann: mean square of the window 3/8, coherent gain 1/2
+}

@@ -1,6 +1,7 @@
 // A strip of traces over time: smallest and largest value of every bucket are both drawn, so a spike always shows.
 import uPlot from "./vendor/uPlot.esm.js";
 import { colours, css, digits, h, unitText } from "./dom.js";
+import { drawSpans, spanText } from "./holds.js";
 
 /** Range of an axis that grows at once and shrinks slowly, so that a live trace does not make it jump. */
 export class CalmRange {
@@ -60,6 +61,8 @@ export class Strip {
     this.range = new CalmRange(options.least);
     this.fixed = null;
     this.marks = [];
+    this.spans = [];
+    this.spanWords = h("span.hold-words", { hidden: true });
     this.legend = h("div.legend");
     this.values = traces.map(() => h("b"));
     this.body = h("div.plot-body");
@@ -76,7 +79,7 @@ export class Strip {
     const title = (text) => (text ? { label: text, labelSize: 15, labelGap: 0, labelFont: "10px " + css("--sans") } : {});
     const axis = { stroke: css("--faint"), grid: { stroke: css("--grid"), width: 1 }, ticks: { stroke: css("--line"), size: 4 }, font: "10px " + css("--mono") };
     this.legend.replaceChildren(
-      ...this.traces.map((trace, i) => h("span", { style: `--dot:${trace.colour || palette[i % palette.length]}` }, trace.label, " ", this.values[i])),
+      ...this.traces.map((trace, i) => h("span", { style: `--dot:${trace.colour || palette[i % palette.length]}` }, trace.label, " ", this.values[i])), this.spanWords,
     );
     const { width, height } = this.size();
     const strip = this;
@@ -109,6 +112,10 @@ export class Strip {
           setSelect: [(u) => {
             if (u.select.width > 4) strip.options.onSelect?.(u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x"));
             u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
+          }],
+          drawClear: [(u) => {
+            const { left, top, width, height } = u.bbox;
+            drawSpans(u.ctx, strip.spans, { left, right: left + width, top, bottom: top + height }, (x) => u.valToPos(x, "x", true), css("--warn"), devicePixelRatio);
           }],
           draw: [(u) => strip.drawMarks(u)],
           setCursor: [(u) => strip.options.onCursor?.(u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null)],
@@ -160,9 +167,14 @@ export class Strip {
   size() { return { width: Math.max(80, this.body.clientWidth), height: Math.max(40, this.body.clientHeight) }; }
   resize() { if (this.element.isConnected) this.plot.setSize(this.size()); }
 
-  /** New data: `x` seconds and one y array per series, shown from x0 to x1; `texts` instead of the newest values. */
-  show(x, ys, x0, x1, texts = null) {
+  /** New data: `x` seconds and one y array per series, shown from x0 to x1; `texts` instead of the newest values;
+   * `spans` of time behind them. */
+  show(x, ys, x0, x1, texts = null, spans = []) {
     this.x = [x0, x1];
+    this.spans = spans;
+    const words = spanText(spans);
+    this.spanWords.hidden = !words;
+    if (this.spanWords.textContent !== words) this.spanWords.textContent = words;
     this.data = [x, ...ys];
     this.plot.setData(this.data);
     if (texts) texts.forEach((text, i) => { this.values[i].textContent = text; });

@@ -1,6 +1,7 @@
 // The three stacks: volts, strokes, hysteresis; and driving them by hand while a button is held.
 import { canvas, colours, css, digits, h, persistent, segments } from "../dom.js";
 import { explained } from "../figures.js";
+import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 
 const CHANNELS = ["command_1", "command_2", "command_3", "stroke_1", "stroke_2", "stroke_3", "clip"];
@@ -137,7 +138,7 @@ export function mount(root, { link }) {
       card.loop.redraw();
     });
     const t = b.times();
-    strip.show(times(b, t[t.length - 1]), [0, 1, 2].map((c) => interleave(b, c)), -8, 0);
+    strip.show(times(b, t[t.length - 1]), [0, 1, 2].map((c) => interleave(b, c)), -8, 0, null, holdSpans(link.state?.holds, t[t.length - 1], -8, 0));
     let bits = 0;
     for (const v of b.highs(6)) bits |= v;
     const s = link.state?.status || {};

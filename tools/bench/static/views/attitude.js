@@ -1,6 +1,7 @@
 // The instrument in space, its numbers, its drift, and another filter beside it.
 import { get, post } from "../api.js";
 import { canvas, css, digits, h, persistent } from "../dom.js";
+import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 import { angleBetween, drawInstrument, euler, orbit } from "../solid.js";
 
@@ -100,7 +101,7 @@ export function mount(root, { link }) {
     if (history.buckets.n) {
       const t = history.buckets.times();
       const end = t[t.length - 1];
-      strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0);
+      strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0, null, holdSpans(link.state?.holds, end, -10, 0));
     }
   }
   const offServer = link.on("server", () => { // the filter beside it ran in the server that is gone

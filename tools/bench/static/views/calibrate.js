@@ -1,6 +1,7 @@
 // Wizards: poses by hand with a live arrow, warm-up, identification on the emulated lab; applied or discarded.
 import { get, post } from "../api.js";
 import { css, digits, duration, h } from "../dom.js";
+import { holdSpans } from "../holds.js";
 import { Strip } from "../plot.js";
 import { poseWizard } from "./calibrate_poses.js";
 
@@ -55,7 +56,7 @@ export function mount(root, { link }) {
       const warm = await get("/api/calibrate/warmth");
       warmth.textContent = warm.text;
       warmth.style.color = warm.steady === undefined ? css("--soft") : css(warm.steady ? "--good" : "--warn");
-      if (warm.t.length) strip.show(Float64Array.from(warm.t), [Float32Array.from(warm.temperature)], warm.t[0], warm.t[warm.t.length - 1]);
+      if (warm.t.length) strip.show(Float64Array.from(warm.t), [Float32Array.from(warm.temperature)], warm.t[0], warm.t[warm.t.length - 1], null, holdSpans(link.state?.holds, 0, warm.t[0], warm.t[warm.t.length - 1]));
     } catch (error) { fail(error); }
     timer = setTimeout(poll, 1000);
   }

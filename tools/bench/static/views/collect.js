@@ -1,6 +1,7 @@
 // Recordings: start, stop, notes, list, quick look, export. The server records; this page may be closed.
 import { download, get, post } from "../api.js";
 import { bytes, colours, duration, h, unitText } from "../dom.js";
+import { holdSpans } from "../holds.js";
 import { Strip } from "../plot.js";
 
 const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["temperature", "temperature"]];
@@ -85,7 +86,7 @@ export function mount(root, { link }) {
     const ys = data.low.map((low, c) => Float32Array.from(low.flatMap((v, i) => [v, data.high[c][i]])));
     const picker = h("select", { "aria-label": "What to look at", onchange: () => { what = picker.value; show(which); } }, LOOKS.map(([value, title]) => h("option", { value, selected: value === what }, title)));
     look.replaceChildren(h("h2", {}, which, picker), strip.element, h("p.note", { className: data.lost ? "note bad" : "note" }, data.health.join(" · ")));
-    strip.show(x, ys, x[0], x[x.length - 1]);
+    strip.show(x, ys, x[0], x[x.length - 1], null, holdSpans(data.holds, 0, x[0], x[x.length - 1]));
     refresh();
   }
 

@@ -1,5 +1,6 @@
 // The oscilloscope: traces in lanes, live or paused, with zoom, cursors, a trigger, maths and spectra.
 import { css, digits, h, persistent, segments } from "../dom.js";
+import { holdSpans } from "../holds.js";
 import { Strip, times } from "../plot.js";
 import { withUnit } from "../signals.js";
 import { TOPS, analysis } from "./scope_analysis.js";
@@ -245,12 +246,13 @@ export function mount(root, { link, catalogue }) {
     triggerBox.say(paused ? (paused.over ? "paused; this run is over, its picture stays" : "paused") : settings.mode === "time" ? trigger.text() : "");
     modes.show(settings.mode);
     displays.show(settings.display);
-    if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused);
-    else analysed.show({ traces, samples: traces.map((trace) => samples.get(trace)), rateHz, seconds: t.length / rateHz });
+    if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused, tEnd);
+    else analysed.show({ spans: holdSpans(link.state?.holds, t[t.length - 1], -t.length / rateHz, 0), traces, samples: traces.map((trace) => samples.get(trace)), rateHz, seconds: t.length / rateHz });
     showReadout(tEnd, samples, t);
   }
 
-  function drawStrips(samples, x, twice, x0, x1, triggered) {
+  function drawStrips(samples, x, twice, x0, x1, triggered, tEnd) {
+    const spans = holdSpans(link.state?.holds, tEnd, x0, x1);
     const marks = cursors.flatMap((c, i) => (c === null ? [] : [{ x: c, colour: css(i ? "--c2" : "--accent"), dash: [4, 3], label: "AB"[i] }]));
     if (triggered) marks.push({ x: 0, colour: css("--warn"), dash: [2, 3], label: "T" });
     for (const { strip, members, inLanes, divs } of strips) {
@@ -289,7 +291,7 @@ export function mount(root, { link, catalogue }) {
         strip.values[i].classList.toggle("bad", out > 0);
         return y;
       });
-      strip.show(x, [...ys, ...beyond], x0, x1, texts);
+      strip.show(x, [...ys, ...beyond], x0, x1, texts, spans);
     }
   }
 

@@ -1,6 +1,7 @@
 // What the scope shows instead of time: one trace over another, spectra, and a spectrum over time.
 import { canvas, colours, css, h } from "../dom.js";
 import { spectrum } from "../fourier.js";
+import { drawSpans, spanText } from "../holds.js";
 import { mids, step125, withUnit } from "../signals.js";
 
 export const TOPS = [30, 100, 500];
@@ -168,6 +169,11 @@ export function analysis(settings, changed) {
     });
     grid(g, box, frequencies(most), false);
     grid(g, box, [0, 0.25, 0.5, 0.75, 1].map((s) => [s, String(Number(((s - 1) * data.seconds).toPrecision(3)))]), true);
+    const spans = data.spans || [];
+    drawSpans(g, spans, { left: box.left, right: box.right, top: box.top, bottom: box.bottom }, (x) => box.right + (x / data.seconds) * wide, css("--warn"));
+    g.fillStyle = css("--warn");
+    g.font = `10px ${css("--mono")}`;
+    g.fillText(spanText(spans).slice(0, 60), box.left + 120, 10);
     g.fillStyle = css("--soft");
     g.textAlign = "right";
     g.fillText(`bright: ${withUnit(peak, data.traces[i].unit)}, dark: 80 dB less`, box.right, 10);

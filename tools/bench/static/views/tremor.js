@@ -1,11 +1,13 @@
 // The tremor as the firmware sees it: path of the tip before and after, size and pace over time, spectrum, reduction.
 import { canvas, css, digits, h, persistent, segments } from "../dom.js";
-import { spectrum } from "../fourier.js";
+import { bandRms, spectrum } from "../fourier.js";
 import { figure } from "../figures.js";
+import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 
 const AXES = ["x", "y", "z"];
-const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahead_${a}`), ...AXES.map((a) => `confidence_${a}`), "status"];
+const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahead_${a}`), ...AXES.map((a) => `confidence_${a}`), "status", ...AXES.map((a) => `tip_displacement_${a}`)];
+const BANDS = [[0, 2], [2, 8], [8, 12], [20, 500]];
 const SLOW = [...AXES.map((a) => `tremor_amplitude_${a}`), ...AXES.map((a) => `tremor_frequency_${a}`)];
 const UM = 1e6;
 const HZ = 1000;
@@ -19,6 +21,7 @@ export function mount(root, { link }) {
   const slow = link.subscribe(SLOW, 60000, 900);
   let before = null;
   let after = null;
+  let tip = null; // [without, with]: motion of the tip along x, y, z
   let size = 60;
 
   const path = canvas(drawPath, "Path of the tip before and after");
@@ -27,6 +30,9 @@ export function mount(root, { link }) {
   const bar = h("i", { style: "width:0" });
   const table = h("table");
   const rows = [];
+  const bandCells = BANDS.map(() => [h("td.num"), h("td.num"), h("td.num")]);
+  const bandTable = h("table.bands", {}, h("tr", {}, h("th", {}, "Hz"), ["without", "with", "change"].map((t) => h("th.num", {}, t))),
+    BANDS.map(([low, high], i) => h("tr", {}, h("td.num", { style: "text-align:left" }, `${low}–${high}`), bandCells[i])));
   const amplitude = new Strip(AXES.map((a) => ({ label: `amplitude ${a}`, unit: "µm" })), { noTimeAxis: true, least: 5, yTitle: "µm" });
   const frequency = new Strip(AXES.map((a) => ({ label: `frequency ${a}`, unit: "Hz" })), { least: 2, xTitle: "time, s", yTitle: "Hz" });
   const gain = h("input", { type: "range", min: 0, max: 1.2, step: 0.05, value: 1, "aria-label": "Gain of the compensation", style: "flex:1" });
@@ -43,6 +49,7 @@ export function mount(root, { link }) {
     h("section.panel.fig", {}, h("h2", {}, "Spectrum, 4 s ", h("small", {}, "all axes together; band 8 to 12 Hz shaded")), h("div.chart", {}, spectra)),
     h("div.stack.side", {},
       h("section.panel", {}, h("h2", {}, figure("gain", "Compensation"), gainText), h("div.row", { style: "flex-wrap:nowrap" }, onOff, gain)),
+      h("section.panel", {}, h("h2", {}, figure("bands", "Four bands, 4 s"), h("small", {}, "tip, µm rms")), bandTable),
       h("section.panel", {}, h("h2", {}, figure("reduction", "Reduction, 4 s")), h("div.row", { style: "align-items:baseline" }, reduction), h("div.meter", { style: "margin:8px 0" }, bar), table,
         h("p.note", {}, "The firmware's estimate against its own prediction; errors of the stacks are not in it (micron run has them)."))),
     h("div.strips.plots", {}, amplitude.element, frequency.element)));
@@ -55,7 +62,7 @@ export function mount(root, { link }) {
     const status = b.lows(9);
     const g = link.state?.status?.gain ?? 1;
     before = AXES.map((_, c) => b.lows(c));
-    after = AXES.map((_, c) => {
+    const driven = AXES.map((_, c) => {
       const now = b.lows(c);
       const ahead = b.lows(3 + c);
       const sure = b.lows(6 + c);
@@ -65,10 +72,14 @@ export function mount(root, { link }) {
         const j = Math.max(0, i - delay);
         if (status[j] & MANUAL) held = 0;
         else if (status[j] & COMMANDED) held = sure[j] > 0 ? g * ahead[j] : 0;
-        rest[i] = now[i] - held;
+        rest[i] = held;
       }
       return rest;
     });
+    const less = (values, c) => values.map((v, i) => v - driven[c][i]);
+    after = before.map(less);
+    const motion = AXES.map((_, c) => b.lows(10 + c));
+    tip = [motion, motion.map(less)];
   }
 
   const rms = (parts) => Math.sqrt(parts.reduce((sum, p) => sum + p.reduce((s, v) => s + v * v, 0) / Math.max(1, p.length), 0)) * UM;
@@ -137,6 +148,18 @@ export function mount(root, { link }) {
     return { values, step: parts[0].step, colour };
   }
 
+  function showBands() {
+    const parts = tip.map((motion) => motion.map((p) => spectrum(p, HZ)));
+    BANDS.forEach(([low, high], i) => {
+      const [without, left] = parts.map((axes) => Math.hypot(...axes.map((s) => bandRms(s, low, high))) * UM);
+      const change = without > 1e-3 ? 100 * (left / without - 1) : 0;
+      bandCells[i][0].textContent = without.toFixed(2);
+      bandCells[i][1].textContent = left.toFixed(2);
+      bandCells[i][2].textContent = `${change > 0.5 ? "+" : change < -0.5 ? "−" : ""}${Math.abs(change).toFixed(0)} %`;
+      bandCells[i][2].className = `num ${change < -0.5 ? "good-text" : change > 0.5 ? "warn-text" : ""}`;
+    });
+  }
+
   let frame = 0;
   let turn = 0;
   function draw() {
@@ -147,14 +170,16 @@ export function mount(root, { link }) {
     const t = slow.buckets.times();
     if (t.length && turn % 8 === 0) {
       const x = times(slow.buckets, t[t.length - 1]);
-      amplitude.show(x, [0, 1, 2].map((c) => interleave(slow.buckets, c, UM)), -60, 0);
-      frequency.show(x, [3, 4, 5].map((c) => interleave(slow.buckets, c)), -60, 0);
+      const spans = holdSpans(link.state?.holds, t[t.length - 1], -60, 0);
+      amplitude.show(x, [0, 1, 2].map((c) => interleave(slow.buckets, c, UM)), -60, 0, null, spans);
+      frequency.show(x, [3, 4, 5].map((c) => interleave(slow.buckets, c)), -60, 0, null, spans);
     }
   }
   const timer = setInterval(() => {
     if (!before) return;
     lines = [powers(before, css("--c2")), powers(after, css("--accent"))];
     spectra.redraw();
+    showBands();
     const [a, b] = [rms(before), rms(after)];
     const percent = a > 0 ? 100 * (1 - b / a) : 0;
     reduction.replaceChildren(percent > 0.5 ? percent.toFixed(0) : "0", h("span.unit", {}, "% less"));

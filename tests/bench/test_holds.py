@@ -1,0 +1,131 @@
+"""Holds as spans on the time axes of the page, and the four bands of the tremor view beside scipy."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from firmware_py.frame import LAYOUT, FrameStatus
+from tests.bench.conftest import go
+from tests.bench.still import RATE_HZ, Still, made_up_rows, still_server
+from tools.bench.hold_spans import MOST_SPANS, HoldSpans
+
+pytestmark = pytest.mark.timeout(400)
+
+HELD = float(FrameStatus.HELD | FrameStatus.SATURATED)
+CAUSE = "daq: no new scan for 5 ms"
+
+
+def test_edges_are_those_of_the_rows_however_they_are_cut():
+    t_s = np.arange(1000) / RATE_HZ
+    status = np.zeros(1000)
+    status[100:150] = status[700:] = HELD
+    status[400] = np.nan
+    for cut in ([], [120], [100], [150], [99, 700, 999]):
+        holds = HoldSpans()
+        for rows in np.split(np.arange(1000), cut):
+            holds.follow(t_s[rows], status[rows])
+        found = [(span.from_s, span.to_s) for span in holds.spans]
+        assert found == [(t_s[100], t_s[150]), (t_s[700], None)], cut
+        assert holds.current is holds.spans[-1]
+
+
+def test_a_cause_belongs_to_its_hold_whichever_is_told_first():
+    t_s, held, free = np.array([1.0]), np.array([HELD]), np.array([0.0])
+    holds = HoldSpans()
+    holds.name(CAUSE)  # the status line is faster than the rows
+    holds.follow(t_s, held)
+    holds.follow(t_s + 1, free)
+    holds.name("")
+    holds.follow(t_s + 2, held)  # the rows are faster
+    assert [span.cause for span in holds.spans] == [CAUSE, ""]
+    holds.name("supply: 4.2 V")
+    holds.name("")
+    holds.follow(t_s + 3, free)
+    assert [span.cause for span in holds.spans] == [CAUSE, "supply: 4.2 V"]
+    for k in range(2 * MOST_SPANS):
+        holds.follow(np.array([10.0 + k]), held if k % 2 else free)
+    assert len(holds.as_list()) == MOST_SPANS
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
+    with still_server(tmp_path_factory.mktemp("holds") / "recordings") as served:
+        rows = made_up_rows()
+        t_s = rows[:, LAYOUT.start("t")]
+        status = np.where((t_s > 10.6) & (t_s < 11.1), HELD, 0.0)
+        served.session.holds.name(CAUSE)
+        served.session.holds.follow(t_s, status)
+        yield served
+
+
+@pytest.fixture
+def page(browser: Any, still: Still) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
+    tab.goto(still.address)
+    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
+    yield tab
+    context.close()
+    assert not errors
+
+
+def test_every_time_axis_shows_the_hold_with_its_cause(page: Any):
+    for view, strips in (("scope", 2), ("attitude", 1), ("tremor", 2), ("actuators", 1)):
+        go(page, view)
+        words = page.locator("#view .hold-words:not([hidden])")
+        words.nth(strips - 1).wait_for()
+        assert words.count() == strips
+        assert f"hold 0.50 s: {CAUSE}" in words.first.inner_text()
+    go(page, "scope")
+    page.wait_for_function("micron.scope.strips[0].strip.spans.length === 1")
+    shown = page.evaluate(
+        """() => {
+            const strip = micron.scope.strips[0].strip, [span] = strip.spans, u = strip.plot;
+            const at = (x) => [...u.ctx.getImageData(u.valToPos(x, "x", true), u.bbox.top + 1, 1, 1).data.slice(0, 3)];
+            return { from: span.x0, to: span.x1, inside: at((span.x0 + span.x1) / 2), outside: at(span.x0 - 0.05) };
+        }"""
+    )
+    assert shown["to"] - shown["from"] == pytest.approx(0.5, abs=0.003)
+    assert shown["inside"] != shown["outside"], "a band at the top marks the hold"
+
+
+def test_the_spectrogram_has_it_as_well(page: Any):
+    go(page, "scope")
+    page.click("button[data-value=spectrogram]")
+    warm = """() => {
+        const c = document.querySelector(".analysis canvas"), g = c.getContext("2d");
+        const row = g.getImageData(0, 19, c.width, 1).data;
+        let n = 0;
+        for (let i = 0; i < row.length; i += 4) if (row[i] === 245 && row[i + 1] === 176 && row[i + 2] === 66) n++;
+        return n;
+    }"""
+    page.wait_for_function(f"({warm})() > 50")
+
+
+def test_four_bands_beside_scipy(page: Any):
+    rows, names = made_up_rows()[-4096:], LAYOUT.scalar_names()
+    longer = made_up_rows()[-4098:]
+
+    def of(table: np.ndarray, name: str) -> np.ndarray:
+        return np.stack([table[:, names.index(f"{name}_{axis}")] for axis in "xyz"])
+
+    motion = of(rows, "tip_displacement")
+    left = motion - of(longer, "tremor_ahead")[:, :-2]  # commanded two ticks before, gain and confidence 1
+    go(page, "tremor")
+    page.wait_for_function("document.querySelector('.bands td.num').textContent !== ''")
+    shown = [row.locator("td").all_inner_texts() for row in page.locator(".bands tr").all()[1:]]
+    assert [row[0] for row in shown] == ["0–2", "2–8", "8–12", "20–500"]
+    for (low, high), row in zip(((0.1, 2), (2, 8), (8, 12), (20, 500)), shown, strict=True):
+        for data, text in ((motion, row[1]), (left, row[2])):
+            hz, density = signal.periodogram(data, RATE_HZ, "hann", detrend="constant")
+            inside = (hz >= low) & (hz < high)
+            expected = 1e6 * np.sqrt(density[:, inside].sum() * hz[1])
+            assert float(text) == pytest.approx(expected, rel=0.02, abs=0.006), row
+    assert shown[2][3].startswith("−")
