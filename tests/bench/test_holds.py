@@ -119,7 +119,7 @@ def test_four_bands_beside_scipy(page: Any):
     motion = of(rows, "tip_displacement")
     left = motion - of(longer, "tremor_ahead")[:, :-2]  # commanded two ticks before, gain and confidence 1
     go(page, "tremor")
-    page.wait_for_function("document.querySelector('.bands td.num').textContent !== ''")
+    page.wait_for_function("document.querySelector('.bands td:nth-child(2)').textContent !== ''")
     shown = [row.locator("td").all_inner_texts() for row in page.locator(".bands tr").all()[1:]]
     assert [row[0] for row in shown] == ["0–2", "2–8", "8–12", "20–500"]
     for (low, high), row in zip(((0.1, 2), (2, 8), (8, 12), (20, 500)), shown, strict=True):

@@ -25,6 +25,7 @@ from tools.bench.session import Session
 from tools.errors import InputError
 
 FORMATS = ("csv", "npz", "parquet")
+SPAN_FORMATS = (*FORMATS, "mcap")
 MAX_LISTED = 500
 LOOK_PIXELS = 900
 LOOK_CHANNELS = 8
@@ -125,6 +126,13 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
     }
 
 
+def _time(table: dict[str, Any], key: str) -> float:
+    value = table.get(key)
+    if isinstance(value, bool) or not isinstance(value, int | float) or not -1e9 < value < 1e9:
+        raise InputError(f"{key} must be a time in seconds")
+    return float(value)
+
+
 def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     recorder = session.recorder
     looking = asyncio.Lock()
@@ -168,6 +176,25 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         command = ["tools.cli.main", "export", str(path), "--out", str(out)]
         return jobs.start("export", f"export {out.name}", [command], folder).as_dict()
 
+    async def span(request: Request) -> Any:
+        """Cut a span out: for Mismatch as a recording beside the others, else as a file to take away."""
+        path, table = existing(request), await body(request)
+        kind = text(table, "to")
+        from_s, to_s = (_time(table, key) for key in ("from_s", "to_s"))
+        if from_s >= to_s:
+            raise InputError("the span has no length: mark its start and its end")
+        if kind not in (*SPAN_FORMATS, "mismatch"):
+            raise InputError(f"{kind!r} is not a format; there are {', '.join(SPAN_FORMATS)}, or mismatch")
+        title = f"{path.stem[:50]} {from_s:.2f}-{to_s:.2f} s"
+        folder = jobs.new_folder()
+        out = recorder.path(title) if kind == "mismatch" else folder / f"{title}.{kind}"
+        if out.is_symlink():
+            raise InputError(f"{out} is a symbolic link; remove it first")
+        times = ("--from", f"{from_s!r}", "--to", f"{to_s!r}", "--overwrite")
+        command = ["tools.cli.main", "export", str(path), "--out", str(out), *times]
+        jobs.start("export", f"span of {path.stem}", [command], folder)
+        return {"file": out.name, "recording": out.name if kind == "mismatch" else ""}
+
     async def delete(request: Request) -> Any:
         path = existing(request)
         if recorder.active and path == recorder.path(recorder.name):
@@ -186,5 +213,6 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         Route("/api/recordings/{name}/look", clear(look)),
         Route("/api/recordings/{name}/file", clear(download)),
         Route("/api/recordings/{name}/export", clear(export), methods=["POST"]),
+        Route("/api/recordings/{name}/span", clear(span), methods=["POST"]),
         Route("/api/recordings/{name}/delete", clear(delete), methods=["POST"]),
     ]

@@ -10,6 +10,7 @@ import asyncio
 import json
 import time
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,12 +18,18 @@ from numpy.typing import NDArray
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from firmware_py.frame import LAYOUT
+from firmware_py.recording.errors import RecordingError
 from tools.bench.guard import Access
-from tools.bench.history import rows_per_bucket
+from tools.bench.history import Buckets, History, rows_per_bucket
+from tools.bench.recorder import check_name, is_own_file
+from tools.bench.replay import SPEEDS, RecordedHistory, Replay, open_recorded
 from tools.bench.session import STATUS_S, Session
 from tools.bench.wire import encode
+from tools.errors import InputError
 
-MAX_SUBSCRIPTIONS = 4
+MAX_SUBSCRIPTIONS = 6
+SHOWN, SECOND, LIVE = 0, 1, 2
+"""What a subscription follows: what the page shows (live or a replay), the run laid over it, or the bench itself."""
 MAX_CHANNELS = 64
 MAX_PIXELS = 8192
 MAX_NONSENSE = 100
@@ -45,6 +52,7 @@ class Subscription:
     channels: NDArray[np.intp]
     rows: int
     per_bucket: int
+    source: int = SHOWN
     next_bucket: int | None = None
 
 
@@ -60,6 +68,19 @@ def _channels(message: dict[str, Any]) -> NDArray[np.intp]:
     if not isinstance(names, list) or len(names) > MAX_CHANNELS or any(name not in _INDEX for name in names):
         raise Nonsense("channels must be names of columns")
     return np.array([_INDEX[name] for name in names], dtype=np.intp)
+
+
+def _source(message: dict[str, Any]) -> int:
+    return int(_number(message, "source", SHOWN, LIVE)) if "source" in message else SHOWN
+
+
+async def _read(
+    history: History | RecordedHistory, channels: NDArray[np.intp], k: int, first: int, stop: int | None = None
+) -> Buckets:
+    """Answer from memory at once; from a file in a thread, so that nobody else waits for the disk."""
+    if isinstance(history, RecordedHistory):
+        return await asyncio.to_thread(history.buckets, channels, k, first, stop)
+    return history.buckets(channels, k, first, stop)
 
 
 class Viewer:
@@ -81,6 +102,11 @@ class Viewer:
         self._orders_since_s = 0.0
         self._run = -1
         self._log_sent = 0
+        self._replay: Replay | None = None
+        self._generation = 0
+        self._replay_told: dict[str, Any] | None = None
+        self._place_told: dict[str, Any] | None = None
+        self._opening = asyncio.Lock()
 
     async def serve(self) -> None:
         """Both directions; the first that ends takes the other with it. An armed viewer that goes away is disarmed."""
@@ -94,6 +120,8 @@ class Viewer:
             for task in tasks:
                 task.cancel()
             await asyncio.gather(*tasks, return_exceptions=True)
+            if self._replay is not None:
+                await self._replay.close()
 
     # -- from the page --------------------------------------------------------------------------------------
 
@@ -109,14 +137,14 @@ class Viewer:
             if message["type"] == "websocket.disconnect":
                 return
             try:
-                self._obey(_parse(message.get("text")))
+                await self._obey(_parse(message.get("text")))
             except Nonsense:
                 self._nonsense += 1
                 if self._nonsense > MAX_NONSENSE:
                     await self._socket.close(1008, "too many messages that make no sense")
                     return
 
-    def _obey(self, message: dict[str, Any]) -> None:
+    async def _obey(self, message: dict[str, Any]) -> None:
         match message.get("type"):
             case "hello":
                 token = message.get("token")
@@ -128,7 +156,9 @@ class Viewer:
             case "unsubscribe":
                 self._subscriptions.pop(int(_number(message, "id", 0, 1e9)), None)
             case "range" if self._may_look:
-                self._range(message)
+                await self._range(message)
+            case "replay" if self._may_look:
+                await self._order_replay(message)
             case "counts" if self._may_look:
                 self._wants_counts = message.get("on") is True
             case "game" if self._may_look:
@@ -151,17 +181,70 @@ class Viewer:
             raise Nonsense("too many subscriptions")
         rows = int(_number(message, "rows", 1, 1e6))
         k = rows_per_bucket(rows, int(_number(message, "pixels", 1, MAX_PIXELS)))
-        self._subscriptions[number] = Subscription(number, _channels(message), rows, k)
+        self._subscriptions[number] = Subscription(number, _channels(message), rows, k, _source(message))
 
-    def _range(self, message: dict[str, Any]) -> None:
+    async def _range(self, message: dict[str, Any]) -> None:
         """A part of the past, once; a later request replaces an earlier one that was not sent yet."""
         first, stop = int(_number(message, "first", 0, 1e15)), int(_number(message, "stop", 0, 1e15))
         k = rows_per_bucket(max(1, stop - first), int(_number(message, "pixels", 1, MAX_PIXELS)))
         number = int(_number(message, "id", 0, 1e9))
         if len(self._ranges) >= MAX_SUBSCRIPTIONS and number not in self._ranges:
             raise Nonsense("too many requests at once")
-        buckets = self._session.history.buckets(_channels(message), k, first // k, -(-stop // k))
+        history = self._history(_source(message))
+        if history is None:
+            raise Nonsense("there is no second run")
+        buckets = await _read(history, _channels(message), k, first // k, -(-stop // k))
         self._ranges[number] = encode(buckets, number)
+
+    def _history(self, source: int) -> History | RecordedHistory | None:
+        """Return what a source of data is now; None for a second run that is not there."""
+        if source == LIVE or self._replay is None:
+            return None if source == SECOND else self._session.history
+        if source == SECOND:
+            return None if self._replay.second is None else self._replay.second.history
+        return self._replay.first.history
+
+    async def _order_replay(self, message: dict[str, Any]) -> None:
+        """Open, move, play or close a recording; what cannot be is said to this page alone."""
+        try:
+            async with self._opening:
+                await self._change_replay(message)
+        except (InputError, RecordingError) as error:
+            await self._socket.send_json({"type": "replay problem", "text": str(error)})
+
+    async def _change_replay(self, message: dict[str, Any]) -> None:
+        replay = self._replay
+        if "name" in message:
+            recorded = await open_recorded(self._recording(message["name"]))
+            self._replay, self._generation, self._replay_told, self._place_told = Replay(recorded), -1, None, None
+            if replay is not None:
+                await replay.close()
+        elif message.get("close") is True and replay is not None:
+            self._replay, self._run = None, -1  # greet the live run again
+            await replay.close()
+        elif replay is None:
+            raise InputError("no recording is open in this page any more; open it again")
+        elif "seek" in message:
+            replay.seek(_number(message, "seek", -1e9, 1e9))
+        elif "play" in message:
+            replay.play(message["play"] is True)
+        elif "speed" in message:
+            if message["speed"] not in SPEEDS:
+                raise Nonsense("no such speed")
+            replay.speed = float(message["speed"])
+        elif "shift" in message and replay.second is not None:
+            await replay.lay_over(replay.second, _number(message, "shift", -1e6, 1e6))
+        elif "second" in message:
+            second = await open_recorded(self._recording(message["second"])) if message["second"] else None
+            await replay.lay_over(second)
+
+    def _recording(self, name: Any) -> Path:
+        path = self._session.recorder.path(check_name(name if isinstance(name, str) else ""))
+        if not is_own_file(path):
+            raise InputError(f"there is no recording {path.stem!r} in {path.parent}")
+        if self._session.recorder.active and self._session.recorder.name == path.stem:
+            raise InputError(f"{path.stem!r} is being recorded; stop it first")
+        return path
 
     def _order(self, message: dict[str, Any]) -> None:
         now_s = time.monotonic()
@@ -197,6 +280,7 @@ class Viewer:
                     now_s = time.monotonic()
                     if self._may_look:
                         await self._greet_new_run()
+                        await self._move_replay()
                         for subscription in list(self._subscriptions.values()):
                             await self._send_new(subscription)
                         shadow = self._session.shadow
@@ -221,13 +305,40 @@ class Viewer:
             return
         self._run = session.run_number
         for subscription in self._subscriptions.values():
-            subscription.next_bucket = None
+            if self._replay is None or subscription.source == LIVE:
+                subscription.next_bucket = None
         await self._socket.send_json(
             {"type": "hello", "run": self._run, "may_order": self._may_order, "server": session.identity}
         )
 
+    async def _move_replay(self) -> None:
+        """Move the replay on, and tell the page where it is; after a jump everything is sent again."""
+        replay = self._replay
+        if replay is None:
+            if self._replay_told is not None:
+                self._replay_told = None
+                await self._socket.send_json({"type": "replay", "name": ""})
+            return
+        replay.advance()
+        if replay.generation != self._generation:
+            self._generation = replay.generation
+            for subscription in self._subscriptions.values():
+                if subscription.source != LIVE:
+                    subscription.next_bucket = None
+            await self._socket.send_json({"type": "jump"})
+        table = replay.as_dict()
+        if table != self._replay_told:
+            self._replay_told = table
+            await self._socket.send_json(table)
+        place = replay.place()
+        if place != self._place_told:
+            self._place_told = place
+            await self._socket.send_json(place)
+
     async def _send_new(self, subscription: Subscription) -> None:
-        history, k = self._session.history, subscription.per_bucket
+        history, k = self._history(subscription.source), subscription.per_bucket
+        if history is None:
+            return
         newest = history.head // k
         oldest = max(0, history.head - subscription.rows) // k
         first = subscription.next_bucket
@@ -235,7 +346,10 @@ class Viewer:
             first = oldest
         if first * k >= history.head:
             return
-        buckets = history.buckets(subscription.channels, k, first)
+        generation = self._generation
+        buckets = await _read(history, subscription.channels, k, first)
+        if generation != self._generation or history is not self._history(subscription.source):
+            return  # somebody has jumped meanwhile
         if buckets.t_s.size:
             subscription.next_bucket = min(newest, buckets.first + buckets.t_s.size)
             await self._socket.send_bytes(encode(buckets, subscription.id))

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
+import tempfile
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from firmware_py.recording.cut import cut
+from firmware_py.recording.export import ExportReport
 from firmware_py.recording.export import export as export_recording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
@@ -40,12 +44,14 @@ def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
     out: Annotated[
         Path,
-        typer.Option(metavar="PATH", help="name.csv, name.npz, name.parquet, or a folder for the contract's form."),
+        typer.Option(metavar="PATH", help="name.csv, .npz, .parquet, .mcap, or a folder for the contract's form."),
     ],
+    from_s: Annotated[float | None, typer.Option("--from", metavar="S", help="First time, s. Default: all.")] = None,
+    to_s: Annotated[float | None, typer.Option("--to", metavar="S", help="End of the span, s.")] = None,
     overwrite: Overwrite = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Write a recording as csv, npz, parquet, or the recording folder that the mismatch engine reads.
+    """Write a recording, or a span of it, as mcap, csv, npz, parquet, or the folder that the mismatch engine reads.
 
     Example: micron export out/run.mcap --out out/run.csv
     """
@@ -53,7 +59,16 @@ def export(
         check_writable(json_file)
         check_writable(out, folders=True)
         recording = Recording(file)
-        report = export_recording(recording, out, overwrite=overwrite)
+        with tempfile.TemporaryDirectory(prefix="micron-") as scratch:
+            if from_s is not None or to_s is not None or out.suffix == ".mcap":
+                span = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
+                part = out if out.suffix == ".mcap" else Path(scratch) / file.name
+                cut(recording, part, *span, overwrite=overwrite)
+                recording = Recording(part)
+            if out.suffix == ".mcap":
+                report = ExportReport(out, "mcap", recording.n_rows, len(recording.columns))
+            else:
+                report = export_recording(recording, out, overwrite=overwrite)
         for note in report.notes:
             console().print(note, soft_wrap=True)
         console().print(f"{report.path}: {report.rows} ticks, {report.columns} columns", soft_wrap=True)

@@ -19,6 +19,7 @@ export class Link extends EventTarget {
     this.log = [];
     this.wantsCounts = false;
     this.run = -1;
+    this.replay = null; // the recording that the views show, if they show one
     this.server = ""; // which server this is: another one has another history, and perhaps another token
     this.refused = false; // whether the server does not know the token
     this.connect();
@@ -31,6 +32,10 @@ export class Link extends EventTarget {
       this.connected = true;
       this.log = [];
       this.send({ type: "hello", token: this.token });
+      if (this.lostReplay) { // the server keeps it for a connection: ask again, at the same place
+        this.reopen(this.lostReplay);
+        this.lostReplay = null;
+      }
       for (const subscription of this.subscriptions.values()) this.ask(subscription);
       if (this.wantsCounts) this.send({ type: "counts", on: true });
       this.emit("connection");
@@ -42,6 +47,7 @@ export class Link extends EventTarget {
     };
     socket.onclose = (event) => {
       this.connected = false;
+      if (this.replay) this.lostReplay = this.replay;
       if (event.code === 4403) this.refused = true;
       for (const { resolve, buckets } of this.waiting.values()) resolve(buckets); // empty: nobody answers any more
       this.waiting.clear();
@@ -68,17 +74,32 @@ export class Link extends EventTarget {
     return () => this.removeEventListener(name, listener);
   }
 
-  /** Follow channels: `rows` newest rows on `pixels` pixels. `subscription.buckets` always holds the newest. */
-  subscribe(channels, rows, pixels) {
-    const subscription = { id: this.next++, channels, rows, pixels: Math.max(1, Math.round(pixels)), buckets: new Buckets(channels.length) };
+  /** Holds of what the views show. */
+  get holds() { return this.replay ? this.replay.holds : this.state?.holds; }
+
+  /** Open, move, play or close a replay. */
+  replayTo(message) { this.send({ type: "replay", ...message }); }
+
+  reopen({ name, position_s, speed, second, shift_s }) {
+    this.replayTo({ name });
+    this.replayTo({ speed });
+    if (second) this.replayTo({ second });
+    if (second && shift_s) this.replayTo({ shift: shift_s });
+    this.replayTo({ seek: position_s });
+  }
+
+  /** Follow channels: `rows` newest rows on `pixels` pixels. `subscription.buckets` always holds the newest.
+   * `source`: what the page shows (0), the run laid over it (1), or the bench itself, whatever is shown (2). */
+  subscribe(channels, rows, pixels, source = 0) {
+    const subscription = { id: this.next++, channels, rows, pixels: Math.max(1, Math.round(pixels)), buckets: new Buckets(channels.length), source };
     this.subscriptions.set(subscription.id, subscription);
     this.ask(subscription);
     return subscription;
   }
 
-  ask({ id, channels, rows, pixels, buckets }) {
+  ask({ id, channels, rows, pixels, buckets, source }) {
     buckets.clear();
-    this.send({ type: "subscribe", id, channels, rows, pixels });
+    this.send({ type: "subscribe", id, channels, rows, pixels, source });
   }
 
   drop(subscription) {
@@ -86,11 +107,11 @@ export class Link extends EventTarget {
   }
 
   /** A part of the past, once: resolves with Buckets. */
-  range(channels, first, stop, pixels) {
+  range(channels, first, stop, pixels, source = 0) {
     const id = this.next++;
     return new Promise((resolve) => {
       this.waiting.set(id, { resolve, buckets: new Buckets(channels.length) });
-      this.send({ type: "range", id, channels, first: Math.max(0, Math.floor(first)), stop: Math.max(0, Math.ceil(stop)), pixels: Math.round(pixels) });
+      this.send({ type: "range", id, source, channels, first: Math.max(0, Math.floor(first)), stop: Math.max(0, Math.ceil(stop)), pixels: Math.round(pixels) });
     });
   }
 
@@ -115,6 +136,19 @@ export class Link extends EventTarget {
       [this.server, this.run] = [message.server, message.run];
       this.emit("run", { same });
       if (another) this.emit("server", message.server);
+    } else if (message.type === "replay") {
+      const began = message.name && this.replay?.name !== message.name;
+      this.replay = message.name ? { position_s: 0, playing: false, speed: 1, ...this.replay, ...message } : null;
+      if (began || !this.replay) this.emit("source", this.replay);
+      this.emit("replay", this.replay);
+    } else if (message.type === "place" && this.replay) {
+      Object.assign(this.replay, message);
+      this.emit("replay", this.replay);
+    } else if (message.type === "jump") {
+      for (const { buckets, source } of this.subscriptions.values()) if (source !== 2) buckets.clear();
+      this.emit("jump");
+    } else if (message.type === "replay problem") {
+      this.emit("replay problem", message.text);
     } else if (message.type === "game") {
       this.emit("game", message.game);
     } else if (message.type === "shadow") {

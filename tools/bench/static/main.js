@@ -4,6 +4,7 @@ import { bytes, duration, h } from "./dom.js";
 import { figure, showHints } from "./figures.js";
 import { layoutPanel } from "./layouts.js";
 import { Link } from "./link.js";
+import { replayBar } from "./replay.js";
 
 const VIEWS = [
   ["scope", "Scope", "M3 5v14h18M6 14c2 0 2-6 4-6s2 9 4 9 2-5 4-5"],
@@ -27,9 +28,16 @@ setToken(token);
 
 const byId = (id) => document.getElementById(id);
 const link = new Link(token);
-const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; }, view: () => shown, reload };
+const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; }, view: () => shown, reload, say };
 let unmount = null;
 let shown = "";
+
+/** One message at the top of the page; it goes when it is pressed. */
+function say(text) {
+  const box = byId("say");
+  box.hidden = !text;
+  box.replaceChildren(text, h("button", { onclick: () => say("") }, "Close"));
+}
 
 /** Mount a view again: its settings are others. */
 function reload(name) {
@@ -63,6 +71,8 @@ function buildNav() {
     a.append(title, h("kbd", {}, String(i + 1)));
     byId("nav").append(a);
   });
+  context.bar = replayBar(link, context);
+  byId("top").append(context.bar.element);
   const layouts = layoutPanel(link, context);
   byId("view").after(layouts.element);
   const button = h("button", { onclick: () => layouts.toggle() });

@@ -53,7 +53,7 @@ export class Strip {
   /**
    * `traces`: [{label, unit, colour?}]; options: sync, onSelect(x0, x1), onClick(x, shift), onWheel(direction, x),
    * least (smallest span), xTitle, yTitle, ticks(heightPx): [{at, text}] of the vertical axis, more: series after the
-   * traces, in the colour of a fault.
+   * traces, in the colour of a fault; over: series after those, in the colours of the traces, dashed.
    */
   constructor(traces, options = {}) {
     this.traces = traces;
@@ -107,6 +107,9 @@ export class Strip {
             dash: trace.dash,
           })),
           ...Array.from({ length: this.options.more || 0 }, () => ({ stroke: css("--bad"), width: 2.5, points: { show: false }, spanGaps: false })),
+          ...this.traces.slice(0, this.options.over || 0).map((trace, i) => ({
+            stroke: trace.colour || palette[i % palette.length], width: 1, dash: [5, 4], points: { show: false }, spanGaps: false,
+          })),
         ],
         hooks: {
           setSelect: [(u) => {
@@ -121,7 +124,7 @@ export class Strip {
           setCursor: [(u) => strip.options.onCursor?.(u.cursor.left >= 0 ? u.posToVal(u.cursor.left, "x") : null)],
         },
       },
-      [[], ...this.traces.map(() => []), ...Array.from({ length: this.options.more || 0 }, () => [])],
+      [[], ...this.traces.map(() => []), ...Array.from({ length: (this.options.more || 0) + (this.options.over || 0) }, () => [])],
       this.body,
     );
     let moved = 0;
@@ -178,7 +181,7 @@ export class Strip {
     this.data = [x, ...ys];
     this.plot.setData(this.data);
     if (texts) texts.forEach((text, i) => { this.values[i].textContent = text; });
-    else ys.forEach((y, i) => this.value(i, y.length ? y[y.length - 1] : NaN));
+    else ys.slice(0, this.traces.length).forEach((y, i) => this.value(i, y.length ? y[y.length - 1] : NaN));
   }
 
   value(i, number) { this.values[i].textContent = digits(number) + (this.traces[i].unit ? ` ${unitText(this.traces[i].unit)}` : ""); }

@@ -8,9 +8,9 @@ export function mids(low, high) {
 }
 
 export function mean(values) {
-  let sum = 0;
-  for (let i = 0; i < values.length; i++) sum += values[i];
-  return values.length ? sum / values.length : 0;
+  let [sum, n] = [0, 0]; // a recording has gaps: no number is no value
+  for (let i = 0; i < values.length; i++) if (values[i] === values[i]) [sum, n] = [sum + values[i], n + 1];
+  return n ? sum / n : 0;
 }
 
 /** Second-order sections by the bilinear transform (Bristow-Johnson's cookbook): [b0, b1, b2, a1, a2], a0 = 1. */
@@ -24,12 +24,12 @@ export function section(kind, hz, q, rateHz) {
 /** Filter `values`, as if the first one had been there for ever. */
 export function run(values, [b0, b1, b2, a1, a2]) {
   const out = new Float64Array(values.length);
-  const x0 = values.length ? values[0] : 0;
+  const x0 = values.find((v) => v === v) ?? 0;
   const y0 = (x0 * (b0 + b1 + b2)) / (1 + a1 + a2);
   let s2 = b2 * x0 - a2 * y0;
   let s1 = b1 * x0 - a1 * y0 + s2;
   for (let i = 0; i < values.length; i++) {
-    const x = values[i];
+    const x = values[i] === values[i] ? values[i] : x0;
     const y = b0 * x + s1;
     s1 = b1 * x - a1 * y + s2;
     s2 = b2 * x - a2 * y;
@@ -68,7 +68,7 @@ export function rms(values, seconds, rateHz) {
   const zero = mean(values);
   let [sum, squares] = [0, 0];
   for (let i = 0; i < values.length; i++) {
-    const v = values[i] - zero;
+    const v = values[i] === values[i] ? values[i] - zero : 0;
     sum += v;
     squares += v * v;
     if (i >= n) {

@@ -73,7 +73,7 @@ export function mount(root, { link }) {
   }
   function showArm() {
     const state = link.state?.status?.manual || "off";
-    const running = link.state?.phase === "running" && link.state.status.state === "running";
+    const running = link.state?.phase === "running" && link.state.status.state === "running" && !link.replay; // nobody drives by what was recorded
     if (armTimer && !running) disarm();
     const armed = Boolean(armTimer);
     arm.setAttribute("aria-checked", String(armed));
@@ -81,7 +81,8 @@ export function mount(root, { link }) {
     arm.disabled = !link.mayOrder || !running;
     cards.forEach((card) => card.buttons.forEach((b) => { b.disabled = !armed || state !== "armed"; }));
     manual.textContent = state === "armed" ? "Compensation is off. Hold a button to move; release stops." : state === "returning" ? "Going back to neutral …"
-      : link.mayOrder ? "Compensation drives the stacks. Arm to move them by hand." : "View only.";
+      : link.replay ? "A recording is shown: go back to live to drive by hand."
+        : link.mayOrder ? "Compensation drives the stacks. Arm to move them by hand." : "View only.";
   }
 
   const strip = new Strip([1, 2, 3].map((n) => ({ label: `command ${n}`, unit: "V" })), { least: 10, xTitle: "time, s", yTitle: "V" });
@@ -138,7 +139,7 @@ export function mount(root, { link }) {
       card.loop.redraw();
     });
     const t = b.times();
-    strip.show(times(b, t[t.length - 1]), [0, 1, 2].map((c) => interleave(b, c)), -8, 0, null, holdSpans(link.state?.holds, t[t.length - 1], -8, 0));
+    strip.show(times(b, t[t.length - 1]), [0, 1, 2].map((c) => interleave(b, c)), -8, 0, null, holdSpans(link.holds, t[t.length - 1], -8, 0));
     let bits = 0;
     for (const v of b.highs(6)) bits |= v;
     const s = link.state?.status || {};

@@ -90,7 +90,7 @@ export function mount(root, { link }) {
       if (size < 0.5) q = null;
       if (q && !reference) reference = q;
     }
-    const method = link.state?.shadow;
+    const method = link.replay ? "" : link.state?.shadow; // it follows the bench, not a recording
     secondPanel.hidden = !method;
     other = method && link.shadow && Math.hypot(...link.shadow) > 0.5 ? link.shadow : null;
     main.redraw();
@@ -101,7 +101,7 @@ export function mount(root, { link }) {
     if (history.buckets.n) {
       const t = history.buckets.times();
       const end = t[t.length - 1];
-      strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0, null, holdSpans(link.state?.holds, end, -10, 0));
+      strip.show(times(history.buckets, end), [0, 1, 2].map((c) => interleave(history.buckets, c, 180 / Math.PI)), -10, 0, null, holdSpans(link.holds, end, -10, 0));
     }
   }
   const offServer = link.on("server", () => { // the filter beside it ran in the server that is gone
@@ -119,6 +119,7 @@ export function mount(root, { link }) {
   const retheme = () => { colours = palette(); strip.build(); };
   window.addEventListener("themechange", retheme);
   const offRun = link.on("run", ({ same }) => { if (!same) q = reference = null; });
+  const offSource = link.on("source", () => { q = reference = null; });
   draw();
   return () => {
     cancelAnimationFrame(frame);
@@ -126,6 +127,7 @@ export function mount(root, { link }) {
     window.removeEventListener("themechange", retheme);
     offRun();
     offServer();
+    offSource();
     offState();
     link.drop(subscription);
     link.drop(history);

@@ -16,7 +16,7 @@ export const POSES = [...FACES, ...CORNERS];
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
 
 export function poseWizard(link, apply, fail) {
-  const subscription = link.subscribe([...FORCE, ...VOLTS], HOLD, HOLD);
+  const subscription = link.subscribe([...FORCE, ...VOLTS], HOLD, HOLD, 2);
   const taken = new Map();
   let up = null;
   let noise = Infinity;

@@ -6,7 +6,8 @@ import { Strip } from "../plot.js";
 
 const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["temperature", "temperature"]];
 
-export function mount(root, { link }) {
+export function mount(root, context) {
+  const { link } = context;
   let chosen = null;
   let what = LOOKS[0][0];
   let strip = null;
@@ -57,7 +58,7 @@ export function mount(root, { link }) {
       if (sure) act(() => post(`${path}/delete`));
       else { sure = true; remove.textContent = "Really delete?"; remove.classList.add("bad"); }
     } }, "Delete");
-    return [h("button.quiet", { onclick: () => act(() => download(`${path}/file`, `${r.name}.mcap`)) }, "Download"), formats, remove];
+    return [h("button", { onclick: () => { link.replayTo({ name: r.name }); context.navigate("scope"); } }, "Open"), h("button.quiet", { onclick: () => act(() => download(`${path}/file`, `${r.name}.mcap`)) }, "Download"), formats, remove];
   }
 
   async function exportAs(path, format) {

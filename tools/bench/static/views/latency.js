@@ -37,7 +37,8 @@ export function mount(root, { link }) {
   };
   const body = h("tbody");
   const head = ["task", "rate", "distribution, log 1 µs to 20 ms", "p50", "p99", "p99.9", "worst", "budget", "of budget", "over", "late", "held", "at tick"];
-  root.append(h("div.cols.latency", {},
+  const note = h("p.warn-text", { hidden: true }, "A recording is shown. A recording holds no timing: these figures are of the bench that runs now.");
+  root.append(note, h("div.cols.latency", {},
     h("section.panel.total", {},
       h("div", {}, h("h2", {}, "From sample to command"), headline),
       h("div.chart", {}, big)),
@@ -86,6 +87,7 @@ export function mount(root, { link }) {
 
   function show(state) {
     const { timing, status } = state;
+    note.hidden = !link.replay;
     const total = timing["sample to command"];
     if (total?.[0]) {
       for (const [name, value] of [["p50", total[1]], ["p99", total[2]], ["worst", total[4]]]) headline.say(name, (value / 1000).toFixed(2), "ms");

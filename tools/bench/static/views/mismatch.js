@@ -30,6 +30,9 @@ export function mount(root, { link }) {
   async function refresh() {
     const state = await get("/api/mismatch");
     select.replaceChildren(...state.recordings.map((name) => h("option", { value: name }, name)));
+    const wanted = JSON.parse(localStorage.getItem("micron.mismatch") || "null")?.recording; // sent here from a replay
+    localStorage.removeItem("micron.mismatch");
+    if (state.recordings.includes(wanted)) select.value = wanted;
     if (!state.recordings.length) select.replaceChildren(h("option", { value: "" }, `no recording in ${state.folder}`));
     showApplied(state.applied);
     show(state.job);

@@ -16,7 +16,7 @@ const MOST_PIXELS = 8192; // the server gives no more
 const ANALYSIS_MS = 200;
 const SLACK = 0.3; // further part of the window in which a trigger may be found
 
-export function mount(root, { link, catalogue }) {
+export function mount(root, { link, catalogue, bar }) {
   const defaults = {
     channels: catalogue.filter((c) => ["tip_displacement", "command"].includes(c.group)).map((c) => c.name),
     // the tip also wanders, by more than it trembles: without that the tremor is seen
@@ -31,6 +31,8 @@ export function mount(root, { link, catalogue }) {
   let columns = []; // what is subscribed to: channels shown, and what maths and trigger need
   let strips = [];
   let subscription = null;
+  let over = null; // the second run of a replay
+  let overName = "";
   let paused = null; // {tEnd, head, view: [x0, x1], buckets}
   let cursors = [null, null];
   let dirty = true;
@@ -80,7 +82,11 @@ export function mount(root, { link, catalogue }) {
   function subscribe() {
     link.drop(subscription);
     const more = settings.trigger.on ? 1 + SLACK : 1;
-    subscription = columns.length ? link.subscribe(columns, settings.rows * more, Math.min(MOST_PIXELS, pixels(settings.rows) * more)) : null;
+    const ask = (source) => link.subscribe(columns, settings.rows * more, Math.min(MOST_PIXELS, pixels(settings.rows) * more), source);
+    link.drop(over);
+    subscription = columns.length ? ask(0) : null;
+    over = columns.length && link.replay?.second ? ask(1) : null;
+    overName = link.replay?.second || "";
   }
 
   function rebuild() {
@@ -105,7 +111,7 @@ export function mount(root, { link, catalogue }) {
       const unit = members[0].unit === "m" ? "µm" : members[0].unit;
       made.strip = new Strip(members.map((t) => ({ label: t.name, unit: t.unit })), {
         sync: "scope", noTimeAxis: i < parts.length - 1, onSelect: zoomTo, onClick: setCursor, onDouble: zoomOut, onWheel: wheel,
-        xTitle: "time, s", yTitle: inLanes ? "" : unit || "no unit", more: members.length,
+        xTitle: "time, s", yTitle: inLanes ? "" : unit || "no unit", more: members.length, over: link.replay?.second ? members.length : 0,
         ticks: inLanes ? (height) => laneTicks(members.length, made.divs, members.map((t) => t.unit), members.map((t) => t.set.offset), height / members.length, withUnit) : undefined,
       });
       if (inLanes) made.strip.fixed = [0, members.length];
@@ -140,6 +146,7 @@ export function mount(root, { link, catalogue }) {
     const tEnd = t[t.length - 1];
     const { first, n, perBucket } = subscription.buckets;
     paused = { tEnd, head: (first + n) * perBucket, view: [-settings.rows / HZ, 0], buckets: snapshot(subscription.buckets), columns };
+    if (over?.buckets.n) Object.assign(paused, { second: snapshot(over.buckets), secondHead: (over.buckets.first + over.buckets.n) * over.buckets.perBucket });
     pauseButton.textContent = "Go on";
     pauseButton.setAttribute("aria-pressed", "true");
     dirty = true;
@@ -199,8 +206,10 @@ export function mount(root, { link, catalogue }) {
     const asked = paused;
     const wanted = columns;
     const buckets = await link.range(columns, asked.head + x0 * HZ - 4, asked.head + x1 * HZ + 4, pixels(Math.ceil((x1 - x0) * HZ) + 8));
+    const second = over && asked.secondHead ? await link.range(columns, asked.secondHead + x0 * HZ - 4, asked.secondHead + x1 * HZ + 4, pixels(Math.ceil((x1 - x0) * HZ) + 8), 1) : null;
     fetching = false;
     if (paused !== asked) return;
+    if (second?.n) asked.second = second;
     if (wanted !== columns) { refetch(); return; }
     if (buckets.n && !asked.over) asked.buckets = buckets;
     dirty = true;
@@ -243,22 +252,37 @@ export function mount(root, { link, catalogue }) {
     const [x0, x1] = paused ? paused.view : held ? trigger.view(settings.rows / HZ) : [-settings.rows / HZ, 0];
     const rateHz = HZ / buckets.perBucket;
     const samples = new Map(traces.map((trace) => [trace, samplesOf(trace, buckets, columns, rateHz)]));
+    const second = paused ? paused.second : over?.buckets;
     triggerBox.say(paused ? (paused.over ? "paused; this run is over, its picture stays" : "paused") : settings.mode === "time" ? trigger.text() : "");
     modes.show(settings.mode);
     displays.show(settings.display);
-    if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused, tEnd);
-    else analysed.show({ spans: holdSpans(link.state?.holds, t[t.length - 1], -t.length / rateHz, 0), traces, samples: traces.map((trace) => samples.get(trace)), rateHz, seconds: t.length / rateHz });
+    if (settings.mode === "time") drawStrips(samples, times(buckets, tEnd), buckets.perBucket === 1 ? 1 : 2, x0, x1, held && !paused, tEnd, second?.n && second.channels === columns.length ? placed(second, t, rateHz) : null);
+    else analysed.show({ spans: holdSpans(link.holds, t[t.length - 1], -t.length / rateHz, 0), traces, samples: traces.map((trace) => samples.get(trace)), rateHz, seconds: t.length / rateHz });
     showReadout(tEnd, samples, t);
   }
 
-  function drawStrips(samples, x, twice, x0, x1, triggered, tEnd) {
-    const spans = holdSpans(link.state?.holds, tEnd, x0, x1);
+  /** The second run on the grid of the first: traces whose buckets are those at the same time since each run's start. */
+  function placed(second, t, rateHz) {
+    const { start_s: start, second_start_s: secondStart, shift_s: shift } = link.replay || {};
+    const own = new Map(traces.map((trace) => [trace, samplesOf(trace, second, columns, HZ / second.perBucket)]));
+    const first = second.times()[0] - secondStart;
+    const at = Array.from(t, (v) => Math.round((v - start + shift - first) * (HZ / second.perBucket)));
+    return new Map(traces.map((trace) => {
+      const { low, high, base } = own.get(trace);
+      const take = (values) => Float64Array.from(at, (i) => (i >= 0 && i < values.length ? values[i] - base : NaN));
+      return [trace, { low: take(low), high: take(high) }];
+    }));
+  }
+
+  function drawStrips(samples, x, twice, x0, x1, triggered, tEnd, second) {
+    const spans = holdSpans(link.holds, tEnd, x0, x1);
     const marks = cursors.flatMap((c, i) => (c === null ? [] : [{ x: c, colour: css(i ? "--c2" : "--accent"), dash: [4, 3], label: "AB"[i] }]));
     if (triggered) marks.push({ x: 0, colour: css("--warn"), dash: [2, 3], label: "T" });
     for (const { strip, members, inLanes, divs } of strips) {
       strip.marks = [...marks];
       const texts = [];
       const beyond = [];
+      const overs = [];
       const ys = members.map((trace, i) => {
         const s = samples.get(trace);
         const scale = trace.unit === "m" && !inLanes ? 1e6 : 1;
@@ -280,6 +304,13 @@ export function mount(root, { link, catalogue }) {
             for (let j = 0; j < twice; j++) red[twice * k + j] = y[twice * k + j];
           }
         }
+        if (strip.options.over) {
+          const s2 = second?.get(trace);
+          overs.push(Array.from(y, (_, j) => {
+            const v = s2 ? (j % twice ? s2.high : s2.low)[Math.floor(j / twice)] : NaN;
+            return Number.isFinite(v) ? zero + slope * v : null;
+          }));
+        }
         beyond.push(limited ? red : new Array(y.length).fill(null));
         for (const limit of limits) if (limit !== null) strip.marks.push({ y: zero + slope * (limit - s.base), colour: css("--bad"), dash: [6, 3] });
         if (settings.trigger.on && settings.trigger.slope !== "event" && trace.name === settings.trigger.channel) {
@@ -291,7 +322,7 @@ export function mount(root, { link, catalogue }) {
         strip.values[i].classList.toggle("bad", out > 0);
         return y;
       });
-      strip.show(x, [...ys, ...beyond], x0, x1, texts, spans);
+      strip.show(x, [...ys, ...beyond, ...overs], x0, x1, texts, spans);
     }
   }
 
@@ -321,7 +352,9 @@ export function mount(root, { link, catalogue }) {
       const va = valueAt(s, t, tEnd + a);
       parts.push(`${trace.name} ${withUnit(va, trace.unit, 4)}${b !== null ? `, Δ ${withUnit(valueAt(s, t, tEnd + b) - va, trace.unit, 4)}` : ""}`);
     }
+    const span = [tEnd + a, tEnd + b].sort((p, q) => p - q);
     readout.replaceChildren(...parts.map((text) => h("span", {}, text)),
+      link.replay && b !== null ? h("button", { onclick: () => bar.setMark({ from: span[0], to: span[1] }) }, "Mark A to B") : "",
       h("button.quiet", { onclick: () => { cursors = [null, null]; dirty = true; } }, "clear cursors"));
   }
 
@@ -330,8 +363,11 @@ export function mount(root, { link, catalogue }) {
     if (event.key === " ") { event.preventDefault(); pauseButton.click(); } else if (event.key === "f") fit();
   };
   document.addEventListener("keydown", onKey);
-  const offData = link.on("data", (s) => { if (s === subscription && !paused) dirty = true; });
+  const offData = link.on("data", (s) => { if ((s === subscription || s === over) && !paused) dirty = true; });
   const offRun = link.on("run", ({ same }) => { if (paused && !same) paused.over = true; trigger.rearm(); strips.forEach(({ strip }) => strip.range.reset()); });
+  const offJump = link.on("jump", () => { if (paused) resume(); trigger.rearm(); dirty = true; });
+  const offReplay = link.on("replay", (replay) => { if ((replay?.second || "") !== overName) rebuild(); });
+  const offSource = link.on("source", () => { if (paused) resume(); trigger.rearm(); rebuild(); });
   let frames = link.frames;
   let countedAt = performance.now();
   const timer = setInterval(() => {
@@ -346,7 +382,7 @@ export function mount(root, { link, catalogue }) {
   if (unknown.length) triggerBox.warn(`This layout names channels that this bench does not have: ${unknown.slice(0, 4).join(", ")}${unknown.length > 4 ? ` and ${unknown.length - 4} more` : ""}.`);
   draw();
   window.micron.scope = { 
-    get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get cursors() { return cursors; }, trigger, setCursor,
+    get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get over() { return over; }, get cursors() { return cursors; }, trigger, setCursor,
   };
   return () => {
     cancelAnimationFrame(frame);
@@ -355,7 +391,11 @@ export function mount(root, { link, catalogue }) {
     window.removeEventListener("themechange", retheme);
     offData();
     offRun();
+    offJump();
+    offReplay();
+    offSource();
     link.drop(subscription);
+    link.drop(over);
     strips.forEach(({ strip }) => strip.destroy());
   };
 }

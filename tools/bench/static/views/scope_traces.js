@@ -41,7 +41,10 @@ export function samplesOf(trace, buckets, columns, rateHz) {
 export function divisionOf(trace, { low, high, base }) {
   if (trace.set.div !== "auto") return Number(trace.set.div);
   let most = 0;
-  for (let i = 0; i < low.length; i++) most = Math.max(most, base - low[i], high[i] - base);
+  for (let i = 0; i < low.length; i++) {
+    if (base - low[i] > most) most = base - low[i];
+    if (high[i] - base > most) most = high[i] - base;
+  }
   const wanted = step125(most / (DIVS / 2 - 0.1));
   const { lane } = trace;
   if (!most && lane.div) return lane.div;

@@ -60,7 +60,7 @@ export function mount(root, { link }) {
     if (b.perBucket !== 1 || b.n < 200) return;
     const delay = 2; // loop delay of the bench file, in ticks
     const status = b.lows(9);
-    const g = link.state?.status?.gain ?? 1;
+    const g = link.replay ? 1 : link.state?.status?.gain ?? 1;
     before = AXES.map((_, c) => b.lows(c));
     const driven = AXES.map((_, c) => {
       const now = b.lows(c);
@@ -170,7 +170,7 @@ export function mount(root, { link }) {
     const t = slow.buckets.times();
     if (t.length && turn % 8 === 0) {
       const x = times(slow.buckets, t[t.length - 1]);
-      const spans = holdSpans(link.state?.holds, t[t.length - 1], -60, 0);
+      const spans = holdSpans(link.holds, t[t.length - 1], -60, 0);
       amplitude.show(x, [0, 1, 2].map((c) => interleave(slow.buckets, c, UM)), -60, 0, null, spans);
       frequency.show(x, [3, 4, 5].map((c) => interleave(slow.buckets, c)), -60, 0, null, spans);
     }
@@ -191,13 +191,14 @@ export function mount(root, { link }) {
         ...AXES.map((axis, c) => h("tr", {}, h("td", { style: `color:var(--c${c + 1})` }, axis), rows[c])));
     }
     AXES.forEach((_, c) => [before, after].forEach((part, i) => { rows[c][i].textContent = `${rms([part[c]]).toFixed(1)} µm`; }));
-    if (s.gain !== undefined) {
+    if (link.replay) gainText.textContent = "gain 1 assumed";
+    else if (s.gain !== undefined) {
       gainText.textContent = `gain ${s.gain.toFixed(2)}`;
       if (document.activeElement !== gain) gain.value = s.gain;
       onOff.show(s.gain === 0 ? "0" : s.gain === 1 ? "1" : "");
     }
-    gain.disabled = !link.mayOrder;
-    onOff.querySelectorAll("button").forEach((button) => { button.disabled = !link.mayOrder; });
+    gain.disabled = !link.mayOrder || Boolean(link.replay);
+    onOff.querySelectorAll("button").forEach((button) => { button.disabled = gain.disabled; });
   }, 250);
   const retheme = () => { amplitude.build(); frequency.build(); };
   window.addEventListener("themechange", retheme);
