@@ -296,6 +296,15 @@ class EndoscopeConfig(_Table):
     """The room goes from ``start_C`` to ``end_C`` with this time constant."""
 
 
+class ServeConfig(_Table):
+    """Where a world in a process of its own serves its buses, besides ptys and sockets (``micron emulate``)."""
+
+    tcp_port: Annotated[int, Field(ge=0, le=65_000)] | None = None
+    """TCP port of the first serial bus; the next ones follow. 0 takes free ports, ``None`` serves none."""
+    can: tuple[str, ...] = ()
+    """CAN interfaces of the kernel for the CAN buses, in their order; further buses are on UDP multicast."""
+
+
 class EmulationConfig(_Table):
     """The whole ``[emulation]`` table."""
 
@@ -317,6 +326,7 @@ class EmulationConfig(_Table):
     environment: EnvironmentConfig = EnvironmentConfig()
     endoscope: EndoscopeConfig | None = None
     daq: DaqConfig = DaqConfig()
+    serve: ServeConfig = ServeConfig()
     imu: dict[str, ImuConfig] = Field(default_factory=dict)
     more_axes: tuple[MoreAxis, ...] = Field(default=(), max_length=2)
     twin: str | tuple[str, str, str] | None = None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -138,13 +137,3 @@ def _channel(fault: str, target: str, count: int) -> int:
     if not (target.isascii() and target.isdigit() and int(target) < count):
         raise UnknownFault(f"'{fault}' needs a channel 0..{count - 1}, not '{target}'")
     return int(target)
-
-
-def answer_order(message: bytes, strike: Callable[[str, str], None]) -> bytes:
-    """Do the fault that a JSON ``message`` orders; the answer, as JSON: ``ok``, or ``error`` in words."""
-    try:
-        order = json.loads(message)
-        strike(str(order["fault"]), str(order.get("target", "")))
-        return json.dumps({"ok": True}).encode()
-    except (ValueError, KeyError, TypeError, UnknownFault) as error:
-        return json.dumps({"ok": False, "error": str(error)}).encode()

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
-import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from hal.clock import VirtualClock
 from hal.contracts import CanBus, I2cBus, SerialPort
-from sim_devices.faults import answer_order, inject
+from sim_devices.control import WorldControl
+from sim_devices.faults import inject
 from sim_devices.process import load_factory
+from sim_devices.transports.control_socket import ControlSocket
 from sim_devices.transports.lockstep import (
     USB_TRANSFER_NS,
     LockstepCanBus,
@@ -43,7 +43,7 @@ class LockstepWorld:
         self._ports: dict[str, LockstepSerialPort | LockstepI2cBus | LockstepCanBus] = {}
         self._scheduled_ns = -1
         self._truth: Truth | None = None
-        self._control: socket.socket | None = None
+        self._control: ControlSocket | None = None
         drivers = {d.get("bus"): d["driver"] for d in description["device"].values()}
         for name, face in self.world.buses.serial.items():
             latency_ns = USB_TRANSFER_NS if drivers.get(name) == "di4108" else 0
@@ -62,30 +62,20 @@ class LockstepWorld:
         return self._truth is None
 
     def obey(self, folder: Path) -> None:
-        """Take faults from ``control.sock`` in ``folder``, as a world in a process of its own does (JSON with ``fault``
-        and ``target``), every ``CONTROL_NS`` of emulated time. A path that is too long for a socket is left alone."""
+        """Take orders from ``control.sock`` in ``folder`` every ``CONTROL_NS`` of emulated time.
+
+        They are those of a world in a process of its own. A path that is too long for a socket is left alone."""
         path = folder / "control.sock"
         if len(str(path)) > MAX_SOCKET_PATH:
             return
-        control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        control.bind(str(path))
-        control.setblocking(False)
-        self._control = control
+        control = WorldControl(self.world, self.inject, self._clock.now_ns)
+        self._control = ControlSocket(path, control.answer)
         self._clock.at(self._clock.now_ns() + CONTROL_NS, self._obey_orders)
 
     def _obey_orders(self, t_ns: int) -> None:
-        if self._control is None:
-            return
-        try:
-            message, sender = self._control.recvfrom(4096)
-        except BlockingIOError:
-            pass
-        else:
-            answer = answer_order(message, self.inject)
-            if sender:
-                with contextlib.suppress(OSError):
-                    self._control.sendto(answer, sender)
-        self._clock.at(t_ns + CONTROL_NS, self._obey_orders)
+        if self._control is not None:
+            self._control.pump()
+            self._clock.at(t_ns + CONTROL_NS, self._obey_orders)
 
     def stalled_ms(self, now_ns: int, within_ms: float) -> float:
         """A world in emulated time is never late."""

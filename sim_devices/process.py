@@ -1,10 +1,10 @@
 """The emulated world as a process of its own, in real time: ``python -m sim_devices.process JOB.json``.
 
 The job file (written by ``sim_devices.process_world``) holds the bench description and where to put things. The
-process serves each serial bus on a pty, each I2C bus on a Unix socket, each CAN bus on UDP multicast (or, with
-``sim://NAME?via=slcan``, as a serial adapter on a pty) and writes their URIs to ``endpoints.json`` when it is
-ready. It obeys fault commands on ``control.sock``; on SIGTERM or when its parent is gone it writes ``truth.npz``
-and ends.
+process serves each serial bus on a pty (and, on request, a TCP port), each I2C bus on a Unix socket, each CAN bus on
+UDP multicast or an interface of the kernel (or, with ``sim://NAME?via=slcan``, as a serial adapter on a pty) and writes
+their URIs to ``endpoints.json`` when it is ready. It obeys orders on ``control.sock`` (``sim_devices.control``); on
+SIGTERM or when its parent is gone it writes ``truth.npz`` and ends.
 
 One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
 millisecond. Device clocks never stretch: after a stall every scan that was due is made up, a few at a time so
@@ -20,23 +20,27 @@ import json
 import os
 import select
 import signal
-import socket
 import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from hal.clock import MonotonicClock
 from hal.errors import HalError
-from sim_devices.faults import answer_order, inject
+from sim_devices.config import ServeConfig
+from sim_devices.control import WorldControl
+from sim_devices.devices.faces import ByteFace
+from sim_devices.faults import inject
 from sim_devices.lateness import Lateness
-from sim_devices.transports.can_multicast import CanMulticast, free_udp_port
+from sim_devices.transports.can_carrier import free_udp_port, on_multicast, on_socketcan
+from sim_devices.transports.control_socket import ControlSocket
 from sim_devices.transports.i2c_socket import I2cSocketServer
 from sim_devices.transports.pty_carrier import PtyCarrier
 from sim_devices.transports.slcan_adapter import SlcanAdapter
+from sim_devices.transports.tcp_line import TcpLine
 from sim_devices.world import Plant, World
 
 POLL_NS = 1_000_000
@@ -49,6 +53,37 @@ LONGEST_LINGER_NS = 60_000_000_000
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
 PRIORITY = 40  # below the loop's, so that the emulation never preempts what it is there to test
 PR_SET_PDEATHSIG = 1
+LONGEST_STEP_S = 60.0
+"""Longest step of a paused clock: clients and the next order wait until it is computed."""
+
+
+class PausableClock(MonotonicClock):
+    """The machine's monotonic time less the time during which it was paused."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.behind_ns = 0
+        """Time in ns by which this clock is behind the machine's, up to the last pause."""
+        self._held_ns: int | None = None
+
+    def now_ns(self) -> int:
+        return super().now_ns() - self.behind_ns if self._held_ns is None else self._held_ns
+
+    def pause(self) -> None:
+        """Stand still. Idempotent."""
+        self._held_ns = self.now_ns()
+
+    def resume(self) -> None:
+        """Go on from where the clock stands. Idempotent."""
+        if self._held_ns is not None:
+            self.behind_ns = super().now_ns() - self._held_ns
+            self._held_ns = None
+
+    def advance(self, seconds: float) -> None:
+        """Let a clock that is paused go on by ``seconds``. ``ValueError`` when it is not paused."""
+        if self._held_ns is None or not 0.0 <= seconds <= LONGEST_STEP_S:
+            raise ValueError(f"time goes on by 0 to {LONGEST_STEP_S:.0f} s at a time, after it was paused")
+        self._held_ns += round(seconds * 1e9)
 
 
 class WorldProcess:
@@ -59,29 +94,39 @@ class WorldProcess:
         sockets = Path(job["socket_dir"])
         self._parent = int(job["parent"])
         description = job["description"]
-        self._clock = MonotonicClock()
+        self._clock = PausableClock()
+        serve = ServeConfig.model_validate(description["emulation"].get("serve", {}))
         make_plant = load_factory(job["plant"])
         # a world that nobody sees: the time in which its devices compile is none that the real one must make up
         warm_up(World(description, make_plant(description, job["hand_file"], job["hand_scale"])).plant)
         plant = make_plant(description, job["hand_file"], job["hand_scale"])
         self.world = World(description, plant, epoch_ns=self._clock.now_ns())
         self._bus_of = {n: d["bus"] for n, d in description["device"].items() if d.get("bus")}
-        self._ptys = {name: PtyCarrier(face) for name, face in self.world.buses.serial.items()}
+        lines = self.world.buses.serial
+        self._tcp: dict[str, TcpLine] = {}
+        if serve.tcp_port is not None:
+            ports = range(serve.tcp_port, serve.tcp_port + len(lines)) if serve.tcp_port else [0] * len(lines)
+            self._tcp = {name: TcpLine(face, port) for (name, face), port in zip(lines.items(), ports, strict=True)}
+        self._ptys = {name: PtyCarrier(cast(ByteFace, self._tcp.get(name, face))) for name, face in lines.items()}
         self._i2c = {
             name: I2cSocketServer(line, sockets / f"{name}.sock") for name, line in self.world.buses.i2c.items()
         }
         slcan = {n for n, bus in description["bus"].items() if str(bus["uri"]).endswith("?via=slcan")}
         hubs = self.world.buses.can
         self._slcan = {n: PtyCarrier(SlcanAdapter(hub)) for n, hub in hubs.items() if n in slcan}
-        self._can = {n: CanMulticast(hub, free_udp_port()) for n, hub in hubs.items() if n not in slcan}
+        interfaces = dict(zip([n for n in hubs if n not in slcan], serve.can, strict=False))
+        self._can = {
+            n: on_socketcan(hub, interfaces[n]) if n in interfaces else on_multicast(hub, free_udp_port())
+            for n, hub in hubs.items()
+            if n not in slcan
+        }
         self._all_ptys = [*self._ptys.values(), *self._slcan.values()]
         speaks = [id(face) for face in self.world.buses.serial.values()]
         self._devices = [(face, id(face) in speaks) for face in self.world.timed_faces()]
         for server in self._i2c.values():
             self.world.add_timed(server)
-        self._control = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-        self._control.bind(str(sockets / "control.sock"))
-        self._control.setblocking(False)
+        control = WorldControl(self.world, self._strike, lambda: self._now_ns, self._clock)
+        self._control = ControlSocket(sockets / "control.sock", control.answer)
         self._stop = False
         self._orphaned_ns: int | None = None
         self._worst_late_ns = 0
@@ -107,6 +152,10 @@ class WorldProcess:
         alone_ns = self._now_ns - self._orphaned_ns
         guarded = any(server.has_clients for server in self._i2c.values())
         return alone_ns < (LONGEST_LINGER_NS if guarded else LINGER_NS)
+
+    def tcp_ports(self) -> dict[str, int]:
+        """TCP port of each serial bus that has one."""
+        return {name: line.port for name, line in self._tcp.items()}
 
     def endpoints(self) -> dict[str, str]:
         """URI of each bus for the ordinary adapters of hal."""
@@ -151,7 +200,9 @@ class WorldProcess:
         for server in self._i2c.values():
             watched += server.filenos()
         watched += [can.fileno() for can in self._can.values()]
-        watched.append(self._control.fileno())
+        for line in self._tcp.values():
+            watched += line.filenos()
+        watched += self._control.filenos()
         # select, not epoll: its timeout has a resolution of 1 us instead of 1 ms
         if ready := select.select(watched, (), (), max(0, deadline_ns - early_ns - now_ns) * 1e-9)[0]:
             return ready
@@ -199,7 +250,7 @@ class WorldProcess:
         """A request to an I2C bus; it tells when it was made, which the world may still have before it."""
         for server in self._i2c.values():
             if fileno in server.filenos():
-                server.on_readable(fileno, self._now_ns, self._clock.now_ns())
+                server.on_readable(fileno, self._now_ns, self._clock.now_ns(), self._clock.behind_ns)
                 return
 
     def _on_readable(self, fileno: int) -> None:
@@ -212,18 +263,20 @@ class WorldProcess:
                 pty.receive(self._now_ns)
                 pty.send()
                 return
-        if fileno == self._control.fileno():
-            self._obey()
+        for name, line in self._tcp.items():
+            if fileno in line.filenos():
+                line.on_readable(fileno, self._now_ns)
+                self._ptys[name].send()
+                return
+        if fileno in self._control.filenos():
+            self._control.on_readable(fileno)
 
-    def _obey(self) -> None:
-        message, sender = self._control.recvfrom(4096)
+    def _strike(self, fault: str, target: str) -> None:
         ptys = self._ptys | self._slcan
         unplug: dict[str, Callable[[], None]] = {name: pty.unplug for name, pty in ptys.items()}
-        answer = answer_order(
-            message, lambda fault, target: inject(self.world, fault, target, unplug, self._bus_of, self._now_ns)
-        )
-        if sender:
-            self._control.sendto(answer, sender)
+        if fault == "unplug" and (line := self._tcp.get(self._bus_of.get(target, target))):
+            line.close()
+        inject(self.world, fault, target, unplug, self._bus_of, self._now_ns)
 
     def _finish(self) -> None:
         truth = self.world.truth(max(self._now_ns, self.world.epoch_ns))
@@ -234,7 +287,7 @@ class WorldProcess:
         (self._runtime_dir / "world.json").write_text(json.dumps(facts), encoding="utf-8")
         for pty in self._all_ptys:
             pty.unplug()
-        for server in (*self._i2c.values(), *self._can.values()):
+        for server in (*self._i2c.values(), *self._can.values(), *self._tcp.values()):
             server.close()
         self._control.close()
 
@@ -282,7 +335,7 @@ def main(argv: list[str]) -> int:
     policy = "SCHED_OTHER"
     if prefer_real_time():
         policy, process.count_down_ns = f"SCHED_FIFO {PRIORITY}", COUNT_DOWN_NS
-    ready = {"endpoints": process.endpoints(), "scheduling": policy, "pid": os.getpid()}
+    ready = {"endpoints": process.endpoints(), "tcp": process.tcp_ports(), "scheduling": policy, "pid": os.getpid()}
     partial = job_path.with_name("endpoints.partial")
     partial.write_text(json.dumps(ready), encoding="utf-8")
     partial.rename(job_path.with_name("endpoints.json"))

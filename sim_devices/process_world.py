@@ -62,7 +62,9 @@ class ProcessWorld:
                 stderr=log,
                 env=child_environment(),
             )
-        self._endpoints = self._await_endpoints()
+        ready = self._await_endpoints()
+        self._endpoints: dict[str, str] = ready["endpoints"]
+        self.tcp_ports: dict[str, int] = ready["tcp"]
         self._lateness = LatenessView(self._dir)
 
     @property
@@ -113,23 +115,31 @@ class ProcessWorld:
 
     def inject(self, fault: str, target: str = "") -> None:
         """Do one of ``sim_devices.faults.FAULTS`` in the running process; ``ValueError`` says why not."""
-        with tempfile.TemporaryDirectory(prefix="micron-") as folder:
-            sock = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
-            with contextlib.closing(sock):
-                sock.bind(str(Path(folder) / "reply.sock"))
-                sock.settimeout(5.0)
-                try:
-                    sock.connect(str(self._sockets / "control.sock"))
-                    sock.send(json.dumps({"fault": fault, "target": target}).encode())
-                    answer = json.loads(sock.recv(4096))
-                except TimeoutError as error:
-                    raise HalTimeout("the emulated world does not answer on its control socket") from error
-                except OSError as error:
-                    raise Disconnected("the emulated world is gone") from error
+        self.control({"fault": fault, "target": target})
+
+    @property
+    def control_path(self) -> Path:
+        """Return the path of the socket that takes orders; it lies in the folder of all sockets of this world."""
+        return self._sockets / "control.sock"
+
+    def control(self, order: dict[str, Any]) -> dict[str, Any]:
+        """Give one order of ``sim_devices.control`` and return its answer; ``ValueError`` says why it was refused."""
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        with contextlib.closing(sock):
+            sock.settimeout(5.0)
+            try:
+                sock.connect(str(self.control_path))
+                sock.sendall(json.dumps(order).encode() + b"\n")
+                answer = json.loads(sock.makefile("rb").readline())
+            except TimeoutError as error:
+                raise HalTimeout("the emulated world does not answer on its control socket") from error
+            except (OSError, ValueError) as error:
+                raise Disconnected("the emulated world is gone") from error
         if not answer["ok"]:
             raise ValueError(answer["error"])
+        return answer
 
-    def _await_endpoints(self) -> dict[str, str]:
+    def _await_endpoints(self) -> dict[str, Any]:
         path = self._dir / "endpoints.json"
         deadline = time.monotonic() + START_S
         while not path.exists():
@@ -143,7 +153,7 @@ class ProcessWorld:
                 self.stop()
                 raise DeviceNotFound(f"the emulated world was not ready in {START_S:.0f} s: {self._tail()}")
             time.sleep(0.01)
-        return json.loads(path.read_text(encoding="utf-8"))["endpoints"]
+        return json.loads(path.read_text(encoding="utf-8"))
 
     def _tail(self) -> str:
         lines = self._log.read_text(encoding="utf-8", errors="replace").strip().splitlines()

@@ -32,6 +32,7 @@ from sim_devices.devices.motion_card import MotionCard
 from sim_devices.devices.mpu6050 import Mpu6050
 from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
 from sim_devices.plant.imu import BMX055_SPEC, LSM6DS3_SPEC, MPU6050_SPEC, Imu, ImuSpec
+from sim_devices.stimuli import Stimuli
 from sim_devices.transports.can_hub import CanHub
 from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.wiring_faults import WiringFaults
@@ -79,6 +80,7 @@ class World:
         self.epoch_ns = epoch_ns
         self.devices: dict[str, Any] = {}
         self.buses = EmulatedBuses()
+        self.stimuli = Stimuli()
         self.faults = WiringFaults(int(description.get("emulation", {}).get("seed", 1)))
         self._timed: list[TimedFace] = []
         self._adc_wiring = np.zeros(4, dtype=np.intp)
@@ -261,7 +263,8 @@ class World:
         added = added_device(device["driver"])
         if added is None:
             return False
-        senses = self._motion, self._analog_V, self._strap_switch
+        motion = self._motion if kind == "daq" else self.stimuli.motion(name, self._motion, Mount())
+        senses = motion, self._analog_V, self._strap_switch
         made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, *senses))
         if kind == "daq":
             self._added_V.update(made)
@@ -280,11 +283,14 @@ class World:
         self._timed.append(face)
 
     def _add_di4108(self, name: str, device: Mapping[str, Any]) -> None:
-        daq = Di4108(self._analog_V, fifo_samples=self._daq.fifo_samples, on_switches=self._strap_switch)
+        volts = self.stimuli.volts(name, self._analog_V, 8)
+        daq = Di4108(volts, fifo_samples=self._daq.fifo_samples, on_switches=self._strap_switch)
         self._add_serial(name, device["bus"], daq)
 
     def _add_e727(self, name: str, device: Mapping[str, Any]) -> None:
-        controller = E727(on_output=self._piezo_demand, measure_um=self._stroke_um)
+        measure_um = self.stimuli.axis(name, self._stroke_um)
+        controller = E727(on_output=self._piezo_demand, measure_um=measure_um)
+        self.stimuli.outputs(name, lambda: controller.output_V, 4)
         self._add_serial(name, device["bus"], controller)
         self._rest_at(controller.output_V)
 
@@ -297,13 +303,15 @@ class World:
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
         monitored = self._monitors.get(name)
+        source = self._magnetometer_V if monitored is None else self._stack_monitor(monitored)
         # outputs step within a conversion; the field does not
-        adc = Ads1115(self._magnetometer_V) if monitored is None else Ads1115(self._stack_monitor(monitored), looks=8)
+        adc = Ads1115(self.stimuli.volts(name, source, 4), looks=1 if monitored is None else 8)
         self._add_i2c(name, device, adc)
         self._timed.append(adc)
 
     def _add_dac(self, name: str, device: Mapping[str, Any]) -> None:
         dac = Ad5696r(on_output=self._amplifier_input)
+        self.stimuli.outputs(name, lambda: dac.output_V, 4)
         self._add_i2c(name, device, dac)
         self._rest_at([volts * AMPLIFIER_GAIN for volts in dac.output_V])
 
@@ -313,6 +321,7 @@ class World:
 
     def _add_can_amplifier(self, name: str, device: Mapping[str, Any]) -> None:
         node = CanPiezoNode(on_output=self._piezo_demand, start_ns=self.epoch_ns)
+        self.stimuli.outputs(name, lambda: node.output_V, 3)
         self._add_can(name, device, node)
         self._rest_at(node.output_V)
 
@@ -332,7 +341,8 @@ class World:
         return {"seed": self._seed, "name": name, "mount": mount, "errors": wish.errors, "noise": wish.noise}
 
     def _imu(self, name: str, spec: ImuSpec) -> Imu:
-        return Imu(spec, self._motion, **self._specimen(name))
+        specimen = self._specimen(name)
+        return Imu(spec, self.stimuli.motion(name, self._motion, specimen["mount"]), **specimen)
 
     def _add_chip(self, name: str, device: Mapping[str, Any], face: Any) -> None:
         self._add_i2c(name, device, face)
@@ -354,14 +364,15 @@ class World:
         self._add_chip(f"{name}.magnetometer", magnetometer, Bmx055Magnetometer(imu, seed=self._seed))
 
     def _add_motion_card(self, name: str, device: Mapping[str, Any]) -> None:
+        specimen = self._specimen(name)
         card = MotionCard(
-            self._motion,
+            self.stimuli.motion(name, self._motion, specimen["mount"]),
             baud=self._baud[device["bus"]],
             rate_hz=float(device.get("rate_hz", 100.0)),
             scaled=device.get("fields") == "scaled",
             start_ns=self.epoch_ns,
             presses=self._presses,
-            **self._specimen(name),
+            **specimen,
         )
         self._add_serial(name, device["bus"], card)
 

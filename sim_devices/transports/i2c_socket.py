@@ -51,9 +51,10 @@ class I2cSocketServer:
     def filenos(self) -> list[int]:
         return [self._listener.fileno(), *self._clients]
 
-    def on_readable(self, fileno: int, reached_ns: int, now_ns: int) -> None:
+    def on_readable(self, fileno: int, reached_ns: int, now_ns: int, behind_ns: int = 0) -> None:
         """Take what arrived on one of ``filenos``. The transfer of a complete request becomes due when it was asked
-        for, but not before ``reached_ns``, up to which the world has gone, nor after ``now_ns``."""
+        for, but not before ``reached_ns``, up to which the world has gone, nor after ``now_ns``. ``behind_ns`` is how
+        far these are behind the machine's clock."""
         if fileno == self._listener.fileno():
             client, _ = self._listener.accept()
             client.setblocking(False)
@@ -67,7 +68,7 @@ class I2cSocketServer:
         try:
             while (request := _parse(buffer)) is not None:
                 asked_ns, address, ops = request
-                self._queue.append((min(max(asked_ns, reached_ns), now_ns), fileno, address, ops))
+                self._queue.append((min(max(asked_ns - behind_ns, reached_ns), now_ns), fileno, address, ops))
         except ValueError:
             data = b""
         if not data:

@@ -96,9 +96,10 @@ class Server:
     def inject(self, fault: str, target: str) -> None:
         """A fault in the emulated world of the firmware's process."""
         sockets = sorted(self.folder.glob("micron-bench-*/control.sock"), key=lambda p: p.stat().st_mtime)
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as sock:
             sock.connect(str(sockets[-1]))
-            sock.send(json.dumps({"fault": fault, "target": target}).encode())
+            sock.sendall(json.dumps({"fault": fault, "target": target}).encode() + b"\n")
+            assert json.loads(sock.makefile().readline())["ok"]
 
     def memory_bytes(self) -> int:
         """Resident memory of the server process."""

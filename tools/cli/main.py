@@ -86,6 +86,10 @@ COMMANDS = {
         "diagnose:capture",
         "Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.",
     ),
+    "emulate": (
+        "emulate:emulate",
+        "Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.",
+    ),
     "can": ("diagnose:can", "CAN buses of a bench."),
     "golden": ("diagnose:golden", "Golden transcripts."),
     "log": ("diagnose:log", "The log of a running bench."),

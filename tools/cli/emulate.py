@@ -1,0 +1,111 @@
+"""``micron emulate``: a bench's emulated devices for any program."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.table import Table
+
+from hal.bench import load_bench
+from tools.cli.bench_option import bench_path
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json
+
+if TYPE_CHECKING:
+    from tools.emulate.world import Served
+
+LOOK_S = 0.2
+
+
+def emulate(
+    bench: Annotated[
+        str | None,
+        typer.Argument(metavar="[BENCH]", help="Bench file, or the name of one that ships (imus)."),
+    ] = None,
+    command: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[-- COMMAND...]", help="A program to run on these buses."),
+    ] = None,
+    tcp: Annotated[
+        int | None,
+        typer.Option("--tcp", metavar="PORT", min=0, max=65000, help="Serial buses on TCP ports, too; 0: free ones."),
+    ] = None,
+    can: Annotated[
+        list[str] | None,
+        typer.Option("--can", metavar="INTERFACE", help="CAN interfaces, in the order of the buses. Default: vcan*."),
+    ] = None,
+    stimulus: Annotated[
+        list[str] | None,
+        typer.Option(metavar="PART.CHANNEL=FILE:COLUMN", help="Play a recorded column into a part; may be repeated."),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.
+
+    Serial devices are on a pty (and with --tcp on socket:// and rfc2217://), I2C chips on /dev/i2c-N for programs that
+    are started with the variables shown (or as COMMAND), CAN nodes on vcan or UDP multicast. A socket takes orders: set
+    and read what parts sense, inject faults, pause time (docs/emulate.md).
+
+    Example: micron emulate imus -- printenv MICRON_I2C0
+    """
+    from tools.emulate.stimulus import read_stimulus
+    from tools.emulate.world import serve
+
+    status = 0
+    with clear_errors():
+        check_writable(json_file)
+        program = None if not command else shutil.which(command[0])
+        if command and program is None:
+            raise InputError(f"{command[0]}: no such program; name one that is on the PATH, or its path")
+        file = load_bench(bench_path(_bench_file(bench)))
+        columns = [read_stimulus(text) for text in stimulus or ()]
+        with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
+            write_json(served.as_dict(), json_file)
+            for note in served.notes:
+                console().print(f"note: {note}", soft_wrap=True)
+            if command:
+                status = subprocess.call([str(program), *command[1:]], env={**os.environ, **served.environment})
+            else:
+                if json_file != "-":
+                    _print(served)
+                while served.world.alive():
+                    time.sleep(LOOK_S)
+                raise InputError("the emulated world has ended by itself; start it again, and report what its log says")
+    if status:
+        raise typer.Exit(status if status > 0 else 128 - status)
+
+
+def _bench_file(named: str | None) -> Path | None:
+    """Return the bench file: a path, or one that ships by its name."""
+    if named is None or Path(named).exists():
+        return None if named is None else Path(named)
+    import benches
+
+    shipped = Path(benches.__file__).parent
+    if (shipped / f"{named}.toml").exists():
+        return shipped / f"{named}.toml"
+    names = ", ".join(sorted(path.stem for path in shipped.glob("*.toml") if "[bus." in path.read_text("utf-8")))
+    raise InputError(f"{named}: no such bench file, and none of that name ships; these do: {names}")
+
+
+def _print(served: Served) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("bus", "kind", "parts", "where"):
+        table.add_column(heading, overflow="fold")
+    for bus in served.buses:
+        table.add_row(bus.name, bus.kind, ", ".join(bus.parts), "\n".join(bus.places))
+    out = data_console()
+    out.print(table)
+    out.print("control", str(served.world.control_path), soft_wrap=True)
+    if "LD_PRELOAD" in served.environment:
+        out.print("for /dev/i2c-N, start your program with", soft_wrap=True)
+        for name in ("LD_PRELOAD", "MICRON_I2C"):
+            out.print(f"  {name}={served.environment[name]}", soft_wrap=True)
+    console().print("Ctrl-C ends it.")
