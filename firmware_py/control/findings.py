@@ -217,7 +217,7 @@ class Finding(Enum):
         "the outputs failed",
         _DEVICE,
         "{error}",
-        "The output went away, contradicted its command, refused it as unsafe, or could not be armed again.",
+        "The output went away, contradicted its command, refused it as unsafe, or could not be armed.",
     )
     NEUTRAL_NOT_REACHED = _latched(
         "neutral not confirmed",

@@ -200,7 +200,12 @@ class InstrumentLoop:
         else:
             self.supervisor.begin_self_test()
         self._started_ns = self._clock.now_ns()
+        self._begin_scan()
+
+    def _begin_scan(self) -> None:
+        """Start the scan; what the device takes from here on is read, lost or unread."""
         self._devices.daq.start()
+        self._last_scan_ns = self._clock.now_ns()
 
     def _run_ticks(self, seconds: float) -> None:
         limits = self._config.safety
@@ -227,10 +232,9 @@ class InstrumentLoop:
             self.scheduler.run(ticks)
             self.host_gaps.look(awake_ns + self._period_ns, self._clock.now_ns())
             if self.supervisor.state is State.SELF_TEST and self._self_test_passed():
-                self.scheduler.ignore_next("arming")
-                self.supervisor.arm()
-                self.armed_ns = self._clock.now_ns()
-                end_ns = self.armed_ns + round(seconds * 1e9)
+                self._arm()
+                if self.armed_ns is not None:
+                    end_ns = self.armed_ns + round(seconds * 1e9)
             elif self.supervisor.is_holding:
                 self._look_after_hold()
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
@@ -279,6 +283,15 @@ class InstrumentLoop:
         watched_ms = min((now_ns - self._started_ns) * 1e-6, self.holds.good_ms(now_ns))
         return self._watch.self_test_passed(watched_ms, (now_ns - self._started_ns) * 1e-6)
 
+    def _arm(self) -> None:
+        self.scheduler.ignore_next("arming")
+        try:
+            self.supervisor.arm()
+        except HalError as error:  # the port that failed does not know whose it is
+            self.incidents.report_error(Finding.OUTPUT_FAILED, self._devices.amplifier.name, error)
+        else:
+            self.armed_ns = self._clock.now_ns()
+
     def _may_finish(self) -> bool:
         """Return False within a hold whose cause has not passed: an end of the run there would hide the cause."""
         return not self.supervisor.is_holding or self.holds.is_ready
@@ -316,19 +329,18 @@ class InstrumentLoop:
         """Begin a new scan after one that failed, with outputs at neutral, because the driver may take a while for it.
         Scans that the device has taken meanwhile are lost."""
         daq = self._devices.daq
+        last_ns = self._last_scan_ns
         try:
             daq.stop()
-            daq.start()
+            self._begin_scan()
         except HalError as error:
             self.incidents.report_error(finding_of_scans(error, 0.0), daq.name, error, stall_ms=0.0)
             return
         self._scan_failed = False
         self.holds.interrupt(self._clock.now_ns(), f"scans of {daq.name}")
-        if self._last_scan_ns:
-            lost = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
-            self.counts.lost += lost
-            self.counts.expected += lost
-            self._last_scan_ns = 0
+        lost = max(0, (self._last_scan_ns - last_ns) // self._period_ns)
+        self.counts.lost += lost
+        self.counts.expected += lost
 
     def _read(self, timeout_s: float) -> ScanBlock:
         began_ns = self._clock.now_ns()
@@ -361,7 +373,7 @@ class InstrumentLoop:
 
     def _count_unread(self) -> None:
         """Count the scans that the device has had time for since the last one that was read."""
-        if self._last_scan_ns:
+        if self._last_scan_ns:  # the scan was started
             self.counts.unread = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
 
     def _ramp_without_scans(self) -> None:

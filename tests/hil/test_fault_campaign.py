@@ -9,6 +9,7 @@ import pytest
 from tests.conftest import DEFAULT_BENCH
 from tools.faults.campaign import FaultRow, totals
 from tools.faults.catalogue import faults
+from tools.faults.pairs import join
 from tools.faults.phases import SELF_TEST
 from tools.faults.points import POINTS, write_bench
 from tools.faults.trial import observe_running, observe_start
@@ -83,3 +84,24 @@ def test_a_firmware_that_dies_with_its_outputs_at_neutral_leaves_them_there(tmp_
     (o,) = observe_running(bench, "typical", [fault], 1, SELF_TEST)
     assert (o.confirmed, o.false_neutral, o.rough) == (True, False, 0)
     assert "died with its outputs at neutral" in o.message
+
+
+def test_scans_of_a_line_that_fails_again_and_again_in_the_self_test_are_counted(tmp_path: Path):
+    """Every new start may fail before its first scan is read."""
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    names = ("serial: bytes doubled", "serial: one byte in a thousand lost", "output bus: adapter unplugged")
+    chosen = [next(f for f in faults() if f.name == name) for name in names]
+    doubled, lost, unplugged = observe_running(bench, "typical", chosen, 2, SELF_TEST)
+    assert (doubled.uncounted, lost.uncounted) == (0, 0)
+    assert unplugged.message.startswith("piezo: ")
+
+
+def test_both_faults_of_a_pair_on_one_bus_act(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    wrong, late = (
+        next(f for f in faults() if f.name == f"output bus: {name}")
+        for name in ("a bit wrong in every transfer", "transfers 1 ms late")
+    )
+    (o,) = observe_running(bench, "typical", [join(wrong, late, 0.001)], 1)
+    assert o.answer == "safe state"
+    assert "commands were late" in o.noticed

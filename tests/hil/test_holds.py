@@ -138,7 +138,7 @@ def run_scene(
             if how == "stall in read-back":
                 stalls[0].due = True
             elif how == "bus-off for 30 ms":
-                can: Any = far.ports["can0"]
+                can: Any = far.ports["can0"][0]
                 can.arm(FaultPlan(bus_off_after_s=0.0))
                 far.clock.at(t_ns + 30_000_000, lambda _, can=can: can.arm(FaultPlan()))
             else:

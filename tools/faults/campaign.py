@@ -53,13 +53,19 @@ class FaultRow:
     @property
     def answer(self) -> str:
         """The commonest answer where the outputs work when the fault strikes, or before the devices are opened."""
-        usual = [o for o in self.observations if o.phase in (LEARNING.name, STEADY.name, START.name)]
+        usual = [o for o in self.observations if o.happened and o.phase in (LEARNING.name, STEADY.name, START.name)]
         answers = [o.answer for o in usual or self.observations]
         return max(sorted(set(answers)), key=answers.count)
 
     @property
     def as_expected(self) -> int:
-        return sum(o.answer in accepted_answers(self.fault, o.phase) for o in self.observations)
+        return sum(self.is_as_expected(o) for o in self.observations)
+
+    def is_as_expected(self, o: Observation) -> bool:
+        """``o`` has an accepted answer; the one to a fault that has not struck after all is none."""
+        if not o.happened:
+            return o.answer == "none" or o.held_on
+        return o.answer in accepted_answers(self.fault, o.phase)
 
     @property
     def late(self) -> int:
@@ -141,7 +147,7 @@ def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
     runs = [o for row in rows for o in row.observations]
     moving = [o for row in rows if not row.fault.is_pair for o in row.observations if o.moved_ms is not None]
     ours = [
-        o for row in rows if not row.fault.is_pair and row.fault.expected != "cannot be seen"
+        o for row in rows if not row.fault.is_pair and row.fault.is_told_in_time
         for o in row.observations if o.moved_ms is not None
     ]  # fmt: skip
     return {
@@ -149,6 +155,7 @@ def totals(rows: Sequence[FaultRow]) -> dict[str, Any]:
         "pairs": len({row.fault.name for row in rows if row.fault.is_pair}),
         "points": len({row.point for row in rows}),
         "runs": len(runs),
+        "did_not_strike": sum(not o.happened for o in runs),
         "as_expected": sum(row.as_expected for row in rows),
         "moving_the_tip_5_um": len(moving),
         "of_these_known_within_20_ms": sum(not moved_unseen(o) for o in moving),
@@ -183,6 +190,8 @@ def run_campaign(
     """
     if has_redundancy(bench):
         faults = [fault.with_redundancy() for fault in faults]
+    if reads_back(bench):
+        faults = [fault.with_read_back() for fault in faults]
     folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
     try:
         benches = {point.name: write_bench(bench, point, folder) for point in points}
@@ -273,6 +282,12 @@ def has_redundancy(bench: Path) -> bool:
     """Return whether the instrument of ``bench`` has more than six accelerometer axes."""
     devices = load_bench(bench).description.devices_with("adxl203").values()
     return sum(len(device.options().get("channels", ())) for device in devices) > 6
+
+
+def reads_back(bench: Path) -> bool:
+    """Return whether the amplifier of ``bench`` reads every command back."""
+    amplifiers = load_bench(bench).description.devices_with("dac_amplifier").values()
+    return any(amplifier.options().get("read_back") for amplifier in amplifiers)
 
 
 def _observe(trial: Trial) -> tuple[Trial, list[Observation]]:

@@ -118,9 +118,13 @@ def sensors() -> tuple[Fault, ...]:
 
 
 def output_bus() -> tuple[Fault, ...]:
-    def piezo(name: str, expected: str, *, why: str = "", watch_s: float = 0.15, **plan: float) -> Fault:
+    def piezo(
+        name: str, expected: Expected, *, why: str = "", watch_s: float = 0.15, slow: bool = False, **plan: float
+    ) -> Fault:
         how, own = OnBus("i2c0", plan, only=DAC), "write_corruption" in plan
-        return Fault(f"output bus: {name}", how, expected, PIEZO, watch_s, own_output=own, effect=4, why=why)  # type: ignore[arg-type]
+        return Fault(
+            f"output bus: {name}", how, expected, PIEZO, watch_s, own_output=own, effect=4, why=why, slow=slow
+        )  # fmt: skip
 
     deaf, stuck = InWorld("nack", "piezo", "ack", 0.002), InWorld("stuck", "i2c0", "free", 0.005)
     return (
@@ -134,7 +138,7 @@ def output_bus() -> tuple[Fault, ...]:
         piezo("one transfer in a hundred refused", "holds", watch_s=0.6, nack=0.01),
         piezo("half of the transfers lost", "holds", loss=0.5),
         piezo("a bit wrong in every transfer", "safe state", write_corruption=1.0, why=ONE_BYTE),
-        piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1, why=ONE_BYTE),
+        piezo("a bit wrong in one transfer of ten", "safe state", write_corruption=0.1, why=ONE_BYTE, slow=True),
         piezo("a bit wrong in one transfer of a thousand", "cannot be seen", write_corruption=0.001, why=ONE_BYTE),
         piezo("transfers 1 ms late", "noticed", delay=1.0, delay_s=0.001),
         piezo("transfers sent twice", "noticed", duplication=1.0),

@@ -68,6 +68,7 @@ class Fault:
 
     ``redraws``: the fault also shifts when samples are taken, so they carry other noise; how far it takes the tip
     is seen without noise. ``own_output``: the fault itself moves the output, whatever the firmware says.
+    ``slow``: this bench comes to know of it, but cannot within 20 ms; a bench that reads back can, and must.
     ``effect``: how much it disturbs a real bench, by the scale of the HIL tests (0 reads .. 4 motion); 9 is for the
     emulated world only. ``why``: for what cannot be seen, comes late or is harmless. ``redundant``: what is expected of
     a bench with more than six axes, where that is something else. ``part``: what a message says that isolates the
@@ -82,6 +83,7 @@ class Fault:
     at_start: bool = False
     redraws: bool = False
     own_output: bool = False
+    slow: bool = False
     effect: int = 9
     why: str = ""
     redundant: Expected | None = None
@@ -96,6 +98,15 @@ class Fault:
         if isinstance(self.how, InWorld) and not self.how.target.isdigit():
             return self.how.target
         return ""
+
+    @property
+    def is_told_in_time(self) -> bool:
+        """The bench has what it takes to know of it within 20 ms."""
+        return self.expected != "cannot be seen" and not self.slow
+
+    def with_read_back(self) -> Fault:
+        """The same on a bench whose amplifier reads every command back."""
+        return replace(self, slow=False)
 
     def with_redundancy(self) -> Fault:
         """The same on a bench that can do without an axis."""

@@ -20,7 +20,7 @@ ENDED_WELL = ("run finished", "stopped by the operator")
 @dataclass(frozen=True)
 class Seen:
     """From both sides of one run: outcome of the firmware; path of the tip, demands at the amplifier (t_ns, channel,
-    volts) and scans taken from the world."""
+    volts) and scans taken from the world; whether a fault that strikes at random did."""
 
     strike_ns: int
     outcome: dict[str, Any]
@@ -28,6 +28,7 @@ class Seen:
     tip_m: NDArray[np.float64]
     demands: list[tuple[int, int, float]]
     scans: int
+    happened: bool = True
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Observation:
     that it is. ``uncounted``: scans of the device that the firmware cannot account for.
     ``lost``: scans that the firmware reports as lost.
     ``phase``: of the run, when the fault struck (``phases.py``).
+    ``happened``: the fault did something; one that strikes at random may not have, while it was watched.
     ``astray_um``: largest distance of the tip from the same run without the fault, until the decision; ``moved_ms``:
     when it passed 5 um; neither is judged where the outputs did not work when the fault struck.
     """
@@ -64,6 +66,7 @@ class Observation:
     held_ms: float | None = None
     resumed: bool = False
     phase: str = "steady"
+    happened: bool = True
 
     @classmethod
     def refusal(cls, fault: str, point: str, seed: int, message: str, phase: str) -> Observation:
@@ -156,6 +159,7 @@ def judge(
         held_ms=(decided_ns - seen.strike_ns) * 1e-6 if holds else 0.0 if held_on else None,
         resumed=bool(holds and holds[-1]["resumed"]),
         phase=phase.name,
+        happened=seen.happened,
     )
 
 

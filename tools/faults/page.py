@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 from tools.faults.campaign import FaultRow, moved_unseen, totals
 from tools.faults.drift_bound import FALSE_PER_HOUR, SEEN, DriftBound
-from tools.faults.phases import PHASES, START, accepted_answers
+from tools.faults.phases import PHASES, START
 
 HEAD = """# Reliability: what breaks, what the instrument does
 
@@ -19,13 +19,14 @@ the bench is opened ("at start"). Beside them {pairs} pairs: the second fault st
 | figure | goal | measured |
 |---|---|---|
 | runs that moved the tip more than 5 um and were known of within 20 ms of that | - | {known} of {moving} |
-| of these, faults that this bench cannot tell in that time ("cannot be seen" below) | - | {known_blind} of {blind} |
+| of these, faults that this bench cannot tell in time ("cannot be seen", "slow") | - | {known_blind} of {blind} |
 | of these, faults that it can | all | {known_ours} of {ours} |
 | unsafe outputs | 0 | {unsafe_outputs} |
 | jumps of outputs that the fault itself makes (restarted DAC, bits flipped on I2C) | - | {jumps_of_the_fault} |
 | samples that nobody counted | 0 | {uncounted_samples} |
 | messages that do not name the cause | 0 | {wrong_messages} |
 | answers as expected below | all | {as_expected} of {runs} |
+| of these, runs in which a fault that strikes at random did not (the answer must be none) | - | {did_not_strike} |
 
 | phase | runs | as expected | moved 5 um, known within 20 ms | unsafe |
 |---|---|---|---|---|
@@ -41,7 +42,13 @@ makes no such claim); or anything but the ramp and neutral from the begin to the
 itself makes is counted apart; a report of neutral that is none is never excused. The tip is judged where the outputs
 work when the fault strikes (learning, steady). In self-test, hold and ramp a latching fault must not end in outputs
 that work (`tools/faults/phases.py`). Uncounted: scans that the device took and that are neither received, nor reported
-lost, nor unread at the end.
+lost, nor unread at the end. Of a pair on one bus both faults act.
+
+How the grading changed after a look at campaigns before this one (seeds 77, 133569468, 46657867, 103200270): faults in
+self-test and hold are watched until outputs work; a fault that strikes at random and has not is answered rightly by
+nothing; "cannot be seen" may be seen by the self-test; a wrong bit in one command of ten is "slow" on a bench that does
+not read commands back, and not counted among what it can tell within 20 ms; the second fault of a pair on one bus no
+longer replaces the first.
 
 ## Answers that were not as expected
 
@@ -205,7 +212,7 @@ def _phases(rows: Sequence[FaultRow]) -> list[str]:
             here = [(row, o) for row, o in every if o.phase == phase.name and row.fault.is_pair == is_pair]
             if not here:
                 continue
-            good = sum(o.answer in accepted_answers(row.fault, o.phase) for row, o in here)
+            good = sum(row.is_as_expected(o) for row, o in here)
             unsafe = sum(o.false_neutral or (o.rough > 0 and not row.fault.own_output) for row, o in here)
             moving = [o for _, o in here if o.moved_ms is not None] if not is_pair else []
             known = f"{sum(not moved_unseen(o) for o in moving)} of {len(moving)}" if moving else "-"
@@ -217,10 +224,7 @@ def _unexpected(rows: Sequence[FaultRow]) -> list[str]:
     lines: list[str] = []
     for row in rows:
         for phase in (START, *PHASES):
-            wrong = [
-                o for o in row.observations
-                if o.phase == phase.name and o.answer not in accepted_answers(row.fault, o.phase)
-            ]  # fmt: skip
+            wrong = [o for o in row.observations if o.phase == phase.name and not row.is_as_expected(o)]
             misnamed = [o for o in row.observations if o.phase == phase.name and row.is_misnamed(o)]
             if misnamed:
                 lines.append(
@@ -241,13 +245,14 @@ def _unseen(rows: Sequence[FaultRow]) -> list[str]:
     for name in dict.fromkeys(row.fault.name for row in rows):
         mine = [row for row in rows if row.fault.name == name]
         late, unsafe = sum(row.late for row in mine), sum(o.rough for row in mine for o in row.observations)
-        blind = mine[0].fault.expected == "cannot be seen"
+        blind = not mine[0].fault.is_told_in_time
         if not (late or blind or unsafe):
             continue
         runs = sum(row.seeds for row in mine)
         detected = sum(row.detected for row in mine)
         worst_um = max(o.astray_um for row in mine for o in row.observations)
-        text = f"- **{name}**: known in {detected} of {runs} runs, in {late} later than 20 ms after 5 um; "
+        slow = " (slow)" if mine[0].fault.slow else ""
+        text = f"- **{name}**{slow}: known in {detected} of {runs} runs, in {late} later than 20 ms after 5 um; "
         text += f"tip error up to {worst_um:.0f} um"
         text += f"; {unsafe} {'jumps of its own' if mine[0].fault.own_output else 'unsafe demands'}" if unsafe else ""
         lines.append(text + (f". {mine[0].fault.why}." if mine[0].fault.why else "."))

@@ -31,6 +31,14 @@ from tools.faults.phases import SELF_TEST, START, STEADY, Phase, Stop
 Sabotaged = FaultSerial | FaultI2c | FaultCan
 
 
+def _sabotaged(port: Port, clock: Clock) -> Sabotaged:
+    if hasattr(port, "transfer"):
+        return FaultI2c(cast(I2cBus, port), clock, FaultPlan())
+    if hasattr(port, "recv"):
+        return FaultCan(cast(CanBus, port), clock, FaultPlan())
+    return FaultSerial(cast(SerialPort, port), clock, FaultPlan())
+
+
 @dataclass
 class FarBench:
     """The opened bench from the far side: its clock, world, ports, and every demand at the amplifier."""
@@ -38,8 +46,9 @@ class FarBench:
     clock: VirtualClock = field(default_factory=VirtualClock)
     world: Any = None
     processes: Processes = field(default_factory=Processes)
-    ports: dict[str, Sabotaged] = field(default_factory=dict[str, Sabotaged])
+    ports: dict[str, tuple[Sabotaged, Sabotaged]] = field(default_factory=dict[str, tuple[Sabotaged, Sabotaged]])
     demands: list[tuple[int, int, float]] = field(default_factory=list[tuple[int, int, float]])
+    struck: How | None = None
 
     def attach(self, opened: OpenBench) -> None:
         self.clock, self.world = cast(VirtualClock, opened.clock), cast(Any, opened.world)
@@ -49,18 +58,14 @@ class FarBench:
         )
 
     def wrap(self, bus: str, port: Port, clock: Clock) -> Port:
-        """Every port can be sabotaged later; until then its plan is empty."""
-        made: Sabotaged
-        if hasattr(port, "transfer"):
-            made = FaultI2c(cast(I2cBus, port), clock, FaultPlan())
-        elif hasattr(port, "recv"):
-            made = FaultCan(cast(CanBus, port), clock, FaultPlan())
-        else:
-            made = FaultSerial(cast(SerialPort, port), clock, FaultPlan())
-        self.ports[bus] = made
-        return made
+        """Every port can be sabotaged later, by two faults at once; until then its plans are empty."""
+        inner = _sabotaged(port, clock)
+        outer = _sabotaged(inner, clock)
+        self.ports[bus] = inner, outer
+        return outer
 
-    def strike(self, how: How, seed: int) -> None:
+    def strike(self, how: How, seed: int, *, second: bool = False) -> None:
+        """Begin the fault. ``second``: one on a bus leaves another there as it is."""
         now_ns = self.clock.now_ns()
         match how:
             case InWorld(name, target, heal, for_s):
@@ -68,7 +73,7 @@ class FarBench:
                 if heal:
                     self.clock.at(now_ns + round(for_s * 1e9), lambda _: self.world.inject(heal, target))
             case OnBus(bus, plan, only):
-                port, full = self.ports[bus], FaultPlan(**{**plan, "seed": seed})
+                port, full = self.ports[bus][second], FaultPlan(**{**plan, "seed": seed})
                 if isinstance(port, FaultI2c):
                     port.arm(full, only=only)
                 else:
@@ -81,9 +86,19 @@ class FarBench:
                 mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
                 most = resource.getrlimit(resource.RLIMIT_AS)[1]
                 resource.setrlimit(resource.RLIMIT_AS, (mapped + round(left_MB * 1e6), most))
-            case Both(first, second, gap_s):
+            case Both(first, later, gap_s):
                 self.strike(first, seed)
-                self.clock.at(now_ns + round(gap_s * 1e9), lambda _: self.strike(second, seed + 1))
+                self.clock.at(now_ns + round(gap_s * 1e9), lambda _: self.strike(later, seed + 1, second=True))
+
+    def happened(self, how: How) -> bool:
+        """Return whether ``how`` has done anything: a fault that strikes at random may not have, before the end."""
+        match how:
+            case OnBus(bus):
+                return any(port.counts.any for port in self.ports[bus])
+            case Both(first, second):
+                return self.happened(first) or self.happened(second)
+            case _:
+                return True
 
     def scans(self) -> int:
         return int(self.world.world.devices["daq"].scans)
@@ -158,6 +173,7 @@ def observe_running(
                 if quiet:
                     far.world.world.plant.hush()
                 if fault is not None:
+                    far.struck = fault.how
                     far.strike(fault.how, seed)
                 if "firmware" in far.processes.dead:
                     me.answer(far.after_death(at_ns, watch_s))
@@ -194,7 +210,8 @@ def observe_running(
         if not me.is_child:
             raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
         assert truth is not None
-        me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans()))
+        happened = far.struck is None or far.happened(far.struck)
+        me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans(), happened))
     finished = [answer for answer in answers if isinstance(answer, Seen)]
     if any("SIGTERM" in str(seen.outcome["safe_state"]["reason"]) for seen in finished):
         raise SystemExit("the campaign was ended from outside")  # the run heard it, and took it for its operator

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from tools.faults.campaign import FaultRow, moved_unseen, totals
@@ -133,3 +135,19 @@ def test_pairs_are_drawn_once_each_and_keep_what_is_worse():
     for pair in pairs:
         assert (pair.expected, pair.own_output, set(pair.names)) == ("safe state", True, {"a", "b"})
         assert "holds" in accepted_answers(pair, STEADY.name)
+
+
+def test_nothing_is_the_right_answer_to_a_fault_that_has_not_struck_after_all():
+    fault = Fault("f", InWorld("x", ""), "holds")
+    quiet = judge("f", "p", 1, seen(outcome("run finished", 99), np.zeros(100)), np.zeros((100, 3)))
+    none, struck = replace(quiet, happened=False), replace(quiet, happened=True)
+    tripped = replace(none, tripped_ms=3.0)
+    row = FaultRow(fault, "p", (none, struck, tripped))
+    assert [row.is_as_expected(o) for o in row.observations] == [True, False, False]
+
+
+def test_a_slow_fault_is_none_that_a_bench_without_read_back_must_tell_in_time():
+    slow = Fault("f", InWorld("x", ""), "safe state", slow=True)
+    late = replace(judge("f", "p", 1, seen(outcome("x", 99), np.zeros(100)), np.zeros((100, 3))), moved_ms=1.0)
+    assert totals([FaultRow(slow, "p", (late,))])["ours_moving_the_tip_5_um"] == 0
+    assert totals([FaultRow(slow.with_read_back(), "p", (late,))])["ours_moving_the_tip_5_um"] == 1
