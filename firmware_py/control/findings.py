@@ -257,6 +257,13 @@ class Finding(Enum):
         "self-test: {what} after {limit_ms:g} ms",
         "What did not become good in that time needs a look.",
     )
+    SELF_TEST_DISTURBED = _latched(
+        "self-test disturbed",
+        _HOST,
+        "self-test: {what} after {limit_ms:g} ms, in which this host stood still again and again; "
+        "see docs/lab-machine.md",
+        "Sensors cannot be watched without interruption by a loop that is interrupted.",
+    )
     TOO_MANY_HOLDS = _latched(
         "too many holds",
         _DEVICE,

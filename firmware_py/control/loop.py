@@ -86,6 +86,7 @@ class InstrumentLoop:
         self._block: ScanBlock | None = None
         self._ticks: Ticks | None = None
         self._started_ns = 0
+        self._disturbed_ns = 0
         self._last_scan_ns = 0
         self._warned = 0
         self._interrupted = ""
@@ -280,8 +281,11 @@ class InstrumentLoop:
             self._restart_scan()
         now_ns = self._clock.now_ns()
         self._watch.restore_guardian(now_ns)
-        watched_ms = min((now_ns - self._started_ns) * 1e-6, self.holds.good_ms(now_ns))
-        return self._watch.self_test_passed(watched_ms, (now_ns - self._started_ns) * 1e-6)
+        if self._host_stalled_ms():
+            self._disturbed_ns = now_ns
+        since_start_ms = (now_ns - self._started_ns) * 1e-6
+        watched_ms = min(since_start_ms, self.holds.good_ms(now_ns))
+        return self._watch.self_test_passed(watched_ms, since_start_ms, (now_ns - self._disturbed_ns) * 1e-6)
 
     def _arm(self) -> None:
         self.scheduler.ignore_next("arming")

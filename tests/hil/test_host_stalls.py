@@ -97,3 +97,30 @@ def test_the_world_tells_when_it_stood_still(tmp_path: Path) -> None:
         world.turn(woke_ns + k * MS)
     assert view.stalled_ms(woke_ns + 12 * MS, 10.0) == 0.0
     assert view.stalls == 1
+
+
+@pytest.mark.parametrize("until_s", [2.0, 60.0])
+def test_a_host_that_stands_still_in_the_self_test_is_waited_for_and_named(tmp_path: Path, until_s: float) -> None:
+    """The DAQ's FIFO overflows every time, so that nothing can be watched for long enough."""
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    bench.write_text(bench.read_text() + "\n[firmware.self_test]\nwatch_ms = 300.0\nlimit_ms = 1000.0\n")
+    far = FarBench()
+
+    def strike(t_ns: int) -> None:
+        if t_ns < until_s * 1e9:
+            far.strike(OnHost(150.0), seed=5)
+            far.clock.at(t_ns + 350 * MS, strike)
+
+    def prepare(opened: OpenBench) -> None:
+        far.attach(opened)
+        far.clock.at(20 * MS, strike)
+
+    request = RunRequest(bench, 0.5, pace="virtual", seed=5)
+    outcome = run_in_process(request, on_open=prepare, wrap=far.wrap)[0]
+    if until_s < 10.0:
+        assert outcome["safe_state"]["normal"], outcome["safe_state"]
+    else:
+        assert outcome["safe_state"]["class"] == "host"
+        assert outcome["safe_state"]["finding"] == "self_test_disturbed"
+        assert "this host stood still again and again" in outcome["safe_state"]["reason"]
+    assert outcome["holds"] == []

@@ -170,13 +170,15 @@ def test_outputs_that_may_not_move_are_not_looked_at() -> None:
 def test_the_self_test_waits_and_then_names_all_that_it_waits_for() -> None:
     bench = Watched(State.SELF_TEST, telemetry=button())
     limits = FirmwareConfig().self_test
-    assert not bench.watch.self_test_passed(limits.watch_ms - 1.0, 5000.0)
-    assert bench.watch.self_test_passed(limits.watch_ms, 5000.0)
+    assert not bench.watch.self_test_passed(limits.watch_ms - 1.0, 5000.0, 5000.0)
+    assert bench.watch.self_test_passed(limits.watch_ms, 5000.0, 5000.0)
     bench = Watched(State.SELF_TEST, telemetry=button(silent=True))
     bench.frame[STATUS] = FrameStatus.ALIGNING
-    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms)
+    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms, limits.limit_ms)
     assert not bench.tripped
-    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms + 1.0)
+    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms + 1.0, 1.0)
+    assert not bench.tripped
+    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms + 1.0, limits.limit_ms + 1.0)
     assert bench.tripped == (
         f"self-test: attitude is not aligned, the stop button has not been heard after {limits.limit_ms:g} ms"
     )
