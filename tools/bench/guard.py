@@ -6,6 +6,7 @@
   page does.
 * A body may have ``MAX_BODY_BYTES`` and take ``BODY_S``; a longer one is refused before it is read, or where it becomes
   too long.
+* A file for ``UPLOADS`` may have ``MAX_UPLOAD_BYTES``; it needs the token, and the route reads it in parts.
 * Requests without the token have ``MAX_REQUESTS`` places, ``MAX_OF_CLIENT`` for one address. Those with the token are
   not counted: an order always finds a place.
 """
@@ -21,6 +22,9 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY_BYTES = 65_536
+MAX_UPLOAD_BYTES = 200 << 20
+UPLOADS = "/api/upload/"
+"""Files come here: with the token alone, read in parts by the route, which has limits of its own."""
 BODY_S = 10.0
 MAX_REQUESTS = 48
 MAX_OF_CLIENT = 32
@@ -87,13 +91,21 @@ class Guard:
         if scope["type"] == "websocket":
             return None  # asks for the token in its first message
         length = headers.get("content-length", "0")
-        if not length.isdigit() or int(length) > MAX_BODY_BYTES:
-            return 413, f"a request may have {MAX_BODY_BYTES} bytes"
+        most = MAX_UPLOAD_BYTES if self._is_upload(scope, headers) else MAX_BODY_BYTES
+        if not length.isdigit() or int(length) > most:
+            known = self._access.knows(headers.get("x-micron-token")) or not scope["path"].startswith(UPLOADS)
+            what = f"{most >> 20} MB" if most == MAX_UPLOAD_BYTES else f"{most} bytes"
+            return (413, f"a request may have {what}") if known else (403, "token missing or wrong")
         changes = scope["method"] not in SAFE_METHODS
         private = scope["path"].startswith("/api/") and not self._access.open_reading
         if (changes or private) and not self._access.knows(headers.get("x-micron-token")):
             return 403, "token missing or wrong: open the address that 'micron bench' printed"
         return None
+
+    def _is_upload(self, scope: Scope, headers: dict[str, str]) -> bool:
+        """Return True for a file from somebody who has the token."""
+        known = self._access.knows(headers.get("x-micron-token"))
+        return known and scope["method"] == "PUT" and scope["path"].startswith(UPLOADS)
 
     async def _in_a_place(self, scope: Scope, headers: dict[str, str], receive: Receive, send: Send) -> None:
         """A request that may be answered, counted unless it has the token, with its body read."""
@@ -105,7 +117,7 @@ class Guard:
             self._open[client] += 1
         try:
             announced = headers.get("content-length", "0") != "0" or "transfer-encoding" in headers
-            if announced or scope["method"] not in SAFE_METHODS:
+            if (announced or scope["method"] not in SAFE_METHODS) and not self._is_upload(scope, headers):
                 receive = _replay(await _whole_body(receive), receive)
             await self._pass_on(scope, receive, send)
         except _TooLarge:

@@ -16,6 +16,7 @@ from hal.errors import HalError
 from tools.bench.applied import Applied
 from tools.bench.calibrate import calibrate_routes
 from tools.bench.collect import collect_routes
+from tools.bench.dropped import dropped_routes
 from tools.bench.jobs import Jobs
 from tools.bench.layouts import layout_routes
 from tools.bench.mismatch import mismatch_routes
@@ -34,6 +35,7 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         *_targets(session),
         *layout_routes(session),
         *collect_routes(session, jobs),
+        *dropped_routes(session, session.dropped),
         *mismatch_routes(session, jobs, applied),
         *calibrate_routes(session, jobs, applied),
     ]

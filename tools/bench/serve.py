@@ -116,6 +116,7 @@ def serve(
         finally:
             await session.targets.stop()
             await jobs.close()
+            session.dropped.close()
 
     asyncio.run(run())
     if any(interrupted):

@@ -18,6 +18,7 @@ from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.frame import LAYOUT, STATUS, TIME
 from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
+from tools.bench.dropped_files import Dropped
 from tools.bench.firmware import Choice, Firmware
 from tools.bench.history import History
 from tools.bench.hold_spans import HoldSpans
@@ -86,6 +87,7 @@ class Session:
         self.history = self._new_history()
         self.holds = HoldSpans()
         self.recorder = RunRecorder(recordings)
+        self.dropped = Dropped(recordings)
         self.targets = Targets(recordings / "targets")
         self.disk = Disk()
         self.shadow: Shadow | None = None

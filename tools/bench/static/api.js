@@ -4,10 +4,11 @@ let token = "";
 export const setToken = (value) => { token = value; };
 
 async function ask(method, path, body) {
+  const isFile = body instanceof Blob;
   const answer = await fetch(path, {
     method,
-    headers: { "X-Micron-Token": token, ...(body ? { "Content-Type": "application/json" } : {}) },
-    body: body ? JSON.stringify(body) : undefined,
+    headers: { "X-Micron-Token": token, ...(body && !isFile ? { "Content-Type": "application/json" } : {}) },
+    body: isFile ? body : body ? JSON.stringify(body) : undefined,
   });
   if (!answer.ok) {
     let reason = `${answer.status}`;
@@ -19,6 +20,7 @@ async function ask(method, path, body) {
 
 export const get = async (path) => (await ask("GET", path)).json();
 export const post = async (path, body = {}) => (await ask("POST", path, body)).json();
+export const put = async (path, file) => (await ask("PUT", path, file)).json();
 export const blobUrl = async (path) => URL.createObjectURL(await (await ask("GET", path)).blob());
 
 export async function download(path, name) {

@@ -1,6 +1,7 @@
 // Where twin and recording differ: pick, run, watch, read, take the corrected twin away.
 import { blobUrl, download, get, post } from "../api.js";
 import { duration, h } from "../dom.js";
+import { newRecording } from "./mismatch_new.js";
 
 const STEPS = { 2: ["locate and fit", "corrected twin"], 3: ["prepare", "locate and fit", "corrected twin"] };
 
@@ -22,8 +23,19 @@ export function mount(root, { link }) {
   const report = h("div.report", {}, h("div.empty", {},
     h("p", {}, "Pick a recording. The engine compares it with its twin, names the physics that is missing and fits it on data that it then checks on the part it has not seen."),
     h("p", {}, "A run takes from half a minute to several, in a process of its own; the firmware does not notice.")));
-  root.append(h("div.cols.mismatch", {},
-    h("section.panel", {}, h("div.row", {}, select, run, cancel, status, h("span.grow"), files, apply, back), problem, applied, lines), report));
+  const own = newRecording(link, async (recording) => {
+    problem.textContent = "";
+    try {
+      await refresh();
+      select.value = recording;
+      await start();
+    } catch (error) { fail(error); }
+  });
+  const view = h("div.cols.mismatch", {},
+    h("section.panel", {}, h("div.row", {}, select, run, cancel, own.open, own.pick, h("span.faint", {}, "or drop a csv, npz or mcap here"), status, h("span.grow"), files, apply, back), problem, own.problem, applied, lines),
+    h("div.stack", {}, own.form, report));
+  own.dropOn(view);
+  root.append(view);
 
   const fail = (error) => { problem.textContent = error.message; };
 

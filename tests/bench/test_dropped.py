@@ -1,0 +1,186 @@
+"""Files dropped into the Mismatch view: columns drawn, roles, units and twin described, and bad input in one place."""
+
+from __future__ import annotations
+
+import http.client
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.bench.conftest import go
+from tests.bench.still import Still, still_server
+from tools.bench.dropped import OFFERED, description, parameter_value
+from tools.bench.dropped_files import MOST_KEPT, Dropped
+from tools.bench.guard import MAX_UPLOAD_BYTES
+from tools.errors import InputError
+from tools.mismatch.recording_load import load
+
+pytestmark = pytest.mark.timeout(400)
+
+
+def motor(path: Path, n: int = 1000) -> Path:
+    t = np.arange(n) / 200.0
+    force = 8 * np.sin(2 * np.pi * 0.7 * t)
+    table = np.column_stack([t, force, 20 * np.cos(t), 20 + t])
+    np.savetxt(path, table, delimiter=",", header="t_s,force_N,x_mm,temp_degC", comments="")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("said", "value"),
+    [("2.1", 2.1), ("[1, 2.5]", [1, 2.5]), ('{ "1" = [0, 0, 1] }', {"1": [0, 0, 1]}), ("zero", "zero"), ("true", True)],
+)
+def test_what_is_typed_for_a_parameter(said: str, value: Any):
+    assert parameter_value("p", said) == value
+
+
+@pytest.mark.parametrize("said", ["2,1", "[1, 2", "= 3", "1\nformat = 2", "'"])
+def test_what_is_no_value_is_refused(said: str):
+    with pytest.raises(InputError, match="parameter mass"):
+        parameter_value("mass", said)
+
+
+def test_kinds_that_run_programs_are_not_offered():
+    assert not {"fmu", "instrument", "columns"} & set(OFFERED)
+    for kind in ("fmu", "instrument", ""):
+        with pytest.raises(InputError, match="choose a kind"):
+            description({"kind": kind}, "data.csv")
+
+
+def test_the_oldest_file_that_nobody_described_goes(tmp_path: Path):
+    dropped = Dropped(tmp_path)
+    kept = []
+    for k in range(MOST_KEPT + 2):
+        number, path = dropped.new_file(f"{k}.csv")
+        path.write_text("a")
+        dropped.files[number] = path
+        kept.append((number, path))
+    assert [path.exists() for _, path in kept] == [False, False] + [True] * MOST_KEPT
+    with pytest.raises(InputError, match="drop it again"):
+        dropped.get(kept[0][0])
+    dropped.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
+    with still_server(tmp_path_factory.mktemp("dropped") / "recordings") as served:
+        yield served
+
+
+def put(still: Still, name: str, body: bytes, token: str | None, length: int | None = None) -> tuple[int, str]:
+    connection = http.client.HTTPConnection(*still.place, timeout=60)
+    connection.putrequest("PUT", f"/api/upload/{name}")
+    connection.putheader("Content-Length", str(len(body) if length is None else length))
+    if token is not None:
+        connection.putheader("X-Micron-Token", token)
+    connection.endheaders(body)
+    answer = connection.getresponse()
+    found = answer.status, answer.read().decode()
+    connection.close()
+    return found
+
+
+def test_who_may_send_what(still: Still, tmp_path: Path):
+    csv = motor(tmp_path / "a.csv").read_bytes()
+    assert put(still, "a.csv", b"", None, 10)[0] == 403
+    assert put(still, "a.csv", b"", "wrong", 10)[0] == 403
+    code, said = put(still, "a.csv", b"", still.token, 500_000_000)
+    assert code == 413
+    assert f"{MAX_UPLOAD_BYTES >> 20} MB" in said
+    code, said = put(still, "a.csv", csv, still.token)
+    assert code == 200, said
+    for name, body, part in (
+        ("a.exe", csv, "must be .csv, .npz or .mcap"),
+        ("torn.npz", b"PK\x03\x04 and no more", "not a readable npz"),
+        ("torn.mcap", b"\x89MCAP0\r\n" + bytes(40), "torn.mcap"),
+        ("words.csv", b"a,b\nx,y\n", "is not a number"),
+        ("empty.csv", b"", "empty"),
+    ):
+        code, said = put(still, name, body, still.token)
+        assert (code, part in said) == (400, True), said
+        assert "/dropped" not in said
+        assert "/.dropped" not in said
+    left = [p for p in still.session.recorder.folder.iterdir() if p.name.startswith(".dropped")]
+    assert [len(list(p.iterdir())) for p in left] == [1], "the good one alone is kept"
+
+
+@pytest.fixture
+def page(browser: Any, still: Still) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
+    tab.goto(still.address)
+    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
+    go(tab, "mismatch")
+    tab.wait_for_selector("select option", state="attached")
+    yield tab
+    context.close()
+    assert not errors
+
+
+FILE = "input[aria-label='Data file']"
+
+
+def test_a_csv_becomes_a_recording_that_is_diagnosed(page: Any, still: Still, tmp_path: Path):
+    page.set_input_files(FILE, motor(tmp_path / "my motor.csv"))
+    form = page.locator(".new-recording")
+    form.wait_for()
+    assert form.locator("canvas").count() == 4
+    assert form.locator("[aria-label='Kind of twin']").input_value() == "mechanical_axis"
+    assert form.locator("[aria-label='Signal of x_mm']").input_value() == "position"
+    form.locator("[aria-label=mass]").fill("2.1")
+    form.locator("[aria-label=stiffness]").fill("120")
+    form.locator("[aria-label='Unit of x_mm']").fill("kg")
+    page.screenshot(path="out/browser/dropped.png") if Path("out/browser").is_dir() else None
+    form.locator("text=Make the recording").click()
+    page.wait_for_function("document.querySelector('.new-recording p[role=alert]').textContent.includes('kg')")
+    said = form.locator("p[role=alert]").inner_text()
+    assert "not of the dimension of m or rad" in said
+    assert form.locator("[aria-label=mass]").input_value() == "2.1", "nothing is lost"
+    form.locator("[aria-label='Unit of x_mm']").fill("mm")
+    form.locator("[aria-label=damping]").fill("5,0")
+    form.locator("text=Make the recording").click()
+    page.wait_for_function("document.querySelector('.new-recording p[role=alert]').textContent.includes('damping')")
+    form.locator("[aria-label=damping]").fill("5.0")
+    form.locator("text=Make the recording").click()
+    page.wait_for_function("document.querySelector('[aria-label=Recording]').value === 'my motor/'")
+    page.wait_for_function("document.getElementById('view').innerText.includes('diagnose my motor/')")
+    assert not form.is_visible()
+    page.locator("button", has_text="Cancel").click()
+    made = still.session.recorder.folder / "my motor"
+    assert load(made).twin.kind == "mechanical_axis"
+    text = tomllib.loads((made / "recording.toml").read_text())
+    assert text["twin"]["parameters"] == {"mass": 2.1, "damping": 5.0, "stiffness": 120}
+    assert [c["unit"] for c in text["channels"]] == ["N", "mm", "degC"]
+
+
+def test_a_file_that_is_dropped_is_taken(page: Any, tmp_path: Path):
+    page.evaluate(
+        """(text) => {
+            const data = new DataTransfer();
+            data.items.add(new File([text], "dropped.csv", { type: "text/csv" }));
+            const drop = new DragEvent("drop", { dataTransfer: data, bubbles: true });
+            document.querySelector(".mismatch").dispatchEvent(drop);
+        }""",
+        motor(tmp_path / "a.csv", 100).read_text(),
+    )
+    page.locator(".new-recording", has_text="dropped.csv").wait_for()
+
+
+def test_a_csv_of_500_mb_is_one_message_and_what_was_there_stays(page: Any, tmp_path: Path):
+    page.set_input_files(FILE, motor(tmp_path / "first.csv"))
+    form = page.locator(".new-recording")
+    form.wait_for()
+    form.locator("[aria-label='Noise of x_mm']").fill("0.02")
+    with (tmp_path / "large.csv").open("wb") as file:
+        file.truncate(500_000_000)
+    page.set_input_files(FILE, tmp_path / "large.csv")
+    page.wait_for_function("document.querySelector('.mismatch').innerText.includes('large.csv has 500.0 MB')")
+    assert form.locator("[aria-label='Noise of x_mm']").input_value() == "0.02"
+    assert "first.csv" in form.inner_text()

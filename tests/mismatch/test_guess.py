@@ -1,0 +1,79 @@
+"""What a data file's columns are, guessed from names, units and values."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tools.mismatch.guess import POINTS, guess, guess_role, main, split_unit
+from tools.mismatch.recording import RecordingError
+
+
+@pytest.mark.parametrize(
+    ("name", "parts"),
+    [
+        ("force_N", ("force", "N")), ("x [mm]", ("x", "mm")), ("speed (m/s)", ("speed", "m/s")), ("t_s", ("t", "s")),
+        ("gyro_deg/s", ("gyro", "deg/s")), ("accel_1", ("accel_1", "")), ("plain", ("plain", "")),
+        ("sensor_left", ("sensor_left", "")), ("T/degC", ("T", "degC")),
+    ],
+)  # fmt: skip
+def test_units_are_read_from_names(name: str, parts: tuple[str, str]):
+    assert split_unit(name) == parts
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "role"),
+    [
+        ("command", "V", "input"), ("displacement", "um", "output"), ("temperature", "degC", "context"),
+        ("a", "N", "input"), ("b", "mm", "output"), ("q", "", ""),
+    ],
+)  # fmt: skip
+def test_roles_come_from_names_then_units(name: str, unit: str, role: str):
+    assert guess_role(name, unit) == role
+
+
+def table(folder: Path, header: str, *columns: np.ndarray) -> Path:
+    path = folder / "data.csv"
+    np.savetxt(path, np.column_stack(columns), delimiter=",", header=header, comments="")
+    return path
+
+
+def test_a_motor_axis(tmp_path: Path):
+    t = np.arange(1000) / 200.0
+    found = guess(table(tmp_path, "t_s,force_N,x_mm,temp_degC", t, np.sin(t), np.cos(t), 20 + t))
+    assert found.time_column == "t_s"
+    assert found.rate_hz == pytest.approx(200.0)
+    assert found.kind == "mechanical_axis"
+    assert [(c.role, c.signal, c.unit) for c in found.columns] == [
+        ("time", "t", "s"), ("input", "force", "N"), ("output", "position", "mm"), ("context", "temperature", "degC"),
+    ]  # fmt: skip
+    x = found.columns[2]
+    assert len(x.low) == POINTS
+    assert min(x.low) == pytest.approx(np.cos(t).min())
+    assert max(x.high) == pytest.approx(1.0)
+
+
+def test_npz_and_names_without_units(tmp_path: Path):
+    np.savez(tmp_path / "data.npz", u=np.arange(50.0), y=np.arange(50.0), words=np.array(["a"]))
+    found = guess(tmp_path / "data.npz")
+    assert [(c.name, c.role) for c in found.columns] == [("u", "input"), ("y", "output")]
+    assert (found.kind, found.time_column, found.rate_hz) == ("", "", None)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"), [("a.csv", b""), ("a.npz", b"PK\x03\x04"), ("a.csv", b"\xff\xfe\x00"), ("a.txt", b"1,2")]
+)
+def test_what_cannot_be_read_is_one_message(tmp_path: Path, name: str, content: bytes):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(RecordingError, match=name):
+        guess(tmp_path / name)
+    assert main([str(tmp_path / name)]) == 2
+
+
+def test_the_command_prints_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    t = np.arange(100) / 10.0
+    assert main([str(table(tmp_path, "t_s,command_V,z_um", t, t, t))]) == 0
+    assert json.loads(capsys.readouterr().out)["kind"] == "piezo_stack"
