@@ -14,6 +14,7 @@ from sim_devices.physics.curve import STATIC_NONLINEARITY
 from sim_devices.physics.damping import AMPLITUDE_DAMPING, QUADRATIC_DRAG
 from sim_devices.physics.dead_zone import DEAD_ZONE
 from sim_devices.physics.delay import CHANNEL_DELAY, DEAD_TIME
+from sim_devices.physics.diode import ONE_SIDED_CONDUCTION
 from sim_devices.physics.drift import RANDOM_WALK
 from sim_devices.physics.dropped_samples import DROPPED_SAMPLES
 from sim_devices.physics.effect import Effect
@@ -78,6 +79,7 @@ _ALL = (
     SQUARE_ROOT_OUTFLOW,
     OVERFLOW,
     PARAMETER_VARIATION,
+    ONE_SIDED_CONDUCTION,
 )
 
 

@@ -45,4 +45,5 @@ NAMES = (
     "square_root_outflow",
     "overflow",
     "parameter_variation",
+    "one_sided_conduction",
 )

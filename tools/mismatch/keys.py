@@ -92,6 +92,7 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("C", "rows of numbers", "one row per output, in the order of the channels"),
             Key("D", "rows of numbers", "y = C x + D u + y0", "0"),
             Key("x0", "list of numbers", "state at the first sample", "set by the first samples"),
+            Key("first", "table of A, B, C, D", "a filter in front, one input and output; written by apply", "none"),
             Key("y0", "list of numbers", "offset of each output", "0"),
             HOLD,
             Key("discrete", "true, false", "A and B are those of the difference equation", "false"),

@@ -264,9 +264,12 @@ class Model:
     ) -> dict[str, Signal]:
         theta = np.asarray(theta, np.float64)
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
-        for k in self.order:
+        inside = str(getattr(self.twin, "inside", ""))
+        for k in sorted(self.order, key=lambda k: self.placed[k].target == inside):
             pl = self.placed[k]
             if pl.site == "input":
+                if pl.target == inside and inside not in inputs:
+                    inputs[inside] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)  # type: ignore[attr-defined]
                 inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
         forces = [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
         if folded is not None and forces:

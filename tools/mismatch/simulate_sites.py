@@ -115,6 +115,8 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
             # a linear operator commutes with a linear twin of one input
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
         found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]
+    if inputs and effect.driven and effect.kind != "linear" and hasattr(twin, "inside"):
+        found.append(Placed(effect, "input", str(twin.inside), "mechanics", twin.outputs))  # type: ignore[attr-defined]
     return found
 
 

@@ -20,6 +20,7 @@ from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, said
 from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.partition import SAMPLES, split_inside, splittable
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
 from tools.mismatch.engine.report import Hold, Report
@@ -34,6 +35,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.corrected import CorrectedTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.make import make
@@ -108,7 +110,7 @@ def free_run(recording: Recording, twin: Twin) -> tuple[Twin, int]:
 
 def restarting(twin: Twin, restart: bool) -> Twin:
     """A dynamic twin, plain or corrected, that starts every range afresh or does not."""
-    assert isinstance(twin, DynamicTwin | CorrectedTwin | OdeTwin)
+    assert isinstance(twin, DynamicTwin | CorrectedTwin | OdeTwin | CascadeTwin)
     return replace(twin, restart=restart)
 
 
@@ -175,6 +177,7 @@ def _diagnose(
 ) -> Report:
     recording, was_joined = joined(recording)
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
+    recording = opened(recording, held_out, seed)
     if is_long(recording, make(recording)):
         catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
@@ -232,6 +235,19 @@ def _diagnose(
         base = over_the_whole(problem, course, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
     return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld, hold)
+
+
+def opened(recording: Recording, held_out: float, seed: int) -> Recording:
+    """The recording with its twin as two filters, where an effect sits between them (``partition``).
+
+    The busiest stretch decides; a twin that cannot be split costs nothing.
+    """
+    if not splittable(recording):
+        return recording
+    part = excerpt(fitted_part(recording), 2 * SAMPLES)
+    problem, _, base = prepared(part, held_out, seed, False)
+    split = split_inside(problem, base)
+    return recording if split is None else replace(recording, twin=split.twin)
 
 
 def over_the_whole(problem: Problem, official: Problem, fitted: Fit) -> Fit:

@@ -229,7 +229,8 @@ def fit(
 OPENING = frozenset(
     (
         "hysteresis", "rate_dependent_hysteresis", "creep", "backlash", "dead_zone", "saturation", "slew_limit",
-        "static_nonlinearity", "first_order_lag", "resonance", "dead_time", "channel_delay", "misalignment",
+        "static_nonlinearity", "one_sided_conduction", "first_order_lag", "resonance", "dead_time", "channel_delay",
+        "misalignment",
         "soft_iron", "cross_axis_nonlinearity", "scale_factor_variation", "coulomb_friction", "stribeck_friction",
         "cubic_stiffness", "cogging", "centripetal_acceleration", "sensor_position_error",
     )

@@ -166,6 +166,11 @@ def _saturation(s: Slot, x: str, d: str) -> str:
     return f"limit({x}, {s.at(lo)}, {s.at(hi)}, {s.at('corner')})"
 
 
+def _conduction(s: Slot, x: str, d: str) -> str:
+    s.writer.used.add("conducted")
+    return f"conducted({x}, {s.at('knee')}, {s.at('width')}, {numbers(s.setting('side'))})"
+
+
 def _quantization(s: Slot, x: str, d: str) -> str:
     if s.setting("step") <= 0:
         return x
@@ -380,6 +385,7 @@ EXPRESSIONS: Mapping[str, Expression] = {
     "dead_zone": _dead_zone,
     "saturation": _saturation,
     "static_nonlinearity": _curve,
+    "one_sided_conduction": _conduction,
     "slew_limit": _slew,
     "first_order_lag": _lag,
     "ac_coupling": _ac,

@@ -20,6 +20,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe
 from tools.mismatch.twins.base import Force
+from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.twins.static import StaticTwin
@@ -132,6 +133,8 @@ class _Module:
             self._dynamic(twin)
         elif isinstance(twin, StaticTwin):
             self._static()
+        elif isinstance(twin, CascadeTwin):
+            raise InputError("two filters with an effect between them have no numpy form; use --out FILE.toml or .csv")
         else:
             raise InputError(f"a twin of {twin.kind} has no numpy form to write; use --out FILE.toml or FILE.csv")
         self._through("output")

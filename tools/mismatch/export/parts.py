@@ -186,6 +186,17 @@ def limit(x, lo, hi, corner):
     return lo + corner * np.logaddexp(0, (x - lo) / corner)
 
 
+def conducted(x, knee, width, side):
+    """Voltage across a diode that x feeds through a resistance: y = x - width w, w + ln w = (x - knee) / width."""
+    z = np.maximum((side * x - knee) / width, -700.0)
+    w = np.where(z > 1.0, z, np.exp(np.minimum(z, 1.0) - np.exp(np.minimum(z, 1.0) - 1.0)))
+    for _ in range(6):  # Fritsch, Shafer, Crowley, Comm. ACM 16 (1973) 123
+        r = z - w - np.log(w)
+        q = 2.0 * (1.0 + w) * (1.0 + w + 2.0 * r / 3.0)
+        w = w * (1.0 + r / (1.0 + w) * (q - r) / (q - 2.0 * r))
+    return x - side * width * w
+
+
 def legendre(x, lo, hi, degree):
     """Legendre polynomials 2 .. degree over lo .. hi, continued by their tangents, (n, degree - 1)."""
     z = (x - 0.5 * (lo + hi)) / (0.5 * (hi - lo))

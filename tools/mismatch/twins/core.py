@@ -5,6 +5,7 @@ from __future__ import annotations
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.axis import axis_twin
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.cascade import cascade_twin
 from tools.mismatch.twins.cluster import cluster_twin
 from tools.mismatch.twins.columns import columns_twin
 from tools.mismatch.twins.fmu import fmu_twin
@@ -30,6 +31,8 @@ def core(recording: Recording) -> Twin:
         case "state_space":
             if "states" in recording.twin.parameters:
                 return physical_twin(recording, read_matrices(recording))
+            if "first" in recording.twin.parameters:
+                return cascade_twin(recording, state_space_twin)
             return state_space_twin(recording)
         case "columns":
             return columns_twin(recording)

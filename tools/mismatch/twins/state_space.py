@@ -19,7 +19,7 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
 
-_NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states")
+_NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
 MAX_ORDER = 64
 """Modes of a plant at most."""
 

@@ -1,0 +1,136 @@
+"""Two filters in a row with an effect between them, and the split of a linear twin that finds it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter, zpk2ss, zpk2tf
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.diode import conducted
+from tests.unit.mismatch_engine.cases import recording
+from tools.mismatch.engine.diagnose import opened
+from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_text import describe, restore
+from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
+from tools.mismatch.twins.make import make
+
+FIRST = ([-0.9, 0.1], [0.75 + 0.35j, 0.75 - 0.35j, 0.5])
+SECOND = ([0.3 + 0.9j, 0.3 - 0.9j], [0.8 + 0.2j, 0.8 - 0.2j, 0.6])
+
+
+def unit_gain(zeros: list[complex], poles: list[complex]) -> float:
+    return float(np.real(np.prod([1 - p for p in poles]) / np.prod([1 - z for z in zeros])))
+
+
+def matrices(zeros: list[complex], poles: list[complex], gain: float) -> dict[str, object]:
+    return {k: m.real.tolist() for k, m in zip("ABCD", zpk2ss(zeros, poles, gain), strict=True)}
+
+
+def filtered(u: np.ndarray, zeros: list[complex], poles: list[complex]) -> np.ndarray:
+    """The response (n,) of a filter of unit gain at rest, from rest."""
+    b, a = zpk2tf(zeros, poles, unit_gain(zeros, poles))
+    return lfilter(np.concatenate([np.zeros(a.size - b.size), b.real]), a.real, u)
+
+
+def circuit(n: int, knee: float) -> tuple[np.ndarray, np.ndarray]:
+    """Input and output (n,) of two filters with a diode between them."""
+    u = 0.6 * lfilter([0.5], [1.0, -0.5], np.random.default_rng(3).standard_normal(n))
+    return u, filtered(conducted(filtered(u, *FIRST), knee, 0.05, 1.0), *SECOND)
+
+
+def in_two(u: np.ndarray, y: np.ndarray) -> Recording:
+    first, second = (matrices(*f, unit_gain(*f)) for f in (FIRST, SECOND))
+    return recording("state_space", {"u": u}, {"y": y}, {**second, "discrete": True, "first": first})
+
+
+def test_two_filters_are_the_same_twin_as_their_product() -> None:
+    u, y = circuit(1500, 1e3)
+    rec = in_two(u, y)
+    twin = make(rec)
+    assert isinstance(twin, CascadeTwin)
+    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
+    one = recording("state_space", {"u": u}, {"y": y}, {**matrices(*product, unit_gain(*product)), "discrete": True})
+    a, b = (Model(make(r)) for r in (rec, one))
+    view = View.whole(rec)
+    assert a.simulate(view, a.start(rec))["y"] == pytest.approx(b.simulate(view, b.start(one))["y"], abs=1e-6)
+
+
+def test_a_diode_between_the_filters_is_simulated_and_written_down() -> None:
+    u, y = circuit(1500, 0.4)
+    rec = in_two(u, y)
+    twin = make(rec)
+    effect = EFFECTS["one_sided_conduction"]
+    place = next(p for p in sites(twin, rec, effect) if p.target == BETWEEN)
+    assert (place.site, place.stage) == ("input", "mechanics")
+    model = Model(twin, [replace(place, settings={"range": (-2.0, 2.0), "side": (1.0,)})])
+    theta = model.start(rec)
+    theta[model.slices(0)[0]] = 0.4, 0.05
+    whole = View.whole(rec)
+    assert model.simulate(whole, theta)["y"] == pytest.approx(y, abs=1e-6)
+    table = describe(model, theta)
+    again = replace(rec, twin=replace(rec.twin, parameters=table["parameters"], effects=tuple(table["effects"])))
+    other, values = restore(again)
+    assert other.simulate(whole, values)["y"] == pytest.approx(y, abs=1e-6)
+
+
+def test_every_parameter_of_two_filters_moves_the_output() -> None:
+    u, y = circuit(1500, 1e3)
+    rec = in_two(u, y)
+    model = Model(make(rec))
+    theta = model.start(rec)
+    plain = model.simulate(View.whole(rec), theta)["y"]
+    for i, p in enumerate(model.parameters):
+        moved = theta.copy()
+        moved[i] += 0.01 * max(abs(theta[i]), 0.1)
+        change = model.simulate(View.whole(rec), moved)["y"] - plain
+        assert np.max(np.abs(change)) > 1e-5, p.name
+
+
+def test_a_split_is_found_where_a_curve_sits_inside() -> None:
+    u, y = circuit(12000, 0.4)
+    noise = 1e-3 * np.random.default_rng(1).standard_normal(y.size)
+    y = y + noise
+    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
+    believed = {**matrices(*product, unit_gain(*product)), "discrete": True}
+    rec = recording("state_space", {"u": u}, {"y": y}, believed)
+    split = opened(rec, 0.3, 0)
+    assert "first" in split.twin.parameters
+    first = split.twin.parameters["first"]
+    assert isinstance(first, dict)
+    poles = np.linalg.eigvals(np.array(first["A"]))
+    assert np.sort_complex(poles) == pytest.approx(np.sort_complex(np.array(FIRST[1])), abs=0.06)
+    straight = recording("state_space", {"u": u}, {"y": filtered(u, *product) + noise}, believed)
+    assert opened(straight, 0.3, 0) is straight
+
+
+def test_a_curve_at_the_output_splits_nothing() -> None:
+    u, _ = circuit(12000, 1e3)
+    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
+    y = conducted(filtered(u, *product), 0.3, 0.05, 1.0)
+    believed = {**matrices(*product, unit_gain(*product)), "discrete": True}
+    rec = recording("state_space", {"u": u}, {"y": y}, believed)
+    assert opened(rec, 0.3, 0) is rec
+
+
+def test_a_filter_in_front_needs_one_input_and_one_output() -> None:
+    u, y = circuit(400, 1e3)
+    rec = in_two(u, y)
+    with pytest.raises(RecordingError, match="one input and one output"):
+        make(replace(rec, outputs={"y": y, "z": y}, unit={**rec.unit, "z": "V"}))
+    with pytest.raises(RecordingError, match="first must be a table"):
+        make(replace(rec, twin=replace(rec.twin, parameters={**rec.twin.parameters, "first": 3})))
+
+
+def test_a_diode_meets_shockley_and_passes_the_other_side() -> None:
+    x = np.linspace(-5.0, 5.0, 400)
+    y = conducted(x, 0.5, 0.05, 1.0)
+    current = x - y  # times the resistance
+    assert current == pytest.approx(0.05 * np.exp((y - 0.5) / 0.05), abs=1e-9)
+    assert y[x < -0.5] == pytest.approx(x[x < -0.5], abs=1e-9)
+    assert conducted(x, 0.5, 0.05, -1.0) == pytest.approx(-conducted(-x, 0.5, 0.05, 1.0))
