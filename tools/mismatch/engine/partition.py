@@ -55,13 +55,9 @@ class Filter:
 
     def matrices(self) -> tuple[Array, Array, Array, Array]:
         """A, B, C, D."""
-        a, b, c, d = zpk2ss(list(self.zeros), list(self.poles), self.gain)
-        return (
-            np.asarray(a.real, np.float64),
-            np.asarray(b.real, np.float64),
-            np.asarray(c.real, np.float64),
-            np.asarray(d.real, np.float64),
-        )
+        found = zpk2ss(list(self.zeros), list(self.poles), self.gain)
+        a, b, c, d = (np.array(np.real(np.array(m, np.complex128)), np.float64) for m in found)
+        return a, b, c, d
 
     def run(self, u: Array, dt: float, hold: Hold) -> Array:
         """The response (n,) from rest to u (n,)."""
