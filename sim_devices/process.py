@@ -69,6 +69,11 @@ class PausableClock(MonotonicClock):
     def now_ns(self) -> int:
         return super().now_ns() - self.behind_ns if self._held_ns is None else self._held_ns
 
+    @property
+    def is_paused(self) -> bool:
+        """The clock stands still."""
+        return self._held_ns is not None
+
     def pause(self) -> None:
         """Stand still. Idempotent."""
         self._held_ns = self.now_ns()
@@ -96,6 +101,8 @@ class WorldProcess:
         description = job["description"]
         self._clock = PausableClock()
         serve = ServeConfig.model_validate(description["emulation"].get("serve", {}))
+        self.serves_others = "serve" in description["emulation"]
+        """The world is there for programs of any kind (``micron emulate``), and takes no processor from them."""
         make_plant = load_factory(job["plant"])
         # a world that nobody sees: the time in which its devices compile is none that the real one must make up
         warm_up(World(description, make_plant(description, job["hand_file"], job["hand_scale"])).plant)
@@ -203,6 +210,8 @@ class WorldProcess:
         for line in self._tcp.values():
             watched += line.filenos()
         watched += self._control.filenos()
+        if self._clock.is_paused:  # nothing becomes due, and a time that is waited for in a loop would never come
+            return select.select(watched, (), (), POLL_NS * 1e-9)[0]
         # select, not epoll: its timeout has a resolution of 1 us instead of 1 ms
         if ready := select.select(watched, (), (), max(0, deadline_ns - early_ns - now_ns) * 1e-9)[0]:
             return ready
@@ -333,7 +342,7 @@ def main(argv: list[str]) -> int:
     gc.freeze()
     gc.disable()
     policy = "SCHED_OTHER"
-    if prefer_real_time():
+    if not process.serves_others and prefer_real_time():
         policy, process.count_down_ns = f"SCHED_FIFO {PRIORITY}", COUNT_DOWN_NS
     ready = {"endpoints": process.endpoints(), "tcp": process.tcp_ports(), "scheduling": policy, "pid": os.getpid()}
     partial = job_path.with_name("endpoints.partial")

@@ -190,6 +190,8 @@ def test_python_can_hears_the_node(emulated: Emulated) -> None:
 
 
 def test_time_stands_still_while_it_is_paused(emulated: Emulated) -> None:
+    # a world that waits in a loop for a time that stands still must not keep a processor from everybody
+    assert os.sched_getscheduler(emulated.described["pid"]) == os.SCHED_OTHER
     assert emulated.order(pause=True)["ok"]
     first = emulated.order(list=True)["t_s"]
     time.sleep(0.05)
