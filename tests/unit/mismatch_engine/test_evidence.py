@@ -102,6 +102,18 @@ def test_which_groups_of_parameters_may_be_zero() -> None:
     assert not holds_zero(ParameterValue(4.0, "1", (4.0, 4.0)))
 
 
+def test_of_several_sizes_one_may_be_away_from_zero_by_chance() -> None:
+    barely = ParameterValue(2.0, "1", (0.1, 3.9))  # 2.06 standard errors
+    assert not holds_zero(barely)
+    assert holds_zero(barely, 2)  # 2.24 are needed of two
+    clear = ParameterValue(2.0, "1", (0.5, 3.5))
+    assert not holds_zero(clear, 3)
+    spring = EFFECTS["cubic_stiffness"]
+    nothing = ParameterValue(0.0, "1", (-1.0, 1.0))
+    assert absent_groups(spring, {"cubic_stiffness": nothing, "quadratic_stiffness": barely})
+    assert not absent_groups(spring, {"cubic_stiffness": nothing, "quadratic_stiffness": clear})
+
+
 def test_a_loop_whose_change_with_speed_may_be_zero_is_a_plain_loop() -> None:
     made = slow_loop()
     problem, selection = with_effect(made, "rate_dependent_hysteresis")
