@@ -12,7 +12,7 @@ from tests.bench.conftest import Server, go
 
 pytestmark = pytest.mark.timeout(400)
 
-VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
+VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
@@ -20,7 +20,7 @@ def test_every_view_opens(page: Any, artefacts: Path, theme: str):
     page.evaluate(f"document.documentElement.dataset.theme === '{theme}' || document.getElementById('theme').click()")
     for number, view in enumerate(VIEWS, 1):
         if theme == "dark":
-            page.keyboard.press(str(number))
+            page.keyboard.press(str(number % 10))
         else:
             go(page, view)
         page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")

@@ -15,7 +15,7 @@ from tests.bench.still import Still, still_server
 
 pytestmark = pytest.mark.timeout(400)
 
-VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
+VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 THEMES = ("dark", "light")
 SIZES = {  # name: CSS width and height, device pixels per CSS pixel
     "320": (320, 640, 1.0),
@@ -38,6 +38,7 @@ READY = {  # what is there when the view's first answers have come
     "collect": "tbody button",
     "mismatch": "select option",
     "calibrate": ".warm b:not(:empty)",
+    "setup": "datalist option",
 }
 SAFE_PX = 44
 CONTRAST = 4.5

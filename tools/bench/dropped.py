@@ -41,7 +41,7 @@ READ_S = 120.0
 _WORD = re.compile(r"[A-Za-z][\w./ -]*")
 
 
-async def _run(*arguments: str) -> str:
+async def run_module(*arguments: str) -> str:
     """Run a module of ours beside the loop and return its output. ``InputError`` with its message when it refuses."""
     process = await asyncio.create_subprocess_exec(
         *child_command(*arguments),
@@ -129,7 +129,7 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
                 path.rename(kept)
                 shutil.rmtree(path.parent, ignore_errors=True)
                 return {"recording": kept.name}
-            found = json.loads(await _run("tools.mismatch.guess", str(path)))
+            found = json.loads(await run_module("tools.mismatch.guess", str(path)))
         except BaseException as error:
             shutil.rmtree(path.parent, ignore_errors=True)
             if isinstance(error, InputError):
@@ -149,7 +149,7 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
         descriptor = path.with_name("recording.toml")
         write_text_atomic(descriptor, toml_text(description(table, path.name)))
         try:
-            await _run("tools.mismatch.guess", "--check", str(descriptor))
+            await run_module("tools.mismatch.guess", "--check", str(descriptor))
         except InputError as error:
             raise InputError(str(error).replace(f"{descriptor}: ", "").replace(f"{path}: ", "")) from None
         path.parent.rename(target)

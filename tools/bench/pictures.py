@@ -15,7 +15,7 @@ from typing import Any
 from tools.bench.started import started
 from tools.terminal import plain_console
 
-VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate")
+VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 SETTLE_MS = {"scope": 9000, "tremor": 8000}
 
 

@@ -22,6 +22,7 @@ from tools.bench.layouts import layout_routes
 from tools.bench.mismatch import mismatch_routes
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
+from tools.bench.setup import setup_routes
 from tools.bench.shadow import METHODS
 from tools.calibrate.calibration_file import calibration_toml
 from tools.errors import InputError
@@ -38,6 +39,7 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         *dropped_routes(session, session.dropped),
         *mismatch_routes(session, jobs, applied),
         *calibrate_routes(session, jobs, applied),
+        *setup_routes(session),
     ]
 
 

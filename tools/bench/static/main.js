@@ -16,6 +16,7 @@ const VIEWS = [
   ["collect", "Collect", "M12 3v12m-4-4l4 4 4-4M4 17v3h16v-3"],
   ["mismatch", "Mismatch", "M3 17c3 0 4-10 9-10s5 6 9 6M3 20c4 0 5-7 9-7s6 3 9 3"],
   ["calibrate", "Calibrate", "M4 20l5-5m0 0l9-9 2 2-9 9zM13 7l4 4"],
+  ["setup", "Setup", "M5 4v6a3 3 0 0 0 3 3h8a3 3 0 0 1 3 3v4M3 4h4M17 20h4M12 13v7M10 20h4"],
 ];
 
 const hash = new URLSearchParams(location.hash.slice(1));
@@ -68,7 +69,7 @@ function buildNav() {
     const a = h("a", { href: `#/${key}` });
     a.dataset.view = key;
     a.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
-    a.append(title, h("kbd", {}, String(i + 1)));
+    a.append(title, h("kbd", {}, String((i + 1) % 10)));
     byId("nav").append(a);
   });
   context.bar = replayBar(link, context);
@@ -220,7 +221,7 @@ function bindKeys() {
   document.addEventListener("keydown", (event) => {
     if (event.key === "Escape") { goSafe(); return; }
     if (event.ctrlKey || event.metaKey || event.altKey || /INPUT|SELECT|TEXTAREA/.test(event.target.tagName)) return;
-    const view = VIEWS[Number(event.key) - 1];
+    const view = /^\d$/.test(event.key) ? VIEWS[(Number(event.key) + 9) % 10] : null;
     if (view) context.navigate(view[0]);
     else if (event.key === "t" || event.key === "T") byId("theme").click();
   });

@@ -1,0 +1,141 @@
+"""The Setup view: a draft becomes a commented bench file that doctor accepts; parts that a bench lacks are left out."""
+
+from __future__ import annotations
+
+import itertools
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hal.bench import load_bench
+from tests.bench.conftest import go
+from tests.bench.still import Still, still_server
+from tests.conftest import copy_of_default_bench
+from tools.bench.setup_file import PLACES, bench_text, checked, read_draft
+from tools.cli.doctor import bench_findings
+from tools.errors import InputError
+
+pytestmark = pytest.mark.timeout(400)
+
+SIM = {bus: f"sim://{bus}" for bus in ("daq0", "i2c0", "i2c1", "can0")}
+GOOD: dict[str, Any] = {
+    "name": "lab", "uris": SIM, "inputs": dict(zip(PLACES, range(8), strict=True)),
+    "piezo": 0x0C, "magnetometer": 0x48, "monitor": 0x49, "telemetry": True,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("magnetometer", "monitor", "telemetry"), list(itertools.product((0x48, None), (0x49, None), (True, False)))
+)
+def test_doctor_accepts_what_is_written_with_any_parts(
+    tmp_path: Path, magnetometer: int | None, monitor: int | None, telemetry: bool
+):
+    draft = read_draft({**GOOD, "magnetometer": magnetometer, "monitor": monitor, "telemetry": telemetry})
+    content = bench_text(draft, [])
+    assert [f["verdict"] for f in checked(content, tmp_path)] == ["ok"] * len(checked(content, tmp_path))
+    (tmp_path / "lab.toml").write_text(content)
+    description = load_bench(tmp_path / "lab.toml").description
+    bench_findings(load_bench(tmp_path / "lab.toml"))
+    assert ("mag" in description.device) is (magnetometer is not None)
+    assert ("monitor" in description.device) is (monitor is not None)
+    assert ("telemetry" in description.device) is telemetry
+    assert ("i2c1" in description.bus) is (magnetometer is not None or monitor is not None)
+    assert ("can0" in description.bus) is telemetry
+    assert content.count("#") >= 8, "it is commented"
+    assert list(tmp_path.iterdir()) == [tmp_path / "lab.toml"]
+
+
+def test_inputs_go_where_they_were_dragged():
+    turned = {**GOOD["inputs"], "1x": 5, "3y": 0}
+    table = tomllib.loads(bench_text(read_draft({**GOOD, "inputs": turned}), ["calibration/sensors.toml"]))
+    assert table["device"]["acc1"]["channels"] == {"x": 5, "z": 1}
+    assert table["device"]["acc3"]["channels"] == {"x": 4, "y": 0}
+    assert table["firmware"]["calibration"] == ["calibration/sensors.toml"]
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"inputs": {**GOOD["inputs"], "1x": 1}}, "input 1 is both 1x and 1z"),
+        ({"inputs": {"1x": 0}}, "1z has no input"),
+        ({"uris": {**SIM, "daq0": "file:///etc/passwd"}}, "daq0"),
+        ({"uris": {**SIM, "i2c0": 'sim://i2c0"\n[x]'}}, "i2c0"),
+        ({"uris": {**SIM, "i2c0": "linux-i2c://1", "i2c1": "linux-i2c://1"}}, "a bus of their own|bus of their own"),
+        ({"piezo": None}, "needs the address"),
+        ({"monitor": 300}, "0x08 to 0x77"),
+        ({"name": "../other"}, "not a name"),
+    ],
+)
+def test_what_makes_no_sense_is_one_message(change: dict[str, Any], said: str):
+    with pytest.raises(InputError, match=said):
+        read_draft({**GOOD, **change})
+
+
+def test_an_address_taken_twice_is_refused_as_doctor_does(tmp_path: Path):
+    with pytest.raises(InputError, match="the bench file"):
+        checked(bench_text(read_draft({**GOOD, "monitor": 0x48}), []), tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
+    folder = tmp_path_factory.mktemp("setup")
+    copy_of_default_bench(folder, "")
+    with still_server(folder / "recordings") as served:
+        served.session.home = folder  # new benches go beside this copy
+        yield served
+
+
+def test_a_bench_is_described_and_written_from_the_page(browser: Any, still: Still):
+    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
+    tab.goto(still.address)
+    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
+    go(tab, "setup")
+    tab.wait_for_function("document.querySelector('[aria-label=\"Address of i2c1\"]').value === 'sim://i2c1'")
+    tab.wait_for_function("document.querySelector('.chip b').textContent.endsWith('V')")
+    assert "0.6" in tab.locator(".chip").nth(0).inner_text(), "live volts"
+    tab.locator(".chip").nth(5).drag_to(tab.locator("[data-place='1x']"))
+    assert tab.evaluate("[micron.setup.inputs['1x'], micron.setup.inputs['3y']]") == [5, 0]
+    tab.select_option("[aria-label='Input of temperature']", "6")
+    assert tab.evaluate("[micron.setup.inputs.temperature, micron.setup.inputs.supply]") == [6, 7]
+    tab.uncheck("[aria-label='The bench has: converter of the monitor']")
+    tab.uncheck("[aria-label='The bench has: telemetry on CAN']")
+    tab.fill("[aria-label='Name of the bench']", "micron")
+    tab.click("text=Write the bench file")
+    tab.wait_for_function("document.querySelector('.setup [role=alert]').textContent.includes('there already')")
+    tab.fill("[aria-label='Name of the bench']", "new lab")
+    tab.click("text=Write the bench file")
+    tab.wait_for_function("document.querySelector('.setup pre').textContent.includes('no monitor')")
+    path = still.session.home / "new lab.toml"
+    description = load_bench(path).description
+    assert description.device["acc1"].model_dump()["channels"] == {"x": 5, "z": 1}
+    assert "monitor" not in description.device
+    assert not tab.locator("text=Try it: sensing only").is_disabled()
+    tab.click("text=Try it: sensing only")
+    tab.wait_for_function("micron.link.state.run === 2")
+    assert still.session.choice.bench == path
+    assert still.session.choice.sense_only
+    context.close()
+    assert not errors
+
+
+@pytest.mark.slow
+def test_the_emulated_buses_are_scanned_and_parts_that_nobody_answers_for_are_left_out(still: Still):
+    import json
+    import urllib.request
+
+    def ask(uri: str) -> list[int]:
+        request = urllib.request.Request(
+            f"{still.base}/api/setup/scan", json.dumps({"uri": uri}).encode(), {"X-Micron-Token": still.token}
+        )
+        with urllib.request.urlopen(request, timeout=200) as answer:
+            return json.loads(answer.read())["addresses"]
+
+    assert 0x0C in ask("sim://i2c0")
+    assert {0x48, 0x49} <= set(ask("sim://i2c1"))

@@ -1,0 +1,111 @@
+"""Requests of the Setup view: what is plugged in, a draft of a bench file, its check, and trying it out."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from starlette.requests import Request
+from starlette.routing import BaseRoute, Route
+
+from tools.bench.dropped import run_module
+from tools.bench.requests import body, clear, text
+from tools.bench.session import Session
+from tools.bench.setup_file import AXES, PLACES, Draft, bench_text, checked, read_draft
+from tools.diagnose.scan import machine_ports
+from tools.errors import InputError
+from tools.output import write_text_atomic
+
+_SCAN = """format = 1
+name = "scan"
+[clock]
+tick_hz = 1000
+[bus.scanned]
+kind = "i2c"
+uri = {uri}
+speed_hz = 400_000
+"""
+
+
+def found_uris(emulated: bool) -> dict[str, list[str]]:
+    """Return the addresses of every bus that this machine has, and those of the emulated bench where that is one."""
+    found: dict[str, list[str]] = {"serial": [], "i2c": [], "can": []}
+    for port in machine_ports():
+        if "/i2c-" in port:
+            found["i2c"].append(f"linux-i2c://{port.rpartition('-')[2]}")
+        elif port.startswith("/sys/class/net/"):
+            found["can"].append(f"socketcan://{Path(port).name}")
+        else:
+            found["serial"].append(f"serial://{port}")
+    if emulated:
+        found["serial"].append("sim://daq0")
+        found["i2c"] += ["sim://i2c0", "sim://i2c1"]
+        found["can"].append("sim://can0")
+    return found
+
+
+def setup_routes(session: Session) -> list[BaseRoute]:
+    def draft_text(draft: Draft) -> str:
+        folder = session.home / "calibration"
+        files = [folder / f"{n}.toml" for n in ("sensors", "piezo", "manipulator")]
+        return bench_text(draft, [f"calibration/{p.name}" for p in files if p.is_file()])
+
+    async def found(_: Request) -> Any:
+        emulated = bool(session.bench.description.emulated_buses())
+        return {**found_uris(emulated), "axes": AXES, "places": PLACES, "folder": str(session.home)}
+
+    async def scan(request: Request) -> Any:
+        """Look for addresses on one I2C bus. It reads a byte from each, so the bus must not be in use."""
+        uri = text(await body(request), "uri", longest=100)
+        if uri not in found_uris(bool(session.bench.description.emulated_buses()))["i2c"]:
+            raise InputError(f"{uri!r} is not an I2C bus of this machine")
+        busy = [name for name, spec in session.bench.description.bus.items() if spec.uri == uri]
+        if busy and not uri.startswith("sim://") and session.run.phase in ("starting", "running"):
+            raise InputError(f"the running bench uses {uri} ({busy[0]}); press Safe state first, then scan")
+        with tempfile.TemporaryDirectory(prefix="micron-scan-") as folder:
+            bench, found = Path(folder) / "scan.toml", Path(folder) / "found.json"
+            bench.write_text(_SCAN.format(uri=json.dumps(uri)), encoding="utf-8")
+            # emulated devices are those of the bench that runs; a second emulated world answers for it
+            what = [str(session.choice.bench), "--virtual"] if uri.startswith("sim://") else [str(bench)]
+            await run_module("tools.cli.main", "scan", "--bench", *what, "--json", str(found))
+            answers = json.loads(found.read_text(encoding="utf-8"))["i2c"]
+        bus = busy[0] if uri.startswith("sim://") and busy else "scanned"
+        return {"uri": uri, "addresses": [a["address"] for a in answers if a["answered"] and a["bus"] == bus]}
+
+    async def check(request: Request) -> Any:
+        content = draft_text(read_draft(await body(request)))
+        return {"text": content, "findings": await asyncio.to_thread(checked, content, session.home)}
+
+    async def write(request: Request) -> Any:
+        """Write the bench file beside the others; never over one."""
+        draft = read_draft(await body(request))
+        path = session.home / f"{draft.name}.toml"
+        if path.exists() or path.is_symlink():
+            raise InputError(f"{path} is there already; choose another name")
+        content = draft_text(draft)
+        findings = await asyncio.to_thread(checked, content, session.home)
+        write_text_atomic(path, content)
+        session.note("info", f"Setup wrote {path}")
+        return {"path": str(path), "text": content, "findings": findings}
+
+    async def attempt(request: Request) -> Any:
+        """Start the firmware with the written file, sensing only: nothing is armed while wiring is checked."""
+        name = text(await body(request), "path", longest=1000)
+        path = next((p for p in session.home.glob("*.toml") if str(p) == name), None)
+        if path is None:
+            raise InputError(f"{name} is not one of the benches in {session.home}")
+        if session.recorder.active:
+            raise InputError("a recording is running; stop it first: the firmware starts again")
+        await session.start(replace(session.choice, bench=path, sense_only=True))
+
+    return [
+        Route("/api/setup", clear(found)),
+        Route("/api/setup/scan", clear(scan), methods=["POST"]),
+        Route("/api/setup/check", clear(check), methods=["POST"]),
+        Route("/api/setup/write", clear(write), methods=["POST"]),
+        Route("/api/setup/try", clear(attempt), methods=["POST"]),
+    ]

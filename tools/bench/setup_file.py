@@ -1,0 +1,173 @@
+"""The bench file that the Setup view describes: a commented text, checked as ``micron doctor`` checks it."""
+
+from __future__ import annotations
+
+import json
+import re
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hal.bench import load_bench
+from hal.errors import HalError
+from tools.bench.recorder import check_name
+from tools.bench.requests import text
+from tools.cli.doctor import bench_findings
+from tools.errors import InputError
+
+AXES = ("1x", "1z", "2y", "2z", "3x", "3y")
+PLACES = (*AXES, "supply", "temperature")
+"""What the inputs of the converter are for; axes as in the drawing of the instrument."""
+INPUTS = 8
+_URIS = {
+    "daq0": r"serial:///dev/[\w./-]+|sim://daq0",
+    "i2c0": r"linux-i2c://\d+|sim://i2c0",
+    "i2c1": r"linux-i2c://\d+|sim://i2c1",
+    "can0": r"socketcan://[\w-]+|sim://can0",
+}
+_SENSORS = {"acc1": "xz", "acc2": "yz", "acc3": "xy"}
+
+
+@dataclass(frozen=True)
+class Draft:
+    """A bench as a person described it. ``inputs``: the converter's input of each of ``PLACES``. Addresses on I2C are
+    None for a part that the bench lacks."""
+
+    name: str
+    uris: dict[str, str]
+    inputs: dict[str, int]
+    piezo: int
+    magnetometer: int | None
+    monitor: int | None
+    telemetry: bool
+
+    @property
+    def emulated(self) -> bool:
+        return any(uri.startswith("sim://") for uri in self.uris.values())
+
+
+def read_draft(table: dict[str, Any]) -> Draft:
+    """Return the draft in a request. ``InputError`` names the field that is wrong."""
+    name = check_name(text(table, "name", longest=80).strip())
+    magnetometer, monitor = (_address(table, part) for part in ("magnetometer", "monitor"))
+    piezo = _address(table, "piezo")
+    if piezo is None:
+        raise InputError("the output needs the address of its DAC")
+    telemetry = table.get("telemetry") is True
+    needed = ["daq0", "i2c0", *(["i2c1"] if magnetometer or monitor else []), *(["can0"] if telemetry else [])]
+    given = table.get("uris")
+    uris: dict[str, str] = {}
+    for bus in needed:
+        uri = given.get(bus) if isinstance(given, dict) else None
+        if not isinstance(uri, str) or not re.fullmatch(_URIS[bus], uri):
+            raise InputError(f"{bus}: {uri!r} is no address of such a bus; choose one that was found, or type it")
+        uris[bus] = uri
+    real = [uri for uri in uris.values() if not uri.startswith("sim://")]
+    if len(set(real)) < len(real):
+        raise InputError("two buses have the same address: the outputs need an I2C bus of their own")
+    return Draft(name, uris, _inputs(table.get("inputs")), piezo, magnetometer, monitor, telemetry)
+
+
+def _address(table: dict[str, Any], part: str) -> int | None:
+    value = table.get(part)
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, int) or not 0x08 <= value <= 0x77:
+        raise InputError(f"{part}: an I2C address is 0x08 to 0x77")
+    return value
+
+
+def _inputs(given: Any) -> dict[str, int]:
+    if not isinstance(given, dict):
+        raise InputError("say which input is which axis")
+    found: dict[str, int] = {}
+    for place in PLACES:
+        value = given.get(place)
+        if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INPUTS:
+            raise InputError(f"{place} has no input; drag one of the {INPUTS} to it")
+        if value in found.values():
+            other = next(p for p, v in found.items() if v == value)
+            raise InputError(f"input {value} is both {other} and {place}; each input is for one")
+        found[place] = value
+    return found
+
+
+def bench_text(draft: Draft, calibrations: list[str]) -> str:
+    """Return the bench file as a text with comments."""
+    uris, inputs = draft.uris, draft.inputs
+    lines = [
+        "# Made by the Setup view of `micron bench`. `micron doctor --bench FILE` checks it; nothing moves there.",
+        "format = 1", f"name = {json.dumps(draft.name)}", "", "[clock]", "tick_hz = 1000", "",
+    ]  # fmt: skip
+    if draft.emulated:
+        lines += [
+            "[emulation] # read only for buses whose URI starts with sim://",
+            'provider = "sim_devices.register:provider"', "unit = 1", "seed = 1", "",
+        ]  # fmt: skip
+    comments = {
+        "daq0": "the converter of the accelerometers",
+        "i2c0": "the outputs, and nothing that could hold them up",
+        "i2c1": "the slow converters",
+        "can0": "telemetry for other programs",
+    }
+    more = {"daq0": "", "i2c0": "speed_hz = 400_000", "i2c1": "speed_hz = 400_000", "can0": "bitrate = 500_000"}
+    kinds = {"daq0": "serial", "i2c0": "i2c", "i2c1": "i2c", "can0": "can"}
+    for bus, uri in uris.items():
+        lines += [f"[bus.{bus}] # {comments[bus]}", f'kind = "{kinds[bus]}"', f"uri = {json.dumps(uri)}"]
+        lines += [more[bus], ""] if more[bus] else [""]
+    lines += [
+        "[device.daq]", 'driver = "di4108"', 'bus = "daq0"', "rate_hz = 1000",
+        f"channels = {sorted(inputs.values())}", "range_V = 5.0", "",
+    ]  # fmt: skip
+    for device, axes in _SENSORS.items():
+        wired = ", ".join(f"{axis} = {inputs[device[-1] + axis]}" for axis in axes)
+        channels = f"channels = {{ {wired} }}"
+        lines += [f"[device.{device}] # inputs of its axes", 'driver = "adxl203"', 'daq = "daq"', channels, ""]
+    for device, what in (("supply", "half the sensors' supply"), ("temperature", "TMP36")):
+        lines += [f"[device.{device}] # {what}", 'driver = "analog"', 'daq = "daq"', f"channel = {inputs[device]}", ""]
+    if draft.magnetometer is not None:
+        lines += [
+            "[device.mag_adc]", 'driver = "ads1115"', 'bus = "i2c1"', f"address = {draft.magnetometer:#04x}",
+            "rate_hz = 100", "", "[device.mag]", 'driver = "hmc2003"', 'adc = "mag_adc"', "channels = [0, 1, 2]", "",
+        ]  # fmt: skip
+    else:
+        lines += ["# no magnetometer: heading drifts with the rate's error; attitude holds by gravity alone", ""]
+    if draft.monitor is not None:
+        lines += [
+            "[device.monitor_adc] # sense wires at the stacks, behind dividers", 'driver = "ads1115"', 'bus = "i2c1"',
+            f"address = {draft.monitor:#04x}", "",
+            "[device.monitor]", 'driver = "amplifier_monitor"', 'adc = "monitor_adc"', "channels = [0, 1, 2]",
+            "ratio = 20.0", "tolerance_V = 0.3", "",
+        ]  # fmt: skip
+    else:
+        lines += ["# no monitor: an amplifier that does not obey is not noticed", ""]
+    lines += [
+        "[device.piezo]", 'driver = "dac_amplifier"', 'bus = "i2c0"', f"address = {draft.piezo:#04x}",
+        "gain = 20.0 # of the amplifier: output volts per volt of the DAC", "neutral_V = 50.0", "",
+    ]  # fmt: skip
+    if draft.telemetry:
+        lines += ["[device.telemetry]", 'driver = "can_telemetry"', 'bus = "can0"', ""]
+    lines += [
+        "[firmware]",
+        "# These belong to another unit until you have calibrated yours (docs/lab-machine.md, 6)."
+        if calibrations
+        else "# No calibration yet: `micron calibrate` and the Calibrate view make them (docs/lab-machine.md, 6).",
+        f"calibration = {json.dumps(calibrations)}", "",
+        "[firmware.sensing] # where the sensors and the tip sit, m; `micron calibrate positions` refines it",
+        "positions_m = [[0.0101, -0.0101, 0.0], [-0.0101, 0.0101, 0.0], [0.0042, 0.0042, 0.116]]",
+        "tip_m = [0.0, 0.0, 0.155]",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def checked(content: str, folder: Path) -> list[dict[str, str]]:
+    """Return what ``micron doctor`` finds for a bench file of this text in ``folder``. ``InputError``: it refuses."""
+    with tempfile.NamedTemporaryFile("w", suffix=".toml", prefix=".setup-", dir=folder, encoding="utf-8") as file:
+        file.write(content)
+        file.flush()
+        try:
+            found = bench_findings(load_bench(Path(file.name)))
+        except HalError as error:
+            raise InputError(str(error).replace(file.name, "the bench file")) from None
+    return [{"part": f.part, "verdict": f.verdict, "detail": f.detail, "remedy": f.remedy} for f in found]

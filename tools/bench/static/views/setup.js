@@ -1,0 +1,159 @@
+// A bench file for a new bench: what is plugged in, which input is which axis, live volts, and what doctor says of it.
+import { get, post } from "../api.js";
+import { digits, h } from "../dom.js";
+
+const VOLTS = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => `volts_${i}`);
+const BUSES = [["daq0", "serial", "converter of the accelerometers"], ["i2c0", "i2c", "outputs"], ["i2c1", "i2c", "slow converters"], ["can0", "can", "telemetry"]];
+const PARTS = [["piezo", "i2c0", 0x0c, "DAC of the outputs", true], ["magnetometer", "i2c1", 0x48, "converter of the magnetometer", false], ["monitor", "i2c1", 0x49, "converter of the monitor", false]];
+const hex = (v) => `0x${v.toString(16).padStart(2, "0").toUpperCase()}`;
+
+export function mount(root, { link, navigate }) {
+  const subscription = link.subscribe(VOLTS, 200, 200, 2);
+  const inputs = { "1x": 0, "1z": 1, "2y": 2, "2z": 3, "3x": 4, "3y": 5, supply: 6, temperature: 7 };
+  const problem = h("p.bad", { role: "alert" });
+  const fail = (error) => { problem.textContent = error.message; };
+  const act = async (work) => {
+    problem.textContent = "";
+    try { await work(); } catch (error) { fail(error); }
+  };
+  let written = "";
+
+  const name = h("input", { type: "text", maxLength: 80, value: "my bench", "aria-label": "Name of the bench" });
+  const uriFields = Object.fromEntries(BUSES.map(([bus, kind]) => {
+    const field = h("input", { type: "text", maxLength: 100, "aria-label": `Address of ${bus}` });
+    field.setAttribute("list", `found-${kind}`);
+    return [bus, field];
+  }));
+  const lists = h("div", { hidden: true });
+  const answers = h("span.num.soft");
+  const scanButton = h("button", { onclick: () => act(scan) }, "Scan the I2C buses");
+  const has = {};
+  const addresses = {};
+  const parts = PARTS.map(([part, bus, address, what, always]) => {
+    has[part] = h("input", { type: "checkbox", checked: true, disabled: always, "aria-label": `The bench has: ${what}`, onchange: () => { addresses[part].disabled = !has[part].checked; } });
+    addresses[part] = h("input.unit-field", { type: "text", value: hex(address), "aria-label": `Address of the ${what}` });
+    return h("div.row", {}, h("label", {}, has[part], what), h("span.faint", {}, `on ${bus} at`), addresses[part]);
+  });
+  const telemetry = h("input", { type: "checkbox", checked: true, "aria-label": "The bench has: telemetry on CAN" });
+  parts.push(h("div.row", {}, h("label", {}, telemetry, "telemetry on CAN")));
+
+  // channels: dragged to places, or chosen there
+  const selects = {};
+  const live = VOLTS.map(() => h("b.num"));
+  const chips = VOLTS.map((_, i) => {
+    const chip = h("div.chip", { draggable: true, title: "Drag it to what it is wired to" }, `input ${i}`, live[i]);
+    chip.addEventListener("dragstart", (event) => event.dataTransfer.setData("text/plain", String(i)));
+    return chip;
+  });
+  const shownIn = {};
+  const places = Object.keys(inputs).map((place) => {
+    selects[place] = h("select", { "aria-label": `Input of ${place}`, onchange: () => give(place, Number(selects[place].value)) }, VOLTS.map((_, i) => h("option", { value: i }, `input ${i}`)));
+    shownIn[place] = h("b.num");
+    const title = /^\d/.test(place) ? `accelerometer ${place[0]}, axis ${place[1]}` : place;
+    const slot = h("div.slot", {}, h("span", {}, title), selects[place], shownIn[place]);
+    slot.dataset.place = place;
+    slot.addEventListener("dragover", (event) => { event.preventDefault(); slot.classList.add("dropping"); });
+    slot.addEventListener("dragleave", () => slot.classList.remove("dropping"));
+    slot.addEventListener("drop", (event) => {
+      event.preventDefault();
+      slot.classList.remove("dropping");
+      const input = Number(event.dataTransfer.getData("text/plain"));
+      if (VOLTS[input]) give(place, input);
+    });
+    return slot;
+  });
+
+  /** Each input is for one place: the place that had it gets the other's. */
+  function give(place, input) {
+    const other = Object.keys(inputs).find((p) => inputs[p] === input);
+    if (other && other !== place) inputs[other] = inputs[place];
+    inputs[place] = input;
+    for (const [p, select] of Object.entries(selects)) select.value = inputs[p];
+  }
+  give("1x", 0);
+
+  async function scan() {
+    const said = [];
+    scanButton.disabled = true;
+    try {
+      for (const bus of ["i2c0", "i2c1"]) {
+        const uri = uriFields[bus].value.trim();
+        if (!uri) continue;
+        answers.textContent = `asking ${uri} …`;
+        const found = await post("/api/setup/scan", { uri });
+        said.push(`${uri}: ${found.addresses.map(hex).join(", ") || "nobody answers"}`);
+        for (const [part, on] of PARTS.map(([p, b]) => [p, b])) if (on === bus && part !== "piezo") {
+          has[part].checked = found.addresses.includes(Number(addresses[part].value));
+          has[part].onchange?.();
+          addresses[part].disabled = !has[part].checked;
+        }
+      }
+    } finally {
+      scanButton.disabled = !link.mayOrder;
+      answers.textContent = said.join("; ");
+    }
+  }
+
+  function draft() {
+    const address = (part) => (has[part].checked ? Number(addresses[part].value) : null);
+    return {
+      name: name.value.trim(), inputs, piezo: address("piezo"), magnetometer: address("magnetometer"), monitor: address("monitor"), telemetry: telemetry.checked,
+      uris: Object.fromEntries(BUSES.map(([bus]) => [bus, uriFields[bus].value.trim()])),
+    };
+  }
+
+  const findings = h("div");
+  const content = h("pre.num.lines", { tabIndex: 0, role: "region", "aria-label": "The bench file" });
+  function show({ text, findings: list }) {
+    content.textContent = text;
+    const colour = { ok: "good-text", limited: "warn-text", missing: "bad" };
+    findings.replaceChildren(...list.map((f) => h("div", {}, h("b", { className: colour[f.verdict] || "" }, f.verdict), ` ${f.part}: ${f.detail}${f.remedy ? `; ${f.remedy}` : ""}`)));
+  }
+  const check = h("button", { onclick: () => act(async () => show(await post("/api/setup/check", draft()))) }, "Check");
+  const write = h("button.primary", { onclick: () => act(async () => {
+    const made = await post("/api/setup/write", draft());
+    written = made.path;
+    show(made);
+    enable();
+  }) }, "Write the bench file");
+  const attempt = h("button", { title: "The firmware starts again with this file; nothing is armed", onclick: () => act(() => post("/api/setup/try", { path: written })) }, "Try it: sensing only");
+  const folder = h("small");
+
+  root.append(h("div.cols.setup", {},
+    h("section.panel", {}, h("h2", {}, "Buses ", h("small", {}, "what this machine has is offered")),
+      h("div.set", {}, BUSES.map(([bus, , what]) => h("label", {}, h("span", {}, h("b", {}, bus), ` ${what}`), uriFields[bus]))), lists,
+      h("div.row", {}, scanButton, answers), h("h2", { style: "margin-top:12px" }, "Parts ", h("small", {}, "leave out what the bench lacks")), parts),
+    h("section.panel", {}, h("h2", {}, "Inputs ", h("small", {}, "drag each to what it is wired to; volts of the running bench")),
+      h("div.wiring", {}, h("div.chips", {}, chips), h("div.slots", {}, places)),
+      h("p.note", {}, "Tilt or tap one sensor: the volts that move are its own.")),
+    h("section.panel", {}, h("h2", {}, "Bench file ", folder),
+      h("div.row", {}, h("label", {}, "name", name), check, write, attempt, h("button.quiet", { onclick: () => navigate("scope") }, "See it in the scope")), problem, findings, content)));
+
+  function enable() {
+    for (const button of [check, write, scanButton]) button.disabled = !link.mayOrder;
+    attempt.disabled = !link.mayOrder || !written;
+  }
+
+  async function refresh() {
+    const found = await get("/api/setup");
+    folder.textContent = `written into ${found.folder}`;
+    lists.replaceChildren(...["serial", "i2c", "can"].map((kind) => h("datalist", { id: `found-${kind}` }, found[kind].map((uri) => h("option", { value: uri })))));
+    for (const [kind, buses] of [["serial", ["daq0"]], ["i2c", ["i2c0", "i2c1"]], ["can", ["can0"]]]) {
+      buses.forEach((bus, k) => { if (!uriFields[bus].value) uriFields[bus].value = found[kind][Math.min(k, found[kind].length - 1)] || ""; });
+    }
+    enable();
+  }
+
+  const timer = setInterval(() => {
+    const b = subscription.buckets;
+    if (!b.n) return;
+    VOLTS.forEach((_, i) => { live[i].textContent = `${digits(b.last(i), 4)} V`; });
+    for (const [place, input] of Object.entries(inputs)) shownIn[place].textContent = `${digits(b.last(input), 4)} V`;
+  }, 150);
+  const offState = link.on("state", enable);
+  const offServer = link.on("server", () => refresh().catch(fail));
+  enable();
+  refresh().catch(fail);
+  window.micron.setup = { inputs, give };
+  return () => { clearInterval(timer); offState(); offServer(); link.drop(subscription); };
+}
