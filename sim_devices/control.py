@@ -29,8 +29,10 @@ from sim_devices.world import World
 
 
 class WorldTime(Protocol):
-    """The time that a control may stop."""
+    """The time that a control may stop. ``stretched_ns``: it stood still for so long because the host was too slow."""
 
+    @property
+    def stretched_ns(self) -> int: ...
     def pause(self) -> None: ...
     def resume(self) -> None: ...
     def advance(self, seconds: float) -> None: ...
@@ -78,7 +80,13 @@ class WorldControl:
             return json.dumps({"ok": False, "error": str(error)}).encode()
 
     def _list(self, order: dict[str, Any]) -> dict[str, Any]:
-        return {"channels": self._world.stimuli.units, "faults": list(FAULTS), "parts": list(self._world.devices)}
+        stretched_s = 0.0 if self._time is None else self._time.stretched_ns * 1e-9
+        return {
+            "channels": self._world.stimuli.units,
+            "faults": list(FAULTS),
+            "parts": list(self._world.devices),
+            "stretched_s": stretched_s,
+        }
 
     def _truth(self, order: dict[str, Any]) -> dict[str, Any]:
         self._world.plant.advance_to(self._now_ns() - self._world.epoch_ns)

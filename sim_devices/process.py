@@ -7,8 +7,9 @@ their URIs to ``endpoints.json`` when it is ready. It obeys orders on ``control.
 SIGTERM or when its parent is gone it writes ``truth.npz`` and ends.
 
 One loop, absolute deadlines: it wakes for bytes, for the next thing a device does, and at least every
-millisecond. Device clocks never stretch: after a stall every scan that was due is made up, a few at a time so
-that a host that does read is not blamed for our lateness; ``world.json`` tells the worst lateness.
+millisecond. For a firmware in real time device clocks never stretch: after a stall every scan that was due is made up,
+a few at a time so that a host that does read is not blamed for our lateness; ``world.json`` tells the worst lateness.
+For programs of others (``micron emulate``) emulated time waits instead, and counts for how long.
 """
 
 from __future__ import annotations
@@ -64,6 +65,8 @@ class PausableClock(MonotonicClock):
         super().__init__()
         self.behind_ns = 0
         """Time in ns by which this clock is behind the machine's, up to the last pause."""
+        self.stretched_ns = 0
+        """The part of it that the host was too slow for."""
         self._held_ns: int | None = None
 
     def now_ns(self) -> int:
@@ -83,6 +86,11 @@ class PausableClock(MonotonicClock):
         if self._held_ns is not None:
             self.behind_ns = super().now_ns() - self._held_ns
             self._held_ns = None
+
+    def fall_behind(self, late_ns: int) -> None:
+        """Go back by the time that the host had no processor for the world. Not while paused."""
+        self.behind_ns += late_ns
+        self.stretched_ns += late_ns
 
     def advance(self, seconds: float) -> None:
         """Let a clock that is paused go on by ``seconds``. ``ValueError`` when it is not paused."""
@@ -250,6 +258,10 @@ class WorldProcess:
             self.world.advance_to(self._now_ns)
             for pty in self._all_ptys:
                 pty.send()
+            if late_ns > CATCH_UP_NS and self.serves_others and not self._clock.is_paused:
+                # a host that is too slow makes emulated time slow: programs of others must not wait for all of it
+                self._clock.fall_behind(late_ns - CATCH_UP_NS)
+                late_ns = CATCH_UP_NS
             if late_ns <= CATCH_UP_NS:
                 self.world.keep_up(self._now_ns)
                 return

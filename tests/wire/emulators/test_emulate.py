@@ -189,6 +189,15 @@ def test_python_can_hears_the_node(emulated: Emulated) -> None:
     assert len(emulated.run(sys.executable, "-c", program).split()) == 3
 
 
+def test_emulated_time_waits_for_a_host_that_is_too_slow(emulated: Emulated) -> None:
+    before_s = emulated.order(list=True)["stretched_s"]
+    os.kill(emulated.described["pid"], signal.SIGSTOP)
+    time.sleep(0.5)
+    os.kill(emulated.described["pid"], signal.SIGCONT)
+    emulated.order(list=True)
+    assert emulated.order(list=True)["stretched_s"] - before_s > 0.45
+
+
 def test_time_stands_still_while_it_is_paused(emulated: Emulated) -> None:
     # a world that waits in a loop for a time that stands still must not keep a processor from everybody
     assert os.sched_getscheduler(emulated.described["pid"]) == os.SCHED_OTHER
