@@ -21,35 +21,36 @@ ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
 
 
 @kernel
-def friction_limit(v, sign, row):
+def friction_limit(v, sign, row, at):
     """Largest friction at speed v in the direction of motion ``sign``: Coulomb, its asymmetry, Stribeck's extra.
 
     F = Fc + sign dF + Fs exp(-(v/vs)^2); Armstrong-Helouvry, Control of Machines with Friction (1991), eq. 2.3.
+    The numbers of the family begin at ``row[at]``.
     """
-    f = row[0] + sign * row[1]
-    if row[2] != 0.0 and row[3] > 0.0:
-        r = v / row[3]
-        f += row[2] * np.exp(-r * r)
+    f = row[at] + sign * row[at + 1]
+    if row[at + 2] != 0.0 and row[at + 3] > 0.0:
+        r = v / row[at + 3]
+        f += row[at + 2] * np.exp(-r * r)
     return f
 
 
 @kernel
-def bristle_after(z, v, step_s, row):
+def bristle_after(z, v, step_s, row, at):
     """Deflection of the bristles after ``step_s`` at the speed v: z' = v - sigma |v| z / g(v), exact for constant v.
 
     C. Canudas de Wit, H. Olsson, K. J. Astrom, P. Lischinsky, IEEE Trans. AC 40 (1995) 419, eqs. 3-4; g is
-    ``friction_limit`` and sigma ``row[5]``. With a lean (``row[6]``) they are those of ``loop_after``.
+    ``friction_limit`` and sigma ``row[at + 5]``. With a lean (``row[at + 6]``) they are those of ``loop_after``.
     """
     if v == 0.0:
         return z
-    if row[6] != 0.0:
-        return loop_after(z, v * step_s, row[0] / row[5], row[6])
+    if row[at + 6] != 0.0:
+        return loop_after(z, v * step_s, row[at] / row[at + 5], row[at + 6])
     sign = 1.0 if v > 0.0 else -1.0
-    limit = friction_limit(v, sign, row)
+    limit = friction_limit(v, sign, row, at)
     if limit <= 0.0:
         return 0.0
-    settled = sign * limit / row[5]
-    return settled + (z - settled) * np.exp(-row[5] * abs(v) * step_s / limit)
+    settled = sign * limit / row[at + 5]
+    return settled + (z - settled) * np.exp(-row[at + 5] * abs(v) * step_s / limit)
 
 
 @kernel
@@ -92,32 +93,37 @@ def loop_along(x, yielding, lean, starts):
 
 
 @kernel
-def smooth_force(p, v, spring, cogging, friction):
-    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, viscosity."""
+def smooth_force(p, v, spring, cogging, friction, place):
+    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, viscosity.
+
+    The rows of all places stand one behind the other; ``place`` says which of them is meant.
+    """
+    k, c = place * SPRING, place * COGGING
     q = p * p
-    f = -(spring[0] + spring[3] * q) * q * p - spring[1] * q - spring[2] * p - friction[4] * abs(v)
-    f -= (spring[4] * abs(v) + spring[5] * q) * v
-    if spring[6] != 0.0:
-        d = p - spring[8]
-        f -= spring[6] * (d - min(max(d, -spring[7]), spring[7]))
-    if cogging[0] > 0.0:
-        a = 2.0 * np.pi * p / cogging[0]
-        f += cogging[1] * np.sin(a) + cogging[2] * np.cos(a)
-        f += cogging[3] * np.sin(2.0 * a) + cogging[4] * np.cos(2.0 * a)
+    f = -(spring[k] + spring[k + 3] * q) * q * p - spring[k + 1] * q - spring[k + 2] * p
+    f -= friction[place * FRICTION + 4] * abs(v)
+    f -= (spring[k + 4] * abs(v) + spring[k + 5] * q) * v
+    if spring[k + 6] != 0.0:
+        d = p - spring[k + 8]
+        f -= spring[k + 6] * (d - min(max(d, -spring[k + 7]), spring[k + 7]))
+    if cogging[c] > 0.0:
+        a = 2.0 * np.pi * p / cogging[c]
+        f += cogging[c + 1] * np.sin(a) + cogging[c + 2] * np.cos(a)
+        f += cogging[c + 3] * np.sin(2.0 * a) + cogging[c + 4] * np.cos(2.0 * a)
     return f
 
 
 @kernel
-def flow_of(x, row):
+def flow_of(x, law, strength, level):
     """A flow that depends on one state x: its root or what stands above a level, its square, or the state itself."""
-    law, over = row[0], x - row[4]
+    over = x - level
     if law == 0.0:
-        return row[3] * np.sqrt(over) if over > 0.0 else 0.0
+        return strength * np.sqrt(over) if over > 0.0 else 0.0
     if law == 1.0:
-        return row[3] * over if over > 0.0 else 0.0
+        return strength * over if over > 0.0 else 0.0
     if law == 2.0:
-        return row[3] * over * abs(over)
-    return row[3] * over
+        return strength * over * abs(over)
+    return strength * over
 
 
 def base_moves(x: Array, ctx: Context) -> list[Array]:

@@ -117,7 +117,7 @@ def run_feedback(
                     free[i] = a
                 f0 = 0.0
                 if any_smooth:
-                    f0 = smooth_force(p, v, spring, cogging, friction)
+                    f0 = smooth_force(p, v, spring, cogging, friction, 0)
                 for j in range(e.size):
                     r = thresholds[j]
                     if e[j] < p - r:
@@ -139,24 +139,24 @@ def run_feedback(
                             vn += cv[i] * z[i]
                         f1 = 0.0
                         if any_smooth:
-                            f1 = smooth_force(pn, vn, spring, cogging, friction)
+                            f1 = smooth_force(pn, vn, spring, cogging, friction, 0)
                         for j in range(e.size):
                             r = thresholds[j]
                             f1 -= memory[j] * min(max(pn - e[j], -r), r)
                         if stiff > 0.0:
-                            bent = bristle_after(bristle, 0.5 * (v + vn), step_s, friction)
+                            bent = bristle_after(bristle, 0.5 * (v + vn), step_s, friction, 0)
                             f1 -= stiff * bent
                 if stiff > 0.0:
                     vn = 0.0
                     for i in range(s):
                         vn += cv[i] * z[i]
-                    bristle = bristle_after(bristle, 0.5 * (v + vn), step_s, friction)
+                    bristle = bristle_after(bristle, 0.5 * (v + vn), step_s, friction, 0)
                 if dry:
                     vn = 0.0
                     for i in range(s):
                         vn += cv[i] * z[i]
                     sign = 1.0 if vn > 0.0 else -1.0
-                    limit = max(friction_limit(v, sign, friction), 0.0)
+                    limit = max(friction_limit(v, sign, friction, 0), 0.0)
                     if limit > 0.0:
                         f = -sign * limit if abs(vn) > limit * gv else -vn / gv
                         for i in range(s):

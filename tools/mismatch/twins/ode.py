@@ -60,16 +60,13 @@ class Inside:
         """friction, spring, cogging, counts, thresholds, memory."""
         rows = self.rows
 
-        def stack(parts: list[Array]) -> Array:
-            return np.stack(parts) if parts else np.zeros((0, 0))
-
         def join(parts: list[Array]) -> Array:
             return np.concatenate(parts) if parts else np.zeros(0)
 
         return (
-            stack([r.friction for r in rows]),
-            stack([r.spring for r in rows]),
-            stack([r.cogging for r in rows]),
+            join([r.friction for r in rows]),
+            join([r.spring for r in rows]),
+            join([r.cogging for r in rows]),
             np.array([r.thresholds.size for r in rows], np.int64),
             join([r.thresholds for r in rows]),
             join([r.memory for r in rows]),
@@ -125,9 +122,9 @@ class Programs:
 
     def rates(self, x: Array, u: Array, values: Array) -> Array:
         """See Equations."""
-        p, dx = self.rates_program, np.empty(x.size)
-        rates_of(p.operations, self._set(p, values), np.zeros(1), p.results, np.zeros((0, SWAY)), x, u, 0.0, dx)
-        return dx
+        p, rates = self.rates_program, np.empty(x.size)
+        rates_of(p.operations, self._set(p, values), p.results, x, u, 0.0, rates)
+        return rates
 
     def _set(self, program: Program, values: Array) -> Array:
         registers = program.registers.copy()
@@ -414,24 +411,29 @@ class OdeTwin(Head):
         Gauss-Newton; what the window does not show stays at the guess.
         """
         s, step = x0.shape[1], 1e-4
+        first = np.searchsorted(rows, np.arange(x0.shape[0]))
+        together = lambda e: np.add.reduceat(e, first, axis=0)  # noqa: E731
         best = misses(x0)
-        energy = lambda e: np.bincount(rows, np.sum(e * e, axis=1))  # noqa: E731
         for _ in range(ROUNDS):
             slopes = np.stack(
                 [(best - misses(x0 + step * self.typical * np.eye(s)[i])) / step for i in range(s)], axis=-1
             )
-            moved = x0.copy()
-            for k in range(x0.shape[0]):
-                a, b = slopes[rows == k].reshape(-1, s), best[rows == k].ravel()
-                if np.all(np.isfinite(a)) and np.all(np.isfinite(b)):
-                    moved[k] += self.typical * np.linalg.lstsq(a, b, rcond=LEAST_SHOWN)[0]
-            moved = np.clip(moved, *limits)
+            gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
+            cross = together(np.einsum("rqi,rq->ri", slopes, best))
+            whole = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(cross).all(axis=1)
+            size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
+            shown = size > LEAST_SHOWN**2 * size[:, -1:]
+            along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
+            turn = np.einsum("kij,kj->ki", ways, np.where(shown, along / np.where(shown, size, 1.0), 0.0))
+            moved = np.clip(x0 + self.typical * turn, *limits)
             after = misses(moved)
-            was, now = energy(best), energy(after)
+            was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
             better = now < was
+            foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
             x0 = np.where(better[:, None], moved, x0)
             best = np.where(better[rows][:, None], after, best)
-            if not np.any(now < 0.999 * was):
+            # where equations are linear nothing is left to gain after one step
+            if not np.any((now < 0.999 * was) & (now > foretold + 0.001 * was)):
                 break
         return x0
 

@@ -37,40 +37,40 @@ def run_program(operations, registers):
         code = operations[i, 0]
         a = registers[operations[i, 2]]
         b = registers[operations[i, 3]]
-        if code == 0:
-            v = a + b
-        elif code == 2:
-            v = a * b
-        elif code == 1:
-            v = a - b
-        elif code == 3:
-            v = a / b
-        elif code == 4:
-            v = a * a if b == 2.0 else a**b
-        elif code == 5:
-            v = -a
-        elif code == 6:
-            v = abs(a)
-        elif code == 7:
-            v = 1.0 if a > 0.0 else (-1.0 if a < 0.0 else 0.0)
-        elif code == 8:
-            v = np.sqrt(a)
-        elif code == 9:
-            v = np.exp(a)
-        elif code == 10:
-            v = np.log(a)
-        elif code == 11:
-            v = np.sin(a)
-        elif code == 12:
-            v = np.cos(a)
-        elif code == 13:
-            v = np.tan(a)
-        elif code == 14:
-            v = np.tanh(a)
-        elif code == 15:
-            v = np.arctan(a)
-        elif code == 16:
-            v = np.arctan2(a, b)
+        # arithmetic first: a long chain of comparisons costs more than the operation
+        if code < 4:
+            if code < 2:
+                v = a + b if code == 0 else a - b
+            else:
+                v = a * b if code == 2 else a / b
+        elif code < 10:
+            if code == 4:
+                v = a * a if b == 2.0 else a**b
+            elif code == 5:
+                v = -a
+            elif code == 6:
+                v = abs(a)
+            elif code == 7:
+                v = 1.0 if a > 0.0 else (-1.0 if a < 0.0 else 0.0)
+            elif code == 8:
+                v = np.sqrt(a)
+            else:
+                v = np.exp(a)
+        elif code < 17:
+            if code == 10:
+                v = np.log(a)
+            elif code == 11:
+                v = np.sin(a)
+            elif code == 12:
+                v = np.cos(a)
+            elif code == 13:
+                v = np.tan(a)
+            elif code == 14:
+                v = np.tanh(a)
+            elif code == 15:
+                v = np.arctan(a)
+            else:
+                v = np.arctan2(a, b)
         elif code == 17:
             v = min(a, b)
         elif code == 18:
