@@ -22,14 +22,14 @@ def _settings(x: Array, residual: Array, ctx: Context) -> Settings:
     return {"range": (low, high if high > low else low + 1.0), "rate": (rate,), PAIRS: pairs}
 
 
-def _pairs(settings: Settings) -> list[tuple[int, int]]:
+def flow_pairs(settings: Settings) -> list[tuple[int, int]]:
     flat = settings.get(PAIRS, (0.0, 0.0))
     return [(int(a), int(b)) for a, b in zip(flat[::2], flat[1::2], strict=True)]
 
 
 def _names(settings: Settings) -> list[str]:
     """A name for each flow; states count from one."""
-    return [f"outflow_{a + 1}" if a == b else f"inflow_{b + 1}_from_{a + 1}" for a, b in _pairs(settings)]
+    return [f"outflow_{a + 1}" if a == b else f"inflow_{b + 1}_from_{a + 1}" for a, b in flow_pairs(settings)]
 
 
 def _root_parts(settings: Settings) -> Parts:
@@ -48,12 +48,12 @@ def _root_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 def _root_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     root = np.sqrt(np.maximum(x - q[0], 0.0))
-    return np.stack([-root if a == b else root for a, b in _pairs(settings)], axis=1)
+    return np.stack([-root if a == b else root for a, b in flow_pairs(settings)], axis=1)
 
 
 def _fill(law: int, level: float, w: Array, settings: Settings) -> dict[str, Array]:
     rows = np.zeros((w.size, FLOW))
-    for row, (a, b), strength in zip(rows, _pairs(settings), w, strict=True):
+    for row, (a, b), strength in zip(rows, flow_pairs(settings), w, strict=True):
         row[:] = law, a, b, -strength if a == b else strength, level
     return {"flows": rows.ravel()}
 
@@ -101,7 +101,7 @@ def _over_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
 
 def _over_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     over = np.maximum(x - q[0], 0.0)
-    return np.stack([-over if a == b else over for a, b in _pairs(settings)], axis=1)
+    return np.stack([-over if a == b else over for a, b in flow_pairs(settings)], axis=1)
 
 
 def _over_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:

@@ -263,15 +263,7 @@ class Model:
         only: Collection[str] | None = None,
     ) -> dict[str, Signal]:
         theta = np.asarray(theta, np.float64)
-        inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
-        inside = str(getattr(self.twin, "inside", ""))
-        for k in sorted(self.order, key=lambda k: self.placed[k].target == inside):
-            pl = self.placed[k]
-            if pl.site == "input":
-                if pl.target == inside and inside not in inputs:
-                    inputs[inside] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)  # type: ignore[attr-defined]
-                inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
-        forces = [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
+        inputs, forces = self._driven(run, theta, join, folded, given)
         if folded is not None and forces:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
@@ -291,6 +283,29 @@ class Model:
                 by = inputs[drive] if self.twin.static and drive else None
                 outputs[o] = self._pass(run, k, outputs[o], by, o, theta, join, folded)
         return outputs
+
+    def _driven(
+        self, run: Run, theta: Array, join: bool, folded: set[int] | None, given: Mapping[str, Signal] | None = None
+    ) -> tuple[dict[str, Signal], list[Force]]:
+        """Return what the base physics is driven by: inputs behind their effects, and forces."""
+        inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
+        inside = str(getattr(self.twin, "inside", ""))
+        for k in sorted(self.order, key=lambda k: self.placed[k].target == inside):
+            pl = self.placed[k]
+            if pl.site == "input":
+                if pl.target == inside and inside not in inputs:
+                    inputs[inside] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)  # type: ignore[attr-defined]
+                inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
+        return inputs, [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
+
+    def start_states(self, view: View, theta: Array) -> Array:
+        """States (s,) at the first sample of a free run of differential equations."""
+        inside = inside_of(self.twin)
+        assert inside is not None
+        run = view_run(self.twin, view)
+        inputs, forces = self._driven(run, theta, True, None)
+        used = {s: fold(x, theta) for s, x in inputs.items()}
+        return inside.states(run, used, theta, forces)[0][0]
 
     def _force(self, k: int, theta: Array) -> Force:
         pl = self.placed[k]

@@ -9,7 +9,7 @@ from sim_devices.physics.effect import STAGES, Effect, Stage
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
-from tools.mismatch.twins.ode import Place
+from tools.mismatch.twins.equations import Place
 
 SAME = "input or output"
 AXIS = Place("", "motion", 0, 1, 1, "")

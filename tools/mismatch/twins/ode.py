@@ -5,151 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Literal, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import FLOW, UNCENTRED
-from tools.guest.equations import Program
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.dynamic import shot_to_repeat
+from tools.mismatch.twins.equations import NOTHING, Equations, Inside, Linearised, Place, State, linearise, meet_start
 from tools.mismatch.twins.feedback import Rows, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
-from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
+from tools.mismatch.twins.ode_run import SWAY
 
 MOST_SUBSTEPS = 200
 LEAST_WINDOW = 20
-ROUNDS = 3  # Gauss-Newton steps to a start state
-LEAST_SHOWN = 3e-4  # of the best determined combination of start states: what shows less keeps its guess
 FORGOTTEN = 20.0  # time constants in a record: a slower state is set afresh in every stretch
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where a force or flow may act. ``position``, ``velocity``, ``target``: indices of states; of a storage (a level,
-    a current, a temperature) all three are that state. ``name``: the state whose derivative the force is added to.
-    """
-
-    name: str
-    kind: Literal["motion", "storage", "storages", "parameter"]
-    position: int
-    velocity: int
-    target: int
-    unit: str
-    """Of the position, or of what is stored."""
-    pairs: tuple[float, ...] = ()
-    """Of a storage: see ``flows.PAIRS``. Of a parameter: its register and that of the signal which it may follow."""
-
-
-@dataclass(frozen=True)
-class Inside:
-    """Forces and flows of one run, packed for the compiled loop (``ode_run.run_equations``)."""
-
-    place: NDArray[np.int64]
-    rows: tuple[Rows, ...]
-    flows: Array
-    sway: Array
-
-    @cached_property
-    def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:
-        """friction, spring, cogging, counts, thresholds, memory."""
-        rows = self.rows
-
-        def join(parts: list[Array]) -> Array:
-            return np.concatenate(parts) if parts else np.zeros(0)
-
-        return (
-            join([r.friction for r in rows]),
-            join([r.spring for r in rows]),
-            join([r.cogging for r in rows]),
-            np.array([r.thresholds.size for r in rows], np.int64),
-            join([r.thresholds for r in rows]),
-            join([r.memory for r in rows]),
-        )
-
-
-NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)))
-
-
-class Equations(Protocol):
-    """Derivatives and outputs of a model, however they are worked out."""
-
-    def states(
-        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
-        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
-    ) -> Array:  # fmt: skip
-        """States (n, s) in free run; ``times`` (n,): seconds; ``values``: parameters."""
-        ...
-
-    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
-        """Outputs (n, q)."""
-        ...
-
-    def rates(self, x: Array, u: Array, values: Array) -> Array:
-        """Derivatives (s,) at one instant, at time zero, without forces."""
-        ...
-
-
-@dataclass(frozen=True)
-class Programs:
-    """Equations that are data (``program.py``), compiled once for all."""
-
-    rates_program: Program
-    outputs: Program
-    at: int
-    """Register of the first parameter."""
-
-    def states(
-        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
-        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
-    ) -> Array:  # fmt: skip
-        """See Equations."""
-        p = self.rates_program
-        friction, spring, cogging, counts, thresholds, memory = inside.arrays
-        return run_equations(
-            p.operations, self._set(p, values), p.results, inside.sway, x0, starts, stop, u, held, times, step_s,
-            sub, inside.place, friction, spring, cogging, counts, thresholds, memory, inside.flows, *limits,
-        )  # fmt: skip
-
-    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
-        """See Equations."""
-        return run_readings(self.outputs.operations, self._set(self.outputs, values), self.outputs.results, x, u, t)
-
-    def rates(self, x: Array, u: Array, values: Array) -> Array:
-        """See Equations."""
-        p, rates = self.rates_program, np.empty(x.size)
-        rates_of(p.operations, self._set(p, values), p.results, x, u, 0.0, rates)
-        return rates
-
-    def _set(self, program: Program, values: Array) -> Array:
-        registers = program.registers.copy()
-        registers[self.at : self.at + values.size] = values
-        return registers
-
-
-@dataclass(frozen=True)
-class State:
-    """A state: unit, where it starts (a guess that the recording improves), and what it cannot leave."""
-
-    name: str
-    unit: str
-    start: float = 0.0
-    lowest: float = -np.inf
-    highest: float = np.inf
-
-
-@dataclass(frozen=True)
-class Linearised:
-    """``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
-
-    a: Array
-    b: Array
-    c: Array
 
 
 @dataclass(frozen=True)
@@ -290,23 +165,29 @@ class OdeTwin(Head):
         key = (*key, *((f.effect.form, f.target, f.q.tobytes(), f.weights.tobytes(), _settings(f)) for f in forces))
 
         def make() -> Array:
-            # a made-up stretch that only asks which parameters are linear has no context
-            none = np.zeros(run.t.size)
-            signals = {s: used[s].value if s in used else run.signals.get(s, none) for s in self.signals}
-            x = self._simulated(run, signals, theta, forces)
-            u = np.column_stack([signals[s] for s in self.signals])
+            x, u = self.states(run, used, theta, forces)
             return np.ascontiguousarray(self.equations.readings(x, u, run.t, self.values(theta)).T)
 
         with np.errstate(all="ignore"):
             stacked = remember(run.memo, key, make)
         return {o: Signal(stacked[i], {}, (key, o)) for i, o in enumerate(self.outputs)}
 
+    def states(
+        self, run: Run, inputs: Mapping[str, Signal], theta: Array, forces: Sequence[Force]
+    ) -> tuple[Array, Array]:
+        """States (n, s) of a free run, and the signals (n, m) that the equations saw; ``inputs`` without columns."""
+        # a made-up stretch that only asks which parameters are linear has no context
+        none = np.zeros(run.t.size)
+        signals = {s: inputs[s].value if s in inputs else run.signals.get(s, none) for s in self.signals}
+        return self._simulated(run, signals, theta, forces), np.column_stack([signals[s] for s in self.signals])
+
     def readings(self, x: Array, run: Run, theta: Array) -> Array:
         """Outputs (n, q) for states (n, s) of a run."""
         u = np.column_stack([run.signals[s] for s in self.signals])
         return self.equations.readings(x, u, run.t, self.values(theta))
 
-    def _inside(self, forces: Sequence[Force]) -> Inside:
+    def inside(self, forces: Sequence[Force]) -> Inside:
+        """Forces and flows, packed for the compiled loop."""
         by: dict[str, list[Force]] = {}
         for f in forces:
             by.setdefault(f.target, []).append(f)
@@ -331,28 +212,28 @@ class OdeTwin(Head):
             np.array(sway, np.float64).reshape(-1, SWAY),
         )
 
-    def _substeps(self, run: Run, inside: Inside) -> int:
+    def substeps(self, dt: float, inside: Inside) -> int:
         """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (a power of two, so
         that it seldom changes while a fit moves), two at least where dry friction may stick, six to a period of
         cogging.
         """
-        sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
+        sub = int(np.ceil(dt * self.fastest_per_s / 0.25))
         for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
             springs = float(np.sum(np.abs(rows.memory))) + max(float(rows.friction[5]), 0.0)
-            stiff = run.dt * np.sqrt(springs) / 0.5
+            stiff = dt * np.sqrt(springs) / 0.5
             if stiff > sub:
                 sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
             if np.any(rows.friction[:3] != 0.0):
                 sub = max(sub, 2)
             if rows.cogging[0] > 0.0 and position != velocity:
-                sub = max(sub, int(np.ceil(6 * self.typical[velocity] * run.dt / rows.cogging[0])))
+                sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
         return int(np.clip(sub, 1, MOST_SUBSTEPS))
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """States (n, s) in free run from start states that the first measured samples of each stretch set."""
         values = self.values(theta)
-        inside = self._inside(forces)
-        sub = self._substeps(run, inside)
+        inside = self.inside(forces)
+        sub = self.substeps(run.dt, inside)
         u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
         limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))
         starts = np.array(run.starts, np.int64)
@@ -396,46 +277,12 @@ class OdeTwin(Head):
 
         def plain() -> Array:
             # the engineer's own model, run through from its own start: where later stretches begin to be sought
-            end, sub = np.array([run.t.size], np.int64), self._substeps(run, NOTHING)
+            end, sub = np.array([run.t.size], np.int64), self.substeps(run.dt, NOTHING)
             return go(given, starts[:1], end, u, run.t, sub, self.start_values, NOTHING)[starts]
 
         x0 = remember(run.memo, ("about", run.starts), plain)
         x0 = np.where(np.isfinite(x0), x0, given)
-        return go(self._met(x0, misses, rows, limits), starts, ends, u, run.t)
-
-    def _met(
-        self, x0: Array, misses: Callable[[Array], Array], rows: NDArray[np.int64], limits: tuple[Array, Array]
-    ) -> Array:
-        """Start states (starts, s) that leave least of ``misses`` (rows, q); ``rows``: the stretch of each row.
-
-        Gauss-Newton; what the window does not show stays at the guess.
-        """
-        s, step = x0.shape[1], 1e-4
-        first = np.searchsorted(rows, np.arange(x0.shape[0]))
-        together = lambda e: np.add.reduceat(e, first, axis=0)  # noqa: E731
-        best = misses(x0)
-        for _ in range(ROUNDS):
-            slopes = np.stack(
-                [(best - misses(x0 + step * self.typical * np.eye(s)[i])) / step for i in range(s)], axis=-1
-            )
-            gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
-            cross = together(np.einsum("rqi,rq->ri", slopes, best))
-            whole = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(cross).all(axis=1)
-            size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
-            shown = size > LEAST_SHOWN**2 * size[:, -1:]
-            along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
-            turn = np.einsum("kij,kj->ki", ways, np.where(shown, along / np.where(shown, size, 1.0), 0.0))
-            moved = np.clip(x0 + self.typical * turn, *limits)
-            after = misses(moved)
-            was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
-            better = now < was
-            foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
-            x0 = np.where(better[:, None], moved, x0)
-            best = np.where(better[rows][:, None], after, best)
-            # where equations are linear nothing is left to gain after one step
-            if not np.any((now < 0.999 * was) & (now > foretold + 0.001 * was)):
-                break
-        return x0
+        return go(meet_start(x0, misses, rows, self.typical, limits), starts, ends, u, run.t)
 
     # -- linearised -----------------------------------------------------------------------------------
 
@@ -463,29 +310,6 @@ class OdeTwin(Head):
             return y[output] + free
 
         return carry
-
-
-def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: Array) -> Linearised:
-    """Derivatives of the right-hand side and of the outputs, by central differences about ``x`` (s,) and ``u`` (m,)."""
-    step = 1e-5 * typical
-    width = 1e-5 * np.maximum(np.abs(u), 1e-3)
-    move = np.concatenate([step, width])
-    around = np.concatenate([x, u])
-    at = np.concatenate([around + np.diag(move), around - np.diag(move)])
-    s = x.size
-    f = rates_at(equations, at[:, :s], at[:, s:], values)
-    y = equations.readings(np.ascontiguousarray(at[:, :s]), np.ascontiguousarray(at[:, s:]), np.zeros(len(at)), values)
-    half = move.size
-    slope = (f[:half] - f[half:]).T / (2 * move)
-    # what is left of digits that cancel
-    slope[np.abs(slope) < 1e-9 * np.max(np.abs(f), axis=0)[:, None] / move] = 0.0
-    reading = (y[:half] - y[half:]).T / (2 * move)
-    return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]))
-
-
-def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
-    """Derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
-    return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
 
 
 def _settings(force: Force) -> tuple[object, ...]:

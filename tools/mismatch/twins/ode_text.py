@@ -16,7 +16,8 @@ from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
 from tools.mismatch.recording import Recording, RecordingError
-from tools.mismatch.twins.ode import FORGOTTEN, NOTHING, Equations, OdeTwin, Place, Programs, State, linearise, rates_at
+from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, State, linearise, rates_at
+from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.program import parse
 
 TABLES = ("states", "equations", "outputs", "units", "function", "fixed", "hold")

@@ -1,0 +1,207 @@
+"""Differential equations as data: derivatives, outputs, the forces inside them, and their linearisation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_devices.physics.effect import Array
+from sim_devices.physics.forces import FLOW
+from tools.guest.equations import Program
+from tools.mismatch.twins.feedback import Rows
+from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
+
+LEAST_SHOWN = 3e-4  # of the best determined combination of start states: what shows less keeps its guess
+ROUNDS = 3  # Gauss-Newton steps to a start state
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a force or flow may act. ``position``, ``velocity``, ``target``: indices of states; of a storage (a level,
+    a current, a temperature) all three are that state. ``name``: the state whose derivative the force is added to.
+    """
+
+    name: str
+    kind: Literal["motion", "storage", "storages", "parameter"]
+    position: int
+    velocity: int
+    target: int
+    unit: str
+    """Of the position, or of what is stored."""
+    pairs: tuple[float, ...] = ()
+    """Of a storage: see ``flows.PAIRS``. Of a parameter: its register and that of the signal which it may follow."""
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Forces and flows of one run, packed for the compiled loop (``ode_run.run_equations``)."""
+
+    place: NDArray[np.int64]
+    rows: tuple[Rows, ...]
+    flows: Array
+    sway: Array
+
+    @cached_property
+    def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:
+        """friction, spring, cogging, counts, thresholds, memory."""
+        rows = self.rows
+
+        def join(parts: list[Array]) -> Array:
+            return np.concatenate(parts) if parts else np.zeros(0)
+
+        return (
+            join([r.friction for r in rows]),
+            join([r.spring for r in rows]),
+            join([r.cogging for r in rows]),
+            np.array([r.thresholds.size for r in rows], np.int64),
+            join([r.thresholds for r in rows]),
+            join([r.memory for r in rows]),
+        )
+
+
+NOTHING = Inside(np.zeros((0, 4), np.int64), (), np.zeros((0, FLOW)), np.zeros((0, SWAY)))
+
+
+class Equations(Protocol):
+    """Derivatives and outputs of a model, however they are worked out."""
+
+    def states(
+        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
+        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
+    ) -> Array:  # fmt: skip
+        """States (n, s) in free run; ``times`` (n,): seconds; ``values``: parameters."""
+        ...
+
+    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """Outputs (n, q)."""
+        ...
+
+    def rates(self, x: Array, u: Array, values: Array) -> Array:
+        """Derivatives (s,) at one instant, at time zero, without forces."""
+        ...
+
+
+@dataclass(frozen=True)
+class Programs:
+    """Equations that are data (``program.py``), compiled once for all."""
+
+    rates_program: Program
+    outputs: Program
+    at: int
+    """Register of the first parameter."""
+
+    def states(
+        self, x0: Array, starts: NDArray[np.int64], stop: NDArray[np.int64], u: Array, held: NDArray[np.bool_],
+        times: Array, step_s: float, sub: int, values: Array, inside: Inside, limits: tuple[Array, Array],
+    ) -> Array:  # fmt: skip
+        """See Equations."""
+        p = self.rates_program
+        friction, spring, cogging, counts, thresholds, memory = inside.arrays
+        return run_equations(
+            p.operations, self._set(p, values), p.results, inside.sway, x0, starts, stop, u, held, times, step_s,
+            sub, inside.place, friction, spring, cogging, counts, thresholds, memory, inside.flows, *limits,
+        )  # fmt: skip
+
+    def readings(self, x: Array, u: Array, t: Array, values: Array) -> Array:
+        """See Equations."""
+        return run_readings(self.outputs.operations, self._set(self.outputs, values), self.outputs.results, x, u, t)
+
+    def rates(self, x: Array, u: Array, values: Array) -> Array:
+        """See Equations."""
+        p, rates = self.rates_program, np.empty(x.size)
+        rates_of(p.operations, self._set(p, values), p.results, x, u, 0.0, rates)
+        return rates
+
+    def _set(self, program: Program, values: Array) -> Array:
+        registers = program.registers.copy()
+        registers[self.at : self.at + values.size] = values
+        return registers
+
+
+@dataclass(frozen=True)
+class State:
+    """A state: unit, where it starts (a guess that the recording improves), and what it cannot leave."""
+
+    name: str
+    unit: str
+    start: float = 0.0
+    lowest: float = -np.inf
+    highest: float = np.inf
+
+
+@dataclass(frozen=True)
+class Linearised:
+    """``x' = a x + b u``, ``y = c x`` about the mean of a run, in the order of states, signals and outputs."""
+
+    a: Array
+    b: Array
+    c: Array
+
+
+def linearise(equations: Equations, x: Array, u: Array, typical: Array, values: Array) -> Linearised:
+    """Derivatives of the right-hand side and of the outputs, by central differences about ``x`` (s,) and ``u`` (m,)."""
+    step = 1e-5 * typical
+    width = 1e-5 * np.maximum(np.abs(u), 1e-3)
+    move = np.concatenate([step, width])
+    around = np.concatenate([x, u])
+    at = np.concatenate([around + np.diag(move), around - np.diag(move)])
+    s = x.size
+    f = rates_at(equations, at[:, :s], at[:, s:], values)
+    y = equations.readings(np.ascontiguousarray(at[:, :s]), np.ascontiguousarray(at[:, s:]), np.zeros(len(at)), values)
+    half = move.size
+    slope = (f[:half] - f[half:]).T / (2 * move)
+    # what is left of digits that cancel
+    slope[np.abs(slope) < 1e-9 * np.max(np.abs(f), axis=0)[:, None] / move] = 0.0
+    reading = (y[:half] - y[half:]).T / (2 * move)
+    return Linearised(slope[:, :s], slope[:, s:], np.ascontiguousarray(reading[:, :s]))
+
+
+def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
+    """Derivatives (k, s) at states (k, s) and signals (k, m), at time zero."""
+    return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
+
+
+def meet_start(
+    x0: Array,
+    misses: Callable[[Array], Array],
+    rows: NDArray[np.int64],
+    typical: Array,
+    limits: tuple[Array, Array],
+) -> Array:
+    """Start states (starts, s) that leave least of ``misses`` (rows, q), from ``x0`` on.
+
+    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. Gauss-Newton; what the window
+    does not show stays at the guess.
+    """
+    s, step = x0.shape[1], 1e-4
+    first = np.searchsorted(rows, np.arange(x0.shape[0]))
+
+    def together(e: Array) -> Array:
+        return np.add.reduceat(e, first, axis=0)
+
+    best = misses(x0)
+    for _ in range(ROUNDS):
+        slopes = np.stack([(best - misses(x0 + step * typical * np.eye(s)[i])) / step for i in range(s)], axis=-1)
+        gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
+        cross = together(np.einsum("rqi,rq->ri", slopes, best))
+        whole = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(cross).all(axis=1)
+        size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
+        shown = size > LEAST_SHOWN**2 * size[:, -1:]
+        along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
+        turn = np.einsum("kij,kj->ki", ways, np.where(shown, along / np.where(shown, size, 1.0), 0.0))
+        moved = np.clip(x0 + typical * turn, *limits)
+        after = misses(moved)
+        was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
+        better = np.less(now, was)
+        foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
+        x0 = np.where(better[:, None], moved, x0)
+        best = np.where(better[rows][:, None], after, best)
+        # where equations are linear nothing is left to gain after one step
+        if not np.any(better & (now < 0.999 * was) & (now > foretold + 0.001 * was)):
+            break
+    return x0
