@@ -197,7 +197,7 @@ def meet_start(
         moved = np.clip(x0 + typical * turn, *limits)
         after = misses(moved)
         was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
-        better = np.less(now, was)
+        better: NDArray[np.bool_] = np.asarray(now < was, np.bool_)
         foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
         x0 = np.where(better[:, None], moved, x0)
         best = np.where(better[rows][:, None], after, best)
