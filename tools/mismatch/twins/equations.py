@@ -189,7 +189,7 @@ def meet_start(
         slopes = np.stack([(best - misses(x0 + step * typical * np.eye(s)[i])) / step for i in range(s)], axis=-1)
         gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
         cross = together(np.einsum("rqi,rq->ri", slopes, best))
-        whole = np.isfinite(gram).all(axis=(1, 2)) & np.isfinite(cross).all(axis=1)
+        whole = np.isfinite(np.sum(gram, axis=(1, 2)) + np.sum(cross, axis=1))
         size, ways = np.linalg.eigh(np.where(whole[:, None, None], gram, 0.0))
         shown = size > LEAST_SHOWN**2 * size[:, -1:]
         along = np.einsum("kji,kj->ki", ways, np.where(whole[:, None], cross, 0.0))
@@ -197,7 +197,7 @@ def meet_start(
         moved = np.clip(x0 + typical * turn, *limits)
         after = misses(moved)
         was, now = together(np.sum(best**2, axis=1)), together(np.sum(after**2, axis=1))
-        better: NDArray[np.bool_] = np.asarray(now < was, np.bool_)
+        better = now < was
         foretold = together(np.sum((best - np.einsum("rqi,ri->rq", slopes, turn[rows])) ** 2, axis=1))
         x0 = np.where(better[:, None], moved, x0)
         best = np.where(better[rows][:, None], after, best)
