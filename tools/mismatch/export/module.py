@@ -15,13 +15,16 @@ from sim_devices.physics.effect import STAGES, Array
 from tools.errors import InputError
 from tools.mismatch import units
 from tools.mismatch.export import parts
-from tools.mismatch.export.effects import PER_FORCE, ForceCode, Slot, Writer, force, numbers, written
+from tools.mismatch.export.effects import PER_FORCE, Slot, Writer, force, numbers, written
+from tools.mismatch.export.equations import EquationLines, Inner
+from tools.mismatch.export.motion import motion, substeps_of
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe
 from tools.mismatch.twins.base import Force
 from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.ode import OdeTwin
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.twins.static import StaticTwin
 from tools.mismatch.twins.vocabulary import user_kinds
@@ -86,8 +89,13 @@ class _Module:
         u_out = self.twin.units.get(pl.outputs[0], "1")
         if pl.site == "feedback" and self.twin.counted:
             u_out = u_out.removesuffix("/s")
+        is_force = pl.site == "feedback"
+        gain = self.twin.input_gain(self.twin.inputs[0], self.theta) if is_force else 1.0
+        if isinstance(self.twin, OdeTwin) and is_force:
+            u_in, u_out = self.twin.place_units(pl.target)
+            is_force = self.twin.place(pl.target).kind == "motion"
+            gain = self.twin.force_gain(pl.target, self.theta)[0] if is_force else 1.0
         weights = {p.name for p in pl.parts.weights}
-        gain = self.twin.input_gain(self.twin.inputs[0], self.theta) if pl.site == "feedback" else 1.0
         carried = self.twin.input_gain(pl.target, self.theta) if pl.site == "input" and pl.effect.kind == "add" else 1.0
         for key in [key for key in self.writer.parameters if key.startswith(f"{self.labels[k]}.")]:
             value, unit = self.writer.parameters[key]
@@ -95,7 +103,7 @@ class _Module:
             if stem in weights or any(re.fullmatch(rf"{re.escape(stem)}_?\d+", w) for w in weights):
                 # weights before the base physics carry its gain inside the engine; here they are forces and inputs
                 value = (np.asarray(value) / (gain * carried)).tolist()
-                if pl.site == "feedback":
+                if is_force:
                     unit = PER_FORCE.get(unit, unit)
             self.writer.parameters[key] = (value, unit.replace("{in}", u_in).replace("{out}", u_out))
         return slot
@@ -135,6 +143,8 @@ class _Module:
             self._static()
         elif isinstance(twin, CascadeTwin):
             raise InputError("two filters with an effect between them have no numpy form; use --out FILE.toml or .csv")
+        elif isinstance(twin, OdeTwin):
+            self._equations(twin)
         else:
             raise InputError(f"a twin of {twin.kind} has no numpy form to write; use --out FILE.toml or FILE.csv")
         self._through("output")
@@ -243,6 +253,27 @@ class _Module:
         substeps = substeps_of(twin, self.model, self.theta, self.recording, forces)
         self.writer.setup += motion(codes, a, b, place, speed, hold, start, substeps)
 
+    def _equations(self, twin: OdeTwin) -> None:
+        for name, value in zip(twin.names, twin.values(self.theta).tolist(), strict=True):
+            self._put(name, value, twin.parameter_units.get(name, ""))
+        self._put("start", self.start.tolist(), ", ".join(s.unit for s in twin.state_list))
+        inner = [
+            Inner(twin.place(pl.target), self._slot(k, pl.outputs[0]))
+            for k, pl in enumerate(self.model.placed)
+            if pl.site == "feedback"
+        ]
+        gains = {one.place.name: twin.force_gain(one.place.name, self.theta)[0] for one in inner}
+        forces = [
+            Force(pl.effect, pl.settings, self.theta[a], self.theta[b], b.start, pl.target)
+            for pl, (a, b) in ((pl, self.model.slices(k)) for k, pl in enumerate(self.model.placed))
+            if pl.site == "feedback"
+        ]
+        substeps = twin.substeps(self.recording.dt, twin.packed(forces))
+        lines = EquationLines(twin, _name, substeps, gains)
+        self.writer.run += [f'{_name(s)} = u["{s}"]' for s in twin.signals if s not in twin.inputs]
+        self.writer.setup += lines.setup(inner)
+        self.writer.run += lines.run()
+
     # -- text ---------------------------------------------------------------------------------------
 
     def text(self) -> str:
@@ -276,7 +307,7 @@ class _Module:
             said = [f"{s} ({self.file_units[s]}, column {rec.column[s]})" for s in names]
             lines += textwrap.wrap(f"{role}  " + ", ".join(said), WIDTH, subsequent_indent=" " * 9)
         lines += [wrapped for line in self.report for wrapped in textwrap.wrap(line, WIDTH, subsequent_indent=" " * 9)]
-        if isinstance(self.twin, DynamicTwin):
+        if isinstance(self.twin, DynamicTwin | OdeTwin):
             lines += ['"start" is the state at the first sample of that recording; another record begins elsewhere.']
         return [*(line.replace("\\", "/") for line in lines), '"""']
 
@@ -388,121 +419,3 @@ def _order(used: set[str]) -> list[str]:
         if not more:
             return [n for n in SOURCES if n in every]
         every |= more
-
-
-def substeps_of(twin: DynamicTwin, model: Model, theta: Array, recording: Recording, forces: Sequence[int]) -> int:
-    """Steps per sample that the engine takes with these forces."""
-    from tools.mismatch.simulate_view import View, view_run
-    from tools.mismatch.twins.feedback import pack
-
-    if twin.hold == "discrete":
-        return 1
-    placed = [(model.placed[k], *model.slices(k)) for k in forces]
-    packed = pack([Force(pl.effect, pl.settings, theta[a], theta[b], b.start) for pl, a, b in placed])
-    plant = twin.plant_of(theta)
-    row = np.zeros(plant.a.shape[0])
-    if twin.counted:
-        row[0] = 1.0
-    else:
-        carried = twin.input_gain(twin.inputs[0], theta) != 1.0
-        for link in twin.links:
-            if link.output == twin.feedback_on and link.source == twin.inputs[0] and link.row >= 0:
-                row[link.row] = 1.0 if carried else theta[link.j]
-    push = float(row @ plant.a @ plant.b) or 1.0
-    return twin._substeps(view_run(twin, View.whole(recording)), packed, push)
-
-
-def motion(
-    codes: Sequence[ForceCode], a: str, b: str, place: str, speed: str, hold: str, start: str, substeps: int
-) -> list[str]:
-    """Lines of ``moving(drive)``: a linear plant with forces of its position x and velocity v in free run.
-
-    The scheme is that of ``twins.feedback.run_feedback``, written out for the forces that there are.
-    """
-    smooth = "".join(c.smooth for c in codes)
-    limits = [c.limit for c in codes if c.limit]
-    stiff = " + ".join(c.stiff for c in codes if c.stiff)
-    lean = next((c.lean for c in codes if c.lean), "")
-    radii = next((c.radii for c in codes if c.radii), "")
-    springs = next((c.springs for c in codes if c.springs), "")
-    straight = hold == "linear"
-    step = "dt" if substeps == 1 else f"dt / {substeps}"
-    lines = [
-        f"ad, g0, g1 = discretise({a}, {b}, {step}, {hold!r})",
-        f"g0, g1, place, speed = g0[:, 0], g1[:, 0], {place}, {speed}  # rows of position and velocity",
-        f"s, before = {start}, None",
-    ]
-    terms, later = (["smooth(place @ s, speed @ s)"], ["smooth(place @ z, speed @ z)"]) if smooth else ([], [])
-    memory = ["s", "before"]
-    if radii:
-        memory.append("held")
-        lines.append(f"radii, springs = np.array({radii}), np.array({springs})")
-        lines.append("held = place @ s + 0 * radii  # where each elastic element is at rest")
-        terms.append("- springs @ (place @ s - held)")
-        later.append("- springs @ np.clip(place @ z - held, -radii, radii)")
-    if stiff:
-        memory.append("bristle")
-        lines.append(f"stiff, bristle = {stiff}, 0.0")
-        terms.append("- stiff * bristle")
-        later.append("- stiff * bend(bristle, 0.5 * speed @ (s + z))")
-    if limits:
-        lines += ["", "def limit(v, sign):", f"    return max({' + '.join(limits)}, 0.0)"]
-    if lean:
-        lines += [
-            "",
-            "def bend(z, v):  # Bouc-Wen: z' = v - stiff (|v| z + lean v |z|) / limit, exact for constant v",
-            f"    way, w, lean = abs(v) * {step}, np.sign(v) * z, {lean}",
-            "    back, on = (1 - lean) * stiff / limit(v, 1.0), (1 + lean) * stiff / limit(v, 1.0)",
-            "    if w < 0:",
-            "        rest = np.log1p(-back * w) / back if back else -w",
-            "        if rest >= way:",
-            "            gone = -np.expm1(-back * way) / back if back else way",
-            "            return np.sign(v) * (w * np.exp(-back * way) + gone)",
-            "        way, w = way - rest, 0.0",
-            "    return np.sign(v) * (w * np.exp(-on * way) - (np.expm1(-on * way) / on if on else -way)) if v else z",
-        ]
-    elif stiff:
-        lines += [
-            "",
-            "def bend(z, v):  # LuGre: z' = v - stiff |v| z / limit, exact for constant v",
-            "    settled = np.sign(v) * limit(v, np.sign(v)) / stiff",
-            f"    return settled + (z - settled) * np.exp(-abs(v / settled) * {step}) if settled else z",
-        ]
-    if smooth:
-        lines += ["", "def smooth(x, v):", f"    return {_sum(smooth.strip())}"]
-    lines += ["", "def moving(drive):", f"    nonlocal {', '.join(memory)}", "    out = np.empty((len(drive), len(s)))"]
-    steps = "if before is not None:" if substeps == 1 else f"for j in range({substeps} if before is not None else 0):"
-    lines += ["    for k, now in enumerate(drive):", f"        {steps}"]
-    if straight:
-        rise = "now - before" if substeps == 1 else f"(now - before) / {substeps}"
-        body = [f"rise = {rise}", f"u = before{'' if substeps == 1 else ' + j * rise'}"]
-        plus = "u + rise"
-    else:
-        body, plus = ["u = before"], "u"
-    if radii:
-        body.append("held = np.clip(held, place @ s - radii, place @ s + radii)")
-    if terms:
-        body += [
-            f"f = {_sum(' '.join(terms))}",
-            f"z = ad @ s + g0 * (u + f) + g1 * ({plus} + f)",
-            f"g = {_sum(' '.join(later))}",
-            f"z = ad @ s + g0 * (u + f) + g1 * ({plus} + g)",
-        ]
-    else:
-        body.append(f"z = ad @ s + g0 * u + g1 * ({plus})")
-    if stiff:
-        body.append("bristle = bend(bristle, 0.5 * speed @ (s + z))")
-    elif limits:
-        body += [
-            "v, push = speed @ z, speed @ (g0 + g1)",
-            "most = limit(speed @ s, 1.0 if v > 0 else -1.0)  # dry friction takes no more than stops the motion",
-            "z = z - (g0 + g1) * (np.sign(v) * most if abs(v) > most * push else v / push)",
-        ]
-    body.append("s = z")
-    lines += ["            " + line for line in body]
-    return [*lines, "        before, out[k] = now, s", "    return out"]
-
-
-def _sum(terms: str) -> str:
-    """Code of a sum whose first term has its sign before a blank."""
-    return "-" + terms[2:] if terms.startswith("- ") else terms.removeprefix("+ ")

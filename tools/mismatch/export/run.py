@@ -86,10 +86,15 @@ def free_run(recording: Recording) -> dict[str, Array]:
 
 def whole_run(recording: Recording, model: Model, theta: Array) -> dict[str, Array]:
     """The outputs (n,) of a model in one free run; the first samples that a diagnosis would use set its state."""
+    return model.simulate(whole_view(recording, model), theta)
+
+
+def whole_view(recording: Recording, model: Model) -> View:
+    """The whole recording as one free run, with the first samples that a diagnosis would use to set its state."""
     from tools.mismatch.engine.diagnose import free_run as course
 
     init = recording.split.initialization or course(recording, model.twin)[1]
-    return model.simulate(View(recording, ((0, recording.n),), init), theta)
+    return View(recording, ((0, recording.n),), init)
 
 
 def in_file_units(recording: Recording) -> dict[str, Array]:

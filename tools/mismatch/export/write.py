@@ -17,11 +17,12 @@ from tools.errors import InputError
 from tools.mismatch import units
 from tools.mismatch.apply import Corrected
 from tools.mismatch.export.module import python_module
-from tools.mismatch.export.run import in_file_units, whole_run
+from tools.mismatch.export.run import in_file_units, whole_run, whole_view
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.ode import OdeTwin
 from tools.output import write_text_atomic
 
 FORMATS = {
@@ -73,6 +74,8 @@ def module_of(twin: Corrected, report: Mapping[str, Any]) -> str:
         rec = part.recording
         return python_module(rec, part.model, part.theta, rec.file_unit, _said(report), start)
 
+    if isinstance(twin.model.twin, OdeTwin):
+        return text(twin, twin.model.start_states(whole_view(twin.recording, twin.model), twin.theta))
     order = order_of(twin)
     if order == 0:
         return text(twin, np.zeros(0))

@@ -186,7 +186,7 @@ class OdeTwin(Head):
         u = np.column_stack([run.signals[s] for s in self.signals])
         return self.equations.readings(x, u, run.t, self.values(theta))
 
-    def inside(self, forces: Sequence[Force]) -> Inside:
+    def packed(self, forces: Sequence[Force]) -> Inside:
         """Forces and flows, packed for the compiled loop."""
         by: dict[str, list[Force]] = {}
         for f in forces:
@@ -232,7 +232,7 @@ class OdeTwin(Head):
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
         """States (n, s) in free run from start states that the first measured samples of each stretch set."""
         values = self.values(theta)
-        inside = self.inside(forces)
+        inside = self.packed(forces)
         sub = self.substeps(run.dt, inside)
         u = np.ascontiguousarray(np.column_stack([signals[s] for s in self.signals]))
         limits = (np.array([s.lowest for s in self.state_list]), np.array([s.highest for s in self.state_list]))

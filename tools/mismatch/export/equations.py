@@ -1,0 +1,325 @@
+"""Differential equations of a corrected twin as lines of numpy code, forces and flows inside them included.
+
+The lines take the steps that ``twins.ode_run.run_equations`` takes, so that both runs agree to rounding.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_devices.physics.flows import PAIRS, flow_pairs
+from tools.errors import InputError
+from tools.guest.equations import (
+    ABS,
+    ADD,
+    ATAN,
+    ATAN2,
+    COS,
+    DIV,
+    EXP,
+    LEQ,
+    LESS,
+    LOG,
+    MAX,
+    MIN,
+    MUL,
+    NEG,
+    PICK,
+    POW,
+    SIGN,
+    SIN,
+    SQRT,
+    SUB,
+    TAN,
+    TANH,
+    Program,
+)  # fmt: skip
+from tools.mismatch.export.effects import ForceCode, Slot, force, numbers
+from tools.mismatch.export.motion import bend_code, sum_code
+from tools.mismatch.twins.equations import Place, Programs
+from tools.mismatch.twins.ode import OdeTwin
+
+_CALLS = {
+    ABS: "abs", SIGN: "np.sign", SQRT: "np.sqrt", EXP: "np.exp", LOG: "np.log", SIN: "np.sin", COS: "np.cos",
+    TAN: "np.tan", TANH: "np.tanh", ATAN: "np.arctan", ATAN2: "np.arctan2", MIN: "np.minimum", MAX: "np.maximum",
+    PICK: "np.where",
+}  # fmt: skip
+_BINARY = {ADD: ("+", 1, 1), SUB: ("-", 1, 2), MUL: ("*", 2, 2), DIV: ("/", 2, 3), POW: ("**", 4, 4)}
+_COMPARED = {LESS: "<", LEQ: "<="}
+_ARGUMENTS = {ATAN2: 2, MIN: 2, MAX: 2, PICK: 3}
+ATOM = 4
+TAKEN = ("s", "h", "t", "u", "p", "dt", "np")
+"""Names that the lines use themselves."""
+
+
+def program_code(program: Program, names: Mapping[int, str]) -> tuple[list[str], list[str]]:
+    """Assignments of what is used more than once, and the code of each result. ``names``: code of the variables.
+
+    Operations keep their order, so that rounding is that of the program.
+    """
+    made = {int(row[1]): row for row in program.operations}
+    uses: dict[int, int] = {}
+
+    def count(r: int) -> None:
+        uses[r] = uses.get(r, 0) + 1
+        if uses[r] == 1 and r in made:
+            for a in arguments(r):
+                count(a)
+
+    def arguments(r: int) -> list[int]:
+        code = int(made[r][0])
+        return [
+            int(a) for a in made[r][2 : 2 + (2 if code in _BINARY or code in _COMPARED else _ARGUMENTS.get(code, 1))]
+        ]
+
+    for r in program.results:
+        count(int(r))
+    lines: list[str] = []
+    known: dict[int, tuple[str, int]] = {}
+
+    def code_of(r: int) -> tuple[str, int]:
+        """Code and how tightly it holds together."""
+        if r in names:
+            return names[r], ATOM
+        if r not in made:
+            value = float(program.registers[r])
+            return (numbers(value), ATOM) if value >= 0.0 else (f"({numbers(value)})", ATOM)
+        if r not in known:
+            text, level = built(r)
+            if uses[r] > 1:
+                lines.append(f"w{len(lines) + 1} = {text}")
+                text, level = f"w{len(lines)}", ATOM
+            known[r] = text, level
+        return known[r]
+
+    def within(r: int, least: int) -> str:
+        text, level = code_of(r)
+        return text if level >= least else f"({text})"
+
+    def built(r: int) -> tuple[str, int]:
+        code, given = int(made[r][0]), arguments(r)
+        if code in _BINARY:
+            sign, left, right = _BINARY[code]
+            # what stands on the right is worked out first
+            return f"{within(given[0], left)} {sign} {within(given[1], max(right, left + 1))}", min(left, 3)
+        if code in _COMPARED:
+            return f"1.0 * ({within(given[0], 1)} {_COMPARED[code]} {within(given[1], 1)})", 2
+        if code == NEG:
+            return f"-{within(given[0], 3)}", 1
+        return f"{_CALLS[code]}({', '.join(code_of(a)[0] for a in given)})", ATOM
+
+    results = [code_of(int(r))[0] for r in program.results]
+    return lines, results
+
+
+@dataclass(frozen=True)
+class Inner:
+    """A force or flow as the lines need it: its place, its slot of parameters."""
+
+    place: Place
+    slot: Slot
+
+
+@dataclass
+class EquationLines:
+    """Lines of an ode twin: ``setup`` defines ``moving(t, drive)``, ``run`` calls it and reads the outputs."""
+
+    twin: OdeTwin
+    name: Callable[[str], str]
+    """A signal as a name in ``run``."""
+    substeps: int
+    gains: Mapping[str, float]
+    """What one unit of a force does to the derivative at its place."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.twin.equations, Programs):
+            raise InputError(f"a twin of {self.twin.kind} has no numpy form to write; use --out FILE.toml or FILE.csv")
+        self.programs = self.twin.equations
+
+    def _variables(self, states: Sequence[str], signals: Sequence[str], swayed: Mapping[int, str]) -> dict[int, str]:
+        every = ["t", *states, *signals, *(f'p["{n}"]' for n in self.twin.names)]
+        return {i: f"{n} * ({swayed[i]})" if i in swayed else n for i, n in enumerate(every)}
+
+    def run(self) -> list[str]:
+        """Lines that turn inputs into outputs."""
+        signals = [self.name(s) for s in self.twin.signals]
+        lines = [f"x = moving(t, np.stack([{', '.join(signals)}], axis=1))"]
+        columns = [f"x[:, {i}]" for i in range(len(self.twin.state_list))]
+        shared, read = program_code(self.programs.outputs, self._variables(columns, signals, {}))
+        lines += shared
+        # all are read before a name of an output may hide an input of that name
+        if len(read) == 1:
+            return [*lines, f"{self.name(self.twin.outputs[0])} = {read[0]} + 0 * t"]
+        return [
+            *lines,
+            f"{', '.join(self.name(o) for o in self.twin.outputs)} = {', '.join(f'{r} + 0 * t' for r in read)}",
+        ]
+
+    def setup(self, inner: Sequence[Inner]) -> list[str]:
+        """Lines that define the equations and the steps; they go on where the last call stopped."""
+        twin = self.twin
+        states = [f"{s.name}_" if s.name in TAKEN else s.name for s in twin.state_list]
+        signals = [f"{s}_" if s in TAKEN else s for s in twin.signals]
+        swayed: dict[int, list[str]] = {}
+        for one in inner:
+            if one.place.kind == "parameter":
+                parameter, signal = (int(v) for v in one.slot.placed.settings[PAIRS])
+                follows = [*states, *signals][signal - 1]
+                centre = numbers(one.slot.setting("centre"))
+                swayed.setdefault(parameter, []).append(f"1 + {one.slot.at('per_unit')} * ({follows} - {centre})")
+        changed = {r: ") * (".join(parts) for r, parts in swayed.items()}
+        shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
+        h = "dt" if self.substeps == 1 else f"dt / {self.substeps}"
+        lines = [f'h, s, before, began = {h}, np.array(p["start"]), None, 0.0']
+        lines += ["", "def derivatives(t, s, u):", f"    {_unpacked(states)} = s", f"    {_unpacked(signals)} = u"]
+        lines += [f"    {line}" for line in shared]
+        flows = [line for one in inner for line in self._flow(one)]
+        moved = [one for one in inner if one.place.kind == "motion"]
+        pushes, more = self._forces(moved)
+        if not flows and not pushes:
+            lines.append(f"    return np.array([{', '.join(rates)}])")
+        else:
+            lines += [f"    rates = np.array([{', '.join(rates)}])", *(f"    {line}" for line in (*flows, *pushes))]
+            lines.append("    return rates")
+        return [*lines, *more]
+
+    def _flow(self, one: Inner) -> list[str]:
+        name = one.slot.placed.effect.name
+        if one.place.kind not in ("storage", "storages"):
+            return []
+        lines: list[str] = []
+        level = one.slot.at("empty_level" if name == "square_root_outflow" else "level")
+        for weight, (a, b) in zip(one.slot.placed.parts.weights, flow_pairs(one.slot.placed.settings), strict=True):
+            over = f"max(s[{a}] - {level}, 0.0)"
+            flow = f"np.sqrt({over})" if name == "square_root_outflow" else over
+            lines.append(f"rates[{b}] {'-' if a == b else '+'}= {one.slot.at(weight.name)} * {flow}")
+        return lines
+
+    def _forces(self, moved: Sequence[Inner]) -> tuple[list[str], list[str]]:
+        """Lines inside ``derivatives`` (``s``: states, ``h``: step), and those that define the steps."""
+        by: dict[str, list[ForceCode]] = {}
+        at: dict[str, Place] = {}
+        for one in moved:
+            by.setdefault(one.place.name, []).append(force(one.slot))
+            at[one.place.name] = one.place
+        pushes: list[str] = []
+        special = [n for n, codes in by.items() if any(c.limit or c.stiff or c.radii for c in codes)]
+        if len(special) > 1:
+            raise InputError("friction or memory at several states has no numpy form; use --out FILE.toml or FILE.csv")
+        for name, codes in by.items():
+            place, gain = at[name], numbers(self.gains[name])
+            smooth = "".join(c.smooth for c in codes).strip()
+            springs = next((c.springs for c in codes if c.springs), "")
+            terms = sum_code(smooth) if smooth else ""
+            if springs:
+                terms += f"{' ' if terms else ''}- springs @ np.clip(x - held, -radii, radii)"
+            if terms:
+                pushes += [
+                    f"x, v = s[{place.position}], s[{place.velocity}]",
+                    f"rates[{place.target}] += {gain} * ({terms})",
+                ]
+        if not special:
+            return pushes, self._moving(None, [])
+        return pushes, self._moving(at[special[0]], by[special[0]])
+
+    def _moving(self, place: Place | None, codes: Sequence[ForceCode]) -> list[str]:
+        limits = " + ".join(c.limit for c in codes if c.limit)
+        stiff = " + ".join(c.stiff for c in codes if c.stiff)
+        lean = next((c.lean for c in codes if c.lean), "")
+        radii = next((c.radii for c in codes if c.radii), "")
+        springs = next((c.springs for c in codes if c.springs), "")
+        memory = ["s", "before", "began"]
+        lines: list[str] = []
+        gain = numbers(self.gains[place.name]) if place is not None else "1.0"
+        if place is not None and radii:
+            memory.append("held")
+            lines.append(f"radii, springs = np.array({radii}), np.array({springs})")
+            lines.append(f"held = s[{place.position}] + 0 * radii  # where each elastic element is at rest")
+        if limits:
+            lines += ["", "def limit(v, sign):", f"    return {gain} * ({limits})"]
+        since = ", since" if stiff else ""
+        if place is not None and stiff:
+            memory.append("bristle")
+            lines += [
+                f"stiff, bristle = {gain} * ({stiff}), 0.0", "",
+                *bend_code(lean, "def bend(z, v, since):", "since"),
+            ]  # fmt: skip
+        lines += ["", "def step(t, s, ua, ub, uc):  # Runge and Kutta, fourth order"]
+        slope = "derivatives"
+        if place is not None and stiff:
+            i = place.velocity
+            lines += [
+                "    def slope(t, s_, u, since):",
+                "        rates = derivatives(t, s_, u)",
+                f"        rates[{i}] -= stiff * bend(bristle, 0.5 * (s[{i}] + s_[{i}]), since)",
+                "        return rates", "",
+            ]  # fmt: skip
+            slope = "slope"
+        elif place is not None and limits:
+            i = place.velocity
+            lines += [
+                f"    v, push = s[{i}], derivatives(t, s, ua)[{i}]",
+                "    sign = 1.0 if (v or push) > 0 else -1.0",
+                "    stuck = v == 0 and abs(push) <= limit(0.0, sign)", "",
+                "    def slope(t, s, u):  # the direction of slip is fixed within a step",
+                "        rates = derivatives(t, s, u)",
+                f"        rates[{i}] = 0.0 if stuck else rates[{i}] - sign * max(limit(s[{i}], sign), 0.0)",
+                "        return rates", "",
+            ]  # fmt: skip
+            slope = "slope"
+        ends = [f", {part}" if since else "" for part in ("0.0", "h / 2", "h / 2", "h")]
+        lines += [
+            f"    a = {slope}(t, s, ua{ends[0]})",
+            f"    b = {slope}(t + h / 2, s + h / 2 * a, ub{ends[1]})",
+            f"    c = {slope}(t + h / 2, s + h / 2 * b, ub{ends[2]})",
+            f"    d = {slope}(t + h, s + h * c, uc{ends[3]})",
+            "    z = s + h / 6 * (a + 2 * b + 2 * c + d)",
+        ]
+        if place is not None and limits and not stiff:
+            i = place.velocity
+            lines += [
+                f"    if stuck or z[{i}] * sign < 0:  # does the rest of the step move it again?",
+                f"        crossed = 1.0 if stuck else v / (v - z[{i}])",
+                "        rest = z.copy() if stuck else s + crossed * (z - s)",
+                f"        rest[{i}] = 0.0",
+                f"        after = derivatives(t + h, rest, uc)[{i}]",
+                "        over = abs(after) - limit(0.0, 1.0 if after > 0 else -1.0)",
+                "        part = 0.5 * min(over / (abs(after - push) or 1.0), 1.0) if stuck else 1.0 - crossed",
+                f"        z[{i}] = np.sign(after) * max(over, 0.0) * part * h",
+            ]
+        lines += ["    return z", "", "def moving(t, drive):", f"    nonlocal {', '.join(memory)}"]
+        lines += ["    out = np.empty((len(drive), len(s)))", "    for k, now in enumerate(drive):"]
+        again = f"for j in range({self.substeps} if before is not None else 0):"
+        lines.append(f"        {'if before is not None:' if self.substeps == 1 else again}")
+        start = "began" if self.substeps == 1 else "began + j * h"
+        if self.twin.held:
+            body = [f"z = step({start}, s, before, before, before)"]
+        elif self.substeps == 1:
+            body = [f"z = step({start}, s, before, (before + now) / 2, now)"]
+        else:
+            body = [
+                f"ua, ub, uc = (before + (j + c) / {self.substeps} * (now - before) for c in (0, 0.5, 1))",
+                f"z = step({start}, s, ua, ub, uc)",
+            ]
+        if place is not None and stiff:
+            i = place.velocity
+            body.append(f"bristle = bend(bristle, 0.5 * (s[{i}] + z[{i}]), h)")
+        if place is not None and radii:
+            body.append(f"held = np.clip(held, z[{place.position}] - radii, z[{place.position}] + radii)")
+        low = [s.lowest for s in self.twin.state_list]
+        high = [s.highest for s in self.twin.state_list]
+        bounded = np.any(np.isfinite(low)) or np.any(np.isfinite(high))
+        body.append(f"s = np.clip(z, {_bounds(low)}, {_bounds(high)})" if bounded else "s = z")
+        lines += ["            " + line for line in body]
+        return [*lines, "        before, began, out[k] = now, t[k], s", "    return out"]
+
+
+def _bounds(values: Sequence[float]) -> str:
+    return "[" + ", ".join(repr(v) if np.isfinite(v) else ("-" if v < 0 else "") + "np.inf" for v in values) + "]"
+
+
+def _unpacked(names: Sequence[str]) -> str:
+    return f"({names[0]},)" if len(names) == 1 else ", ".join(names)
