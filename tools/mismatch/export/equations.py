@@ -50,7 +50,8 @@ _CALLS = {
 _BINARY = {ADD: ("+", 1, 1), SUB: ("-", 1, 2), MUL: ("*", 2, 2), DIV: ("/", 2, 3), POW: ("**", 4, 4)}
 _COMPARED = {LESS: "<", LEQ: "<="}
 _ARGUMENTS = {ATAN2: 2, MIN: 2, MAX: 2, PICK: 3}
-ATOM = 4
+ATOM = 9
+LONG = 60  # characters: longer derivatives stand on a line each
 TAKEN = ("s", "h", "t", "u", "p", "dt", "np")
 """Names that the lines use themselves."""
 
@@ -138,31 +139,41 @@ class EquationLines:
         if not isinstance(self.twin.equations, Programs):
             raise InputError(f"a twin of {self.twin.kind} has no numpy form to write; use --out FILE.toml or FILE.csv")
         self.programs = self.twin.equations
+        self.signals = tuple(self.twin.inputs)
+
+    def see(self, inner: Sequence[Inner]) -> list[str]:
+        """The context signals that equations or parameters follow; the lines take these and the inputs."""
+        first = 1 + len(self.twin.state_list)
+        seen = {int(one.slot.placed.settings[PAIRS][1]) for one in inner if one.place.kind == "parameter"}
+        for program in (self.programs.rates_program, self.programs.outputs):
+            seen |= {int(r) for r in (*program.operations[:, 2:].flat, *program.results)}
+        contexts = [s for i, s in enumerate(self.twin.signals, first) if s not in self.twin.inputs and i in seen]
+        self.signals = (*self.twin.inputs, *contexts)
+        return contexts
 
     def _variables(self, states: Sequence[str], signals: Sequence[str], swayed: Mapping[int, str]) -> dict[int, str]:
         every = ["t", *states, *signals, *(f'p["{n}"]' for n in self.twin.names)]
-        return {i: f"{n} * ({swayed[i]})" if i in swayed else n for i, n in enumerate(every)}
+        return {i: f"({n} * ({swayed[i]}))" if i in swayed else n for i, n in enumerate(every)}
 
     def run(self) -> list[str]:
         """Lines that turn inputs into outputs."""
         signals = [self.name(s) for s in self.twin.signals]
-        lines = [f"x = moving(t, np.stack([{', '.join(signals)}], axis=1))"]
+        drive = ", ".join(self.name(s) for s in self.signals)
+        lines = [f"x = moving(t, np.stack([{drive}], axis=1))"]
         columns = [f"x[:, {i}]" for i in range(len(self.twin.state_list))]
         shared, read = program_code(self.programs.outputs, self._variables(columns, signals, {}))
         lines += shared
         # all are read before a name of an output may hide an input of that name
-        if len(read) == 1:
-            return [*lines, f"{self.name(self.twin.outputs[0])} = {read[0]} + 0 * t"]
-        return [
-            *lines,
-            f"{', '.join(self.name(o) for o in self.twin.outputs)} = {', '.join(f'{r} + 0 * t' for r in read)}",
-        ]
+        # what depends on parameters alone has a value at every instant, too
+        each = [r if "x[:" in r else f"{r} + 0 * t" for r in read]
+        return [*lines, f"{', '.join(self.name(o) for o in self.twin.outputs)} = {', '.join(each)}"]
 
     def setup(self, inner: Sequence[Inner]) -> list[str]:
         """Lines that define the equations and the steps; they go on where the last call stopped."""
         twin = self.twin
         states = [f"{s.name}_" if s.name in TAKEN else s.name for s in twin.state_list]
         signals = [f"{s}_" if s in TAKEN else s for s in twin.signals]
+        given = [n for n, s in zip(signals, twin.signals, strict=True) if s in self.signals]
         swayed: dict[int, list[str]] = {}
         for one in inner:
             if one.place.kind == "parameter":
@@ -174,11 +185,14 @@ class EquationLines:
         shared, rates = program_code(self.programs.rates_program, self._variables(states, signals, changed))
         h = "dt" if self.substeps == 1 else f"dt / {self.substeps}"
         lines = [f'h, s, before, began = {h}, np.array(p["start"]), None, 0.0']
-        lines += ["", "def derivatives(t, s, u):", f"    {_unpacked(states)} = s", f"    {_unpacked(signals)} = u"]
+        lines += ["", "def derivatives(t, s, u):", f"    {_unpacked(states)} = s", f"    {_unpacked(given)} = u"]
         lines += [f"    {line}" for line in shared]
         flows = [line for one in inner for line in self._flow(one)]
         moved = [one for one in inner if one.place.kind == "motion"]
         pushes, more = self._forces(moved)
+        if sum(map(len, rates)) > LONG:
+            lines += [f"    rate_{i + 1} = {r}" for i, r in enumerate(rates)]
+            rates = [f"rate_{i + 1}" for i in range(len(rates))]
         if not flows and not pushes:
             lines.append(f"    return np.array([{', '.join(rates)}])")
         else:

@@ -270,7 +270,7 @@ class _Module:
         ]
         substeps = twin.substeps(self.recording.dt, twin.packed(forces))
         lines = EquationLines(twin, _name, substeps, gains)
-        self.writer.run += [f'{_name(s)} = u["{s}"]' for s in twin.signals if s not in twin.inputs]
+        self.writer.run += [f'{_name(s)} = u["{s}"]' for s in lines.see(inner)]
         self.writer.setup += lines.setup(inner)
         self.writer.run += lines.run()
 
