@@ -90,6 +90,11 @@ def clear_errors() -> Iterator[None]:
         raise typer.Exit(Exit.BAD_INPUT) from error
     except HalError as error:
         _fail(error, exit_code_of(error))
+    except MemoryError as error:
+        print_error(
+            f"not enough memory: {error or 'nothing more could be allocated'}; end other programs, or ask for less"
+        )
+        raise typer.Exit(Exit.FAILED) from error
     if is_stopped():
         print_error("stopped by Ctrl-C")
         raise typer.Exit(Exit.INTERRUPTED)

@@ -15,6 +15,7 @@ ONE_BYTE = (
     "`read_back = true` at the amplifier every command is read back within its own transfer (0.21 ms more of the bus), "
     "and each wrong one is known: benches/micron-read-back.toml, below"
 )
+NO_NEED = "a tick allocates nothing"
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 RESUMES_S = 0.7
 """Watched for so long where outputs are expected to hold and to resume: the cause, 20 ms, 200 ms, a new alignment."""
@@ -206,7 +207,14 @@ def host() -> tuple[Fault, ...]:
         Fault("host: stalls for 5 ms", OnHost(5.0), "noticed", ("daq",), effect=0),
         Fault("host: stalls for 50 ms", OnHost(50.0), "resumes", ("guardian",), RESUMES_S, effect=0, why=GUARDED),
         Fault("host: stalls for 500 ms", OnHost(500.0), "resumes", ("daq", "host"), 1.1, effect=0, why=GUARDED),
-        Fault("host: 8 MB of memory left", OutOfMemory(8.0), "harmless", effect=0, why="a tick allocates nothing"),
+        Fault(
+            "host: 8 MB of memory left",
+            OutOfMemory(8.0),
+            "harmless",
+            ("memory",),
+            effect=0,
+            why="a tick allocates nothing",
+        ),
         Fault("host: firmware killed (kill -9)", Kill("firmware"), "safe state", ("firmware died",), 0.3),
         Fault("host: guardian killed (kill -9)", Kill("guardian"), "resumes", ("guardian",), 1.1),
     )

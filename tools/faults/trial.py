@@ -204,7 +204,9 @@ def observe_running(
         pass
     except BaseException as error:
         if me.is_child:
-            me.answer(Refused(str(error)) if isinstance(error, HalError) and phase == SELF_TEST else error)
+            refuses = phase.name == SELF_TEST.name and isinstance(error, (HalError, MemoryError))
+            told = f"not enough memory: {error}" if isinstance(error, MemoryError) else str(error)
+            me.answer(Refused(told) if refuses else error)
         raise
     else:
         if not me.is_child:
