@@ -348,9 +348,8 @@ class Di4108:
         return f"ps {16 << self.settings.packet_code}"
 
     def _eol(self, line: str, rest: str) -> str:
+        """Page 38: it has an effect in ASCII mode only. The vendor's own examples send it before ``encode 1``."""
         code = _integer(rest, 0, 2)
-        if not self.settings.ascii_output:  # page 38: valid only while in ASCII mode
-            return NOT_FOUND
         self.settings.eol = (b"\r", b"\n", b"\r\n")[code]
         return line
 

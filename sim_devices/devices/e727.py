@@ -12,6 +12,8 @@ Model limits
   answered with error 2 as unknown commands. ``TAD?``/``TSP?`` report the measured position.
 - Decided where the manual text was not at hand: an odd number of arguments is error 24, a line of more than 512
   characters error 3, voltage beyond the limits error 302; ``ATZ`` takes 0.5 s; several errors keep the last one.
+- ``HLP?`` and ``HPA?`` list what this device knows, in the vendor's layout; its sensors are absolute, so ``FRF?``
+  reports every axis as referenced. ``TVI?`` names the characters of an axis identifier.
 - Start-up time and axis coupling are not modelled; commands are executed when their last byte has arrived.
 """
 
@@ -21,17 +23,18 @@ import math
 from collections import deque
 from collections.abc import Callable, Sequence
 
+from sim_devices.devices.e727_lists import LIMIT_V, MEANINGS, PARAMETERS, TRAVEL_UM
+
 AXES = ("1", "2", "3")
 OUTPUTS = 4
 BYTE_NS = round(10 * 1e9 / 115_200)
-TRAVEL_UM = (0.0, 15.0)
-LIMIT_V = (0.0, 100.0)
 NOMINAL_UM_PER_V = 0.15
 SERVO_NS = 1_000_000
 SERVO_GAIN = 0.3
 ON_TARGET_UM = 0.05
 AUTOZERO_NS = 500_000_000
 MAX_LINE = 512
+VALID_IDENTIFIERS = "1234567890ABCDEFGHIJKLMNOPQRSTUVWXYZ-_"
 IDENTITY = "(c)2016 Physik Instrumente (PI) GmbH & Co. KG, E-727.3SDA, 0116047977, 13.21.00.02"
 (SYNTAX, UNKNOWN, TOO_LONG, SERVO_OFF, POSITION, VELOCITY, STOPPED) = (1, 2, 3, 5, 7, 8, 10)
 (AXIS, RANGE, AXIS_TWICE, COUNT, NUMBER, PARAMETER, PASSWORD, PROTECTED) = (15, 17, 22, 24, 25, 54, 56, 60)
@@ -67,7 +70,7 @@ class E727:
         self._measure_um = measure_um
         self._error = 0
         self._command_level = 0
-        self._parameters = {(a, p): v for a in AXES for p, v in _PARAMETERS.items()}
+        self._parameters = {(a, p): known[0] for a in AXES for p, known in PARAMETERS.items()}
         self._now_ns = 0
         self._servo_ns = 0
         self._busy_until_ns = 0
@@ -237,6 +240,10 @@ class E727:
             "TPC?": fixed(str(OUTPUTS)),
             "TSC?": fixed("3"),
             "CCL?": lambda args: [str(self._command_level)],
+            "FRF?": per_axis(lambda a: "1"),
+            "TVI?": fixed(VALID_IDENTIFIERS),
+            "HLP?": self._help,
+            "HPA?": self._parameter_help,
             "SPA?": self._read_parameter,
             "VER?": fixed("FW_DSP: 13.21.00.02"),
         }
@@ -324,10 +331,23 @@ class E727:
         return key
 
     def _read_parameter(self, args: list[str]) -> list[str]:
-        if len(args) % 2 or not args:
+        if len(args) % 2:
             raise GcsError(COUNT)
-        keys = [self._parameter_key(a, p) for a, p in zip(args[::2], args[1::2], strict=True)]
+        asked = [self._parameter_key(a, p) for a, p in zip(args[::2], args[1::2], strict=True)]
+        keys = asked or sorted(self._parameters)
         return [f"{a} 0x{number:08X}={self._parameters[a, number]:g}" for a, number in keys]
+
+    def _help(self, args: list[str]) -> list[str]:
+        names = [*("#5", "#7", "#24"), *sorted((*self._queries, *self._setters))]
+        return ["The following commands are valid:", *(f"{n} {MEANINGS[n]}" for n in names), "end of help"]
+
+    def _parameter_help(self, args: list[str]) -> list[str]:
+        """Fields of a line: level for writing, number of items, type, group and name (GCS manual PZ281E, HPA?)."""
+        lines = [
+            f"0x{number:X}=\t{level}\t{len(AXES)}\t{kind}\tAxis\t{name}"
+            for number, (_, level, kind, name) in PARAMETERS.items()
+        ]
+        return ["The following parameters are valid:", *lines, "end of help"]
 
     def _set_parameter(self, args: list[str]) -> None:
         if len(args) != 3:
@@ -336,16 +356,6 @@ class E727:
         if self._command_level < 1:
             raise GcsError(PROTECTED)
         self._parameters[key] = _number(args[2])
-
-
-# analog input as target source, range limits, open-loop voltage limits (as asked for by PI's own client)
-_PARAMETERS = {
-    0x06000500: 0.0,
-    0x07000000: TRAVEL_UM[0],
-    0x07000001: TRAVEL_UM[1],
-    0x0C000000: LIMIT_V[0],
-    0x0C000001: LIMIT_V[1],
-}
 
 
 def _number(text: str) -> float:
