@@ -27,6 +27,8 @@ Pose = tuple[Array, Array, Array, Array]
 TRUTH_STEP_NS = 10_000_000
 IMPACT_S = 4e-3
 LED_S = 0.05
+STACK_M_PER_V = 0.15e-6
+"""Stroke of an ideal stack of 15 um at 100 V, for an amplifier with a position sensor that is emulated alone."""
 _LEVEL = np.eye(3)
 
 
@@ -60,7 +62,9 @@ class Scanner:
         self.now_ns = max(self.now_ns, t_ns)
 
     def set_demand_V(self, channel: int, volts: float, t_ns: int) -> None:
-        """There is no manipulator on this bench."""
+        """There is no manipulator on this bench: an amplifier drives ideal stacks that move nothing."""
+        if channel < 3:
+            self.stack_V[channel] = volts
 
     def sag_supply(self, part: float) -> None:
         """The IMU regulates its own supply."""
@@ -77,7 +81,7 @@ class Scanner:
             "rate_rad_s": motion.rate_rad_s,
             "specific_force_m_s2": motion.specific_force_m_s2,
             "temperature_C": np.array([motion.temperature_C]),
-            "stroke_m": np.zeros(3),
+            "stroke_m": self.stack_V * STACK_M_PER_V,
         }
 
     def truth(self) -> dict[str, NDArray]:

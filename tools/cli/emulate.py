@@ -6,7 +6,6 @@ import os
 import shutil
 import subprocess
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -55,6 +54,7 @@ def emulate(
 
     Example: micron emulate imus -- printenv MICRON_I2C0
     """
+    from tools.emulate.shipped import bench_file
     from tools.emulate.stimulus import read_stimulus
     from tools.emulate.world import serve
 
@@ -64,7 +64,7 @@ def emulate(
         program = None if not command else shutil.which(command[0])
         if command and program is None:
             raise InputError(f"{command[0]}: no such program; name one that is on the PATH, or its path")
-        file = load_bench(bench_path(_bench_file(bench)))
+        file = load_bench(bench_path(None if bench is None else bench_file(bench)))
         columns = [read_stimulus(text) for text in stimulus or ()]
         with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
             write_json(served.as_dict(), json_file)
@@ -80,19 +80,6 @@ def emulate(
                 raise InputError("the emulated world has ended by itself; start it again, and report what its log says")
     if status:
         raise typer.Exit(status if status > 0 else 128 - status)
-
-
-def _bench_file(named: str | None) -> Path | None:
-    """Return the bench file: a path, or one that ships by its name."""
-    if named is None or Path(named).exists():
-        return None if named is None else Path(named)
-    import benches
-
-    shipped = Path(benches.__file__).parent
-    if (shipped / f"{named}.toml").exists():
-        return shipped / f"{named}.toml"
-    names = ", ".join(sorted(path.stem for path in shipped.glob("*.toml") if "[bus." in path.read_text("utf-8")))
-    raise InputError(f"{named}: no such bench file, and none of that name ships; these do: {names}")
 
 
 def _print(served: Served) -> None:

@@ -69,11 +69,13 @@ def test_info_5_keeps_a_description_with_spaces() -> None:
     assert ask(device, b"info 5") == b"info 5 Dev 0\r"
 
 
-def test_eol_is_unknown_in_binary_mode() -> None:
+def test_eol_is_kept_for_ascii_mode_and_has_no_effect_before() -> None:
+    """Page 38. The vendor's own programs send it before ``encode 1`` and then read lines."""
     device, _ = make()
-    assert ask(device, b"eol 1") == b"command not found\r"  # page 38
-    assert ask(device, b"encode 1") == b"encode 1\r"
     assert ask(device, b"eol 1") == b"eol 1\r"
+    assert ask(device, b"eol 3") == b"command not found\r"
+    assert device.settings.eol == b"\n"
+    assert ask(device, b"encode 1") == b"encode 1\r"
 
 
 @pytest.mark.parametrize(

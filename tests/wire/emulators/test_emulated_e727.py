@@ -81,6 +81,30 @@ def test_errors_are_latched_and_cleared_by_reading(commands: bytes, number: int)
     assert line.error() == 0
 
 
+def test_its_lists_name_every_command_and_parameter_that_it_knows() -> None:
+    line = Line()
+
+    def ask(command: bytes) -> bytes:
+        line.send(command)
+        return line.wait(0.3)
+
+    told = ask(b"HLP?\n").decode().splitlines()
+    assert told[0].startswith("The following commands are valid")
+    assert told[-1] == "end of help"
+    names = [text.split()[0] for text in told[1:-1]]
+    for name in names:
+        if name.endswith("?"):
+            assert ask(name.encode() + b"\n")
+            assert line.error() == 0
+    assert {"MOV", "SVO", "WGO"} - set(names) == {"WGO"}
+    parameters = ask(b"HPA?\n").decode().splitlines()[1:-1]
+    every = ask(b"SPA?\n").decode().splitlines()
+    assert len(every) == 3 * len(parameters)
+    assert "1 0x0E000200=5e-05 " in every  # manual p. 108: the servo update time is 50 us
+    assert line.ask(b"WGO 1 1\n") == b""
+    assert line.error() == 2
+
+
 def test_all_axes_move_or_none() -> None:
     line = Line()
     line.send(b"SVO 1 1 2 1\nMOV 1 5 2 16\n")
