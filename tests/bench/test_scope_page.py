@@ -228,6 +228,44 @@ def test_other_ways_to_look_are_drawn_and_labelled(scope: Any, mode: str):
     assert not scope.locator(".plots").is_visible()
 
 
+def test_cursors_in_the_spectrum_name_frequencies_and_amplitudes(scope: Any):
+    use(scope, channels=[TIP[0]], trigger=NO_TRIGGER, rows=5000, mode="fft", top=30)
+    scope.wait_for_function("micron.scope.subscription.buckets.perBucket === 1")
+    scope.locator(".analysis .marks", has_text="Click sets cursor A").wait_for()
+    scope.evaluate("micron.scope.analysed.setCursor([9.5, 0], false); micron.scope.analysed.setCursor([19, 0], false)")
+    said = scope.locator(".analysis .marks").inner_text()
+    assert "A 9.5 Hz" in said
+    assert "Δ 9.5 Hz" in said
+    amplitude_um = float(re.search(r"tip_displacement_x (\S+) µm", said)[1])  # type: ignore[index]
+    samples = column(TIP[0])[-4096:]
+    window = np.hanning(4097)[:-1]
+    expected = np.abs(np.fft.rfft((samples - samples.mean()) * window))[round(9.5 / 1000 * 4096)] * 4 / 4096 * 1e6
+    assert amplitude_um == pytest.approx(expected, rel=0.01)
+    box = scope.locator(".analysis canvas").bounding_box()
+    assert box is not None
+    x = box["x"] + 64 + (box["width"] - 74) / 3
+    scope.mouse.click(x, box["y"] + box["height"] / 2)
+    assert scope.evaluate("micron.scope.analysed.cursors[0][0]") == pytest.approx(10.0, abs=0.1)
+
+
+@pytest.mark.parametrize("mode", ["xy", "spectrogram"])
+def test_cursors_in_the_plane_have_differences_along_both_axes(scope: Any, mode: str):
+    use(scope, channels=TIP, trigger=NO_TRIGGER, mode=mode, top=30)
+    scope.locator(".analysis .marks", has_text="Click sets cursor A").wait_for()
+    points = ([-1.0, 9.5], [-0.5, 20.0]) if mode == "spectrogram" else ([1e-5, -2e-5], [4e-5, 2e-5])
+    scope.evaluate("(p) => p.forEach((c) => micron.scope.analysed.setCursor(c, false))", points)
+    said = scope.locator(".analysis .marks").inner_text()
+    if mode == "xy":
+        assert "Δ 30 µm, 40 µm" in said
+        assert "distance 50 µm" in said
+    else:
+        assert "Δ 0.5 s, 10.5 Hz" in said or "Δ 500 ms, 10.5 Hz" in said
+        levels = re.findall(r"Hz: (\S+) (.?)m", said)
+        assert float(levels[0][0]) > 5, "the tremor is at A"
+    scope.click("button[data-value=fft]")
+    scope.locator(".analysis .marks", has_text="Click sets cursor A").wait_for()
+
+
 def test_settings_come_back_after_a_reload(scope: Any):
     use(scope, channels=["volts_3"], trigger=NO_TRIGGER, traces={"volts_3": {"offset": "1", "filter": "low"}})
     scope.reload()

@@ -382,7 +382,7 @@ export function mount(root, { link, catalogue, bar }) {
   if (unknown.length) triggerBox.warn(`This layout names channels that this bench does not have: ${unknown.slice(0, 4).join(", ")}${unknown.length > 4 ? ` and ${unknown.length - 4} more` : ""}.`);
   draw();
   window.micron.scope = { 
-    get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get over() { return over; }, get cursors() { return cursors; }, trigger, setCursor,
+    get strips() { return strips; }, get traces() { return traces; }, settings, setWindow, changed, get subscription() { return subscription; }, get over() { return over; }, get cursors() { return cursors; }, trigger, setCursor, analysed,
   };
   return () => {
     cancelAnimationFrame(frame);

@@ -31,14 +31,55 @@ export function pieces(values, rateHz, seconds = 0.5, most = 240) {
   return { columns, centres, step, hop };
 }
 
+/** Value of a spectrum at `hz`: the bin that holds it. */
+export const amplitudeAt = ({ values, step }, hz) => values[Math.max(0, Math.min(values.length - 1, Math.round(hz / step)))];
+
 export function analysis(settings, changed) {
+  let cursors = [null, null]; // [x, y] in what the axes show, for the way to look that is on
+  let place = null; // of the picture drawn last: {box, x: [low, high], y: [low, high], titles, say(point)}
   let data = null; // {traces, samples, rateHz, seconds}
   const top = h("select", { "aria-label": "Highest frequency", onchange: () => { settings.top = Number(top.value); changed(); } }, TOPS.map((hz) => h("option", { value: hz, selected: hz === settings.top }, `to ${hz} Hz`)));
   const first = h("select", { "aria-label": "Trace", onchange: () => { settings.first = first.value; changed(); } });
   const second = h("select", { "aria-label": "Trace over it", onchange: () => { settings.second = second.value; changed(); } });
   const picture = canvas(draw, "Analysis of the traces shown");
   const controls = h("div.row");
-  const element = h("section.panel.fig.analysis", {}, controls, h("div.chart", {}, picture));
+  const readout = h("div.row.num.marks", { role: "status" });
+  const element = h("section.panel.fig.analysis", {}, controls, h("div.chart", {}, picture), readout);
+  picture.addEventListener("click", (event) => {
+    if (!place) return;
+    const { box, x, y } = place;
+    const [u, v] = [(event.offsetX - box.left) / (box.right - box.left), (box.bottom - event.offsetY) / (box.bottom - box.top)];
+    if (u < 0 || u > 1 || v < 0 || v > 1) return;
+    setCursor([x[0] + u * (x[1] - x[0]), y[0] + v * (y[1] - y[0])], event.shiftKey);
+  });
+
+  /** The first click sets A, the next one B; with both, a click moves A and one with Shift moves B, as over time. */
+  function setCursor(point, shift) {
+    cursors[shift || (cursors[0] && !cursors[1]) ? 1 : 0] = point;
+    picture.redraw();
+  }
+
+  function drawCursors(g) {
+    if (!place) { readout.replaceChildren(); return; }
+    const { box, x, y, say } = place;
+    cursors.forEach((point, i) => {
+      if (!point) return;
+      const [px, py] = [box.left + ((point[0] - x[0]) / (x[1] - x[0])) * (box.right - box.left), box.bottom - ((point[1] - y[0]) / (y[1] - y[0])) * (box.bottom - box.top)];
+      g.save();
+      g.strokeStyle = g.fillStyle = css(i ? "--c2" : "--accent");
+      g.setLineDash([4, 3]);
+      g.beginPath();
+      if (px >= box.left && px <= box.right) { g.moveTo(px, box.top); g.lineTo(px, box.bottom); }
+      if (settings.mode !== "fft" && py >= box.top && py <= box.bottom) { g.moveTo(box.left, py); g.lineTo(box.right, py); }
+      g.stroke();
+      g.font = `600 11px ${css("--mono")}`;
+      if (px >= box.left && px <= box.right) g.fillText("AB"[i], px + 3, box.top + 11);
+      g.restore();
+    });
+    const words = cursors[0] ? say(...cursors) : ["Click sets cursor A, click again cursor B; then a click moves A, with Shift B"];
+    readout.replaceChildren(...words.map((text) => h("span", { className: cursors[0] ? "" : "faint" }, text)),
+      cursors[0] ? h("button.quiet", { onclick: () => { cursors = [null, null]; picture.redraw(); } }, "clear cursors") : "");
+  }
 
   function choices(names) {
     for (const [select, key, otherwise] of [[first, "first", 0], [second, "second", 1]]) {
@@ -50,6 +91,8 @@ export function analysis(settings, changed) {
   }
 
   function mode() {
+    cursors = [null, null];
+    place = null;
     controls.replaceChildren(...{ xy: [second, h("span.soft", {}, "over"), first], fft: [top], spectrogram: [first, top] }[settings.mode]);
   }
 
@@ -99,6 +142,11 @@ export function analysis(settings, changed) {
       return Array.from({ length: Math.floor((middle + half) / by) - from + 1 }, (_, k) => (from + k) * by)
         .map((v) => [0.5 + (v - middle) / (2 * half), withUnit(v, unit)]);
     };
+    const units = [a, b].map((i) => data.traces[i].unit);
+    const both = (p, name) => `${name} ${withUnit(p[0], units[0], 4)}, ${withUnit(p[1], units[1], 4)}`;
+    place = { box, x: [ranges[0].middle - ranges[0].half, ranges[0].middle + ranges[0].half], y: [ranges[1].middle - ranges[1].half, ranges[1].middle + ranges[1].half],
+      say: (p, q) => (q ? [both(p, "A"), both(q, "B"), both([q[0] - p[0], q[1] - p[1]], "Δ"),
+        ...(units[0] === units[1] ? [`distance ${withUnit(Math.hypot(q[0] - p[0], q[1] - p[1]), units[0], 4)}`] : [])] : [both(p, "A")]) };
     grid(g, box, ticks(ranges[0], data.traces[a].unit), true);
     grid(g, box, ticks(ranges[1], data.traces[b].unit), false);
     g.strokeStyle = css("--accent");
@@ -122,6 +170,12 @@ export function analysis(settings, changed) {
     const peak = Math.max(1e-9, ...lines.map(({ values, step }) => values.reduce((m, v, i) => (i * step > 0.3 && i * step <= most ? Math.max(m, v) : m), 0)));
     const high = Math.ceil(Math.log10(peak) + 0.1);
     const decades = 5;
+    place = { box, x: [0, most], y: [0, 1], say: (p, q) => [`A ${withUnit(p[0], "Hz", 4)}`, ...(q ? [`B ${withUnit(q[0], "Hz", 4)}`, `Δ ${withUnit(q[0] - p[0], "Hz", 4)}`] : []),
+      ...lines.map((line, i) => {
+        const unit = data.traces[i].unit === "m" ? "µm" : data.traces[i].unit;
+        const [va, vb] = [p, q].map((c) => (c ? amplitudeAt(line, c[0]) : NaN));
+        return `${line.name} ${withUnit(va, unit)}${q ? `, ${withUnit(vb, unit)} (× ${Number((vb / va).toPrecision(3))})` : ""}`;
+      })] };
     grid(g, box, frequencies(most), true);
     grid(g, box, Array.from({ length: decades + 1 }, (_, i) => [i / decades, String(Number(`1e${high - decades + i}`))]), false);
     g.save();
@@ -159,6 +213,9 @@ export function analysis(settings, changed) {
     for (const column of columns) for (let k = 1; k < bins; k++) peak = Math.max(peak, column[k]);
     const total = data.samples[i].low.length;
     const [wide, tall] = [box.right - box.left, box.bottom - box.top];
+    const cell = (p) => columns[centres.reduce((best, c, k) => (Math.abs(c - (1 + p[0] / data.seconds) * total) < Math.abs(centres[best] - (1 + p[0] / data.seconds) * total) ? k : best), 0)][Math.min(bins - 1, Math.max(0, Math.round(p[1] / step)))];
+    const point = (p, name) => `${name} ${withUnit(p[0], "s", 4)}, ${withUnit(p[1], "Hz", 4)}: ${withUnit(cell(p), data.traces[i].unit)}`;
+    place = { box, x: [-data.seconds, 0], y: [0, bins * step], say: (p, q) => (q ? [point(p, "A"), point(q, "B"), `Δ ${withUnit(q[0] - p[0], "s", 4)}, ${withUnit(q[1] - p[1], "Hz", 4)}`] : [point(p, "A")]) };
     columns.forEach((column, c) => {
       const x = box.left + (wide * (centres[c] - hop / 2)) / total;
       for (let k = 1; k < bins; k++) {
@@ -181,9 +238,11 @@ export function analysis(settings, changed) {
   }
 
   function draw(g, w, hgt) {
+    place = null;
     if (!data?.traces.length) return;
     ({ xy: drawXY, fft: drawFFT, spectrogram: drawSpectrogram })[settings.mode](g, w, hgt);
+    drawCursors(g);
   }
 
-  return { element, mode, show(now) { data = now; choices(now.traces.map((t) => t.name)); picture.redraw(); } };
+  return { element, mode, setCursor, get cursors() { return cursors; }, show(now) { data = now; choices(now.traces.map((t) => t.name)); picture.redraw(); } };
 }
