@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import json
 import secrets
 import shutil
 import time
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.frame import LAYOUT, STATUS, TIME
@@ -20,7 +22,7 @@ from hal.bench import BenchFile, load_bench
 from hal.errors import BenchError
 from tools.bench.dropped_files import Dropped
 from tools.bench.firmware import Choice, Firmware
-from tools.bench.history import History
+from tools.bench.history import Buckets, History
 from tools.bench.hold_spans import HoldSpans
 from tools.bench.layouts import Layouts
 from tools.bench.recorder import RunRecorder
@@ -95,6 +97,9 @@ class Session:
         self.log_number = 0
         self.missed_rows = 0
         self.frame_ready = asyncio.Event()
+        self._frame_buckets: dict[tuple[bytes, int, int], Buckets] = {}
+        self._state_text = ""
+        self._state_s = -STATUS_S
         self._row = 0
         self._held_by = ""
         self._fresh_s = time.monotonic()
@@ -114,6 +119,8 @@ class Session:
             self.choice, self.bench = choice or self.choice, bench
             self.run, self.history, self._row, self.shadow = Run(), self._new_history(), 0, None
             self.holds = HoldSpans()
+            self._frame_buckets.clear()
+            self._state_s = -STATUS_S
             self.run_number += 1
             run = self.run
             self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
@@ -258,6 +265,20 @@ class Session:
             "log": self.log_number,
         }
 
+    def state_text(self, *, fresh: bool = False) -> str:
+        """Return the status message as JSON without its last brace, made once per ``STATUS_S`` for all viewers."""
+        now_s = time.monotonic()
+        if fresh or now_s - self._state_s >= 0.9 * STATUS_S:
+            self._state_s, self._state_text = now_s, json.dumps(self.state(), separators=(",", ":"))[:-1]
+        return self._state_text
+
+    def live_buckets(self, channels: NDArray[np.intp], k: int, first: int) -> Buckets:
+        """Return what is new of the live data; viewers that ask for the same within one frame share the answer."""
+        key = (channels.tobytes(), k, first)
+        if key not in self._frame_buckets:
+            self._frame_buckets[key] = self.history.buckets(channels, k, first)
+        return self._frame_buckets[key]
+
     def counts(self) -> dict[str, dict[str, list[int]]]:
         """The non-empty buckets of every histogram, for drawing: lower bounds and widths in ns, counts."""
         from firmware_py.scheduler.histogram import bucket_bounds_ns
@@ -283,6 +304,7 @@ class Session:
         while True:
             due_s = max(due_s + FRAME_S, loop.time())
             self._take_rows()
+            self._frame_buckets.clear()
             ready, self.frame_ready = self.frame_ready, asyncio.Event()
             ready.set()
             if due_s >= disk_s:

@@ -102,6 +102,7 @@ class Viewer:
         self._orders_since_s = 0.0
         self._run = -1
         self._log_sent = 0
+        self._is_new = True
         self._replay: Replay | None = None
         self._generation = 0
         self._replay_told: dict[str, Any] | None = None
@@ -347,7 +348,10 @@ class Viewer:
         if first * k >= history.head:
             return
         generation = self._generation
-        buckets = await _read(history, subscription.channels, k, first)
+        if history is self._session.history:
+            buckets = self._session.live_buckets(subscription.channels, k, first)
+        else:
+            buckets = await _read(history, subscription.channels, k, first)
         if generation != self._generation or history is not self._history(subscription.source):
             return  # somebody has jumped meanwhile
         if buckets.t_s.size:
@@ -356,7 +360,9 @@ class Viewer:
 
     async def _send_state(self) -> None:
         session = self._session
-        await self._socket.send_json({**session.state(), "may_order": self._may_order})
+        may_order = "true" if self._may_order else "false"
+        await self._socket.send_text(f'{session.state_text(fresh=self._is_new)},"may_order":{may_order}}}')
+        self._is_new = False
         if session.log_number > self._log_sent:
             lines = [line for line in session.log if line["n"] > self._log_sent]
             self._log_sent = session.log_number
