@@ -114,7 +114,7 @@ def test_views_look_as_they_did(browser: Any, still: Still, frame: str):
         elif widths != json.loads(FONTS.read_text(encoding="utf-8")):
             pytest.skip(f"other fonts than those of the stored pictures: letters are {widths} wide")
         # the folder's name is another one in every run, the rate of frames is a measurement
-        tab.add_style_tag(content=".list h2 small, .rate { visibility: hidden }")
+        tab.add_style_tag(content=".list h2 small, .setup h2 small, .rate { visibility: hidden }")
         wrong: dict[str, str] = {}
         for view in VIEWS:
             png = take(tab, view)

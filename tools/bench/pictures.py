@@ -16,16 +16,22 @@ from tools.bench.started import started
 from tools.terminal import plain_console
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
-SETTLE_MS = {"scope": 9000, "tremor": 8000}
+SETTLE_MS = {"scope": 3000, "tremor": 3000}
+STEADY_S = 9.0
+"""Time of the run at the first picture: the start-up has left every window by then."""
 
 
-def take(page: Any, base: str, folder: Path, views: tuple[str, ...]) -> None:
+def take(page: Any, folder: Path, views: tuple[str, ...]) -> None:
     """One picture per view."""
     page.wait_for_function("micron.link.state.status.state === 'running'", timeout=240_000)
+    page.wait_for_function(f"micron.link.state.status.t_s > {STEADY_S}", timeout=240_000)
+    # folders are those of the machine that takes the pictures
+    page.add_style_tag(content=".list h2 small, .setup h2 small { visibility: hidden }")
     for view in views:
-        page.goto(f"{base}/#/{view}")
+        page.evaluate(f"location.hash = '/{view}'")
         page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
         page.wait_for_timeout(SETTLE_MS.get(view, 3000))
+        page.wait_for_function("!document.querySelector('#alerts .error')", timeout=60_000)
         page.screenshot(path=folder / f"{view}.png", timeout=90_000)
 
 
@@ -59,7 +65,8 @@ def main(arguments: list[str]) -> int:
         with started("--recordings", recordings) as (_, address):
             page.goto(address)
             page.wait_for_function("window.micron && micron.link.state && micron.link.state.status")
-            take(page, address.partition("/#")[0], folder, VIEWS)
+            take(page, folder, VIEWS)
+            page.evaluate("location.hash = '/scope'")
             page.keyboard.press("t")
             page.wait_for_timeout(1000)
             page.screenshot(path=folder / "dark.png", timeout=90_000)
