@@ -8,7 +8,7 @@ import pytest
 
 from tests.contract.emulated_client import need_client, run_client
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
 CONTROL = """
 import json, os, socket, time

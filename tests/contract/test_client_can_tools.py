@@ -9,7 +9,7 @@ import pytest
 from drivers import dbc
 from tests.contract.emulated_client import run_client
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
 # the screen programs run in a pty of their own, and are left with the key that their help names
 PROGRAM = """

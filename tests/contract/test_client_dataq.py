@@ -9,7 +9,7 @@ import pytest
 
 from tests.contract.emulated_client import run_client
 
-pytestmark = pytest.mark.realtime
+pytestmark = [pytest.mark.realtime, pytest.mark.slow]
 
 PROGRAM = """
 import json, os, time
