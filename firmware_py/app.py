@@ -237,7 +237,7 @@ def make_outcome(
             "method": loop.stages.configs.sensing.kinematics_method,
             "fallbacks": loop.stages.sensing.fallbacks,
         },
-        "host": describe_host(opened, loop.host_gaps),
+        "host": describe_host(opened, loop.scans.host_gaps),
         "realtime": describe_scheduling(report, opened.virtual),
         "recording": str(recording.path) if recording is not None else None,
         "recorder": {

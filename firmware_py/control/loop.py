@@ -14,14 +14,14 @@ import numpy as np
 
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.field_input import FieldInput
-from firmware_py.control.findings import Finding, finding_of_button, finding_of_output, finding_of_scans
-from firmware_py.control.host_gaps import HostGaps
+from firmware_py.control.findings import Finding, finding_of_button, finding_of_output
 from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
 from firmware_py.control.plausibility import ScanCheck, turns_of_pairs
 from firmware_py.control.redundancy import Redundancy
 from firmware_py.control.safety import State, Supervisor
+from firmware_py.control.scan_input import ScanInput
 from firmware_py.control.stages import Stages
 from firmware_py.control.status import LoopStatus
 from firmware_py.control.tasks import Works, task_table
@@ -43,9 +43,7 @@ from firmware_py.scheduler.task import BackgroundSpec, TickInfo
 from firmware_py.scheduler.ticker import ScanTicker, Ticks
 from hal.contracts import Clock
 from hal.errors import HalError
-from hal.types import ScanBlock, Status, TimeSource
 
-MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 SETTLE_TICKS = 5  # covers the amplifier's own lag after the last step of the ramp
 LONGEST_PAUSE_NS = 10_000_000
 """Longest pause between two attempts at a ramp step over a failing bus. The pauses double up to this value."""
@@ -73,7 +71,6 @@ class InstrumentLoop:
     ) -> None:
         self._live = live
         self._sense_only = sense_only
-        self._others_stalled_ms = others_stalled_ms
         self._devices = devices
         self.stages = stages
         self._frame = stages.frame
@@ -82,12 +79,9 @@ class InstrumentLoop:
         self._period_ns = 1_000_000_000 // tick_hz
         self._recorder = recorder
         self._on_status = on_status
-        self._rows = np.zeros((MAX_BLOCK, len(devices.scan.channels)), dtype=np.int16)
-        self._block: ScanBlock | None = None
         self._ticks: Ticks | None = None
         self._started_ns = 0
         self._disturbed_ns = 0
-        self._last_scan_ns = 0
         self._warned = 0
         self._interrupted = ""
         self._interrupts = 0
@@ -96,9 +90,10 @@ class InstrumentLoop:
         self.supervisor = Supervisor(devices.amplifier)
         self.incidents = Incidents(self.supervisor, self.counts, clock, recorder, config.safety)
         self.holds = self.incidents.holds
-        self.host_gaps = HostGaps(config.safety.stale_ms)
-        self._scan_failed = False
-        self._was_silent = False
+        self.scans = ScanInput(
+            devices, config.safety, clock, self._period_ns, self.counts, self.supervisor, self.incidents,
+            others_stalled_ms,
+        )  # fmt: skip
         self._rearm_signalled = False
         self.armed_ns: int | None = None
         self.safe_reached_ns: int | None = None
@@ -177,7 +172,7 @@ class InstrumentLoop:
             self._ramp_without_scans()
             self._tell_end()
             self._stop()
-            self._count_unread()
+            self.scans.count_unread()
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
@@ -201,17 +196,12 @@ class InstrumentLoop:
         else:
             self.supervisor.begin_self_test()
         self._started_ns = self._clock.now_ns()
-        self._begin_scan()
-
-    def _begin_scan(self) -> None:
-        """Start the scan; what the device takes from here on is read, lost or unread."""
-        self._devices.daq.start()
-        self._last_scan_ns = self._clock.now_ns()
+        self.scans.start()
 
     def _run_ticks(self, seconds: float) -> None:
         limits = self._config.safety
         ticker = ScanTicker(
-            self._read,
+            self.scans.read,
             self._clock,
             self._period_ns,
             silent_after_ns=round(limits.stale_ms * 1e6),
@@ -223,7 +213,7 @@ class InstrumentLoop:
             self._ticks = ticks
             self.incidents.tick = ticks.k0
             newest_ns = ticks.due_ns + (ticks.n - 1) * ticks.dt_ns
-            self._look_at(ticks)
+            self.scans.look_at(ticks)
             if self._interrupted:
                 self.incidents.report(Finding.STOPPED, signal=self._interrupted)
             elif end_ns is not None and newest_ns >= end_ns and self._may_finish():
@@ -231,7 +221,7 @@ class InstrumentLoop:
             elif end_ns is None and self._sense_only:
                 end_ns = newest_ns + round(seconds * 1e9)
             self.scheduler.run(ticks)
-            self.host_gaps.look(awake_ns + self._period_ns, self._clock.now_ns())
+            self.scans.host_gaps.look(awake_ns + self._period_ns, self._clock.now_ns())
             if self.supervisor.state is State.SELF_TEST and self._self_test_passed():
                 self._arm()
                 if self.armed_ns is not None:
@@ -247,41 +237,15 @@ class InstrumentLoop:
         except HalError:
             if self.supervisor.trip_cause is not None:
                 raise
-        self._block = ScanBlock(0, self._clock.now_ns(), self._period_ns, 0, TimeSource.HOST)
+        self.scans.take_none(self._clock.now_ns())
         return ticker.tick_without_scan()
 
-    def _look_at(self, ticks: Ticks) -> None:
-        """Report what the arrival of ``ticks`` reveals about the link and this host."""
-        limits, name = self._config.safety, self._devices.daq.name
-        if ticks.n > 1:
-            self.incidents.notice("scans came late")
-            if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
-                self.incidents.report(Finding.HOST_LATE, scans=ticks.n, device=name)
-            elif self.supervisor.is_holding and ticks.n * ticks.dt_ns > limits.stale_ms * 1e6:
-                self.holds.interrupt(self._clock.now_ns(), "scans that come in time")
-        if ticks.source is not TimeSource.HOST:
-            # bytes may have been lost: only a scan that is started anew is known to be whole, and when it was taken
-            self._scan_failed = self._was_silent
-            self._was_silent = False
-        elif not self._scan_failed:
-            self._was_silent = True
-            if stall_ms := self._host_stalled_ms():
-                self.incidents.report(Finding.HOST_OVERSLEPT, stall_ms=stall_ms, device=name)
-            else:
-                self.incidents.report(Finding.SCANS_MISSING, device=name, limit_ms=limits.stale_ms)
-
-    def _host_stalled_ms(self) -> float:
-        """Return how long (ms) this loop or another process of this host has just stood still, 0 if neither has."""
-        now_ns, within_ms = self._clock.now_ns(), 2.0 * self._config.safety.stale_ms
-        others_ms = self._others_stalled_ms(now_ns, within_ms) if self._others_stalled_ms is not None else 0.0
-        return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
-
     def _self_test_passed(self) -> bool:
-        if self._scan_failed:
-            self._restart_scan()
+        if self.scans.failed:
+            self.scans.restart()
         now_ns = self._clock.now_ns()
         self._watch.restore_guardian(now_ns)
-        if self._host_stalled_ms():
+        if self.scans.host_stalled_ms():
             self._disturbed_ns = now_ns
         since_start_ms = (now_ns - self._started_ns) * 1e-6
         watched_ms = min(since_start_ms, self.holds.good_ms(now_ns))
@@ -307,8 +271,8 @@ class InstrumentLoop:
         if self.supervisor.state is not State.HOLD:
             self.holds.interrupt(now_ns, self.holds.waits_for)
             return
-        if self._scan_failed:
-            self._restart_scan()
+        if self.scans.failed:
+            self.scans.restart()
         if waiting := self._watch.waiting_for():
             self.holds.interrupt(now_ns, ", ".join(waiting))
         self._watch.restore_guardian(now_ns)
@@ -328,57 +292,6 @@ class InstrumentLoop:
             self.incidents.report_error(finding_of_output(error), self._devices.amplifier.name, error)
         else:
             self.incidents.end_hold()
-
-    def _restart_scan(self) -> None:
-        """Begin a new scan after one that failed, with outputs at neutral, because the driver may take a while for it.
-        Scans that the device has taken meanwhile are lost."""
-        daq = self._devices.daq
-        last_ns = self._last_scan_ns
-        try:
-            daq.stop()
-            self._begin_scan()
-        except HalError as error:
-            self.incidents.report_error(finding_of_scans(error, 0.0), daq.name, error, stall_ms=0.0)
-            return
-        self._scan_failed = False
-        self.holds.interrupt(self._clock.now_ns(), f"scans of {daq.name}")
-        lost = max(0, (self._last_scan_ns - last_ns) // self._period_ns)
-        self.counts.lost += lost
-        self.counts.expected += lost
-
-    def _read(self, timeout_s: float) -> ScanBlock:
-        began_ns = self._clock.now_ns()
-        due_ns = began_ns + round(timeout_s * 1e9)
-        if self._scan_failed:
-            self._clock.sleep_until_ns(due_ns)
-            self._block = ScanBlock(0, due_ns, self._period_ns, 0, TimeSource.HOST)
-            return self._block
-        try:
-            block = self._devices.daq.read_scans(self._rows, timeout_s)
-        except HalError as error:
-            self.host_gaps.look(due_ns, self._clock.now_ns())
-            stall_ms = self._host_stalled_ms()
-            finding = finding_of_scans(error, stall_ms)
-            self.incidents.report_error(finding, self._devices.daq.name, error, stall_ms=stall_ms)
-            self._scan_failed = True
-            raise
-        self.host_gaps.look(due_ns, self._clock.now_ns())
-        self._block = block
-        if block.n:
-            self._last_scan_ns = block.t0_ns + (block.n - 1) * block.dt_ns
-            if block.status & Status.SHIFTED:
-                self.incidents.notice(f"scans of {self._devices.daq.name} come at another time than their clock says")
-        self.counts.received += block.n
-        if block.lost:
-            self.incidents.notice("scans were lost")
-            self.counts.lost += block.lost
-        self.counts.expected += block.n + block.lost
-        return block
-
-    def _count_unread(self) -> None:
-        """Count the scans that the device has had time for since the last one that was read."""
-        if self._last_scan_ns:  # the scan was started
-            self.counts.unread = max(0, (self._clock.now_ns() - self._last_scan_ns) // self._period_ns)
 
     def _ramp_without_scans(self) -> None:
         """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
@@ -420,8 +333,7 @@ class InstrumentLoop:
     # -- tasks --------------------------------------------------------------------------------------------
 
     def _sense(self, info: TickInfo) -> None:
-        frame, block, ticks = self._frame, self._block, self._ticks
-        assert block is not None
+        frame, block, ticks = self._frame, self.scans.block, self._ticks
         assert ticks is not None
         self.incidents.tick = info.k
         frame[TIME] = (info.due_ns - self._started_ns) * 1e-9
@@ -431,8 +343,8 @@ class InstrumentLoop:
         row = info.k - ticks.k0
         frame[TICK] = info.k
         frame[STATUS] = FrameStatus.GAP if block.lost and row == 0 else 0
-        scan = self._rows[row]
-        frame[COUNTS : COUNTS + self._rows.shape[1]] = scan
+        scan = self.scans.rows[row]
+        frame[COUNTS : COUNTS + len(scan)] = scan
         impossible = self._check.scan(scan, info.k)
         if impossible and (impossible := self._redundancy.impossible(self._check.channel, impossible)):
             self.incidents.doubt(Finding.INPUT_IMPOSSIBLE, what=impossible)
