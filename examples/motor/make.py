@@ -1,4 +1,4 @@
-"""Writes the recordings of the motor: ``python make.py FOLDER``."""
+"""Writes the recordings of the motor: ``python make.py FOLDER [VARIANT ...]``."""
 
 from __future__ import annotations
 
@@ -73,8 +73,8 @@ time_constant_s = {TIME_CONSTANT_S}
 }
 
 
-def main(folder: Path) -> None:
-    for variant in VARIANTS:
+def main(folder: Path, variants: list[str]) -> None:
+    for variant in variants or VARIANTS:
         here = folder / variant
         here.mkdir(parents=True, exist_ok=True)
         columns = record(variant)
@@ -91,4 +91,4 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]))
+    main(Path(sys.argv[1]), sys.argv[2:])

@@ -40,6 +40,13 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def friction(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("friction")
+    subprocess.run([sys.executable, "make.py", str(folder), "friction"], cwd=EXAMPLE, check=True, timeout=300)
+    return folder / "friction"
+
+
 def sure(report: Report) -> set[str]:
     """The names that are more than half sure."""
     return {p.name for p in report.physics if p.confidence > 0.5}
@@ -67,10 +74,25 @@ def test_columns_name_what_is_behind_the_motor_and_advise_for_the_rest(recording
         assert sure(report) == TRUTH[variant]
 
 
+def test_friction_at_the_speed_explains_all_but_the_noise(friction: Path) -> None:
+    """The generator takes sixty steps to a sample and another rule at rest."""
+    problem, _, base = prepared(load(friction / "ode.toml"), 0.3, 0, False)
+    with np.errstate(all="ignore"):
+        ground = bend(problem, base)
+        seen = [one_step(problem, base, p, ground) for p in places(problem, (EFFECTS["coulomb_friction"],), ())]
+        plain = next(c for c in seen if not c.placed.parts.nonlinear)
+        model, _ = extended(problem, base, plain.placed)
+        fitted = fit(problem, model, plain.starts, iterations=20, tolerance=1e-4)
+    assert misfits(problem, base)["angle"] > 1000.0
+    assert misfits(problem, fitted)["angle"] < 1.5
+    level = fitted.model.human(fitted.theta)[plain.placed.label][0]
+    assert level.value == pytest.approx(0.35, rel=0.01)
+
+
 @pytest.mark.slow
-def test_equations_let_friction_be_tried_where_it_is(recordings: Path) -> None:
+def test_equations_let_friction_be_tried_where_it_is(friction: Path) -> None:
     """Of what may stand for friction, friction at the speed leaves least by far, and its size is right."""
-    problem, _, base = prepared(load(recordings / "friction" / "ode.toml"), 0.3, 0, False)
+    problem, _, base = prepared(load(friction / "ode.toml"), 0.3, 0, False)
     assert not_tried(problem.twin) == ""
     left: dict[tuple[str, str], float] = {}
     level: list[Human] = []

@@ -214,8 +214,10 @@ class OdeTwin(Head):
 
     def substeps(self, dt: float, inside: Inside) -> int:
         """Steps per sample: four to a radian of the fastest mode, two to one of the stiffest memory (a power of two, so
-        that it seldom changes while a fit moves), two at least where dry friction may stick, six to a period of
-        cogging.
+        that it seldom changes while a fit moves), six to a period of cogging.
+
+        Where dry friction may stick: two at least, and up to eight for 32 to a radian, because a step in which the
+        velocity crosses zero is of second order only.
         """
         sub = int(np.ceil(dt * self.fastest_per_s / 0.25))
         for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
@@ -224,7 +226,7 @@ class OdeTwin(Head):
             if stiff > sub:
                 sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
             if np.any(rows.friction[:3] != 0.0):
-                sub = max(sub, 2)
+                sub = max(sub, 2, min(8, int(np.ceil(32 * dt * self.fastest_per_s))))
             if rows.cogging[0] > 0.0 and position != velocity:
                 sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
         return int(np.clip(sub, 1, MOST_SUBSTEPS))
