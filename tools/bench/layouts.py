@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from starlette.requests import Request
 from starlette.routing import BaseRoute, Route
@@ -13,9 +13,6 @@ from tools.bench.recorder import is_own_file
 from tools.bench.requests import body, clear, text
 from tools.errors import InputError
 from tools.output import write_text_atomic
-
-if TYPE_CHECKING:
-    from tools.bench.session import Session
 
 SUFFIX = ".layout.json"
 KIND = "micron bench layout"
@@ -95,19 +92,19 @@ class Layouts:
         self.path(name).unlink()
 
 
-def layout_routes(session: Session) -> list[BaseRoute]:
+def layout_routes(layouts: Layouts) -> list[BaseRoute]:
     async def names(_: Request) -> Any:
-        return {"layouts": session.layouts.list(), "folder": str(session.layouts.folder)}
+        return {"layouts": layouts.list(), "folder": str(layouts.folder)}
 
     async def read(request: Request) -> Any:
-        return session.layouts.read(request.path_params["name"])
+        return layouts.read(request.path_params["name"])
 
     async def save(request: Request) -> Any:
         table = await body(request)
-        return {"name": session.layouts.save(text(table, "name", longest=200), table.get("layout"))}
+        return {"name": layouts.save(text(table, "name", longest=200), table.get("layout"))}
 
     async def delete(request: Request) -> Any:
-        session.layouts.delete(request.path_params["name"])
+        layouts.delete(request.path_params["name"])
 
     return [
         Route("/api/layouts", clear(names)),

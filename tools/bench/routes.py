@@ -34,7 +34,7 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     return [
         *_attitude(session, applied),
         *_targets(session),
-        *layout_routes(session),
+        *layout_routes(session.layouts),
         *collect_routes(session, jobs),
         *dropped_routes(session, session.dropped),
         *mismatch_routes(session, jobs, applied),
