@@ -15,7 +15,7 @@ from tests.bench.conftest import go
 from tests.bench.still import Still, still_server
 from tests.conftest import copy_of_default_bench
 from tools.bench.setup_file import PLACES, bench_text, checked, read_draft
-from tools.cli.doctor import bench_findings
+from tools.diagnose.findings import bench_findings
 from tools.errors import InputError
 
 pytestmark = pytest.mark.timeout(400)

@@ -13,7 +13,7 @@ from hal.bench import load_bench
 from hal.errors import HalError
 from tools.bench.recorder import check_name
 from tools.bench.requests import text
-from tools.cli.doctor import bench_findings
+from tools.diagnose.findings import bench_findings
 from tools.errors import InputError
 
 AXES = ("1x", "1z", "2y", "2z", "3x", "3y")
