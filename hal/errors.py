@@ -55,6 +55,13 @@ class HalError(Exception):
         self.lost = lost
 
 
+def name_device(error: HalError, name: str) -> HalError:
+    """Put the bench's ``name`` of a device in front of the message, for a port that knows only its path. In place."""
+    if not str(error).startswith(name):
+        error.args = (f"{name}: {error}",)
+    return error
+
+
 class BenchError(HalError):
     """The bench description or a configuration is wrong (exit status 2)."""
 

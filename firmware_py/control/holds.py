@@ -116,6 +116,7 @@ class Holds:
                 "finding": hold.finding.name.lower(),
                 "t_ns": hold.t_ns,
                 "resumed": hold.resumed,
+                "neutral_ms": None if hold.neutral_ns is None else (hold.neutral_ns - hold.t_ns) * 1e-6,
             }
             for hold in self._supervisor.holds
         ]

@@ -405,6 +405,8 @@ class InstrumentLoop:
         if self.supervisor.step(may_retry=self._may_retry()) and self.safe_reached_ns is None:
             self.safe_reached_ns = self._clock.now_ns()
         trip = self.supervisor.trip_cause
+        if self.supervisor.state is State.HOLD and self.supervisor.holds[-1].neutral_ns is None:
+            self.supervisor.holds[-1].neutral_ns = self._clock.now_ns()
         if was_holding and trip is not None:
             self.incidents.note({"event": "safe state", "reason": trip.reason})
 

@@ -111,7 +111,7 @@ class Trip:
 @dataclass
 class Hold:
     """Records one hold. ``t_ns``: time of the decision, bench clock; ``end_ns``: time at which the outputs were free
-    again or the run was ended, ``None`` while the hold lasts."""
+    again or the run was ended, ``None`` while the hold lasts. ``neutral_ns``: time at which neutral was reached."""
 
     finding: Finding
     reason: str
@@ -120,6 +120,7 @@ class Hold:
     cause: CauseClass
     end_ns: int | None = None
     resumed: bool = False
+    neutral_ns: int | None = None
 
 
 class Supervisor:

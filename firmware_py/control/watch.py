@@ -98,9 +98,11 @@ class Watch:
 
     def verify_output(self, info: TickInfo) -> None:
         """Run the read-back task (100 Hz, 300 Hz without a monitor): the amplifier must hold the value it was sent. A
-        DAC that restarted or received a wrong value does not."""
+        DAC that restarted or received a wrong value does not, nor one that rests beside neutral in a hold."""
         assert self._devices.verify_output is not None
-        if not self._supervisor.may_move:
+        care = self._devices.guardian
+        rests = self._supervisor.state is State.HOLD and not (care is not None and care.heart.taken_ns)
+        if not (self._supervisor.may_move or rests):
             return
         name = self._devices.amplifier.name
         try:

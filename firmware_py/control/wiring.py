@@ -38,7 +38,7 @@ from drivers.specs import (
 from firmware_py.guardian.care import GuardianCare
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
-from hal.errors import BenchError, HalError, OpenFailed
+from hal.errors import BenchError, HalError, OpenFailed, name_device
 from hal.middleware.share import SharedCan
 from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
@@ -146,8 +146,11 @@ def open_devices(bench: OpenBench) -> Devices:
     sensing = sensing_table(options, scan.channels, scan.rate_hz, scan.lsb_V[0], where)
     if magnetometer is not None:
         # set and reset pulses reveal the bridge's present offset; the DAQ takes no commands while it scans
-        for _ in magnetometer.measure_offset():
-            wait_s(bench.clock, 0.001)
+        try:
+            for _ in magnetometer.measure_offset():
+                wait_s(bench.clock, 0.001)
+        except HalError as error:
+            raise name_device(error, magnetometer.name) from error.__cause__
         sensing["magnetometer_bias_V"] = magnetometer.offset_V.tolist()
     labels = tuple(f"{device}.{axis} (DAQ input {options[device].channels[axis]})" for device, axis in _axes(options))
     labels += tuple(

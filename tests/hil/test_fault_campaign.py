@@ -116,3 +116,25 @@ def test_a_firmware_that_has_no_memory_left_to_start_with_refuses(tmp_path: Path
     (o,) = observe_running(bench, "typical", [fault], 80439933, phase)
     assert (o.answer, o.message[:18]) == ("refused", "not enough memory:")
     assert FaultRow(fault, "typical", (o,)).is_good
+
+
+def test_a_hold_whose_ramp_was_held_up_says_when_neutral_was_reached(tmp_path: Path):
+    """The host stands still within the ramp of a hold."""
+    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
+    killed, stall = (
+        next(f for f in faults() if f.name == f"host: {name}")
+        for name in ("guardian killed (kill -9)", "stalls for 50 ms")
+    )
+    (o,) = observe_running(bench, "typical", [join(killed, stall, 0.012)], 1)
+    assert o.neutral_ms is not None
+    assert o.neutral_ms > 21.0
+    assert not o.false_neutral
+
+
+def test_outputs_that_rest_beside_neutral_in_a_hold_are_seen(tmp_path: Path):
+    bench = write_bench(DEFAULT_BENCH, POINTS[0], tmp_path)
+    killed = next(f for f in faults() if f.name == "host: guardian killed (kill -9)")
+    wrong = next(f for f in faults() if f.name == "output bus: a bit wrong in every transfer")
+    (o,) = observe_running(bench, "steady", [join(killed, wrong, 0.012)], 35582166)
+    assert o.answer == "safe state"
+    assert not o.false_neutral

@@ -111,7 +111,7 @@ def sensors() -> tuple[Fault, ...]:
         ),
         plain("temperature wire broken", "sensor_open", "7", "safe state", ("temperature",)),
         plain("supply wire broken", "sensor_open", "6", "safe state", ("supply",)),
-        plain("supply reading stuck", "sensor_stuck", "6", "harmless", why="the supply moves slowly"),
+        plain("supply reading stuck", "sensor_stuck", "6", "harmless", ("supply",), why="the supply moves slowly"),
         Fault("sensor: stuck at start", InWorld("sensor_stuck", "1"), "refused", ("acc", "DAQ input"), at_start=True),
         Fault("sensor: wire broken at start", InWorld("sensor_open", "1"), "refused", ("acc", "DAQ"), at_start=True),
         Fault("sensor: exchanged at start", InWorld("sensor_swap", "2"), "refused", ("acc", "DAQ"), at_start=True),

@@ -38,8 +38,8 @@ class Observation:
     ``held_ms``: the first hold began, 0 if the outputs held already and went on to; ``resumed``: the last one ended and
     the outputs moved again.
     ``rough``: demands at the amplifier beyond its range, faster than the slew limit, or anything but the ramp and
-    neutral in a hold. ``false_neutral``: a channel was not neutral 21 ms after the decision although the report says
-    that it is. ``uncounted``: scans of the device that the firmware cannot account for.
+    neutral in a hold. ``false_neutral``: a channel was not neutral 21 ms after the decision, or later when the
+    report says that it was. ``uncounted``: scans of the device that the firmware cannot account for.
     ``lost``: scans that the firmware reports as lost.
     ``phase``: of the run, when the fault struck (``phases.py``).
     ``happened``: the fault did something; one that strikes at random may not have, while it was watched.
@@ -136,6 +136,7 @@ def judge(
     moved = np.flatnonzero(before & (away_m > MOVED_M))
     first_end_ns = decided_ns + round(holds[0]["length_s"] * 1e9) if holds and holds[0]["resumed"] else None
     neutral = neutral_ms(seen.demands, decided_ns, first_end_ns) if confirmed else None
+    told_ms = (holds[0].get("neutral_ms") if holds else safe.get("late_ms")) or 0.0
     samples = outcome["samples"]
     counted = samples["received"] + samples["lost"] + samples["unread"] + 1  # and the one under way
     return Observation(
@@ -151,7 +152,7 @@ def judge(
         confirmed=confirmed,
         rough=rough_demands(seen.demands)
         + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in all_holds),
-        false_neutral=confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + (safe.get("late_ms") or 0.0))),
+        false_neutral=confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + told_ms)),
         uncounted=max(0, seen.scans - counted),
         astray_um=1e6 * float(away_m[before].max(initial=0.0)) if phase.works else 0.0,
         moved_ms=float(t_ns[moved[0]] - seen.strike_ns) * 1e-6 if moved.size and phase.works else None,

@@ -28,6 +28,7 @@ from tools.faults.fault import Both, Fault, How, InWorld, Kill, OnBus, OnHost, O
 from tools.faults.judge import Observation, Seen, judge
 from tools.faults.phases import SELF_TEST, START, STEADY, Phase, Stop
 
+BEFORE_GUARDIAN = "the firmware died before it had a guardian; its outputs had not been driven"
 Sabotaged = FaultSerial | FaultI2c | FaultCan
 
 
@@ -113,7 +114,7 @@ class FarBench:
         outcome: dict[str, Any] = {
             "armed_ns": 0,
             "safe_ns": report.get("taken_ns") or self.clock.now_ns(),
-            "safe_state": {"reason": describe(report) if report else "no guardian", "reached": reached},
+            "safe_state": {"reason": describe(report) if report else BEFORE_GUARDIAN, "reached": reached},
             "noticed": {},
             "samples": {"received": self.scans(), "lost": 0, "unread": 0},
         }

@@ -185,7 +185,7 @@ def test_the_list_of_holds_counts_from_the_start_of_the_run():
     first, second = stand.holds.as_list(500 * MS, now_ns)
     assert first == {
         "t_s": 0.5, "cause": "daq: no new scan for 5 ms; check its link", "class": "link", "length_s": 0.2,
-        "finding": "scans_missing", "t_ns": 1000 * MS, "resumed": True,
+        "finding": "scans_missing", "t_ns": 1000 * MS, "resumed": True, "neutral_ms": None,
     }  # fmt: skip
     assert not second["resumed"]
     assert second["t_s"] == pytest.approx(0.7)
