@@ -2,6 +2,9 @@
 
 Source: PI E-727 manual E727T0005 (28 June 2019), parameter tables from p. 185 and p. 108; layout of the lists: GCS
 commands manual PZ281E as collected from PI's client.
+
+Model limits
+- The parameters are those that our drivers and PI's client ask for, not all of the manual; values are not saved.
 """
 
 from __future__ import annotations

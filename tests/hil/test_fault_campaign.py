@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -106,16 +105,6 @@ def test_both_faults_of_a_pair_on_one_bus_act(tmp_path: Path):
     (o,) = observe_running(bench, "typical", [join(wrong, late, 0.001)], 1)
     assert o.answer == "safe state"
     assert "commands were late" in o.noticed
-
-
-def test_a_firmware_that_has_no_memory_left_to_start_with_refuses(tmp_path: Path):
-    """The strike of this seed comes before the estimator is designed."""
-    bench = write_bench(DEFAULT_BENCH, POINTS[1], tmp_path)
-    fault = next(f for f in faults() if f.name == "host: 8 MB of memory left")
-    phase = replace(SELF_TEST, from_s=0.0005, to_s=0.001)
-    (o,) = observe_running(bench, "typical", [fault], 80439933, phase)
-    assert (o.answer, o.message[:18]) == ("refused", "not enough memory:")
-    assert FaultRow(fault, "typical", (o,)).is_good
 
 
 def test_a_hold_whose_ramp_was_held_up_says_when_neutral_was_reached(tmp_path: Path):

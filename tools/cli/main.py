@@ -60,7 +60,7 @@ COMMANDS = {
     ),
     "export": (
         "recordings:export",
-        "Write a recording as csv, npz, parquet, or the recording folder that the mismatch engine reads.",
+        "Write a recording, or a span of it, as mcap, csv, npz, parquet, or the folder that the mismatch engine reads.",
     ),
     "scan": (
         "diagnose:scan",

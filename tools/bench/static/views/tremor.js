@@ -31,7 +31,7 @@ export function mount(root, { link }) {
   const table = h("table");
   const rows = [];
   const bandCells = BANDS.map(() => [h("td.num"), h("td.num"), h("td.num")]);
-  const bandTable = h("table.bands", {}, h("tr", {}, h("th", {}, "Hz"), ["without", "with", "change"].map((t) => h("th.num", {}, t))),
+  const bandTable = h("table.bands", {}, h("tr", {}, h("th", {}, figure("band", "Hz")), ["without", "with", "change"].map((t) => h("th.num", {}, figure(t)))),
     BANDS.map(([low, high], i) => h("tr", {}, h("td.num", { style: "text-align:left" }, `${low}–${high}`), bandCells[i])));
   const amplitude = new Strip(AXES.map((a) => ({ label: `amplitude ${a}`, unit: "µm" })), { noTimeAxis: true, least: 5, yTitle: "µm" });
   const frequency = new Strip(AXES.map((a) => ({ label: `frequency ${a}`, unit: "Hz" })), { least: 2, xTitle: "time, s", yTitle: "Hz" });
