@@ -6,6 +6,7 @@ after the sources that they come from, says that it has been done.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import selectors
 import subprocess
@@ -38,10 +39,11 @@ def prepare(bench: BenchFile, method: str | None, console: Console) -> None:
         bar = progress.add_task("compile", total=sum(EXPECTED.values()))
         done = 0
         for wave in WAVES:
-            children = [_start(part, bench.path, method) for part in wave]
-            for _ in _lines([child.stdout for child in children if child.stdout is not None]):
-                progress.advance(bar)
-            if any(child.wait() for child in children):
+            with contextlib.ExitStack() as running:  # waits for each and closes its pipe
+                children = [running.enter_context(_start(part, bench.path, method)) for part in wave]
+                for _ in _lines([child.stdout for child in children if child.stdout is not None]):
+                    progress.advance(bar)
+            if any(child.returncode for child in children):
                 return
             done += sum(EXPECTED[part] for part in wave)
             progress.update(bar, completed=done)

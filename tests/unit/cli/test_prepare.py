@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import io
+import sys
 from pathlib import Path
 
 import pytest
@@ -16,30 +18,20 @@ from tools import prepare as module
 from tools.prepare import WAVES, compile_part, prepare
 
 
-class Child:
-    """A child that compiles nothing and ends with ``code``."""
-
-    def __init__(self, code: int) -> None:
-        self.stdout = None
-        self._code = code
-
-    def wait(self) -> int:
-        return self._code
-
-
 @pytest.mark.parametrize(("code", "starts"), [(0, 3), (1, 4)])
 def test_once_unless_it_failed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, starts: int) -> None:
     started: list[str] = []
 
-    def start(part: str, bench: Path, method: str | None) -> Child:
+    def command(_: str, part: str, *arguments: str) -> list[str]:
         started.append(part)
-        return Child(code)
+        return [sys.executable, "-c", f"print('compiled'); raise SystemExit({code})"]
 
     monkeypatch.setattr(compiled, "user_cache", lambda: tmp_path)
-    monkeypatch.setattr(module, "_start", start)
+    monkeypatch.setattr(module, "child_command", command)
     console = Console(file=io.StringIO())
     for _ in range(2):
         prepare(load_bench(DEFAULT_BENCH), None, console)
+    gc.collect()  # a pipe that is still open would be a ResourceWarning here, and so a failure
     assert len(started) == starts
     assert set(started) <= {part for wave in WAVES for part in wave}
 
