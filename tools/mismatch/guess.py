@@ -18,11 +18,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from hal.npz import open_npz
 from tools.errors import InputError
 from tools.mismatch import units
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_columns import Array, column_names, read_columns
+from tools.mismatch.recording_load import MIN_SAMPLES
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 
 GuessedRole = Literal["time", "input", "output", "context", ""]
@@ -95,13 +95,15 @@ def guess_role(name: str, unit: str) -> GuessedRole:
 
 def guess(path: Path) -> Guess:
     """Read a csv, npz or mcap file and propose what its columns are. Raises RecordingError."""
-    names = _names(path)
+    names = column_names(path)
     if not names:
         raise RecordingError(f"{path}: no columns of numbers; a csv needs one header row, an npz one array per column")
     if len(names) > MOST_COLUMNS:
         raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
     columns = read_columns(path, names)
     n = next(iter(columns.values())).size
+    if n < 2:
+        raise RecordingError(f"{path}: {n} samples; a recording needs at least {MIN_SAMPLES}")
     parts = {name: split_unit(name) for name in names}
     clock = next((name for name in names if _is_time(columns[name], *parts[name])), "")
     roles: dict[str, GuessedRole] = {k: "time" if k == clock else guess_role(*parts[k]) for k in names}
@@ -118,18 +120,6 @@ def guess(path: Path) -> Guess:
         for k in names
     ]
     return Guess(n, clock, rate_hz, kind, found)
-
-
-def _names(path: Path) -> list[str]:
-    if path.suffix.lower() != ".npz":
-        return column_names(path)
-    if not path.is_file():
-        raise RecordingError(f"{path}: data file does not exist")
-    try:
-        with open_npz(path) as data:
-            return [k for k in data.files if data[k].ndim == 1 and data[k].dtype.kind in "fiub"]
-    except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
 
 
 def _is_time(values: Array, name: str, unit: str) -> bool:

@@ -1,12 +1,12 @@
-"""Columns of a data file: csv, npz, mcap. Sizes are bounded; every fault names the file and the line or sample."""
+"""Columns of a data file: text tables, npz, mat, mcap. Sizes are bounded; a fault is named with file and place."""
 
 from __future__ import annotations
 
-import csv
 import itertools
 import json
 from array import array
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +16,12 @@ from numpy.typing import NDArray
 from firmware_py.recording.errors import RecordingError as McapRecordingError
 from firmware_py.recording.scan import ChunkMessage, mcap_records
 from hal.npz import open_npz
+from tools.mismatch import mat_file, text_table
 from tools.mismatch.recording import RecordingError
+from tools.mismatch.text_table import missing_column
 
 Array = NDArray[np.float64]
+SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap")
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000
 MAX_MESSAGE_BYTES = 1 << 24
@@ -27,15 +30,7 @@ _NOT_JSON = (ValueError, RecursionError, OverflowError)
 
 def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
     """The named columns as float64 (n,). Raises RecordingError."""
-    if not path.is_file():
-        raise RecordingError(f"{path}: data file does not exist; 'data' in the descriptor is relative to its folder")
-    if path.stat().st_size > MAX_BYTES:
-        raise RecordingError(f"{path}: larger than {MAX_BYTES >> 30} GiB; cut the recording into parts")
-    readers = {".csv": _csv, ".npz": _npz, ".mcap": _mcap}
-    reader = readers.get(path.suffix.lower())
-    if reader is None:
-        raise RecordingError(f"{path}: data must be .csv, .npz or .mcap, not '{path.suffix}'")
-    columns = reader(path, names)
+    columns = _format(path).read(path, names)
     lengths = {k: v.size for k, v in columns.items()}
     if len(set(lengths.values())) > 1:
         shown = ", ".join(f"{k} {v}" for k, v in lengths.items())
@@ -45,22 +40,84 @@ def read_columns(path: Path, names: list[str]) -> dict[str, Array]:
     return columns
 
 
+def read_blocks(path: Path, names: list[str]) -> Iterator[dict[str, Array]]:
+    """Yield the named columns in parts, so that a text file may be larger than memory. Raises RecordingError."""
+    if path.suffix.lower() not in text_table.SUFFIXES:
+        yield read_columns(path, names)
+        return
+    _format(path)
+    for block in text_table.text_table(path).blocks(names):
+        yield {name: block[:, i] for i, name in enumerate(names)}
+
+
 def column_names(path: Path) -> list[str]:
     """The columns that ``read_columns`` could read from a data file. Raises RecordingError."""
+    return _format(path).names(path)
+
+
+@dataclass(frozen=True)
+class _Format:
+    """How the columns of one kind of file are listed and read."""
+
+    names: Callable[[Path], list[str]]
+    read: Callable[[Path, list[str]], dict[str, Array]]
+
+
+def _format(path: Path) -> _Format:
     if not path.is_file():
-        raise RecordingError(f"{path}: data file does not exist")
+        raise RecordingError(f"{path}: data file does not exist; 'data' in the descriptor is relative to its folder")
+    if path.stat().st_size > MAX_BYTES:
+        raise RecordingError(f"{path}: larger than {MAX_BYTES >> 30} GiB; cut the recording into parts")
     suffix = path.suffix.lower()
-    if suffix == ".csv":
-        try:
-            with path.open(newline="", encoding="utf-8-sig") as f:
-                head = f.readline()
-        except UnicodeDecodeError as error:
-            raise RecordingError(f"{path}: not a UTF-8 text file ({error.reason}); save it as UTF-8 csv") from None
-        delimiter = next((d for d in ",;\t" if d in head), ",")
-        return [h.strip() for h in next(csv.reader([head], delimiter=delimiter), [])]
-    if suffix == ".mcap":
-        return _mcap_names(path)
-    raise RecordingError(f"{path}: data must be .csv, .npz or .mcap, not '{path.suffix}'")
+    if suffix not in SUFFIXES:
+        raise RecordingError(f"{path}: data must be {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, not '{path.suffix}'")
+    if suffix in text_table.SUFFIXES:
+        return _Format(_text_names, lambda p, names: text_table.text_table(p).read(names))
+    return {".npz": _Format(_npz_names, _npz), ".mat": _Format(_mat_names, _mat), ".mcap": _Format(_mcap_names, _mcap)}[
+        suffix
+    ]
+
+
+def _text_names(path: Path) -> list[str]:
+    return text_table.text_table(path).columns
+
+
+def _npz_names(path: Path) -> list[str]:
+    try:
+        with open_npz(path) as data:
+            return [k for k in data.files if (a := data[k]).ndim == 1 and a.dtype.kind in "fiub"]
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
+
+
+def _mat_names(path: Path) -> list[str]:
+    columns = mat_file.read_mat(path)
+    longest = max((v.size for v in columns.values()), default=0)
+    return [name for name, values in columns.items() if values.size == longest]
+
+
+def _mat(path: Path, names: list[str]) -> dict[str, Array]:
+    columns = mat_file.read_mat(path)
+    for name in names:
+        if name not in columns:
+            raise missing_column(path, name, list(columns))
+    return {name: columns[name] for name in names}
+
+
+def read_scalars(path: Path) -> dict[str, float]:
+    """Single numbers that a file holds beside its columns, such as a rate. Raises RecordingError."""
+    suffix = path.suffix.lower()
+    if suffix == ".mat":
+        return {k: float(v[0]) for k, v in mat_file.read_mat(path).items() if v.size == 1}
+    if suffix != ".npz":
+        return {}
+    try:
+        with open_npz(path) as data:
+            return {
+                k: float(a.reshape(-1)[0]) for k in data.files if (a := data[k]).size == 1 and a.dtype.kind in "fiu"
+            }
+    except (OSError, ValueError) as error:
+        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
 
 
 def _mcap_names(path: Path) -> list[str]:
@@ -102,59 +159,6 @@ def _messages(path: Path) -> Iterator[tuple[str, str, ChunkMessage]]:
         raise RecordingError(f"{path}: not a readable mcap file ({error})") from None
 
 
-def _missing(path: Path, name: str, have: list[str]) -> RecordingError:
-    shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
-    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
-
-
-def _csv(path: Path, names: list[str]) -> dict[str, Array]:
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as f:
-            head = f.readline()
-            delimiter = next((d for d in ",;\t" if d in head), ",")
-            header = [h.strip() for h in next(csv.reader([head], delimiter=delimiter), [])]
-            for name in names:
-                if name not in header:
-                    raise _missing(path, name, header)
-                if header.count(name) > 1:
-                    raise RecordingError(f"{path}: line 1: column '{name}' appears twice; rename one")
-            use = [header.index(n) for n in names]
-            if not (first := next((line for line in f if line.strip()), "")):
-                raise RecordingError(f"{path}: a header and no samples")
-            try:
-                data = np.loadtxt(
-                    itertools.chain([first], f),
-                    delimiter=delimiter,
-                    usecols=use,
-                    ndmin=2,
-                    comments=None,
-                    quotechar='"',
-                    dtype=np.float64,
-                )
-            except ValueError as error:
-                raise RecordingError(f"{path}: {_first_bad_line(path, delimiter, header, use) or error}") from None
-    except UnicodeDecodeError as error:
-        raise RecordingError(f"{path}: not a UTF-8 text file ({error.reason}); save it as UTF-8 csv") from None
-    return {n: np.ascontiguousarray(data[:, i]) for i, n in enumerate(names)}
-
-
-def _first_bad_line(path: Path, delimiter: str, header: list[str], use: list[int]) -> str:
-    with path.open(newline="", encoding="utf-8-sig") as f:
-        rows = csv.reader(f, delimiter=delimiter)
-        next(rows, None)
-        for row in rows:
-            if not row:
-                continue
-            if len(row) <= max(use):
-                return f"line {rows.line_num}: {len(row)} values, the header names {len(header)}; complete the line"
-            for i in use:
-                try:
-                    float(row[i])
-                except ValueError:
-                    return f"line {rows.line_num}: column '{header[i]}': '{row[i]}' is not a number"
-    return ""
-
-
 def _npz(path: Path, names: list[str]) -> dict[str, Array]:
     try:
         with open_npz(path) as data:
@@ -162,7 +166,7 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
             out: dict[str, Array] = {}
             for name in names:
                 if name not in have:
-                    raise _missing(path, name, have)
+                    raise missing_column(path, name, have)
                 a = data[name]
                 if a.ndim != 1 or a.dtype.kind not in "fiub":
                     raise RecordingError(
@@ -205,7 +209,7 @@ def _mcap(path: Path, names: list[str]) -> dict[str, Array]:
     columns: dict[str, Array] = {}
     for name, values in found.items():
         if not values:
-            raise _missing(path, name, sorted(seen))
+            raise missing_column(path, name, sorted(seen))
         columns[name] = np.array(values)[np.argsort(np.array(times[name]), kind="stable")]
     return columns
 

@@ -64,7 +64,7 @@ def numbers(n: int, z: str = "{k}", command: str = "{k}") -> str:
 
 
 SPLIT = GOOD + "\n[split]\n"
-_DECIMAL_COMMA = numbers(90).replace(",", ";").replace("\n4;4", "\n4,5;4")
+_DECIMAL_COMMA = numbers(90, "{k}.5").replace(",", ";").replace("\n4;4.5", "\n4,5;4.5")
 BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "empty descriptor": ("", None, r"recording\.toml: format must be 1"),
     "empty data": (GOOD, b"", r"data\.csv: no column 'command_mV'; the file has: none"),
