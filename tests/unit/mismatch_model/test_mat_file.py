@@ -9,7 +9,7 @@ import pytest
 from scipy.io import savemat
 
 from tools.mismatch.recording import RecordingError
-from tools.mismatch.recording_columns import column_names, read_columns, read_scalars
+from tools.mismatch.recording_columns import column_names, read_blocks, read_columns, read_scalars
 
 T, U = np.arange(200) * 0.01, np.sin(np.arange(200) * 0.1)
 
@@ -78,3 +78,8 @@ def test_a_claim_of_gigabytes_is_refused_before_it_is_believed(tmp_path: Path):
     (tmp_path / "a.mat").write_bytes(head + struct.pack("<II", 15, len(packed)) + packed)
     with pytest.raises(RecordingError, match="unpacks to more than 2 GiB"):
         column_names(tmp_path / "a.mat")
+
+
+def test_other_files_come_in_one_block(tmp_path: Path):
+    (block,) = read_blocks(v5(tmp_path / "a.mat"), ["t"])
+    np.testing.assert_array_equal(block["t"], T)
