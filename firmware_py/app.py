@@ -132,8 +132,8 @@ def run_in_process(
 
 
 def with_fallbacks(sink: StatusSink | None, stages: Stages) -> StatusSink | None:
-    """``sink``; with numeric kinematics it is also told how many ticks fell back to the analytic one."""
-    if sink is None or stages.configs.sensing.kinematics_method != "numeric":
+    """``sink``, which is also told in how many ticks the chosen kinematics gave way to the other one."""
+    if sink is None:
         return sink
     return lambda status: sink({**status, "fallbacks": stages.sensing.fallbacks} if "t_s" in status else status)
 

@@ -92,7 +92,7 @@ class FrameStatus(IntFlag):
     JERK = 512  # the hand twitches: a burst between voluntary motion and tremor
     DRIFT = 1024  # acceleration has stayed away from zero: bias or attitude drifts
     HELD = 4096  # a hold: the command is the ramp to neutral, or neutral (loop)
-    FALLBACK = 2048  # the numeric kinematics did not converge: this tick is the analytic solution
+    FALLBACK = 2048  # the chosen kinematics could not be used: this tick is the other one's solution
 
 
 class Clip(IntFlag):

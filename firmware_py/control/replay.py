@@ -33,6 +33,7 @@ def recorded_configs(recording: Recording) -> StageConfigs:
         raise RecordingError(f"{recording.path}: its stage configuration is not a table for every stage")
     # a recording that does not name the penalty was made before there was one
     tables.setdefault("tremor", {}).setdefault("adaptive", {}).setdefault("quiet", 0.0)
+    tables.setdefault("sensing", {}).setdefault("kinematics_guard", False)
     return StageConfigs.from_dict(tables, str(recording.path))
 
 

@@ -101,6 +101,8 @@ class SensingConfig(BaseModel):
 
     # numeric: force and rate of the same instant, iterated (000 (2.6)); analytic: centripetal part of the tick before
     kinematics_method: Literal["analytic", "numeric"] = "analytic"
+    # analytic: a tick whose centripetal part changes by more than a tenth of a sample's noise is solved numerically
+    kinematics_guard: bool = True
     attitude_method: Literal["observer", "error-state", "quaternion-kalman"] = "error-state"
     # the slow part of the hand's velocity, rms, with its correlation time: error-state filter
     hand_velocity_m_s: Positive = 8e-5

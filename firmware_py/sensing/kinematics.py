@@ -15,6 +15,9 @@ from numpy.typing import NDArray
 from firmware_py.records import Record, new_record
 from hal.compiled import kernel
 
+MAX_RATE_RAD_S = 20.0
+"""No hand turns faster than this."""
+
 
 def kinematics_dtype(n: int) -> np.dtype[Any]:
     """``solve`` (6, n) maps readings to (f, alpha); ``axes`` and ``positions`` are (n, 3), m; ``weight`` 1 / noise."""
@@ -66,3 +69,25 @@ def solve_motion(
         tangential = readings[i] - centripetal
         for k in range(6):
             out[k] += params.solve[k, i] * tangential
+
+
+@kernel
+def plausible_rate(rate: NDArray[np.float64]) -> bool:
+    """Return True if a hand can turn that fast. The comparison is written so that nan is not plausible either."""
+    return rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2 < MAX_RATE_RAD_S**2
+
+
+@kernel
+def centripetal_change(before: NDArray[np.float64], now: NDArray[np.float64], params: Record) -> float:
+    """Return the largest change of a reading's centripetal part (m/s^2) between two body rates (3,) in rad/s."""
+    largest = 0.0
+    square = now[0] ** 2 + now[1] ** 2 + now[2] ** 2 - before[0] ** 2 - before[1] ** 2 - before[2] ** 2
+    for i in range(len(params.positions)):
+        place, axis = params.positions[i], params.axes[i]
+        late = before[0] * place[0] + before[1] * place[1] + before[2] * place[2]
+        along = now[0] * place[0] + now[1] * place[1] + now[2] * place[2]
+        change = 0.0
+        for k in range(3):
+            change += axis[k] * (now[k] * along - before[k] * late - place[k] * square)
+        largest = max(largest, abs(change))
+    return largest

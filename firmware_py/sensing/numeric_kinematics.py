@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record
-from firmware_py.sensing.kinematics import solve_motion
+from firmware_py.sensing.kinematics import centripetal_change, plausible_rate, solve_motion
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_matrix
 
@@ -78,6 +78,36 @@ def solve_numeric(
     for k in range(UNKNOWNS):
         out[k] = analytic[k]
     return -1
+
+
+@kernel
+def solve_guarded(
+    readings: NDArray[np.float64],
+    previous_rate: NDArray[np.float64],
+    dt_s: float,
+    limit_m_s2: float,
+    params: Record,
+    out: NDArray[np.float64],
+) -> bool:
+    """``solve_motion`` where its centripetal part may be that of the previous rate, else ``solve_numeric``.
+
+    The analytic solution is taken while the centripetal part of every reading changes by at most ``limit_m_s2`` within
+    the step. Fed with its own rate for seconds it would otherwise run away. A previous rate that no hand has (20 rad/s)
+    is taken as zero, so that ``out`` is always finite. Returns True when the analytic solution was not taken.
+    """
+    rate, rest = scratch(3), scratch(3)
+    for k in range(3):
+        rest[k] = 0.0
+    if not plausible_rate(previous_rate):
+        solve_motion(readings, rest, params, out)
+        return True
+    solve_motion(readings, previous_rate, params, out)
+    for k in range(3):
+        rate[k] = previous_rate[k] + dt_s * out[3 + k]
+    if centripetal_change(previous_rate, rate, params) <= limit_m_s2:
+        return False
+    solve_numeric(readings, previous_rate, dt_s, params, out)
+    return True
 
 
 @kernel

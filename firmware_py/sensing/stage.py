@@ -42,9 +42,9 @@ from firmware_py.sensing.calibration import (
     calibration_params,
 )
 from firmware_py.sensing.config import MOST_AXES, STANDARD_GRAVITY, SensingConfig
-from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, solve_motion
+from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, plausible_rate, solve_motion
 from firmware_py.sensing.leave_out import leave_out
-from firmware_py.sensing.numeric_kinematics import solve_numeric
+from firmware_py.sensing.numeric_kinematics import solve_guarded, solve_numeric
 from firmware_py.sensing.redundant_rate import parity, parity_rows
 from firmware_py.sensing.translation import (
     TRANSLATION,
@@ -57,7 +57,8 @@ from firmware_py.sensing.translation import (
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_matrix
 
-MAX_RATE_RAD_S = 20.0
+GUARD = 0.1
+"""Largest change of a centripetal part that the analytic solution may leave out, in units of a sample's noise."""
 N_PARITIES = len(PARITIES)
 LEAN_CORNER_HZ = 0.3
 """Corrections of the attitude slower than this reach the tip's gravity."""
@@ -75,6 +76,7 @@ def sense_dtype(n: int) -> np.dtype[Any]:
             ("lean_sections", "f8", (2, 5)),
             ("max_gap_ticks", "f8"),
             ("numeric", "i8"),  # kinematics: 1 numeric, 0 analytic
+            ("guard_m_s2", "f8"),  # largest change of a centripetal part for the analytic kinematics; inf: any
             ("parities", "i8"),
             ("null", "f8", (len(PARITIES), n)),  # combinations of readings free of f and alpha; zeros beyond N - 6
         ]
@@ -93,7 +95,7 @@ def sense_state_dtype(n: int) -> np.dtype[Any]:
             ("lean", "f8", (3, 2, 2)),  # the same for the attitude's corrections
             ("turned", "f8", (3,)),  # correction of the last tick
             ("last_tick", "f8"),
-            ("fallbacks", "i8"),  # ticks that the numeric kinematics left to the analytic one
+            ("fallbacks", "i8"),  # ticks that the chosen kinematics left to the other one
         ]
     )
 
@@ -117,6 +119,7 @@ def sense_params(config: SensingConfig) -> Record:
         lean_sections=integrator_sections(config.tick_hz, LEAN_CORNER_HZ),
         max_gap_ticks=float(config.max_gap_ticks),
         numeric=config.kinematics_method == "numeric",
+        guard_m_s2=GUARD * float(noise.min()) if config.kinematics_guard else np.inf,
     )
 
 
@@ -125,12 +128,6 @@ def sense_state(axes: int) -> Record:
     state = new_record(sense_state_dtype(axes), smoothed=np.nan, last_tick=np.nan)
     restart(attributes(state)[0].attitude)
     return state
-
-
-@kernel
-def _plausible(rate: NDArray[np.float64]) -> bool:
-    """Return True if a hand can turn that fast. The comparison is written so that nan is not plausible either."""
-    return rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2 < MAX_RATE_RAD_S**2
 
 
 @kernel
@@ -186,7 +183,7 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     if not np.isnan(state.last_tick):
         steps = max(1, int(tick - state.last_tick))
     state.last_tick = tick
-    if steps > param.max_gap_ticks or not _plausible(state.attitude.rate):
+    if steps > param.max_gap_ticks or not plausible_rate(state.attitude.rate):
         restart(state.attitude)
         state.memory[:, :, :] = 0.0
         state.lean[:, :, :] = 0.0
@@ -198,9 +195,14 @@ def sense_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> 
     motion = state.motion
     if param.parities > 0:
         _redundancy(state, param, frame)
-    if param.numeric == 0 or attitude.aligned == 0:
+    dt = steps * param.attitude.dt_s
+    if attitude.aligned == 0:
         solve_motion(readings, attitude.rate, param.kinematics, motion)
-    elif solve_numeric(readings, attitude.rate, steps * param.attitude.dt_s, param.kinematics, motion) < 0:
+    elif param.numeric == 0:
+        if solve_guarded(readings, attitude.rate, dt, param.guard_m_s2, param.kinematics, motion):
+            state.fallbacks += 1
+            status |= FALLBACK
+    elif solve_numeric(readings, attitude.rate, dt, param.kinematics, motion) < 0:
         state.fallbacks += 1
         status |= FALLBACK
     field = frame[MAGNETOMETER : MAGNETOMETER + 3]
@@ -242,7 +244,7 @@ class Sensing:
 
     @property
     def fallbacks(self) -> int:
-        """Return the number of ticks in which the numeric kinematics did not converge and the analytic one stood in."""
+        """Return the number of ticks in which the chosen kinematics could not be used and the other one stood in."""
         return int(np.atleast_1d(self.state)["fallbacks"][0])
 
     def leave_out(self, axis: int, usual: NDArray[np.float64]) -> float:

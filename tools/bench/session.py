@@ -217,7 +217,7 @@ class Session:
         elif run.phase == "running" and self.stale_s() > STALE_S:
             found.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
         if ticks := run.status.get("fallbacks", 0):
-            found.append(("warn", f"Numeric kinematics: {ticks} ticks fell back to the analytic solution."))
+            found.append(("warn", f"Kinematics: {ticks} ticks fell back to the other solution."))
         if self.disk.low:
             found.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
         if self.recorder.active and self.recorder.trouble():

@@ -149,8 +149,11 @@ def summary_lines(result: Mapping[str, Any]) -> list[str]:
             f"the amplifier is slower than the ticks: {sent} commands sent, {passed_over} passed over for newer"
         )
     kinematics = result.get("kinematics", {})
-    if kinematics.get("method") == "numeric":
-        lines.append(f"numeric kinematics: {kinematics['fallbacks']} ticks fell back to the analytic solution")
+    if kinematics and (kinematics["method"] == "numeric" or kinematics["fallbacks"]):
+        other = {"numeric": "analytic", "analytic": "numeric"}[kinematics["method"]]
+        lines.append(
+            f"{kinematics['method']} kinematics: {kinematics['fallbacks']} ticks fell back to the {other} solution"
+        )
     for hold in result.get("holds", ()):
         lines.append(f"hold at {hold['t_s']:.1f} s for {hold['length_s']:.2f} s ({hold['class']}): {hold['cause']}")
     if result["noticed"]:

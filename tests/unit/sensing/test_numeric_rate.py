@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -9,13 +12,14 @@ from firmware_py.frame import ACCELEROMETER, COUNTS, FALLBACK, LAYOUT, STATUS, T
 from firmware_py.records import attributes
 from firmware_py.sensing import stage
 from firmware_py.sensing.config import SensingConfig
-from firmware_py.sensing.kinematics import kinematic_params
-from firmware_py.sensing.numeric_kinematics import back_substitute, fold_row, solve_numeric
+from firmware_py.sensing.kinematics import centripetal_change, kinematic_params, solve_motion
+from firmware_py.sensing.numeric_kinematics import back_substitute, fold_row, solve_guarded, solve_numeric
 from firmware_py.sensing.stage import Sensing
 from hal.errors import BenchError
 from tests.unit.allocations import allocations
 from tests.unit.pure_python import assert_kernel_is_python, without_compiler
 from tests.unit.sensing.rigid_body import AXES, POSITIONS, RATE_HZ, frames_of, hand_motion
+from tools.placement.configurations import micron_004
 
 Array = np.ndarray
 DT_S = 1e-3
@@ -117,7 +121,7 @@ def run(frames: Array, config: SensingConfig) -> Sensing:
 def test_in_the_step_force_and_rate_are_of_the_same_instant(method: str) -> None:
     """The readings come back from (f, alpha) and the rate of their own tick, rate before + dt alpha; without iterating
     they miss by what that tick changed in the centripetal part."""
-    config = NUMERIC.model_copy(update={"kinematics_method": method})
+    config = NUMERIC.model_copy(update={"kinematics_method": method, "kinematics_guard": False})
     frames = wild(301)
     sensing = run(frames[:300], config)
     before = sensing.state["attitude"]["rate"][0].copy()
@@ -143,7 +147,7 @@ def test_both_ways_agree_for_a_hand_and_part_for_a_tumble() -> None:
     frames = wild(400)
     other = frames.copy()
     run(frames, NUMERIC)
-    run(other, NUMERIC.model_copy(update={"kinematics_method": "analytic"}))
+    run(other, NUMERIC.model_copy(update={"kinematics_method": "analytic", "kinematics_guard": False}))
     apart = np.abs(frames - other)[300:, LAYOUT["specific_force"]].max()
     rate = np.abs(frames[300:, LAYOUT["rate"]]).max()
     assert 1e-5 < apart < 10.0 * 0.116 * rate * 60.0 * DT_S
@@ -175,6 +179,73 @@ def test_the_numeric_step_is_the_same_in_plain_python_and_allocates_nothing(monk
         sensing.step(frame)
     assert allocations() - first == one * len(frames[31:])
     assert_kernel_is_python(monkeypatch, stage, "sense_kernel", Sensing(NUMERIC), twins, frames, atol=1e-12)
+
+
+def coning(noise_m_s2: float = 0.0) -> tuple[Array, Array, Array]:
+    """(3000, 6) readings of document 004's placement, (3001, 3) rates of 1.2 rad/s at 3 Hz about three axes, params."""
+    place = micron_004()
+    phase = np.radians([41.0, 147.0, 0.0])
+    rates = 1.2 * np.sin(2.0 * np.pi * 3.0 * np.arange(3001)[:, None] * DT_S + phase)
+    readings = [step_readings(b, a, DT_S, place.positions, place.axes)[0] for a, b in itertools.pairwise(rates)]
+    noise = noise_m_s2 * np.random.default_rng(1).standard_normal((3000, 6))
+    return np.array(readings) + noise, rates, kinematic_params(place.positions, place.axes, np.ones(6))
+
+
+def fed_back(solve: Callable[[Array, Array, Array], object], readings: Array, start: Array) -> Array:
+    """(n, 3) rates when every solution's rate is the next one's previous rate: no attitude corrects them."""
+    rate, out, found = start.copy(), np.empty(6), np.empty((len(readings), 3))
+    for k, reading in enumerate(readings):
+        solve(reading, rate, out)
+        rate += DT_S * out[3:]
+        found[k] = rate
+    return found
+
+
+GUARD_M_S2 = float(Sensing(SensingConfig()).params["guard_m_s2"][0])
+
+
+def test_fed_with_its_own_rate_the_analytic_solution_runs_away_and_the_guarded_one_stays_with_the_numeric() -> None:
+    readings, rates, params = coning()
+    p = params[0]
+    with np.errstate(all="ignore"):
+        analytic = fed_back(lambda y, w, out: solve_motion(y, w, p, out), readings, rates[0])
+    numeric = fed_back(lambda y, w, out: solve_numeric(y, w, DT_S, p, out), readings, rates[0])
+    guarded = fed_back(lambda y, w, out: solve_guarded(y, w, DT_S, GUARD_M_S2, p, out), readings, rates[0])
+    assert not np.isfinite(analytic).all()
+    np.testing.assert_allclose(numeric, rates[1:], atol=9e-9)
+    np.testing.assert_allclose(guarded, rates[1:], atol=9e-9)
+
+
+def test_a_rate_that_no_hand_has_is_taken_as_zero_so_that_the_solution_is_finite() -> None:
+    params = kinematic_params(POSITIONS, AXES, np.ones(6))
+    y, out = np.linspace(-3, 9, 6), np.empty(6)
+    for rate in (np.array([30.0, 0.0, 0.0]), np.full(3, 1e200), np.array([np.nan, 0.0, 0.0])):
+        assert solve_guarded(y, rate, DT_S, GUARD_M_S2, params[0], out)
+        np.testing.assert_allclose(out, params["solve"][0] @ y, rtol=1e-12)
+
+
+def test_the_guard_looks_at_the_centripetal_part_of_every_reading() -> None:
+    params = kinematic_params(POSITIONS, AXES, np.ones(6))
+    before, now = np.array([0.9, -0.4, 1.3]), np.array([1.0, -0.5, 1.1])
+    expected = np.sum(
+        AXES * (np.cross(now, np.cross(now, POSITIONS)) - np.cross(before, np.cross(before, POSITIONS))), 1
+    )
+    assert centripetal_change(before, now, params[0]) == pytest.approx(np.abs(expected).max(), rel=1e-12)
+
+
+def test_the_step_counts_and_marks_what_the_analytic_solution_could_not_take() -> None:
+    """A tumble of 3 rad/s: ticks that fell back are the numeric method's; without the guard there are none."""
+    config = NUMERIC.model_copy(update={"kinematics_method": "analytic"})
+    frames, plain = wild(300), wild(300)
+    guarded, unguarded = run(frames, config), run(plain, config.model_copy(update={"kinematics_guard": False}))
+    marked = frames[:, STATUS].astype(int) & FALLBACK > 0
+    assert guarded.fallbacks == marked.sum() > 100
+    assert unguarded.fallbacks == 0
+    assert not np.any(plain[:, STATUS].astype(int) & FALLBACK)
+    numeric = wild(300)
+    run(numeric, NUMERIC)
+    force = LAYOUT["specific_force"]
+    assert np.abs(frames - numeric)[:, force].max() < 0.2 * np.abs(plain - numeric)[:, force].max()
 
 
 def test_another_name_is_refused() -> None:
