@@ -15,12 +15,13 @@ from mcap.reader import make_reader
 
 from firmware_py.exit_codes import Exit
 from firmware_py.recording.errors import RecordingError
-from firmware_py.recording.export import export, export_folder
+from tools.formats.export import export, export_folder
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover
 from firmware_py.recording.replay import Mismatch, replay
 from firmware_py.recording.writer import RecordingWriter
 from tests.unit.recording.samples import COLUMNS, METADATA, same_bits
+from tools.errors import InputError
 from tools.mismatch.recording_load import load
 
 WriteFile = Callable[..., tuple[Path, np.ndarray]]
@@ -130,7 +131,7 @@ class TestExport:
             return real(name, *args, **kwargs)
 
         monkeypatch.setattr(builtins, "__import__", without)
-        with pytest.raises(RecordingError, match=r"parquet needs pyarrow: pip install 'micron-bench\[parquet\]'"):
+        with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install 'micron-bench\[parquet\]'"):
             export(Recording(path), tmp_path / "run.parquet")
         assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
 

@@ -1,4 +1,5 @@
-"""Exports recordings for other programs: csv, npz, parquet, and the recording folder of the mismatch contract.
+"""Exports recordings for other programs, in the format that the ending of a name asks for, and as the recording folder
+of the mismatch contract.
 
 Everything streams block by block; a failed export leaves nothing behind.
 """
@@ -11,7 +12,7 @@ import zipfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
 import numpy as np
 from numpy.lib import format as npy
@@ -21,6 +22,7 @@ from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import new_file, new_folder, refuse_existing
 from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
+from tools.formats import mdf, netcdf, parquet
 
 _ROLES = (("command", "input"), ("volts", "output"))  # what the instrument twin computes
 _FLAGS_UNIT = "bits"
@@ -38,19 +40,19 @@ class ExportReport:
 
 
 def export(recording: Recording, out: Path, format: str | None = None, *, overwrite: bool = False) -> ExportReport:
-    """Write ``recording`` as ``csv``, ``npz``, ``parquet`` or ``folder`` (None: what the name of ``out`` says,
-    without a suffix the folder). Columns keep their names, values every bit.
+    """Write ``recording`` in one of ``WRITERS`` or as ``folder`` (None: what the name of ``out`` says, without a suffix
+    the folder). Columns keep their names, values every bit.
 
-    Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there.
+    Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there; ``InputError`` when the
+    package that a format needs is not installed.
     """
-    writers: dict[str, Callable[[Recording, Path], None]] = {"csv": _csv, "npz": _npz, "parquet": _parquet}
-    chosen = format or out.suffix.removeprefix(".") or "folder"
+    chosen = format or out.suffix.lower().removeprefix(".") or "folder"
     if chosen == "folder":
         return export_folder(recording, out)
-    if chosen not in writers:
-        raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(writers)} or folder")
+    if chosen not in WRITERS:
+        raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(WRITERS)} or folder")
     with new_file(out, overwrite=overwrite) as part:
-        writers[chosen](recording, part)
+        WRITERS[chosen](recording, part)
     return ExportReport(out, chosen, recording.n_rows, len(recording.columns))
 
 
@@ -169,33 +171,8 @@ def _little_endian(column: Float64Array) -> bytes:
     return column.astype("<f8", copy=False).tobytes()
 
 
-def _parquet(recording: Recording, path: Path) -> None:
-    pa, pq = _pyarrow()
-    schema = pa.schema(
-        [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in recording.columns],
-        metadata={name: json.dumps(fmt.plain(value)) for name, value in recording.metadata.items()},
-    )
-    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
-        for rows in _batches(recording, 200):
-            writer.write_batch(pa.record_batch([pa.array(column) for column in rows], schema=schema))
-
-
-def _batches(recording: Recording, n_blocks: int) -> Any:
-    """Several blocks at a time: a row group of 100 rows would make a large file."""
-    waiting: list[Float64Array] = []
-    for block in recording.blocks():
-        waiting.append(block.data)
-        if len(waiting) == n_blocks:
-            yield np.concatenate(waiting, axis=1)
-            waiting.clear()
-    if waiting:
-        yield np.concatenate(waiting, axis=1)
-
-
-def _pyarrow() -> tuple[Any, Any]:
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise RecordingError("parquet needs pyarrow: pip install 'micron-bench[parquet]', or export npz") from error
-    return pyarrow, pyarrow.parquet
+Writer = Callable[[Recording, Path], None]
+WRITERS: Mapping[str, Writer] = MappingProxyType(
+    {"csv": _csv, "npz": _npz, "parquet": parquet.write, "nc": netcdf.write, "mf4": mdf.write}
+)
+"""Writers by the ending of a name."""

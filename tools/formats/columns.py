@@ -1,0 +1,42 @@
+"""Checks that the readers of this folder share."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.recording import RecordingError
+
+Array = NDArray[np.float64]
+MOST_SAMPLES = 50_000_000
+"""Samples of a column, checked before anything of the size that a file claims is allocated."""
+
+
+def missing_column(path: Path, name: str, have: Collection[str]) -> RecordingError:
+    """Return the error for a column that a file does not have."""
+    shown = ", ".join(list(have)[:12]) + (" ..." if len(have) > 12 else "")
+    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
+
+
+def check_size(path: Path, samples: int) -> None:
+    """Raise RecordingError for more samples than ``MOST_SAMPLES``."""
+    if samples > MOST_SAMPLES:
+        raise RecordingError(f"{path}: {samples} samples, at most {MOST_SAMPLES} are read; cut the recording into parts")
+
+
+def as_numbers(path: Path, name: str, values: object) -> Array:
+    """Return float64 (n,). Times are seconds since the first one. Raises RecordingError for anything but numbers."""
+    array = np.asarray(values)
+    if array.ndim == 1 and array.dtype.kind == "M":
+        steps = (array - array[:1]) / np.timedelta64(1, "ns")
+        return np.asarray(steps * 1e-9, np.float64)
+    if array.ndim == 1 and array.dtype.kind == "m":
+        return np.asarray(array / np.timedelta64(1, "ns") * 1e-9, np.float64)
+    if array.ndim != 1 or array.dtype.kind not in "fiub":
+        raise RecordingError(
+            f"{path}: column '{name}' is {array.dtype} of shape {array.shape}; needed: numbers, one dimension"
+        )
+    return np.ascontiguousarray(array, np.float64)
