@@ -1,7 +1,7 @@
 """Sensor logs: whatever a recording of the contract may be, with or without its descriptor, and our own recordings.
 
-A folder (recording.toml, meta.toml or data.npz in it), a descriptor, a .csv, .npz or .mcap file. Arrays of two
-dimensions in an .npz become columns ``name_0``, ``name_1``, ...
+A folder (recording.toml, meta.toml or data.npz in it), a descriptor, or a data file of any format that
+``recording_columns`` reads. Arrays of two dimensions in an .npz become columns ``name_0``, ``name_1``, ...
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hal.npz import open_npz
 from tools.errors import InputError
-from tools.mismatch.recording_columns import column_names, read_columns
+from tools.mismatch.recording_columns import SUFFIXES, column_names, column_units, read_columns
 
 Array = NDArray[np.float64]
 TIMES = ("t_s", "t", "time_s")
@@ -75,6 +75,7 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
         columns, units = own
     else:
         columns = read_columns(file, column_names(file))
+        units = {**column_units(file), **units}
     if not columns:
         raise InputError(f"{file}: holds no columns")
     named = meta.get("time_column")
@@ -113,7 +114,7 @@ def _find(path: Path) -> tuple[Path, Path | None]:
 def _data(descriptor: Path) -> Path:
     name = _toml(descriptor).get("data", "data.npz")
     if not isinstance(name, str):
-        raise InputError(f"{descriptor}: 'data' must name the data file (.csv, .npz, .mcap), got {name!r}")
+        raise InputError(f"{descriptor}: 'data' must name the data file ({', '.join(SUFFIXES)}), got {name!r}")
     return descriptor.parent / name
 
 

@@ -68,7 +68,7 @@ def print_parameters(title: str, parameters: dict, notes: list[str], json_file: 
 def accelerometer(
     recording: Annotated[
         Path,
-        typer.Argument(metavar="RECORDING", help="Recording (folder, .toml, .csv, .npz, .mcap) with three columns."),
+        typer.Argument(metavar="RECORDING", help="Recording (folder, .toml, or a data file) with three columns."),
     ],
     method: Annotated[
         Method, typer.Option(help="Still poses at unknown angles, a rotary stage, or a quick method of 002.")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def noise(
     recording: Annotated[
         Path,
-        typer.Argument(metavar="RECORDING", help="Recording of a sensor at rest: folder, .toml, .csv, .npz, .mcap."),
+        typer.Argument(metavar="RECORDING", help="Recording of a sensor at rest: folder, .toml, or a data file."),
     ],
     column: Annotated[list[str] | None, typer.Option(help="Column to analyse; default all.")] = None,
     rate_hz: Annotated[float | None, typer.Option(min=1e-6, help="Sampling rate, if the file does not say.")] = None,

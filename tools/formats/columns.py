@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +14,10 @@ MOST_SAMPLES = 50_000_000
 """Samples of a column, checked before anything of the size that a file claims is allocated."""
 
 
-def missing_column(path: Path, name: str, have: Collection[str]) -> RecordingError:
-    """Return the error for a column that a file does not have."""
-    shown = ", ".join(list(have)[:12]) + (" ..." if len(have) > 12 else "")
-    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
-
-
 def check_size(path: Path, samples: int) -> None:
     """Raise RecordingError for more samples than ``MOST_SAMPLES``."""
     if samples > MOST_SAMPLES:
-        raise RecordingError(f"{path}: {samples} samples, at most {MOST_SAMPLES} are read; cut the recording into parts")
+        raise RecordingError(f"{path}: {samples} samples, at most {MOST_SAMPLES} are read; cut it into parts")
 
 
 def as_numbers(path: Path, name: str, values: object) -> Array:

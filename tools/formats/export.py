@@ -43,8 +43,8 @@ def export(recording: Recording, out: Path, format: str | None = None, *, overwr
     """Write ``recording`` in one of ``WRITERS`` or as ``folder`` (None: what the name of ``out`` says, without a suffix
     the folder). Columns keep their names, values every bit.
 
-    Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there; ``InputError`` when the
-    package that a format needs is not installed.
+    Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there; ``InputError`` when
+    the package that a format needs is not installed.
     """
     chosen = format or out.suffix.lower().removeprefix(".") or "folder"
     if chosen == "folder":

@@ -14,12 +14,13 @@ from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
 from tools.errors import InputError
 from tools.formats.blocks import batches
-from tools.formats.columns import Array, as_numbers, check_size, missing_column
+from tools.formats.columns import Array, as_numbers, check_size
 from tools.formats.packages import need
 from tools.mismatch.recording import RecordingError
+from tools.mismatch.text_table import missing_column
 
 EXTRA = "lab"
-_MAGIC = b"MDF     "
+_MAGIC = b"MDF     4."
 _UNFINISHED = b"UnFinMF "
 _MOST_NUMERIC = 5  # channel data types 0 to 5 are integers and floats, ASAM MDF 4.1
 _FIRST_TEXT_CONVERSION = 7  # conversions from here on give texts
@@ -66,10 +67,14 @@ def read(path: Path, wanted: list[str]) -> dict[str, Array]:
         if not common:
             raise RecordingError(f"{path}: {', '.join(wanted)} do not share one time base; {_ONE_GROUP}")
         base = max(common, key=lambda b: b[0])
-        return {
-            name: _samples(path, file, name, next((g, c) for g, c in of if bases[g] == base))
-            for name, of in places.items()
-        }
+        chosen = {name: next(at for at in of if bases[at[0]] == base) for name, of in places.items()}
+        # one pass over the file: channel by channel asammdf would unpack every block once per channel
+        found: dict[str, Array] = {}
+        for raw in (False, True):
+            some = {name: at for name, at in chosen.items() if _gives_texts(file, at) is raw}
+            signals = file.select([(None, *at) for at in some.values()], raw=raw) if some else []
+            found |= {n: as_numbers(path, n, s.samples) for n, s in zip(some, signals, strict=True)}
+        return {name: found[name] for name in wanted}
 
 
 def write(recording: Recording, path: Path) -> None:
@@ -114,21 +119,34 @@ def _time_base(path: Path, file: Any, group: int) -> tuple[int, bytes]:
     return stamps.size, stamps.tobytes()
 
 
-def _samples(path: Path, file: Any, name: str, place: tuple[int, int]) -> Array:
-    group, index = place
-    conversion = file.groups[group].channels[index].conversion
-    raw = conversion is not None and conversion.conversion_type >= _FIRST_TEXT_CONVERSION
-    return as_numbers(path, name, file.get(group=group, index=index, raw=raw).samples)
+def _gives_texts(file: Any, place: tuple[int, int]) -> bool:
+    """Return True for a channel whose conversion turns numbers into texts; its raw numbers are read."""
+    conversion = file.groups[place[0]].channels[place[1]].conversion
+    return conversion is not None and conversion.conversion_type >= _FIRST_TEXT_CONVERSION
+
+
+def _close_halfway(error: Exception) -> None:
+    """Close the objects of asammdf that a failed constructor left behind: their destructor would raise again, and
+    Python would print that beside our message.
+    """
+    trace = error.__traceback__
+    while trace is not None:
+        left = trace.tb_frame.f_locals.get("self")
+        if getattr(left, "_closed", None) is False and type(left).__module__.startswith("asammdf."):
+            left._closed = True
+            if left._tempfile is not None:
+                left._tempfile.close()
+        trace = trace.tb_next
 
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     with path.open("rb") as f:
         head = f.read(len(_MAGIC))
-    if head == _UNFINISHED:
+    if head.startswith(_UNFINISHED):
         raise RecordingError(f"{path}: its recorder did not finish the file; finalise it with the tool that made it")
     if head != _MAGIC:
-        raise RecordingError(f"{path}: not an MDF file; export it again as ASAM MDF 4")
+        raise RecordingError(f"{path}: not an MDF 4 file; export it again as ASAM MDF 4")
     (mdf,) = need(path, EXTRA, "asammdf")
     try:
         with mdf.MDF(path, use_display_names=False) as file:
@@ -136,5 +154,6 @@ def _opened(path: Path) -> Iterator[Any]:
     except InputError:
         raise
     except Exception as error:  # asammdf raises whatever its parser stumbles over
+        _close_halfway(error)
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RecordingError(f"{path}: not a readable MDF file ({first}); export it again as ASAM MDF 4") from None

@@ -1,7 +1,7 @@
 """netCDF through xarray: one variable per column on the dimension ``t``, CF units, and where the file comes from.
 
 A run as a dataset: variables (t,) with ``units`` and ``long_name``, the coordinate ``t`` in seconds since the start of
-the run, events as the variable ``event`` (JSON texts) on the coordinate ``event_t``, the texts of the recording as
+the run, events as the variable ``event_text`` (JSON) on the coordinate ``event_t``, the texts of the recording as
 attributes. ``write`` streams the same into a file.
 """
 
@@ -21,9 +21,10 @@ from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
 from tools.errors import InputError
 from tools.formats.blocks import batches
-from tools.formats.columns import Array, as_numbers, check_size, missing_column
+from tools.formats.columns import Array, as_numbers, check_size
 from tools.formats.packages import need
 from tools.mismatch.recording import RecordingError
+from tools.mismatch.text_table import missing_column
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -52,13 +53,13 @@ def dataset(recording: Recording) -> Dataset:
     times, texts = _events(recording)
     coordinates = {"t": ("t", clock, _time_attributes(recording)), "event_t": ("event", times, {"units": "s"})}
     variables = {name: ("t", values, _attributes(recording, name)) for name, values in columns.items()}
-    variables["event"] = ("event", np.array(texts, dtype=object), {"long_name": "what happened, JSON"})
+    variables["event_text"] = ("event", np.array(texts, dtype=object), {"long_name": "what happened, JSON"})
     return xarray.Dataset(variables, coordinates, provenance(recording))
 
 
 def write(recording: Recording, path: Path) -> None:
     """Write what ``dataset`` returns, with a few blocks in memory at a time. ``InputError`` without h5netcdf."""
-    (h5netcdf,) = need(path.name, EXTRA, "h5netcdf", "h5py")[:1]
+    h5netcdf, h5py = need(path.name, EXTRA, "h5netcdf", "h5py")
     clock = recording.names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in recording.names else None
     times, texts = _events(recording)
     with h5netcdf.File(path, "w") as file:
@@ -82,7 +83,7 @@ def write(recording: Recording, path: Path) -> None:
                 variable[start : start + rows.shape[1]] = rows[i]
         event_t = file.create_variable("event_t", ("event",), "f8")
         event_t.attrs["units"] = "s"
-        event = file.create_variable("event", ("event",), str)
+        event = file.create_variable("event_text", ("event",), h5py.string_dtype())
         event.attrs.update({"long_name": "what happened, JSON", "coordinates": "event_t"})
         if texts:
             event_t[:] = times
@@ -98,7 +99,7 @@ def provenance(recording: Recording) -> dict[str, str]:
         "title": recording.path.stem,
         "source": f"recording of a run (clock {texts.get('clock', 'unknown')}), firmware {revision}",
         "history": f"written from {recording.path.name} by micron-bench {version('micron-bench')}",
-        **{name: text for name, text in texts.items() if len(text.encode()) < fmt.CHUNK_BYTES * 4 - 1024},
+        **texts,
         **_health(recording),
     }
 

@@ -94,7 +94,7 @@ def guess_role(name: str, unit: str) -> GuessedRole:
 
 
 def guess(path: Path) -> Guess:
-    """Read a csv, npz or mcap file and propose what its columns are. Raises RecordingError."""
+    """Read a data file and propose what its columns are. Raises RecordingError."""
     names = column_names(path)
     if not names:
         raise RecordingError(f"{path}: no columns of numbers; a csv needs one header row, an npz one array per column")

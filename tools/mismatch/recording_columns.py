@@ -1,4 +1,4 @@
-"""Columns of a data file: text tables, npz, mat, mcap. Sizes are bounded; a fault is named with file and place."""
+"""Columns of a data file of any format, by its ending. Sizes are bounded; a fault is named with file and place."""
 
 from __future__ import annotations
 
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from firmware_py.recording.errors import RecordingError as McapRecordingError
 from firmware_py.recording.scan import ChunkMessage, mcap_records
 from hal.npz import open_npz
+from tools.formats import mdf, netcdf, parquet
 from tools.mismatch import mat_file, text_table
 from tools.mismatch.recording import RecordingError
 from tools.mismatch.text_table import missing_column
 
 Array = NDArray[np.float64]
-SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap")
+SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap", ".parquet", ".nc", ".mf4")
 MAX_BYTES = 4 << 30
 MAX_SAMPLES = 50_000_000
 MAX_MESSAGE_BYTES = 1 << 24
@@ -55,12 +56,19 @@ def column_names(path: Path) -> list[str]:
     return _format(path).names(path)
 
 
+def column_units(path: Path) -> dict[str, str]:
+    """Return the units that the file itself gives its columns; none for most formats. Raises RecordingError."""
+    units = _format(path).units
+    return units(path) if units is not None else {}
+
+
 @dataclass(frozen=True)
 class _Format:
-    """How the columns of one kind of file are listed and read."""
+    """How the columns of one kind of file are listed and read, and their units, where the format has any."""
 
     names: Callable[[Path], list[str]]
     read: Callable[[Path, list[str]], dict[str, Array]]
+    units: Callable[[Path], dict[str, str]] | None = None
 
 
 def _format(path: Path) -> _Format:
@@ -73,9 +81,14 @@ def _format(path: Path) -> _Format:
         raise RecordingError(f"{path}: data must be {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, not '{path.suffix}'")
     if suffix in text_table.SUFFIXES:
         return _Format(_text_names, lambda p, names: text_table.text_table(p).read(names))
-    return {".npz": _Format(_npz_names, _npz), ".mat": _Format(_mat_names, _mat), ".mcap": _Format(_mcap_names, _mcap)}[
-        suffix
-    ]
+    return {
+        ".npz": _Format(_npz_names, _npz),
+        ".mat": _Format(_mat_names, _mat),
+        ".mcap": _Format(_mcap_names, _mcap),
+        ".parquet": _Format(parquet.names, parquet.read, parquet.units),
+        ".nc": _Format(netcdf.names, netcdf.read, netcdf.units),
+        ".mf4": _Format(mdf.names, mdf.read, mdf.units),
+    }[suffix]
 
 
 def _text_names(path: Path) -> list[str]:

@@ -14,7 +14,7 @@ import numpy as np
 from hal.trust import path_inside
 from tools.mismatch import units
 from tools.mismatch.recording import Array, Recording, RecordingError, Split, TwinText
-from tools.mismatch.recording_columns import read_columns
+from tools.mismatch.recording_columns import SUFFIXES, column_units, read_columns
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
 
 MIN_SAMPLES = 50
@@ -55,10 +55,12 @@ def load(path: Path | str) -> Recording:
         raise RecordingError(f"{where}: no [[channels]]; describe each column that is used")
     data_name = text.get("data")
     if not isinstance(data_name, str):
-        raise RecordingError(f"{where}: 'data' must name the data file (.csv, .npz, .mcap), got {data_name!r}")
+        raise RecordingError(f"{where}: 'data' must name the data file ({', '.join(SUFFIXES)}), got {data_name!r}")
     twin, words = _twin(where, _twin_table(path, text.get("twin")))
     notes = [f"key '{k}' is unknown and not used" for k in text if k not in _TOP]
-    channels = _channels(where, text["channels"], words, twin.kind, notes)
+    data_path = path_inside(path, data_name)
+    in_file = column_units(data_path) if data_path.is_file() else {}
+    channels = _channels(where, text["channels"], words, twin.kind, notes, in_file)
     rate = _number(where, "rate_hz", text.get("rate_hz"))
     time_column = text.get("time_column")
     if rate is None and time_column is None:
@@ -71,7 +73,6 @@ def load(path: Path | str) -> Recording:
             raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
         if time_column not in names:
             names.append(time_column)
-    data_path = path_inside(path, data_name)
     columns = read_columns(data_path, names)
     n = columns[names[0]].size
     if n < MIN_SAMPLES:
@@ -215,7 +216,9 @@ def _twin(where: str, value: object) -> tuple[TwinText, Vocabulary]:
     return TwinText(kind, dict(parameters), tuple(effects)), words
 
 
-def _channels(where: str, value: object, words: Vocabulary, kind: str, notes: list[str]) -> list[_Channel]:
+def _channels(
+    where: str, value: object, words: Vocabulary, kind: str, notes: list[str], in_file: Mapping[str, str]
+) -> list[_Channel]:
     if not isinstance(value, list) or not value:
         raise RecordingError(f"{where}: [[channels]] must be a list of tables")
     out: list[_Channel] = []
@@ -246,7 +249,7 @@ def _channels(where: str, value: object, words: Vocabulary, kind: str, notes: li
         allowed = words.units(role, signal)
         if allowed is None:
             raise RecordingError(f"{at}: {kind} has no {role} '{signal}'; it has: {words.known(role)}")
-        unit, to = _unit(at, entry.get("unit"), allowed, signal, notes)
+        unit, to = _unit(at, entry.get("unit", in_file.get(column)), allowed, signal, notes)
         noise = _positive(at, "noise_rms", entry.get("noise_rms"))
         step = _positive(at, "resolution", entry.get("resolution"))
         if noise is not None and role != "output":

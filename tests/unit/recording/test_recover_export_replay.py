@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import builtins
 import csv
 import tomllib
 from collections.abc import Callable
@@ -15,13 +14,12 @@ from mcap.reader import make_reader
 
 from firmware_py.exit_codes import Exit
 from firmware_py.recording.errors import RecordingError
-from tools.formats.export import export, export_folder
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover
 from firmware_py.recording.replay import Mismatch, replay
 from firmware_py.recording.writer import RecordingWriter
 from tests.unit.recording.samples import COLUMNS, METADATA, same_bits
-from tools.errors import InputError
+from tools.formats.export import export, export_folder
 from tools.mismatch.recording_load import load
 
 WriteFile = Callable[..., tuple[Path, np.ndarray]]
@@ -119,22 +117,6 @@ class TestExport:
         assert same_bits(np.column_stack([table[n].to_numpy() for n in NAMES]), rows)
         assert table.schema.field("volts_0").metadata == {b"unit": b"V"}
 
-    def test_parquet_without_pyarrow_says_how_to_get_it(
-        self, write_file: WriteFile, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        path, _ = write_file(100)
-        real = builtins.__import__
-
-        def without(name: str, *args: Any, **kwargs: Any) -> Any:
-            if name.startswith("pyarrow"):
-                raise ImportError(name)
-            return real(name, *args, **kwargs)
-
-        monkeypatch.setattr(builtins, "__import__", without)
-        with pytest.raises(InputError, match=r"needs pyarrow; install it with: pip install 'micron-bench\[parquet\]'"):
-            export(Recording(path), tmp_path / "run.parquet")
-        assert [p.name for p in tmp_path.iterdir()] == ["run.mcap"]
-
     def test_the_contract_folder(self, tmp_path: Path) -> None:
         rows = np.arange(1500.0).reshape(300, 5)
         rows[7, 4] = np.nan
@@ -199,7 +181,7 @@ class TestExport:
 
     def test_an_unknown_format_names_the_known_ones(self, write_file: WriteFile, tmp_path: Path) -> None:
         path, _ = write_file(100)
-        with pytest.raises(RecordingError, match="'xlsx' is unknown; use csv, npz, parquet or folder"):
+        with pytest.raises(RecordingError, match="'xlsx' is unknown; use csv, npz, parquet, nc, mf4 or folder"):
             export(Recording(path), tmp_path / "run.xlsx")
 
 
