@@ -60,7 +60,7 @@ COMMANDS = {
     ),
     "export": (
         "recordings:export",
-        "Write a recording, or a span of it, as mcap, csv, npz, parquet, or the folder that the mismatch engine reads.",
+        "Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.",
     ),
     "scan": (
         "diagnose:scan",

@@ -10,11 +10,11 @@ from typing import Annotated
 import typer
 
 from firmware_py.recording.cut import cut
-from firmware_py.recording.export import ExportReport
-from firmware_py.recording.export import export as export_recording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
 from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.formats.export import ExportReport
+from tools.formats.export import export as export_recording
 from tools.output import check_writable, write_json
 
 Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the output file if it is there.")]
@@ -44,14 +44,14 @@ def export(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
     out: Annotated[
         Path,
-        typer.Option(metavar="PATH", help="name.csv, .npz, .parquet, .mcap, or a folder for the contract's form."),
+        typer.Option(metavar="PATH", help="name.csv, .npz, .parquet, .nc, .mf4, .mcap, or a folder."),
     ],
     from_s: Annotated[float | None, typer.Option("--from", metavar="S", help="First time, s. Default: all.")] = None,
     to_s: Annotated[float | None, typer.Option("--to", metavar="S", help="End of the span, s.")] = None,
     overwrite: Overwrite = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Write a recording, or a span of it, as mcap, csv, npz, parquet, or the folder that the mismatch engine reads.
+    """Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.
 
     Example: micron export out/run.mcap --out out/run.csv
     """

@@ -131,8 +131,8 @@ def _close_halfway(error: Exception) -> None:
     """
     trace = error.__traceback__
     while trace is not None:
-        left = trace.tb_frame.f_locals.get("self")
-        if getattr(left, "_closed", None) is False and type(left).__module__.startswith("asammdf."):
+        left: Any = trace.tb_frame.f_locals.get("self")
+        if type(left).__module__.startswith("asammdf.") and getattr(left, "_closed", None) is False:
             left._closed = True
             if left._tempfile is not None:
                 left._tempfile.close()

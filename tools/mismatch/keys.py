@@ -20,7 +20,7 @@ class Key:
 TOP = (
     Key("format", "1", "version of this format"),
     Key("title", "text", "heading of the report", "the file's name"),
-    Key("data", "file name", "the data: .csv with one header row, .npz with one array per column, or .mcap"),
+    Key("data", "file name", "the data: csv, tsv, txt, npz, mat, mcap, parquet, netCDF (.nc) or ASAM MDF (.mf4)"),
     Key("rate_hz", "number > 0", "uniform sampling rate", "from time_column"),
     Key("time_column", "column name", "time stamps in seconds, for recordings without rate_hz", "none"),
     Key("twin", "table", "the simulation that the recording is compared with"),
@@ -32,7 +32,7 @@ CHANNEL = (
     Key("column", "text", "name in the data file"),
     Key("role", "input, output, context", "drives the twin, is compared with it, or was recorded beside"),
     Key("signal", "text", "the twin's own name for it (below)"),
-    Key("unit", "text", "SI or another unit of the same dimension (mV, um, deg/s, G, mg, ...)", "the twin's"),
+    Key("unit", "text", "SI or another of its dimension (mV, um, deg/s, G, mg, ...)", "the file's, else the twin's"),
     Key("noise_rms", "number > 0", "of an output: rms noise of the instrument, in unit", "estimated"),
     Key("resolution", "number > 0", "of an output: smallest step of the readings, in unit", "found in the data"),
     Key("tolerance", "number > 0", "of an output: smaller differences do not matter to you, in unit", "none"),

@@ -130,7 +130,7 @@ def _pickled(folder: Path) -> None:
 
 BAD: list[tuple[str, Callable[[Path], None], str]] = [
     ("no data file", _text("data.csv", "gone.csv"), r"gone\.csv: data file does not exist"),
-    ("wrong kind of file", _text("data.csv", "recording.toml"), r"must be \.csv, .* or \.mcap"),
+    ("wrong kind of file", _text("data.csv", "recording.toml"), r"must be \.csv, .* or \.mf4"),
     ("toml syntax", _text("[twin]", "[twin"), r"recording\.toml: not valid TOML.*line"),
     ("format", _text("format = 1", "format = 2"), "format must be 1, got 2"),
     ("unknown unit", _text('"nm"', '"furlong"'), r"\[\[channels\]\] 2 \('z'\): unknown unit 'furlong'"),
