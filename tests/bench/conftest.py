@@ -25,6 +25,7 @@ from typing import Any
 
 import pytest
 
+from tests.bench.still import Still, still_server
 from tests.conftest import DEFAULT_BENCH, copy_of_default_bench
 
 START_S = 220.0
@@ -190,25 +191,52 @@ def browser() -> Iterator[Any]:
         chromium.close()
 
 
+READY = "window.micron && micron.link.state && micron.link.mayOrder"
+
+
 @contextmanager
-def opened_page(browser: Any, server: Server) -> Iterator[Any]:
-    """The bench page with the token, 1280 x 720; an error in the page fails the test."""
-    server.wait_running()
-    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True)
+def opened_tab(browser: Any, address: str, ready: str = READY, **more: Any) -> Iterator[Any]:
+    """A page of its own, 1280 x 720 and dark unless ``more`` says otherwise; an error in the page fails the test."""
+    window = {"viewport": {"width": 1280, "height": 720}, "color_scheme": "dark", "bypass_csp": True}
+    context = browser.new_context(**(window | more))
     context.set_default_timeout(60_000)
     tab = context.new_page()
     errors: list[str] = []
     tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(f"{server.base}/#token={server.token}")
-    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
     try:
+        tab.goto(address)
+        tab.wait_for_function(ready)
         yield tab
-    except BaseException as error:
-        state = server.state()
-        error.add_note(f"firmware: {state['phase']}, {state['reason']!r}; recording {state['recording']}")
-        raise
-    context.close()
+    finally:
+        context.close()
     assert not errors
+
+
+@contextmanager
+def opened_page(browser: Any, server: Server) -> Iterator[Any]:
+    """The bench page of a running firmware, with the token."""
+    server.wait_running()
+    with opened_tab(browser, f"{server.base}/#token={server.token}") as tab:
+        try:
+            yield tab
+        except BaseException as error:
+            state = server.state()
+            error.add_note(f"firmware: {state['phase']}, {state['reason']!r}; recording {state['recording']}")
+            raise
+
+
+@pytest.fixture(scope="module")
+def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
+    """A server over data that stand still, one for the tests of a module."""
+    with still_server(tmp_path_factory.mktemp("still") / "recordings") as served:
+        yield served
+
+
+@pytest.fixture
+def still_page(browser: Any, still: Still) -> Iterator[Any]:
+    """The page of the module's still server, with the token."""
+    with opened_tab(browser, still.address) as tab:
+        yield tab
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tests.bench.conftest import Server, go
+from tests.bench.conftest import Server, go, opened_tab
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -147,18 +147,17 @@ def test_the_safe_button_reaches_the_safe_state(page: Any, server: Server, artef
 
 def test_without_the_token_one_may_look_and_touch_nothing(browser: Any, server: Server):
     server.wait_running()
-    context = browser.new_context(bypass_csp=True)  # playwright evaluates text
-    page = context.new_page()
-    page.goto(f"{server.base}/#token=wrong")
-    page.wait_for_selector("#alerts >> text=View only")
-    page.click("#safe")
-    page.wait_for_function("micron.link.frames >= 0 && micron.link.state.phase === 'running'")
-    request = "{method: 'POST', headers: {'X-Micron-Token': 'wrong'}}"
-    refused = page.evaluate(f"fetch('/api/safe', {request}).then((a) => a.status)")
-    assert refused == 403
-    page.wait_for_timeout(500)
-    assert server.state()["phase"] == "running"
-    context.close()
+    ready = "window.micron && micron.link.state"
+    with opened_tab(browser, f"{server.base}/#token=wrong", ready) as page:
+        page.wait_for_selector("#alerts >> text=View only")
+        page.wait_for_selector("#ask-token >> text=does not know the token")
+        page.click("#safe")
+        page.wait_for_selector("#say >> text=did not reach the bench")
+        request = "{method: 'POST', headers: {'X-Micron-Token': 'wrong'}}"
+        assert page.evaluate(f"fetch('/api/safe', {request}).then((a) => a.status)") == 403
+        now_s = page.evaluate("micron.link.state.status.t_s")
+        page.wait_for_function(f"micron.link.state.status.t_s > {now_s} + 0.5")
+        assert server.state()["phase"] == "running"
 
 
 def test_a_recording_survives_a_reload_and_a_closed_browser(page: Any, browser: Any, server: Server):

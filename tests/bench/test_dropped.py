@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import http.client
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 
 from tests.bench.conftest import go
-from tests.bench.still import Still, still_server
+from tests.bench.still import Still
 from tools.bench.dropped import OFFERED, description, parameter_value
 from tools.bench.dropped_files import MOST_KEPT, Dropped
 from tools.bench.guard import MAX_UPLOAD_BYTES
@@ -66,12 +65,6 @@ def test_the_oldest_file_that_nobody_described_goes(tmp_path: Path):
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("dropped") / "recordings") as served:
-        yield served
-
-
 def put(still: Still, name: str, body: bytes, token: str | None, length: int | None = None) -> tuple[int, str]:
     connection = http.client.HTTPConnection(*still.place, timeout=60)
     connection.putrequest("PUT", f"/api/upload/{name}")
@@ -110,18 +103,10 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
 
 
 @pytest.fixture
-def page(browser: Any, still: Still) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(still.address)
-    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
-    go(tab, "mismatch")
-    tab.wait_for_selector("select option", state="attached")
-    yield tab
-    context.close()
-    assert not errors
+def page(still_page: Any) -> Any:
+    go(still_page, "mismatch")
+    still_page.wait_for_selector("select option", state="attached")
+    return still_page
 
 
 FILE = "input[aria-label='Data file']"

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from tests.bench.conftest import go
-from tests.bench.still import Still, still_server
+from tests.bench.conftest import go, opened_tab
+from tests.bench.still import Still
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -62,32 +62,13 @@ MEASURE = """() => {
 }"""
 
 
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("still") / "recordings") as served:
-        yield served
-
-
 @contextmanager
 def opened(browser: Any, still: Still, size: str, theme: str = "dark", **more: Any) -> Iterator[Any]:
     """A page with the token; an error in the page fails the test."""
     width, height, ratio = SIZES[size]
-    context = browser.new_context(
-        viewport={"width": width, "height": height},
-        device_scale_factor=ratio,
-        bypass_csp=True,
-        color_scheme=theme,
-        reduced_motion="reduce",
-        **more,
-    )
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(still.address)
-    tab.wait_for_function("window.micron && micron.link.state && micron.link.mayOrder")
-    yield tab
-    context.close()
-    assert not errors
+    window = {"viewport": {"width": width, "height": height}, "device_scale_factor": ratio, "color_scheme": theme}
+    with opened_tab(browser, still.address, reduced_motion="reduce", **window, **more) as tab:
+        yield tab
 
 
 def show(tab: Any, view: str) -> None:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from tests.bench.conftest import go
+from tests.bench.conftest import go, opened_tab
 from tests.bench.still import Still, still_server
 from tools.bench.layouts import KIND, Layouts
 from tools.errors import InputError
@@ -26,21 +26,8 @@ READY = "window.micron && micron.scope && micron.scope.traces.length && micron.l
 
 @contextmanager
 def opened(browser: Any, still: Still) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(still.address)
-    tab.wait_for_function(READY)
-    yield tab
-    context.close()
-    assert not errors
-
-
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("layouts") / "recordings") as served:
-        yield served
+    with opened_tab(browser, still.address, READY) as tab:
+        yield tab
 
 
 def names(tab: Any) -> list[str]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -20,16 +19,10 @@ from tools.bench.guard import MAX_BODY_BYTES
 PATIENCE_S = 60.0
 
 
-@pytest.fixture(scope="module")
-def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("limits") / "recordings") as server:
-        yield server
-
-
 @pytest.fixture
-def still(served: Still) -> Still:
-    served.session.orders.clear()
-    return served
+def still(still: Still) -> Still:
+    still.session.orders.clear()
+    return still
 
 
 def opened(still: Still, first: bytes = b"") -> socket.socket:

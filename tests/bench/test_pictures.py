@@ -11,7 +11,6 @@ from __future__ import annotations
 import io
 import json
 import os
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +20,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from tests.bench.conftest import ARTEFACTS
-from tests.bench.still import Still, still_server
+from tests.bench.still import Still
 from tests.bench.test_every_size import READY, VIEWS, show
 
 # other builds of Chromium write dates and break lines otherwise: for the machine that stored the pictures
@@ -48,12 +47,6 @@ WIDTHS = """() => ["--sans", "--mono"].flatMap((font) => [400, 600].map((weight)
     g.font = `${weight} 100px ${getComputedStyle(document.documentElement).getPropertyValue(font)}`;
     return Math.round(g.measureText("Safe state 0123456789 µm/div, sample to command").width);
 }))"""
-
-
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("pictures") / "recordings") as served:
-        yield served
 
 
 def blocks_of(png: bytes) -> NDArray[np.float64]:

@@ -17,7 +17,7 @@ from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.index import IndexedRecording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.writer import RecordingWriter
-from tests.bench.conftest import go
+from tests.bench.conftest import go, opened_tab
 from tests.bench.still import Still, made_up_rows, still_server
 from tools.bench.history import History
 from tools.bench.overview import EXTREMES, SPANS, summarize
@@ -192,15 +192,8 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
 
 @pytest.fixture
 def page(browser: Any, still: Still) -> Iterator[Any]:
-    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(still.address)
-    tab.wait_for_function("window.micron && micron.scope && micron.link.mayOrder")
-    yield tab
-    context.close()
-    assert not errors
+    with opened_tab(browser, still.address, "window.micron && micron.scope && micron.link.mayOrder") as tab:
+        yield tab
 
 
 def row(page: Any, name: str) -> Any:

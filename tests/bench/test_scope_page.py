@@ -14,8 +14,8 @@ import pytest
 from scipy import signal
 
 from firmware_py.frame import LAYOUT
-from tests.bench.conftest import go
-from tests.bench.still import TREMOR_HZ, Still, made_up_rows, still_server
+from tests.bench.conftest import go, opened_tab
+from tests.bench.still import TREMOR_HZ, Still, made_up_rows
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -24,25 +24,13 @@ COMMANDS = ["command_1", "command_2", "command_3"]
 FRAMES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))"
 
 
-@pytest.fixture(scope="module")
-def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
-    with still_server(tmp_path_factory.mktemp("scope") / "recordings") as served:
-        yield served
-
-
 @pytest.fixture
 def scope(browser: Any, still: Still) -> Iterator[Any]:
     """The page, on the scope as it opens for somebody who was never there."""
-    context = browser.new_context(viewport={"width": 1280, "height": 720}, bypass_csp=True, color_scheme="dark")
-    tab = context.new_page()
-    errors: list[str] = []
-    tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
-    tab.goto(still.address)
-    tab.wait_for_function("window.micron && micron.scope && micron.scope.subscription.buckets.n > 100")
-    tab.evaluate(FRAMES)
-    yield tab
-    context.close()
-    assert not errors
+    ready = "window.micron && micron.scope && micron.scope.subscription.buckets.n > 100"
+    with opened_tab(browser, still.address, ready) as tab:
+        tab.evaluate(FRAMES)
+        yield tab
 
 
 def use(scope: Any, **settings: Any) -> None:

@@ -15,8 +15,8 @@ from starlette.routing import BaseRoute, Route
 from tools.bench.dropped import run_module
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
-from tools.bench.setup_file import AXES, PLACES, Draft, bench_text, checked, read_draft
-from tools.diagnose.scan import machine_ports
+from tools.bench.setup_file import DAQS, OUTPUTS, Draft, bench_text, checked, read_draft
+from tools.diagnose.scan import machine_ports, serial_ports
 from tools.errors import InputError
 from tools.output import write_text_atomic
 
@@ -25,26 +25,31 @@ name = "scan"
 [clock]
 tick_hz = 1000
 [bus.scanned]
-kind = "i2c"
+kind = "{kind}"
 uri = {uri}
-speed_hz = 400_000
+{speed}
 """
+_SPEEDS = {"i2c": "speed_hz = 400_000", "can": "bitrate = 500_000"}
 
 
-def found_uris(emulated: bool) -> dict[str, list[str]]:
-    """Return the addresses of every bus that this machine has, and those of the emulated bench where that is one."""
-    found: dict[str, list[str]] = {"serial": [], "i2c": [], "can": []}
+def found_uris(emulated: bool) -> dict[str, dict[str, str]]:
+    """Return the URIs of every bus that this machine has by kind, each with what the machine knows of it.
+
+    Serial ports are known by their USB descriptors: nothing is sent to them. The emulated bench has buses as well.
+    """
+    found: dict[str, dict[str, str]] = {"serial": {}, "i2c": {}, "can": {}}
+    products = {port.path: port.product for port in serial_ports()}
     for port in machine_ports():
         if "/i2c-" in port:
-            found["i2c"].append(f"linux-i2c://{port.rpartition('-')[2]}")
+            found["i2c"][f"linux-i2c://{port.rpartition('-')[2]}"] = ""
         elif port.startswith("/sys/class/net/"):
-            found["can"].append(f"socketcan://{Path(port).name}")
+            found["can"][f"socketcan://{Path(port).name}"] = ""
         else:
-            found["serial"].append(f"serial://{port}")
+            found["serial"][f"serial://{port}"] = products.get(port, "")
     if emulated:
-        found["serial"].append("sim://daq0")
-        found["i2c"] += ["sim://i2c0", "sim://i2c1"]
-        found["can"].append("sim://can0")
+        found["serial"] |= {"sim://daq0": "emulated DI-4108", "sim://e7270": "emulated E-727"}
+        found["i2c"] |= {"sim://i2c0": "emulated", "sim://i2c1": "emulated"}
+        found["can"]["sim://can0"] = "emulated"
     return found
 
 
@@ -56,25 +61,42 @@ def setup_routes(session: Session) -> list[BaseRoute]:
 
     async def found(_: Request) -> Any:
         emulated = bool(session.bench.description.emulated_buses())
-        return {**found_uris(emulated), "axes": AXES, "places": PLACES, "folder": str(session.home)}
+        return {
+            **found_uris(emulated),
+            "daqs": DAQS,
+            "outputs": {name: [title, bus] for name, (title, bus, _) in OUTPUTS.items()},
+            "folder": str(session.home),
+        }
 
     async def scan(request: Request) -> Any:
-        """Look for addresses on one I2C bus. It reads a byte from each, so the bus must not be in use."""
+        """Look for addresses on one I2C bus, or listen to one CAN bus.
+
+        The former reads a byte from each address, so that the bus must not be in use; the latter sends nothing.
+        """
         uri = text(await body(request), "uri", longest=100)
-        if uri not in found_uris(bool(session.bench.description.emulated_buses()))["i2c"]:
-            raise InputError(f"{uri!r} is not an I2C bus of this machine")
+        found = found_uris(bool(session.bench.description.emulated_buses()))
+        kind = next((k for k in _SPEEDS if uri in found[k]), None)
+        if kind is None:
+            raise InputError(f"{uri!r} is not an I2C or CAN bus of this machine")
         busy = [name for name, spec in session.bench.description.bus.items() if spec.uri == uri]
-        if busy and not uri.startswith("sim://") and session.run.phase in ("starting", "running"):
+        emulated = uri.startswith("sim://")
+        if kind == "i2c" and busy and not emulated and session.run.phase in ("starting", "running"):
             raise InputError(f"the running bench uses {uri} ({busy[0]}); press Safe state first, then scan")
         with tempfile.TemporaryDirectory(prefix="micron-scan-") as folder:
-            bench, found = Path(folder) / "scan.toml", Path(folder) / "found.json"
-            bench.write_text(_SCAN.format(uri=json.dumps(uri)), encoding="utf-8")
+            bench, answer = Path(folder) / "scan.toml", Path(folder) / "found.json"
+            content = _SCAN.format(kind=kind, uri=json.dumps(uri), speed=_SPEEDS[kind])
+            bench.write_text(content, encoding="utf-8")
             # emulated devices are those of the bench that runs; a second emulated world answers for it
-            what = [str(session.choice.bench), "--virtual"] if uri.startswith("sim://") else [str(bench)]
-            await run_module("tools.cli.main", "scan", "--bench", *what, "--json", str(found))
-            answers = json.loads(found.read_text(encoding="utf-8"))["i2c"]
-        bus = busy[0] if uri.startswith("sim://") and busy else "scanned"
-        return {"uri": uri, "addresses": [a["address"] for a in answers if a["answered"] and a["bus"] == bus]}
+            what = [str(session.choice.bench), "--virtual"] if emulated else [str(bench)]
+            await run_module("tools.cli.main", "scan", "--bench", *what, "--json", str(answer))
+            answers = json.loads(answer.read_text(encoding="utf-8"))
+        bus = busy[0] if emulated and busy else "scanned"
+        return {
+            "uri": uri,
+            "kind": kind,
+            "addresses": [a["address"] for a in answers["i2c"] if a["answered"] and a["bus"] == bus],
+            "frames": [[c["can_id"], c["name"], c["rate_hz"]] for c in answers["can"] if c["bus"] == bus],
+        }
 
     async def check(request: Request) -> Any:
         content = draft_text(read_draft(await body(request)))

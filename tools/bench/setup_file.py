@@ -21,23 +21,41 @@ PLACES = (*AXES, "supply", "temperature")
 """What the inputs of the converter are for; axes as in the drawing of the instrument."""
 INPUTS = 8
 _URIS = {
-    "daq0": r"serial:///dev/[\w./-]+|sim://daq0",
+    "daq0": r"serial:///dev/[\w./:+-]+|sim://daq0",
     "i2c0": r"linux-i2c://\d+|sim://i2c0",
     "i2c1": r"linux-i2c://\d+|sim://i2c1",
+    "e7270": r"serial:///dev/[\w./:+-]+|sim://e7270",
     "can0": r"socketcan://[\w-]+|sim://can0",
 }
+_BUSES = {  # kind, what hangs on it, more keys
+    "daq0": ("serial", "the converter of the accelerometers", ""),
+    "i2c0": ("i2c", "the outputs, and nothing that could hold them up", "speed_hz = 400_000"),
+    "i2c1": ("i2c", "the slow converters", "speed_hz = 400_000"),
+    "e7270": ("serial", "the controller of the outputs", "baud = 115_200"),
+    "can0": ("can", "telemetry for other programs", "bitrate = 500_000"),
+}
 _SENSORS = {"acc1": "xz", "acc2": "yz", "acc3": "xy"}
+DAQS = {"di4108": "DATAQ DI-4108", "nidaqmx": "NI card (NI-DAQmx)"}
+OUTPUTS = {  # what people call it, its bus, s from a sample to what the command does (benches of this project)
+    "dac_amplifier": ("AD5696R on I2C and an amplifier", "i2c0", 0.0017),
+    "e727": ("PI E-727, serial", "e7270", 0.0070),
+    "can_amplifier": ("piezo node on CAN", "can0", 0.0015),
+    "nidaqmx_ao": ("NI card and an amplifier", "", 0.0017),
+}
 
 
 @dataclass(frozen=True)
 class Draft:
     """A bench as a person described it. ``inputs``: the converter's input of each of ``PLACES``. Addresses on I2C are
-    None for a part that the bench lacks."""
+    None for a part that the bench lacks. ``cards``: names of NI cards for "daq" and "output", where they are some."""
 
     name: str
     uris: dict[str, str]
     inputs: dict[str, int]
-    piezo: int
+    daq: str
+    output: str
+    cards: dict[str, str]
+    piezo: int | None
     magnetometer: int | None
     monitor: int | None
     telemetry: bool
@@ -51,11 +69,18 @@ def read_draft(table: dict[str, Any]) -> Draft:
     """Return the draft in a request. ``InputError`` names the field that is wrong."""
     name = check_name(text(table, "name", longest=80).strip())
     magnetometer, monitor = (_address(table, part) for part in ("magnetometer", "monitor"))
-    piezo = _address(table, "piezo")
-    if piezo is None:
+    daq, output = text(table, "daq", "di4108"), text(table, "output", "dac_amplifier")
+    if daq not in DAQS or output not in OUTPUTS:
+        raise InputError(f"the converter is one of {', '.join(DAQS)}, the output one of {', '.join(OUTPUTS)}")
+    cards = {
+        part: _card(table, part) for part, kind in (("daq", daq), ("output", output)) if kind.startswith("nidaqmx")
+    }
+    piezo = _address(table, "piezo") if output == "dac_amplifier" else None
+    if piezo is None and output == "dac_amplifier":
         raise InputError("the output needs the address of its DAC")
     telemetry = table.get("telemetry") is True
-    needed = ["daq0", "i2c0", *(["i2c1"] if magnetometer or monitor else []), *(["can0"] if telemetry else [])]
+    wanted = {"daq0": daq == "di4108", "i2c1": magnetometer or monitor, "can0": telemetry}
+    needed = [bus for bus in _BUSES if wanted.get(bus) or bus == OUTPUTS[output][1]]
     given = table.get("uris")
     uris: dict[str, str] = {}
     for bus in needed:
@@ -65,8 +90,17 @@ def read_draft(table: dict[str, Any]) -> Draft:
         uris[bus] = uri
     real = [uri for uri in uris.values() if not uri.startswith("sim://")]
     if len(set(real)) < len(real):
-        raise InputError("two buses have the same address: the outputs need an I2C bus of their own")
-    return Draft(name, uris, _inputs(table.get("inputs")), piezo, magnetometer, monitor, telemetry)
+        raise InputError("two buses have the same address: the outputs need a bus of their own")
+    return Draft(
+        name, uris, _inputs(table.get("inputs")), daq, output, cards, piezo, magnetometer, monitor, telemetry
+    )  # fmt: skip
+
+
+def _card(table: dict[str, Any], part: str) -> str:
+    card = text(table, f"{part}_card", longest=60).strip()
+    if not re.fullmatch(r"[A-Za-z][\w-]*", card):
+        raise InputError(f"{part}: {card!r} is no name of an NI card; NI MAX or `nilsdev` lists them, as Dev1")
+    return card
 
 
 def _address(table: dict[str, Any], part: str) -> int | None:
@@ -105,19 +139,15 @@ def bench_text(draft: Draft, calibrations: list[str]) -> str:
             "[emulation] # read only for buses whose URI starts with sim://",
             'provider = "sim_devices.register:provider"', "unit = 1", "seed = 1", "",
         ]  # fmt: skip
-    comments = {
-        "daq0": "the converter of the accelerometers",
-        "i2c0": "the outputs, and nothing that could hold them up",
-        "i2c1": "the slow converters",
-        "can0": "telemetry for other programs",
-    }
-    more = {"daq0": "", "i2c0": "speed_hz = 400_000", "i2c1": "speed_hz = 400_000", "can0": "bitrate = 500_000"}
-    kinds = {"daq0": "serial", "i2c0": "i2c", "i2c1": "i2c", "can0": "can"}
     for bus, uri in uris.items():
-        lines += [f"[bus.{bus}] # {comments[bus]}", f'kind = "{kinds[bus]}"', f"uri = {json.dumps(uri)}"]
-        lines += [more[bus], ""] if more[bus] else [""]
+        kind, comment, more = _BUSES[bus]
+        if bus == "can0" and draft.output == "can_amplifier":
+            comment = "the node of the outputs, and telemetry" if draft.telemetry else "the node of the outputs"
+        lines += [f"[bus.{bus}] # {comment}", f'kind = "{kind}"', f"uri = {json.dumps(uri)}"]
+        lines += [more, ""] if more else [""]
     lines += [
-        "[device.daq]", 'driver = "di4108"', 'bus = "daq0"', "rate_hz = 1000",
+        f"[device.daq] # {DAQS[draft.daq]}", f'driver = "{draft.daq}"',
+        f"device = {json.dumps(draft.cards['daq'])}" if draft.daq == "nidaqmx" else 'bus = "daq0"', "rate_hz = 1000",
         f"channels = {sorted(inputs.values())}", "range_V = 5.0", "",
     ]  # fmt: skip
     for device, axes in _SENSORS.items():
@@ -142,10 +172,16 @@ def bench_text(draft: Draft, calibrations: list[str]) -> str:
         ]  # fmt: skip
     else:
         lines += ["# no monitor: an amplifier that does not obey is not noticed", ""]
-    lines += [
-        "[device.piezo]", 'driver = "dac_amplifier"', 'bus = "i2c0"', f"address = {draft.piezo:#04x}",
-        "gain = 20.0 # of the amplifier: output volts per volt of the DAC", "neutral_V = 50.0", "",
-    ]  # fmt: skip
+    title, bus, delay_s = OUTPUTS[draft.output]
+    lines += [f"[device.piezo] # {title}", f'driver = "{draft.output}"', *([f'bus = "{bus}"'] if bus else [])]
+    if draft.piezo is not None:
+        lines += [f"address = {draft.piezo:#04x}", "gain = 20.0 # of the amplifier: output volts per volt of the DAC"]
+    elif draft.output == "nidaqmx_ao":
+        card = json.dumps(draft.cards["output"])
+        lines += [f"device = {card}", "channels = [0, 1, 2]", "gain = 20.0 # of the amplifier: output per card volt"]
+    elif draft.output == "e727":
+        lines += ["rate_hz = 100 # commands a second; a frame takes 1.3 ms of the wire"]
+    lines += ["neutral_V = 50.0", ""]
     if draft.telemetry:
         lines += ["[device.telemetry]", 'driver = "can_telemetry"', 'bus = "can0"', ""]
     lines += [
@@ -156,7 +192,8 @@ def bench_text(draft: Draft, calibrations: list[str]) -> str:
         f"calibration = {json.dumps(calibrations)}", "",
         "[firmware.sensing] # where the sensors and the tip sit, m; `micron calibrate positions` refines it",
         "positions_m = [[0.0101, -0.0101, 0.0], [-0.0101, 0.0101, 0.0], [0.0042, 0.0042, 0.116]]",
-        "tip_m = [0.0, 0.0, 0.155]",
+        "tip_m = [0.0, 0.0, 0.155]", "",
+        "[firmware.tremor]", f"loop_delay_s = {delay_s} # sample to what the command does, on the emulated bench",
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 from drivers.dbc import load_database
@@ -62,6 +63,39 @@ def machine_ports() -> list[str]:
     """Serial ports, I2C buses and CAN interfaces of this machine."""
     patterns = ("/dev/ttyACM*", "/dev/ttyUSB*", "/dev/ttyAMA*", "/dev/i2c-*", "/sys/class/net/*can*")
     return sorted(path for pattern in patterns for path in glob.glob(pattern))
+
+
+@dataclass(frozen=True)
+class SerialPort:
+    """A serial port of this machine and what its USB descriptor says of the device; empty when there is none."""
+
+    path: str
+    product: str
+
+
+def serial_ports(root: Path = Path("/")) -> list[SerialPort]:
+    """Serial ports with maker, product and serial number as USB told the system. Nothing is sent to a device.
+
+    ``root`` has ``dev`` and ``sys`` in it.
+    """
+    found: list[SerialPort] = []
+    for pattern in ("ttyACM*", "ttyUSB*", "ttyAMA*"):
+        for port in sorted((root / "dev").glob(pattern)):
+            # .../usb1/1-2/1-2:1.0/ttyUSB0: the descriptor is one or two folders above the interface
+            device = (root / "sys/class/tty" / port.name / "device").resolve()
+            usb = next((p for p in (device, *device.parents[:3]) if (p / "idVendor").is_file()), None)
+            words = [] if usb is None else [_descriptor(usb / name) for name in ("manufacturer", "product", "serial")]
+            found.append(SerialPort("/" + str(port.relative_to(root)), " ".join(w for w in words if w)))
+    return found
+
+
+def _descriptor(file: Path) -> str:
+    """A line of a USB descriptor; a device writes what it likes into it."""
+    try:
+        said = file.read_text(encoding="utf-8", errors="replace").strip()
+    except OSError:
+        return ""
+    return "".join(c for c in said if c.isprintable())[:60]
 
 
 def scan_bench(

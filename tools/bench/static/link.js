@@ -22,6 +22,7 @@ export class Link extends EventTarget {
     this.replay = null; // the recording that the views show, if they show one
     this.server = ""; // which server this is: another one has another history, and perhaps another token
     this.refused = false; // whether the server does not know the token
+    this.wasTrusted = false; // whether a server knew a token of this page
     this.connect();
   }
 
@@ -131,6 +132,7 @@ export class Link extends EventTarget {
       for (const subscription of this.subscriptions.values()) subscription.buckets.clear();
       this.mayOrder = message.may_order;
       this.refused = Boolean(this.token) && !this.mayOrder;
+      this.wasTrusted ||= this.mayOrder;
       const another = this.server && this.server !== message.server;
       const same = !another && this.run === message.run; // only the connection, or the token, is another one
       [this.server, this.run] = [message.server, message.run];

@@ -158,8 +158,9 @@ function showAlerts() {
   if (!link.connected) alerts.unshift({ kind: "error", text: "Connection to the bench server lost. What you see is old. Trying again …" });
   else if (age > 1.5) alerts.unshift({ kind: "error", text: `The bench server has said nothing for ${age.toFixed(0)} s. What you see is old.` });
   showTokenForm();
-  if (link.connected && link.state && !link.mayOrder && !link.refused) {
-    alerts.push({ kind: "info", text: "View only: to control the bench open the address that “micron bench” printed." });
+  if (link.connected && link.state && !link.mayOrder) {
+    const remedy = link.refused ? "" : ": to control the bench open the address that “micron bench” printed";
+    alerts.push({ kind: "info", text: `View only${remedy}. The safe button of this page has no effect.` });
   }
   const text = JSON.stringify(alerts) + link.mayOrder + link.state?.phase;
   if (text === lastAlerts) return;
@@ -172,12 +173,13 @@ function showAlerts() {
   );
 }
 
-/** The server was started again and has another token: it is asked for in words, and everything on the page stays. */
+/** The server does not know the page's token: it is asked for in words, and everything on the page stays. */
 function showTokenForm() {
   const form = byId("ask-token");
   if (form.hidden === !link.refused) return;
   form.hidden = !link.refused;
-  form.querySelector("label").textContent = "The bench server was started again and has a new token. Paste the address that “micron bench” printed; what is on this page stays.";
+  const cause = link.wasTrusted ? "The bench server was started again and has a new token." : "The bench server does not know the token of this page.";
+  form.querySelector("label").textContent = `${cause} Paste the address that “micron bench” printed; what is on this page stays.`;
 }
 
 function useToken(event) {
@@ -205,10 +207,11 @@ function showLog(lines) {
     h("div", { className: line.level }, h("time", {}, new Date(line.time * 1000).toLocaleTimeString()), line.text)));
 }
 
-/** The one button that must always work: over the websocket, and by request in case that is stuck. */
+/** The one button that must always work: over the websocket, and by request in case that is stuck. An order that reached
+ * nobody is said: the person has to act. */
 function goSafe() {
   link.order("safe");
-  post("/api/safe").catch(() => {});
+  post("/api/safe").catch((error) => say(`The safe order did not reach the bench (${error.message}). Switch the amplifier off if there is danger.`));
 }
 
 function setTheme(theme) {

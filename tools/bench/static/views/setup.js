@@ -3,8 +3,8 @@ import { get, post } from "../api.js";
 import { digits, h } from "../dom.js";
 
 const VOLTS = [0, 1, 2, 3, 4, 5, 6, 7].map((i) => `volts_${i}`);
-const BUSES = [["daq0", "serial", "converter of the accelerometers"], ["i2c0", "i2c", "outputs"], ["i2c1", "i2c", "slow converters"], ["can0", "can", "telemetry"]];
-const PARTS = [["piezo", "i2c0", 0x0c, "DAC of the outputs", true], ["magnetometer", "i2c1", 0x48, "converter of the magnetometer", false], ["monitor", "i2c1", 0x49, "converter of the monitor", false]];
+const BUSES = [["daq0", "serial", "converter of the accelerometers"], ["i2c0", "i2c", "outputs"], ["e7270", "serial", "controller of the outputs"], ["i2c1", "i2c", "slow converters"], ["can0", "can", "telemetry, or the node of the outputs"]];
+const PARTS = [["piezo", "i2c0", 0x0c, "DAC of the outputs"], ["magnetometer", "i2c1", 0x48, "converter of the magnetometer"], ["monitor", "i2c1", 0x49, "converter of the monitor"]];
 const hex = (v) => `0x${v.toString(16).padStart(2, "0").toUpperCase()}`;
 
 export function mount(root, { link, navigate }) {
@@ -24,18 +24,42 @@ export function mount(root, { link, navigate }) {
     field.setAttribute("list", `found-${kind}`);
     return [bus, field];
   }));
+  const uriRows = Object.fromEntries(BUSES.map(([bus, , what]) => [bus, h("label", {}, h("span", {}, h("b", {}, bus), ` ${what}`), uriFields[bus])]));
   const lists = h("div", { hidden: true });
-  const answers = h("span.num.soft");
-  const scanButton = h("button", { onclick: () => act(scan) }, "Scan the I2C buses");
+  const known = h("div.soft.num");
+  const answers = h("div.num.soft", { role: "status" });
+  const scanButton = h("button", { title: "Reads a byte from each I2C address; listens to CAN for two seconds", onclick: () => act(scan) }, "Scan I2C and CAN");
+
+  // what the bench has: a converter, an output, and what may be left out
+  const daq = h("select", { "aria-label": "Converter of the accelerometers", onchange: () => showNeeded() });
+  const output = h("select", { "aria-label": "Outputs", onchange: () => showNeeded() });
+  const card = (what, value) => h("input.unit-field", { type: "text", maxLength: 60, value, "aria-label": `NI card of the ${what}` });
+  const cards = { daq: card("converter", "Dev1"), output: card("outputs", "Dev2") };
   const has = {};
   const addresses = {};
-  const parts = PARTS.map(([part, bus, address, what, always]) => {
-    has[part] = h("input", { type: "checkbox", checked: true, disabled: always, "aria-label": `The bench has: ${what}`, onchange: () => { addresses[part].disabled = !has[part].checked; } });
+  const partRows = Object.fromEntries(PARTS.map(([part, bus, address, what]) => {
+    has[part] = h("input", { type: "checkbox", checked: true, disabled: part === "piezo", "aria-label": `The bench has: ${what}`, onchange: () => showNeeded() });
     addresses[part] = h("input.unit-field", { type: "text", value: hex(address), "aria-label": `Address of the ${what}` });
-    return h("div.row", {}, h("label", {}, has[part], what), h("span.faint", {}, `on ${bus} at`), addresses[part]);
-  });
-  const telemetry = h("input", { type: "checkbox", checked: true, "aria-label": "The bench has: telemetry on CAN" });
-  parts.push(h("div.row", {}, h("label", {}, telemetry, "telemetry on CAN")));
+    return [part, h("div.row", {}, h("label", {}, has[part], what), h("span.faint", {}, `on ${bus} at`), addresses[part])];
+  }));
+  const telemetry = h("input", { type: "checkbox", checked: true, "aria-label": "The bench has: telemetry on CAN", onchange: () => showNeeded() });
+  const parts = [h("div.set", {}, h("label", {}, h("span", {}, h("b", {}, "converter"), " of the accelerometers"), daq, cards.daq), h("label", {}, h("span", {}, h("b", {}, "outputs")), output, cards.output)),
+    ...Object.values(partRows), h("div.row", {}, h("label", {}, telemetry, "telemetry on CAN"))];
+  let outputBus = {};
+
+  /** The buses that the chosen parts hang on; the fields of the others go. */
+  function neededBuses() {
+    return BUSES.map(([bus]) => bus).filter((bus) => bus === outputBus[output.value] || (bus === "daq0" && daq.value === "di4108")
+      || (bus === "i2c1" && (has.magnetometer.checked || has.monitor.checked)) || (bus === "can0" && telemetry.checked));
+  }
+  function showNeeded() {
+    const needed = neededBuses();
+    for (const [bus] of BUSES) uriRows[bus].hidden = !needed.includes(bus);
+    partRows.piezo.hidden = output.value !== "dac_amplifier";
+    for (const part of ["magnetometer", "monitor"]) addresses[part].disabled = !has[part].checked;
+    cards.daq.hidden = daq.value !== "nidaqmx";
+    cards.output.hidden = output.value !== "nidaqmx_ao";
+  }
 
   // channels: dragged to places, or chosen there
   const selects = {};
@@ -76,29 +100,29 @@ export function mount(root, { link, navigate }) {
     const said = [];
     scanButton.disabled = true;
     try {
-      for (const bus of ["i2c0", "i2c1"]) {
+      // a bus may have parts that the bench was not told of: i2c1 is asked also when nothing is ticked there
+      for (const bus of new Set([...neededBuses(), "i2c1"])) {
         const uri = uriFields[bus].value.trim();
-        if (!uri) continue;
+        if (!uri || bus === "daq0" || bus === "e7270") continue;
         answers.textContent = `asking ${uri} …`;
         const found = await post("/api/setup/scan", { uri });
-        said.push(`${uri}: ${found.addresses.map(hex).join(", ") || "nobody answers"}`);
-        for (const [part, on] of PARTS.map(([p, b]) => [p, b])) if (on === bus && part !== "piezo") {
-          has[part].checked = found.addresses.includes(Number(addresses[part].value));
-          has[part].onchange?.();
-          addresses[part].disabled = !has[part].checked;
-        }
+        const names = found.kind === "can" ? found.frames.map(([id, name, hz]) => `${hex(id)} ${name === "?" ? "" : `${name} `}${digits(hz, 3)}/s`) : found.addresses.map(hex);
+        said.push(h("div", {}, `${uri}: ${names.join(", ") || (found.kind === "can" ? "no frame within two seconds" : "nobody answers")}`));
+        for (const [part, on] of PARTS) if (on === bus && part !== "piezo") has[part].checked = found.addresses.includes(Number(addresses[part].value));
       }
     } finally {
       scanButton.disabled = !link.mayOrder;
-      answers.textContent = said.join("; ");
+      answers.replaceChildren(...said);
+      showNeeded();
     }
   }
 
   function draft() {
     const address = (part) => (has[part].checked ? Number(addresses[part].value) : null);
     return {
-      name: name.value.trim(), inputs, piezo: address("piezo"), magnetometer: address("magnetometer"), monitor: address("monitor"), telemetry: telemetry.checked,
-      uris: Object.fromEntries(BUSES.map(([bus]) => [bus, uriFields[bus].value.trim()])),
+      name: name.value.trim(), inputs, daq: daq.value, daq_card: cards.daq.value, output: output.value, output_card: cards.output.value,
+      piezo: address("piezo"), magnetometer: address("magnetometer"), monitor: address("monitor"), telemetry: telemetry.checked,
+      uris: Object.fromEntries(neededBuses().map((bus) => [bus, uriFields[bus].value.trim()])),
     };
   }
 
@@ -121,8 +145,9 @@ export function mount(root, { link, navigate }) {
 
   root.append(h("div.cols.setup", {},
     h("section.panel", {}, h("h2", {}, "Buses ", h("small", {}, "what this machine has is offered")),
-      h("div.set", {}, BUSES.map(([bus, , what]) => h("label", {}, h("span", {}, h("b", {}, bus), ` ${what}`), uriFields[bus]))), lists,
-      h("div.row", {}, scanButton, answers), h("h2", { style: "margin-top:12px" }, "Parts ", h("small", {}, "leave out what the bench lacks")), parts),
+      h("div.set", {}, Object.values(uriRows)), lists, known,
+      h("div.row", {}, scanButton, h("button.quiet", { title: "Look again for what is plugged in", onclick: () => act(refresh) }, "Look again")), answers,
+      h("h2", { style: "margin-top:12px" }, "Parts ", h("small", {}, "leave out what the bench lacks")), parts),
     h("section.panel", {}, h("h2", {}, "Inputs ", h("small", {}, "drag each to what it is wired to; volts of the running bench")),
       h("div.wiring", {}, h("div.chips", {}, chips), h("div.slots", {}, places)),
       h("p.note", {}, "Tilt or tap one sensor: the volts that move are its own.")),
@@ -137,10 +162,19 @@ export function mount(root, { link, navigate }) {
   async function refresh() {
     const found = await get("/api/setup");
     folder.textContent = `written into ${found.folder}`;
-    lists.replaceChildren(...["serial", "i2c", "can"].map((kind) => h("datalist", { id: `found-${kind}` }, found[kind].map((uri) => h("option", { value: uri })))));
-    for (const [kind, buses] of [["serial", ["daq0"]], ["i2c", ["i2c0", "i2c1"]], ["can", ["can0"]]]) {
-      buses.forEach((bus, k) => { if (!uriFields[bus].value) uriFields[bus].value = found[kind][Math.min(k, found[kind].length - 1)] || ""; });
+    lists.replaceChildren(...["serial", "i2c", "can"].map((kind) => h("datalist", { id: `found-${kind}` }, Object.entries(found[kind]).map(([uri, what]) => h("option", { value: uri, label: what ? `${uri} ${what}` : uri })))));
+    const plugged = Object.entries({ ...found.serial, ...found.i2c, ...found.can }).filter(([uri]) => !uri.startsWith("sim:"));
+    known.replaceChildren(...plugged.map(([uri, what]) => h("div", {}, what ? `${uri}: ${what}` : uri)));
+    for (const [kind, buses] of [["serial", ["daq0", "e7270"]], ["i2c", ["i2c0", "i2c1"]], ["can", ["can0"]]]) {
+      const uris = Object.keys(found[kind]);
+      buses.forEach((bus, k) => { if (!uriFields[bus].value) uriFields[bus].value = uris[Math.min(k, uris.length - 1)] || ""; });
     }
+    if (!daq.options.length) {
+      daq.append(...Object.entries(found.daqs).map(([key, title]) => h("option", { value: key }, title)));
+      output.append(...Object.entries(found.outputs).map(([key, [title]]) => h("option", { value: key }, title)));
+      outputBus = Object.fromEntries(Object.entries(found.outputs).map(([key, [, bus]]) => [key, bus]));
+    }
+    showNeeded();
     enable();
   }
 
