@@ -150,11 +150,19 @@ def bench_server(more_toml: str) -> Iterator[Server]:
 
 
 @pytest.fixture(scope="session")
-def server() -> Iterator[Server]:
+def session_server() -> Iterator[Server]:
     """One server for all tests of a session."""
     # the injected spike is to be seen, not to end the run: a sensor that jumps trips the firmware
     with bench_server("\n[firmware.plausibility]\njump_V = 2.0\n") as running:
         yield running
+
+
+@pytest.fixture(scope="module")
+def server(session_server: Server) -> Iterator[Server]:
+    """The session's server with a running firmware; between modules no firmware takes time from other tests."""
+    session_server.wait_running()
+    yield session_server
+    assert session_server.request("POST", "/api/safe", b"{}")[0] == 200
 
 
 def go(page: Any, view: str) -> None:

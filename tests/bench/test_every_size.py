@@ -4,7 +4,7 @@ be read. One browser, one server in this process over data that stand still (tes
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -17,6 +17,14 @@ pytestmark = pytest.mark.timeout(400)
 
 VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 THEMES = ("dark", "light")
+
+
+def combinations(sizes: Iterable[str], *default: tuple[str, str]) -> list[Any]:
+    """Every size in every theme; those that are not in ``default`` run with the slow tests."""
+    every = [(size, theme) for size in sizes for theme in THEMES]
+    return [pytest.param(*pair, marks=() if pair in default else pytest.mark.slow) for pair in every]
+
+
 SIZES = {  # name: CSS width and height, device pixels per CSS pixel
     "320": (320, 640, 1.0),
     "390": (390, 844, 1.0),
@@ -78,8 +86,10 @@ def show(tab: Any, view: str) -> None:
     tab.evaluate("() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(done)))")
 
 
-@pytest.mark.parametrize("theme", THEMES)
-@pytest.mark.parametrize("size", SIZES)
+@pytest.mark.parametrize(
+    ("size", "theme"),
+    combinations(SIZES, ("320", "dark"), ("768", "light"), ("1280", "dark"), ("1280 at 400 %", "light")),
+)
 def test_safe_is_in_reach_nothing_scrolls_sideways_charts_keep_their_shape(
     browser: Any, still: Still, size: str, theme: str
 ):
@@ -128,7 +138,7 @@ def test_an_order_reaches_the_server_from_the_smallest_window(browser: Any, stil
     assert set(still.session.orders) == {"safe"}
 
 
-@pytest.mark.parametrize("size", ["320", "390", "1280 at 200 %", "1280 at 400 %"])
+@pytest.mark.parametrize("size", ["390", "1280 at 400 %"])
 def test_the_menu_opens_goes_to_a_view_and_closes(browser: Any, still: Still, size: str):
     with opened(browser, still, size, has_touch=True) as tab:
         assert not tab.locator("#nav").is_visible()
@@ -145,7 +155,7 @@ def test_the_menu_opens_goes_to_a_view_and_closes(browser: Any, still: Still, si
         assert not tab.locator("#nav").is_visible()
 
 
-@pytest.mark.parametrize("size", ["768", "1024", "1280", "1920"])
+@pytest.mark.parametrize("size", ["768", "1920"])
 def test_larger_windows_show_all_views(browser: Any, still: Still, size: str):
     with opened(browser, still, size) as tab:
         assert not tab.locator("#menu").is_visible()
@@ -231,8 +241,7 @@ COLOURS = """() => {
 }"""
 
 
-@pytest.mark.parametrize("theme", THEMES)
-@pytest.mark.parametrize("size", ["390", "1280"])
+@pytest.mark.parametrize(("size", "theme"), combinations(["390", "1280"], ("390", "dark"), ("1280", "light")))
 def test_text_stands_out_from_what_is_behind_it(browser: Any, still: Still, size: str, theme: str):
     with opened(browser, still, size, theme) as tab:
         for view in VIEWS:
@@ -242,8 +251,7 @@ def test_text_stands_out_from_what_is_behind_it(browser: Any, still: Still, size
             assert [text for text in texts if text[0] < CONTRAST] == [], view
 
 
-@pytest.mark.parametrize("theme", THEMES)
-@pytest.mark.parametrize("size", ["390", "1280"])
+@pytest.mark.parametrize(("size", "theme"), combinations(["390", "1280"], ("390", "dark"), ("1280", "light")))
 def test_axe_finds_nothing_serious(browser: Any, still: Still, size: str, theme: str):
     base = pytest.importorskip("axe_playwright_python.base", reason="axe-core is not installed; 'make setup' does it")
     with opened(browser, still, size, theme) as tab:

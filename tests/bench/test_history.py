@@ -30,12 +30,10 @@ def test_every_bucket_holds_the_extremes_of_its_rows(n: int, k: int, chunk: int)
     history, rows = filled(n, chunk=chunk)
     found = history.buckets(np.array([1, 2]), k, 0)
     complete = n if k < BLOCK else n // BLOCK * BLOCK
-    for i in range(found.t_s.size):
-        part = rows[i * k : min((i + 1) * k, complete), 1:]
-        np.testing.assert_array_equal(found.low[:, i], part.min(axis=0))
-        np.testing.assert_array_equal(found.high[:, i], part.max(axis=0))
-        assert found.t_s[i] == rows[i * k, 0]
-    assert found.t_s.size == -(-complete // k)
+    parts = [rows[i : min(i + k, complete)] for i in range(0, complete, k)]
+    assert found.t_s.tolist() == [part[0, 0] for part in parts]
+    expected = [[*part[:, 1:].min(axis=0), *part[:, 1:].max(axis=0)] for part in parts]
+    np.testing.assert_array_equal(np.vstack([found.low, found.high]).T, np.reshape(expected, (len(parts), 4)))
 
 
 @pytest.mark.parametrize("pixels", [40, 400, 1300])

@@ -33,7 +33,7 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins import make
+from tools.mismatch.twins.make import make
 
 Array = NDArray[np.float64]
 N, DT = 320, 4e-3

@@ -17,7 +17,7 @@ from tools.mismatch.simulate_sites import sites, why_not
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins import make
+from tools.mismatch.twins.make import make
 
 Array = NDArray[np.float64]
 N, DT = 1200, 2e-3

@@ -24,7 +24,6 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins import make
 from tools.mismatch.twins.feedback import run_feedback
 from tools.mismatch.twins.linear import (
     discretise,
@@ -34,6 +33,7 @@ from tools.mismatch.twins.linear import (
     run_states,
     start_state,
 )
+from tools.mismatch.twins.make import make
 
 Array = NDArray[np.float64]
 AXIS = {"force": "N", "position": "m", "velocity": "m/s"}
