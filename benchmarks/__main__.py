@@ -29,7 +29,7 @@ RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
 MODULES = (
     "step", "kinematics", "latency", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder",
-    "memory", "start",
+    "memory", "start", "bench_page",
 )  # fmt: skip
 LIMIT_S = 600.0
 """A module that takes longer is stopped; the mismatch engine with 30 min of recording takes about half of it."""

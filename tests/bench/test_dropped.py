@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import http.client
+import json
 import tomllib
+import urllib.error
+import urllib.request
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +15,12 @@ import pytest
 
 from tests.bench.conftest import go
 from tests.bench.still import Still
-from tools.bench.dropped import OFFERED, description, parameter_value
+from tools.bench.dropped import NEEDS_FILE, OFFERED, description, parameter_value
 from tools.bench.dropped_files import MOST_KEPT, Dropped
 from tools.bench.guard import MAX_UPLOAD_BYTES
 from tools.errors import InputError
 from tools.mismatch.recording_load import load
+from tools.mismatch.twins.make import make
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -43,11 +47,47 @@ def test_what_is_no_value_is_refused(said: str):
         parameter_value("mass", said)
 
 
-def test_kinds_that_run_programs_are_not_offered():
-    assert not {"fmu", "instrument", "columns"} & set(OFFERED)
-    for kind in ("fmu", "instrument", ""):
-        with pytest.raises(InputError, match="choose a kind"):
-            description({"kind": kind}, "data.csv")
+def test_kinds_that_name_a_file_take_one_of_this_machine(still: Still, tmp_path: Path):
+    assert set(NEEDS_FILE) <= set(OFFERED)
+    with pytest.raises(InputError, match="choose a kind"):
+        description({"kind": ""}, "data.csv")
+    code, said = put(still, "run.csv", motor(tmp_path / "a.csv").read_bytes(), still.token)
+    assert code == 200
+    number = json.loads(said)["number"]
+    table = {
+        "number": number, "name": "whole instrument", "kind": "instrument", "time_column": "t_s",
+        "channels": [
+            {"column": "force_N", "role": "input", "signal": "command_1", "unit": "V"},
+            {"column": "x_mm", "role": "output", "signal": "tip_x", "unit": "um"},
+        ],
+    }  # fmt: skip
+    for kind, key, wrong in (
+        ("instrument", "bench", "passwd.toml"),
+        ("fmu", "path", "none.fmu"),
+        ("fmu", "path", ""),
+    ):
+        said = post(still, "/api/mismatch/new", {**table, "kind": kind, "parameters": {key: wrong}}, 400)["error"]
+        assert "choose one of the files" in said
+    for kind in json.loads(get(still, "/api/mismatch/kinds"))["kinds"]:
+        assert (kind["files"] != []) == (kind["kind"] == "instrument"), "there is no FMU among the recordings"
+    post(still, "/api/mismatch/new", {**table, "parameters": {"bench": "micron.toml", "hand": "bench"}}, 200)
+    folder = still.session.recorder.folder / "whole instrument"
+    assert make(load(folder)).kind == "instrument"
+    assert (folder / "micron.toml").read_bytes() == (still.session.home / "micron.toml").read_bytes()
+
+
+def test_simulated_columns_beside_measured_ones_are_a_twin(still: Still, tmp_path: Path):
+    code, said = put(still, "two.csv", motor(tmp_path / "a.csv").read_bytes(), still.token)
+    assert code == 200
+    table = {
+        "number": json.loads(said)["number"], "name": "other program", "kind": "columns", "time_column": "t_s",
+        "channels": [
+            {"column": "temp_degC", "role": "input", "signal": "simulated_x", "unit": "mm"},
+            {"column": "x_mm", "role": "output", "signal": "x", "unit": "mm"},
+        ],
+    }  # fmt: skip
+    post(still, "/api/mismatch/new", table, 200)
+    assert make(load(still.session.recorder.folder / "other program")).kind == "columns"
 
 
 def test_the_oldest_file_that_nobody_described_goes(tmp_path: Path):
@@ -100,6 +140,23 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
         assert "/.dropped" not in said
     left = [p for p in still.session.recorder.folder.iterdir() if p.name.startswith(".dropped")]
     assert [len(list(p.iterdir())) for p in left] == [1], "the good one alone is kept"
+
+
+def post(still: Still, path: str, table: dict[str, Any], expected: int) -> dict[str, Any]:
+    request = urllib.request.Request(f"{still.base}{path}", json.dumps(table).encode(), {"X-Micron-Token": still.token})
+    try:
+        with urllib.request.urlopen(request, timeout=60) as answer:
+            code, said = answer.status, answer.read()
+    except urllib.error.HTTPError as error:
+        with error:
+            code, said = error.code, error.read()
+    assert code == expected, said
+    return json.loads(said)
+
+
+def get(still: Still, path: str) -> bytes:
+    with urllib.request.urlopen(f"{still.base}{path}", timeout=60) as answer:
+        return answer.read()
 
 
 @pytest.fixture

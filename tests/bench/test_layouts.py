@@ -163,7 +163,11 @@ def test_an_open_page_outlives_its_server_and_asks_for_the_new_token(browser: An
             tab.wait_for_function("micron.link.connected && micron.scope.subscription.buckets.n > 100")
         tab.fill("#token", "not this one")
         tab.click("#ask-token button")
-        tab.wait_for_selector("#ask-token", state="visible")
+        tab.wait_for_function("micron.link.token === 'not this one'")
+        tab.wait_for_function(
+            "micron.link.connected"
+        )  # --listen: the server still waits for a token on this connection
+        assert tab.locator("#ask-token").is_visible()
         tab.fill("#token", second.address)
         tab.click("#ask-token button")
         tab.wait_for_function("micron.link.mayOrder && micron.scope.subscription.buckets.n > 100")

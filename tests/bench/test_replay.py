@@ -301,3 +301,17 @@ def test_what_cannot_be_shown_is_one_message_and_nothing_is_lost(page: Any, name
     go(page, "collect")
     row(page, name).locator("button", has_text="Open").click()
     page.wait_for_function(f"document.getElementById('say').textContent.includes('{said}')")
+
+
+def test_a_torn_recording_is_made_whole_from_the_list(page: Any, still: Still):
+    go(page, "collect")
+    torn = still.session.recorder.folder / "torn.mcap"
+    before = torn.read_bytes()
+    page.select_option("[aria-label='Export torn']", "recover")
+    page.locator("h2", has_text="torn recovered").wait_for()
+    assert torn.read_bytes() == before
+    assert Recording(torn.with_name("torn recovered.mcap")).n_rows > 15_000
+    page.select_option("[aria-label='Export torn']", "recover")
+    page.wait_for_function("document.querySelector('.collect [role=alert]').textContent.includes('already')")
+    row(page, "torn recovered").locator("button", has_text="Open").click()
+    page.wait_for_function("micron.link.replay && micron.link.replay.name === 'torn recovered'")

@@ -176,6 +176,19 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         command = ["tools.cli.main", "export", str(path), "--out", str(out)]
         return jobs.start("export", f"export {out.name}", [command], folder).as_dict()
 
+    async def recover(request: Request) -> Any:
+        """Make a finished recording of what is sound in a torn one, beside it; the original stays."""
+        path = existing(request)
+        if (recorder.active and path == recorder.path(recorder.name)) or is_being_recorded(path):
+            raise InputError(f"{path.stem!r} is being recorded; stop it first")
+        out = recorder.path(check_name(f"{path.stem[:60]} recovered"))
+        if out.exists() or out.is_symlink():
+            raise InputError(f"there is a recording {out.stem!r} already; delete it first")
+        folder = jobs.new_folder()
+        command = ["tools.cli.main", "recover", str(path), "--out", str(out)]
+        jobs.start("recover", f"recover {path.stem}", [command], folder)
+        return {"recording": out.stem}
+
     async def span(request: Request) -> Any:
         """Cut a span out: for Mismatch as a recording beside the others, else as a file to take away."""
         path, table = existing(request), await body(request)
@@ -213,6 +226,7 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         Route("/api/recordings/{name}/look", clear(look)),
         Route("/api/recordings/{name}/file", clear(download)),
         Route("/api/recordings/{name}/export", clear(export), methods=["POST"]),
+        Route("/api/recordings/{name}/recover", clear(recover), methods=["POST"]),
         Route("/api/recordings/{name}/span", clear(span), methods=["POST"]),
         Route("/api/recordings/{name}/delete", clear(delete), methods=["POST"]),
     ]

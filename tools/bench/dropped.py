@@ -17,7 +17,7 @@ from starlette.routing import BaseRoute, Route
 from hal.children import child_command, child_environment
 from tools.bench.dropped_files import Dropped
 from tools.bench.guard import MAX_UPLOAD_BYTES
-from tools.bench.recorder import SUFFIX, check_name
+from tools.bench.recorder import SUFFIX, check_name, is_own_file
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -34,8 +34,13 @@ OFFERED = (
     "accelerometer_cluster",
     "state_space",
     "ode",
+    "columns",
+    "instrument",
+    "fmu",
 )
-"""Kinds that need no program or further file beside the data."""
+NEEDS_FILE = {"instrument": "bench", "fmu": "path"}
+"""Parameter of a kind that names a file: one that lies on this machine already is chosen and copied beside the data. No
+program comes in by the page, and one that is named there runs after ``micron trust`` alone."""
 IDLE_S = 20.0
 READ_S = 120.0
 _WORD = re.compile(r"[A-Za-z][\w./ -]*")
@@ -74,6 +79,15 @@ def parameter_value(name: str, said: str) -> Any:
         if _WORD.fullmatch(said):
             return said
     raise InputError(f"parameter {name}: {said!r} is no number, list or word; write numbers as 2.1")
+
+
+def files_of(session: Session, kind: str) -> dict[str, Path]:
+    """Return the files that a twin of this kind can name: benches beside the running one, FMUs among the recordings."""
+    folder, pattern = {
+        "instrument": (session.home, "*.toml"),
+        "fmu": (session.recorder.folder, "*.fmu"),
+    }[kind]
+    return {path.name: path for path in sorted(folder.glob(pattern)) if is_own_file(path)}
 
 
 def description(table: dict[str, Any], data: str) -> dict[str, Any]:
@@ -146,8 +160,10 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
         target = recordings / title
         if target.exists() or target.is_symlink():
             raise InputError(f"there is a recording {title!r} already; choose another name")
+        described = description(table, path.name)
+        _bring_file(session, described["twin"], path.parent)
         descriptor = path.with_name("recording.toml")
-        write_text_atomic(descriptor, toml_text(description(table, path.name)))
+        write_text_atomic(descriptor, toml_text(described))
         try:
             await run_module("tools.mismatch.guess", "--check", str(descriptor))
         except InputError as error:
@@ -157,7 +173,8 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
         return {"recording": f"{title}/"}
 
     async def kinds(_: Request) -> Any:
-        return {"kinds": [_kind(kind) for kind in OFFERED], "most_bytes": MAX_UPLOAD_BYTES}
+        files = {kind: list(files_of(session, kind)) for kind in NEEDS_FILE}
+        return {"kinds": [_kind(kind, files.get(kind)) for kind in OFFERED], "most_bytes": MAX_UPLOAD_BYTES}
 
     return [
         Route("/api/upload/{name}", clear(upload), methods=["PUT"]),
@@ -166,10 +183,25 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
     ]
 
 
-def _kind(kind: str) -> dict[str, Any]:
+def _bring_file(session: Session, twin: dict[str, Any], folder: Path) -> None:
+    """Copy the file that the twin names beside the data. ``InputError``: it was not offered."""
+    key = NEEDS_FILE.get(twin["kind"])
+    if key is None:
+        return
+    offered = files_of(session, twin["kind"])
+    name = twin["parameters"].get(key)
+    if name not in offered:
+        where = "among the recordings" if twin["kind"] == "fmu" else f"in {session.home}"
+        raise InputError(f"parameter {key}: choose one of the files {where}: {', '.join(offered) or 'there are none'}")
+    shutil.copyfile(offered[name], folder / name)
+
+
+def _kind(kind: str, files: list[str] | None) -> dict[str, Any]:
     words = KINDS[kind]
     return {
         "kind": kind,
+        "file_key": NEEDS_FILE.get(kind, ""),
+        "files": files or [],
         "inputs": [[p, list(u)] for p, u in words.inputs],
         "outputs": [[p, list(u)] for p, u in words.outputs],
         "keys": [asdict(key) for key in of_kind(kind) if key.name.isidentifier()],

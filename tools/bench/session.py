@@ -208,7 +208,7 @@ class Session:
         if run.phase == "starting":
             found.append(("info", "Starting. The first start on a machine compiles, one to three minutes."))
         elif run.phase == "failed":
-            found.append(("error", f"The firmware failed: {run.reason}"))
+            found.append(("error", self._failure()))
         elif run.phase == "ended":
             found.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
         elif run.phase == "safe":
@@ -223,6 +223,15 @@ class Session:
         if self.recorder.active and self.recorder.trouble():
             found.append(("error", f"Recording: {self.recorder.trouble()}"))
         return [*self._hold_alert(), *({"kind": kind, "text": text} for kind, text in found)]
+
+    def _failure(self) -> str:
+        """What to do after a firmware that told no outcome depends on whether its outputs were driven."""
+        if not self.run.status:
+            return f"The firmware did not start: {self.run.reason}"
+        return (
+            f"The firmware died: {self.run.reason}. Nobody confirmed neutral: switch the amplifier off, look at the "
+            "tip, then start again."
+        )
 
     def _hold_alert(self) -> list[dict[str, str]]:
         """Why the outputs rest at neutral; with ``order`` where a person may end that."""

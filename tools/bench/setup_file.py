@@ -37,10 +37,10 @@ _BUSES = {  # kind, what hangs on it, more keys
 _SENSORS = {"acc1": "xz", "acc2": "yz", "acc3": "xy"}
 DAQS = {"di4108": "DATAQ DI-4108", "nidaqmx": "NI card (NI-DAQmx)"}
 OUTPUTS = {  # what people call it, its bus, s from a sample to what the command does (benches of this project)
-    "dac_amplifier": ("AD5696R on I2C and an amplifier", "i2c0", 0.0017),
+    "dac_amplifier": ("AD5696R and amplifier, I2C", "i2c0", 0.0017),
     "e727": ("PI E-727, serial", "e7270", 0.0070),
     "can_amplifier": ("piezo node on CAN", "can0", 0.0015),
-    "nidaqmx_ao": ("NI card and an amplifier", "", 0.0017),
+    "nidaqmx_ao": ("NI card and amplifier", "", 0.0017),
 }
 
 

@@ -32,13 +32,7 @@ export class Link extends EventTarget {
     socket.onopen = () => {
       this.connected = true;
       this.log = [];
-      this.send({ type: "hello", token: this.token });
-      if (this.lostReplay) { // the server keeps it for a connection: ask again, at the same place
-        this.reopen(this.lostReplay);
-        this.lostReplay = null;
-      }
-      for (const subscription of this.subscriptions.values()) this.ask(subscription);
-      if (this.wantsCounts) this.send({ type: "counts", on: true });
+      this.introduce();
       this.emit("connection");
     };
     socket.onmessage = (event) => {
@@ -58,11 +52,18 @@ export class Link extends EventTarget {
     this.socket = socket;
   }
 
+  /** The token, and all that this page follows: behind --listen nothing was taken before the token was right. */
+  introduce() {
+    this.send({ type: "hello", token: this.token });
+    if (this.lostReplay) this.reopen(this.lostReplay); // the server keeps it for a connection: at the same place
+    for (const subscription of this.subscriptions.values()) this.ask(subscription);
+    if (this.wantsCounts) this.send({ type: "counts", on: true });
+  }
+
   /** Another token, for a server that was started again; everything else stays as it is. */
   useToken(token) {
     this.token = token;
-    this.refused = false;
-    this.send({ type: "hello", token });
+    this.introduce(); // the answer says whether it is the right one
   }
 
   emit(name, detail) { this.dispatchEvent(new CustomEvent(name, { detail })); }
@@ -132,6 +133,7 @@ export class Link extends EventTarget {
       for (const subscription of this.subscriptions.values()) subscription.buckets.clear();
       this.mayOrder = message.may_order;
       this.refused = Boolean(this.token) && !this.mayOrder;
+      this.lostReplay = null;
       this.wasTrusted ||= this.mayOrder;
       const another = this.server && this.server !== message.server;
       const same = !another && this.run === message.run; // only the connection, or the token, is another one

@@ -168,7 +168,7 @@ function showAlerts() {
   const ended = ["safe", "ended", "failed"].includes(link.state?.phase);
   byId("alerts").replaceChildren(
     ...alerts.map((alert, i) => h(`p.${alert.kind}`, {}, alert.text,
-      i === 0 && ended && link.connected && link.mayOrder ? h("button", { onclick: () => post("/api/firmware/start").catch(() => {}) }, "Start again") : null,
+      i === 0 && ended && link.connected && link.mayOrder ? h("button", { onclick: () => post("/api/firmware/start").catch((error) => say(error.message)) }, "Start again") : null,
       alert.order && link.connected && link.mayOrder ? h("button", { onclick: () => link.order(alert.order) }, "Resume") : null)),
   );
 }

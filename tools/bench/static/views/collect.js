@@ -51,8 +51,9 @@ export function mount(root, context) {
 
   function actions(r) {
     const path = `/api/recordings/${encodeURIComponent(r.name)}`;
-    const formats = h("select", { "aria-label": `Export ${r.name}`, onchange: () => { exportAs(path, formats.value); formats.value = ""; } },
-      h("option", { value: "" }, "export …"), ["csv", "npz", "parquet"].map((f) => h("option", { value: f }, f)));
+    const formats = h("select", { "aria-label": `Export ${r.name}`, onchange: () => { (formats.value === "recover" ? recover(path) : exportAs(path, formats.value)); formats.value = ""; } },
+      h("option", { value: "" }, "export …"), ["csv", "npz", "parquet"].map((f) => h("option", { value: f }, f)),
+      link.mayOrder ? h("option", { value: "recover" }, "recover: make a torn file whole") : null);
     let sure = false;
     const remove = h("button.quiet", { disabled: !link.mayOrder, onclick: () => {
       if (sure) act(() => post(`${path}/delete`));
@@ -61,16 +62,31 @@ export function mount(root, context) {
     return [h("button", { onclick: () => { link.replayTo({ name: r.name }); context.navigate("scope"); } }, "Open"), h("button.quiet", { onclick: () => act(() => download(`${path}/file`, `${r.name}.mcap`)) }, "Download"), formats, remove];
   }
 
+  /** The job when it is done; an Error with its last line when it failed. */
+  async function ended(kind) {
+    for (;;) {
+      const job = await get(`/api/jobs/${kind}`);
+      if (job.state === "done") return job;
+      if (job.state !== "running") throw new Error(job.lines.at(-1) || `${kind} failed`);
+      await new Promise((resolve) => setTimeout(resolve, 300));
+    }
+  }
+
   async function exportAs(path, format) {
     if (!format) return;
     await act(async () => {
       await post(`${path}/export`, { format });
-      for (;;) {
-        const job = await get("/api/jobs/export");
-        if (job.state === "done") { await download(`/api/jobs/export/files/${encodeURIComponent(job.files[0])}`, job.files[0]); return; }
-        if (job.state !== "running") throw new Error(job.lines.at(-1) || "the export failed");
-        await new Promise((resolve) => setTimeout(resolve, 300));
-      }
+      const { files: [file] } = await ended("export");
+      await download(`/api/jobs/export/files/${encodeURIComponent(file)}`, file);
+    });
+  }
+
+  /** A torn file is made whole beside itself, and looked at: what is missing is said there. */
+  async function recover(path) {
+    await act(async () => {
+      const { recording } = await post(`${path}/recover`);
+      await ended("recover");
+      show(recording);
     });
   }
 

@@ -3,10 +3,16 @@ import { get, post, put } from "../api.js";
 import { bytes, canvas, css, digits, h } from "../dom.js";
 
 const ROLES = [["time", "time"], ["input", "input"], ["output", "output"], ["context", "context"], ["", "not used"]];
+const NOTES = {
+  columns: ". Another program worked the outputs out: beside each output stands an input named simulated_ and the output's signal",
+  instrument: ". Signals: command_1 to command_3, path_, tip_, angle_ and volts_0 to volts_7; the bench file is copied beside the data",
+  fmu: ". The FMU lies in the folder of the recordings and is copied beside the data; before it runs, “micron trust FILE” is needed once",
+};
 const EXAMPLES = { "[xyz]": ["x", "y", "z"] };
 
 /** The words that a twin has for a role: patterns become examples. */
-export function wordsOf(kind, role) {
+export function wordsOf(kind, role, outputs = []) {
+  if (kind?.kind === "columns" && role === "input") return outputs.map((output) => `simulated_${output}`);
   const known = role === "input" ? kind?.inputs : role === "output" ? kind?.outputs : [];
   return (known || []).flatMap(([pattern]) => (pattern.endsWith("[xyz]") && !pattern.includes("\\")
     ? EXAMPLES["[xyz]"].map((axis) => pattern.replace("[xyz]", axis)) : pattern.includes("\\") ? [] : [pattern]));
@@ -62,6 +68,9 @@ export function newRecording(link, done) {
     }, `Picture of ${column.name}`);
   }
 
+  /** A file of this machine that the twin needs. */
+  const fileChoice = (key, files) => h("select", { title: key.help, "aria-label": key.name }, files.length ? files.map((f) => h("option", { value: f }, f)) : h("option", { value: "" }, "none is there"));
+
   function build() {
     const name = h("input", { type: "text", maxLength: 80, value: file.name.replace(/\.[^.]+$/, "").replace(/[^A-Za-z0-9._ -]/g, "_"), "aria-label": "Name of the recording" });
     const rate = h("input", { type: "number", step: "any", min: 0, value: file.rate_hz ? Number(file.rate_hz.toPrecision(9)) : "", placeholder: "samples a second", "aria-label": "Rate, Hz" });
@@ -69,7 +78,7 @@ export function newRecording(link, done) {
     const lists = h("div", { hidden: true });
     const chosen = () => kinds.find((k) => k.kind === kind.value);
     const rows = file.columns.map((column, i) => {
-      const role = h("select", { "aria-label": `Role of ${column.name}`, onchange: () => showRole() }, ROLES.map(([value, text]) => h("option", { value, selected: value === column.role }, text)));
+      const role = h("select", { "aria-label": `Role of ${column.name}`, onchange: () => { showRole(); showWords(); } }, ROLES.map(([value, text]) => h("option", { value, selected: value === column.role }, text)));
       const signal = h("input", { type: "text", value: column.signal, maxLength: 100, "aria-label": `Signal of ${column.name}` });
       signal.setAttribute("list", `words-${column.role}`);
       const unit = h("input.unit-field", { type: "text", value: column.unit, maxLength: 30, placeholder: "V, um, N …", "aria-label": `Unit of ${column.name}` });
@@ -79,6 +88,7 @@ export function newRecording(link, done) {
         for (const e of [signal, unit]) e.disabled = ["", "time"].includes(role.value);
         noise.disabled = role.value !== "output";
       };
+      signal.addEventListener("change", () => { if (kind.value === "columns") showWords(); });
       showRole();
       const range = `${digits(Math.min(...column.low), 3)} to ${digits(Math.max(...column.high), 3)}`;
       return { column, role, signal, unit, noise, element: h("tr", {},
@@ -92,11 +102,16 @@ export function newRecording(link, done) {
 
     function showKind() {
       const k = chosen();
-      fields = (k?.keys || []).map((key) => ({ key, field: h("input", { type: "text", maxLength: 2000, placeholder: key.default ? `if empty: ${key.default}` : "needed", title: `${key.help}: ${key.value}`, "aria-label": key.name }) }));
+      fields = (k?.keys || []).map((key) => ({ key, field: key.name === k.file_key ? fileChoice(key, k.files) : h("input", { type: "text", maxLength: 2000, placeholder: key.default ? `if empty: ${key.default}` : "needed", title: `${key.help}: ${key.value}`, "aria-label": key.name }) }));
       parameters.replaceChildren(...fields.map(({ key, field }) => h("label", {}, h("span", {}, h("b", {}, key.name), " ", key.help), field)));
       known.textContent = !k ? "The kind says which physics the twin starts from." : [["inputs", k.inputs], ["outputs", k.outputs]]
-        .map(([role, words]) => `${role}: ${words.length ? words.map(([p, u]) => `${p} (${u.join(" or ")})`).join(", ") : "any names and units"}`).join("; ");
-      lists.replaceChildren(...ROLES.map(([role]) => h("datalist", { id: `words-${role}` }, wordsOf(k, role).map((w) => h("option", { value: w })))));
+        .map(([role, words]) => `${role}: ${words.length ? words.map(([p, u]) => `${p} (${u.join(" or ")})`).join(", ") : "any names and units"}`).join("; ") + (NOTES[k.kind] || "");
+      showWords();
+    }
+
+    function showWords() {
+      const outputs = rows.filter((r) => r.role.value === "output").map((r) => r.signal.value.trim());
+      lists.replaceChildren(...ROLES.map(([role]) => h("datalist", { id: `words-${role}` }, wordsOf(chosen(), role, outputs).map((w) => h("option", { value: w })))));
     }
 
     async function make() {
