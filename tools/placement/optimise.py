@@ -2,7 +2,9 @@
 
 Cost: trace of W C with C = sigma^2 (H^T H)^-1, H the firmware's observation matrix; its gradient is written out
 (dC = -C d(H^T H) C). Coarse first: how many packages in which box, corners and directions drawn; then
-L-BFGS-B from the best, positions bounded by their box, directions as rotation vectors (axes stay orthogonal).
+L-BFGS-B from the best, positions bounded by their box, directions as rotation vectors (axes stay orthogonal). Angular
+noise alone would give translation up: the force at the tip and the weakest direction of the axes have limits, first as
+soft walls, then as hard ones, and a result that breaks them is not taken.
 """
 
 from __future__ import annotations
@@ -23,8 +25,12 @@ from tools.placement.space import Space
 Array = NDArray[np.float64]
 LENGTH_M = 0.05
 """Unit of position in the optimiser, so that its variables are of one size."""
-DRAWS = 60
-REFINED = 3
+DRAWS = 200
+REFINED = 6
+WALLS = (1.0, 1e2, 1e4)
+"""Weights of the walls, one refinement after the other."""
+MARGIN = 1e-3
+"""The walls stand this share inside their limits, since a wall gives way a little."""
 
 
 def weight_matrix(space: Space) -> tuple[Array, Array]:
@@ -53,6 +59,12 @@ def cost_and_gradient(positions: Array, axes: Array, weight: Array) -> tuple[flo
     return cost, np.cross(axes, turn), force + np.cross(turn, positions)
 
 
+def weakest_direction(axes: Array) -> tuple[float, Array]:
+    """Least eigenvalue of the sum of s s^T over unit ``axes`` (N, 3), and its direction (3,)."""
+    values, vectors = np.linalg.eigh(axes.T @ axes)
+    return float(values[0]), vectors[:, 0]
+
+
 @dataclass(frozen=True)
 class Optimum:
     placement: Placement
@@ -75,6 +87,7 @@ def optimise(space: Space, seed: int = 0) -> Optimum:
     m = space.axes_per_package
     package = np.repeat(np.arange(space.packages), m)
     limit = (space.largest_force_noise_m_s2 / space.noise_m_s2) ** 2
+    inside, least = limit * (1.0 - MARGIN), space.least_translation * (1.0 + MARGIN)
     best: tuple[float, Array, Array, tuple[int, ...]] | None = None
 
     def unpack(x: Array) -> tuple[Array, Array]:
@@ -82,7 +95,11 @@ def optimise(space: Space, seed: int = 0) -> Optimum:
         turns = Rotation.from_rotvec(x[3 * space.packages :].reshape(-1, 3)).as_matrix()
         return positions[package], np.concatenate([turn.T[:m] for turn in turns])
 
-    def total(x: Array) -> tuple[float, Array]:
+    def allowed(positions: Array, axes: Array) -> bool:
+        reach = cost_and_gradient(positions, axes, tip)[0]
+        return reach <= limit and weakest_direction(axes)[0] >= space.least_translation
+
+    def total(x: Array, wall: float = 1.0) -> tuple[float, Array]:
         positions, axes = unpack(x)
         value, by_r, by_s = cost_and_gradient(positions, axes, weight)
         if not np.isfinite(value):
@@ -92,10 +109,15 @@ def optimise(space: Space, seed: int = 0) -> Optimum:
         value = float(np.log(value))
         if not np.isfinite(reach):
             return 1e12, np.zeros_like(x)
-        if reach > limit:  # smooth wall: all six degrees of freedom stay observable
-            over = float(np.log(reach / limit))
-            value += over * over
-            by_r, by_s = by_r + 2.0 * over * more_r / reach, by_s + 2.0 * over * more_s / reach
+        if reach > inside:  # all six degrees of freedom stay observable
+            over = float(np.log(reach / inside))
+            value += wall * over * over
+            by_r, by_s = by_r + 2.0 * wall * over * more_r / reach, by_s + 2.0 * wall * over * more_s / reach
+        seen, direction = weakest_direction(axes)
+        if seen < least:
+            under = least - seen
+            value += wall * under * under
+            by_s = by_s - 4.0 * wall * under * np.outer(axes @ direction, direction)
         gradient = np.zeros_like(x)
         np.add.at(gradient[: 3 * space.packages].reshape(-1, 3), package, by_r * LENGTH_M)
         # s = R e: a small world-frame turn d changes s by d x s; rotation vectors need the left Jacobian
@@ -120,11 +142,18 @@ def optimise(space: Space, seed: int = 0) -> Optimum:
         for value, _, start in starts[:REFINED]:
             if value >= 1e11:
                 continue
-            found = minimize(total, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 150})
-            if found.fun < 1e11 and (best is None or found.fun < best[0]):
-                best = (float(found.fun), *unpack(found.x), boxes)
+            x = start
+            for wall in WALLS:
+                x = minimize(total, x, (wall,), jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": 150}).x
+            positions, axes = unpack(x)
+            cost = float(np.log(cost_and_gradient(positions, axes, weight)[0]))
+            if allowed(positions, axes) and (best is None or cost < best[0]):
+                best = (cost, positions, axes, boxes)
     if best is None:
-        raise ValueError(f"{space.title}: no placement in this space shows all six degrees of freedom")
+        raise ValueError(
+            f"{space.title}: no placement in this space keeps the force at the tip to "
+            f"{space.largest_force_noise_m_s2:g} m/s^2 and every direction seen by {space.least_translation:g} axes"
+        )
     cost, positions, axes, boxes = best
     placement = Placement(f"{space.packages} packages of {m} axes, optimised", positions, axes)
     return Optimum(placement, tuple(space.box[b].name for b in boxes), angular_noise(placement, space.noise_m_s2), cost)

@@ -45,6 +45,8 @@ class Space(BaseModel):
     least: Literal["angular", "tip"] = "angular"
     largest_force_noise_m_s2: Annotated[float, Field(gt=0.0)] = 0.05
     """rms of the specific force at the tip: keeps all six degrees of freedom observable."""
+    least_translation: Annotated[float, Field(ge=0.0, le=2.0)] = 1.0
+    """Least eigenvalue of the sum of s s^T over the axes: 1 is one whole axis along the worst seen direction."""
 
     @model_validator(mode="after")
     def _enough(self) -> Space:

@@ -11,8 +11,13 @@ from tools.mismatch.recording_load import load
 from tools.reproduce.real_sensors import data_folder
 from tools.reproduce.rows import Row
 
-WINDOWS = {"uncompensated": (5051, 6051, 1.68), "compensated": (11151, 12151, 0.58)}
+SKIP = 200
+"""Samples of the first second, which holds the start."""
+WINDOWS = {"without a model": (5051, 6051, 1.68), "with their inverse": (11151, 12151, 0.58)}
 """Samples of the paper's test windows, and its rms desired minus measured there, um."""
+DELAY = 1
+"""Samples by which the measured position is later than the desired one that it is compared with in the paper."""
+STRAIGHT_LINE = "a straight line fitted to the test itself"
 
 
 def _rms(e: NDArray[np.float64]) -> float:
@@ -20,44 +25,61 @@ def _rms(e: NDArray[np.float64]) -> float:
 
 
 def real_stack() -> list[Row]:
-    """Return what the model cannot predict is what its inverse would leave; the stage cannot be driven from here."""
+    """The paper's tracking errors computed again from its file, and what our model of the training file predicts.
+
+    The stage cannot be driven from here, so the paper's control errors and our prediction errors are not compared.
+    """
     folder = data_folder() / "piezo_micromanipulator_dbo"
     if not (folder / "train.toml").is_file():
         return []
     train, test = load(folder / "train.toml"), load(folder / "test.toml")
     fit = identify_stack(train)
-    drive = test.inputs["command"]
-    z = test.outputs["displacement"]
-    e = z - simulate(fit.stack, drive, 1.0 / test.dt, float(train.inputs["command"].max()))
+    drive, z = test.inputs["command"], test.outputs["displacement"]
+    with np.load(folder / "test.npz") as data:
+        desired = data["desired_um"].astype(np.float64)
     source = "Aye and Ang 2018, P-885.91 micromanipulator"
-    rows = []
-    for name, (start, stop, published) in WINDOWS.items():
-        rows.append(
-            Row(
-                source,
-                f"rms prediction error, the paper's {name} window",
-                "um",
-                "trained on the constant-amplitude file, mean of the window taken off as in the paper",
-                published,
-                float(np.std(e[start:stop])),
-                "lower",
-                "recording",
-                why="published: desired minus measured "
-                + ("without a model" if published > 1.0 else "with their inverse")
-                + f"; with its mean ours is {_rms(e[start:stop]):.2f}",
-            )
-        )
-    rows.append(
+    rows = [
         Row(
             source,
-            "rms prediction error, whole test file",
+            f"rms desired minus measured, {name}",
             "um",
-            "after the first second, mean taken off",
-            0.58,
-            float(np.std(e[200:])),
+            f"samples {start} to {stop} of the test file, measured {DELAY} sample later, mean taken off; their control",
+            published,
+            float(np.std(desired[start:stop] - z[start + DELAY : stop + DELAY])),
+            "equal",
+            "recording",
+            tolerance=0.005,
+        )
+        for name, (start, stop, published) in WINDOWS.items()
+    ]
+    e = (z - simulate(fit.stack, drive, 1.0 / test.dt, float(train.inputs["command"].max())))[SKIP:]
+    slope, offset = np.polyfit(drive[SKIP:], z[SKIP:], 1)
+    line = float(np.std(z[SKIP:] - slope * drive[SKIP:] - offset))
+    condition = "model of the training file, free run over the whole test file after the first second, mean taken off"
+    with_mean = f"a prediction, no control; with its mean {_rms(e):.2f}"
+    return [
+        *rows,
+        Row(
+            STRAIGHT_LINE,
+            "rms prediction error",
+            "um",
+            condition,
+            line,
+            float(np.std(e)),
             "lower",
             "recording",
-            why=f"beside the published error with their inverse; with its mean {_rms(e[200:]):.2f}",
-        )
-    )
-    return rows
+            why=with_mean,
+        ),
+        Row(
+            "goal of the project",
+            "rms prediction error",
+            "um",
+            condition,
+            0.25,
+            float(np.std(e)),
+            "lower",
+            "recording",
+            why=f"{with_mean}; ten plays and a quadratic term with two samples of delay reach 0.21 to 0.25, the model "
+            "takes no lag",
+        ),
+    ]

@@ -24,12 +24,6 @@ CHOSEN = {"heading_density": 2, "still_density": 2, "disturbance_rad": 1}
 """Fields of the filter that are chosen, with the power of the noise's amplitude that they are."""
 FACTORS = (2.0, 10.0**0.5)
 """How far an amplitude may be chosen from the fixed setting, up and down."""
-WHY = {
-    (
-        "16",
-        FACTORS[1],
-    ): "the only fast translation: without it nothing says how far a hand's velocity strays",
-}
 
 
 def settings(factor: float) -> list[Record]:
@@ -82,8 +76,8 @@ def rows() -> list[Row]:
 def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None) -> list[Row]:
     condition = "gyroscope as rate source, error-state filter, one setting for all trials"
     peers = [
-        ("Madgwick, best setting of this trial", trial.published["madgwick_best_rmse_deg"], ours[0], "total"),
-        ("Mahony, best setting of this trial", trial.published["mahony_best_rmse_deg"], ours[0], "total"),
+        (f"{name.capitalize()}, best setting of this trial", best, ours[0], "total")
+        for name, best in _best(trial).items()
     ]
     if vqf is not None:
         peers += [
@@ -119,6 +113,12 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
     return found
 
 
+def _best(trial: Trial) -> dict[str, float]:
+    """Published errors with the setting that is best for this trial; nothing where the set prints none."""
+    keys = {name: f"{name}_best_rmse_deg" for name in ("madgwick", "mahony")}
+    return {name: float(trial.published[key]) for name, key in keys.items() if key in trial.published}
+
+
 def _chosen(every: list[Trial], theirs: list[tuple[float, float, float] | None], factor: float) -> list[Row]:
     """Leave one trial out: against the least of Madgwick's and Mahony's best and 1.1 x vqf."""
     if len(every) < 2:
@@ -127,11 +127,13 @@ def _chosen(every: list[Trial], theirs: list[tuple[float, float, float] | None],
     found = []
     for k, (trial, vqf) in enumerate(zip(every, theirs, strict=True)):
         ours = float(errors[chosen_without(errors, k), k])
-        limits = [float(trial.published[f"{name}_best_rmse_deg"]) for name in ("madgwick", "mahony")]
+        limits = list(_best(trial).values())
         ratio = ""
         if vqf is not None:
             limits.append(GOAL * vqf[0])
             ratio = f"{ours / vqf[0]:.2f} x vqf"
+        if not limits:
+            continue
         found.append(
             Row(
                 "BROAD, least of Madgwick's and Mahony's best and 1.1 x vqf",
@@ -143,7 +145,7 @@ def _chosen(every: list[Trial], theirs: list[tuple[float, float, float] | None],
                 ours,
                 "lower",
                 "recording",
-                why="; ".join(text for text in (ratio, WHY.get((trial.name, factor), "")) if text),
+                why=ratio,
             )
         )
     return found

@@ -7,6 +7,7 @@ there is left out with a note.
 from __future__ import annotations
 
 from importlib.util import find_spec
+from math import floor, log10
 
 import numpy as np
 
@@ -28,7 +29,8 @@ GYROSCOPE = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw")
 def xsens() -> list[Row]:
     """Accelerometer of an Xsens MTi from still poses."""
     log = load_log(data_folder() / "imu_tk_xsens")
-    factory = meta("imu_tk_xsens")["reference_factory"]
+    about = meta("imu_tk_xsens")
+    factory, own = about["reference_factory"], about["reference_own_fit"]["acc_scale_count_per_m_s2"]
     result = identify_poses(log.matrix(ACCELEROMETER), log.need_rate(), 9.81744)
     source, condition = "imu_tk, Xsens MTi (factory)", f"{result.poses} poses, |g| = 9.81744 m/s^2"
     rows = [
@@ -56,8 +58,8 @@ def xsens() -> list[Row]:
                 1.0 / result.parameters[f"scale_{axis}"].value,
                 "equal",
                 "recording",
-                tolerance=1.0,
-                why="printed to three digits",
+                tolerance=0.5,
+                why=f"printed to three digits; nine parameters fitted by those who collected the set give {own[i]:g}",
             ),
             # the factory's own |a| scatters by 0.0135 m/s^2 over these poses: that much of an offset is within it
             Row(
@@ -130,16 +132,21 @@ SATURATED = "in two turns the gyroscope is at its end; with them, as the author 
 
 
 def gyroscopes() -> list[Row]:
-    """Scale of two gyroscopes from still poses and the turns between them (Tedaldi sec. V)."""
+    """Scale of two gyroscopes from still poses and the turns between them (Tedaldi sec. V).
+
+    The sources print no uncertainty, so only their digits are the tolerance; the reason says how far both are apart.
+    """
     rows = []
-    xsens_factory = [1.0 / v for v in meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]]
+    counts = meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]
+    xsens_factory, half_count = [1.0 / v for v in counts], [0.5 / v**2 for v in counts]
     mpu = meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
+    printed = [1e-17] * 3
     author = "tomisuarez2/ImuCalibration, MPU-6050"
     cheap = "mpu6050_tomisuarez/calibration.npz"
-    for source, file, rate_hz, gravity, published, keep in (
-        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory, False),
-        (author, cheap, 100.0, 9.80665, mpu, False),
-        (author, cheap, 100.0, 9.80665, mpu, True),
+    for source, file, rate_hz, gravity, published, digits, keep in (
+        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory, half_count, False),
+        (author, cheap, 100.0, 9.80665, mpu, printed, False),
+        (author, cheap, 100.0, 9.80665, mpu, printed, True),
     ):
         log = load_log(data_folder() / file, rate_hz)
         force, turning = log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE)
@@ -151,6 +158,7 @@ def gyroscopes() -> list[Row]:
         for i, axis in enumerate("xyz"):
             scale = fit.parameters[f"scale_{axis}"]
             interval = f"our 95 % interval is +-{100.0 * (scale.high / scale.value - 1.0):.2f} %"
+            apart = 100.0 * (scale.value / published[i] - 1.0)
             rows.append(
                 Row(
                     source,
@@ -161,11 +169,16 @@ def gyroscopes() -> list[Row]:
                     scale.value,
                     "equal",
                     "recording",
-                    tolerance=scale.high - scale.value,
-                    why=f"{interval}; {SATURATED}" if fit.saturated and not keep else interval,
+                    tolerance=digits[i],
+                    why=f"{apart:+.2f} % apart; {interval}" + (f"; {SATURATED}" if fit.saturated and not keep else ""),
                 )
             )
     return rows
+
+
+def allan_digit(value: float) -> float:
+    """Return the last printed digit of a value of that table: 0.01 stands for 0.0100, 5e-5 for 0.000050."""
+    return 10.0 ** max(floor(log10(value)) - 2, -6)
 
 
 def adis16405() -> list[Row]:
@@ -176,8 +189,6 @@ def adis16405() -> list[Row]:
     curve = allan_curve(log.matrix(("gyro_x_raw",))[:, 0] * 0.05, 100.0, factors)
     rows = []
     for tau, published, deviation in zip(reference["tau_s"], reference["avar_deg2_s2"], curve.deviation, strict=True):
-        text = f"{published:.10f}".rstrip("0")
-        decimals = len(text.split(".")[1])
         rows.append(
             Row(
                 "SMAC-Group avar, ADIS16405 imu1",
@@ -188,8 +199,8 @@ def adis16405() -> list[Row]:
                 float(deviation) ** 2,
                 "equal",
                 "recording",
-                tolerance=0.5 * 10.0**-decimals,
-                why="printed to two or three digits",
+                tolerance=0.5 * allan_digit(published),
+                why="printed to three significant digits, at most six decimals",
             )
         )
     return rows

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any, Literal
 
 Better = Literal["equal", "lower", "higher"]
@@ -39,7 +41,7 @@ class Row:
         return self.ours >= self.published
 
     def as_dict(self) -> dict[str, Any]:
-        """The row of contracts/commands.md."""
+        """JSON values of the row itself; ``Table.as_dict`` adds the outcome that is expected."""
         return {**asdict(self), "meets": self.meets}
 
 
@@ -55,13 +57,42 @@ class Table:
     """A page of the table's own, where it has one."""
 
     def as_dict(self) -> dict[str, Any]:
-        return {
-            "format": 1,
-            "name": self.name,
-            "seconds": self.seconds,
-            "rows": [row.as_dict() for row in self.rows],
-            "notes": list(self.notes),
-        }
+        missed = expected_misses(self.name)
+        rows = [
+            {**row.as_dict(), "expected": None if missed is None else key not in missed}
+            for row, key in zip(self.rows, keys(self.rows), strict=True)
+        ]
+        return {"format": 1, "name": self.name, "seconds": self.seconds, "rows": rows, "notes": list(self.notes)}
+
+
+def keys(rows: Sequence[Row]) -> list[str]:
+    """What names a row among its table's: source and quantity, and a number where both come again."""
+    found: list[str] = []
+    count: dict[str, int] = {}
+    for row in rows:
+        name = f"{row.source}: {row.quantity}"
+        count[name] = count.get(name, 0) + 1
+        found.append(name if count[name] == 1 else f"{name} ({count[name]})")
+    return found
+
+
+def expected_misses(table: str) -> set[str] | None:
+    """Keys of the rows that are expected to be missed (``expected.json``); None for a table without expectations."""
+    text = Path(__file__).with_name("expected.json").read_text(encoding="utf-8")
+    expected: dict[str, list[str]] = json.loads(text)
+    return set(expected[table]) if table in expected else None
+
+
+def surprises(table: str, rows: Sequence[Row]) -> list[str]:
+    """Rows of ``rows`` whose outcome is not the expected one, in words. Rows that are not there surprise nobody."""
+    missed = expected_misses(table)
+    if missed is None:
+        return []
+    return [
+        f"{key}: {'met' if row.meets else 'missed'} ({row.ours:.4g}, published {row.published:.4g}), not expected"
+        for row, key in zip(rows, keys(rows), strict=True)
+        if row.meets == (key in missed)
+    ]
 
 
 Section = Callable[[], Sequence[Row]]

@@ -38,7 +38,6 @@ def placement_tables() -> list[Row]:
         for what, value, published in zip(
             ("alpha_x", "alpha_y", "alpha_z", "alpha vector"), ours, TABLE_1[placement.name], strict=True
         ):
-            # the paper's figures went through more than one rounding (ERRATA 132): one unit of the last digit
             rows.append(
                 Row(
                     "004, Table 1",
@@ -49,7 +48,10 @@ def placement_tables() -> list[Row]:
                     float(value),
                     "equal",
                     "exact",
-                    tolerance=0.01,
+                    tolerance=0.005,
+                    why=""
+                    if what != "alpha vector"
+                    else "the printed vector went through a second rounding (ERRATA 132)",
                 )
             )
     for name, published in (("Micron", 73.0), ("cube", 17.0)):
@@ -64,8 +66,8 @@ def placement_tables() -> list[Row]:
                 reduction,
                 "equal",
                 "exact",
-                tolerance=1.0,
-                why="from unrounded vectors (ERRATA 132)",
+                tolerance=0.5,
+                why="ours is from unrounded vectors (ERRATA 132)",
             )
         )
     return rows
@@ -92,7 +94,7 @@ def table_2_4() -> list[Row]:
     geometry = "000 (2.54), 2.25 mg per axis, T = 1 ms"
     rows = []
     for i, axis, published in ((0, "x", 0.65e-2), (1, "y", 0.65e-2), (2, "z", 1.88e-2)):
-        digit = 0.04 * published  # ERRATA 19: within 4 % in variance
+        digit = 0.02 * published  # ERRATA 19: within 4 % in variance, found by its authors and not by this code
         rows += [
             Row(
                 "000, Table 2.4",
@@ -141,19 +143,6 @@ def table_2_4() -> list[Row]:
                 why=f"a 0.75 deg/s gyro at 15 Hz has {gyro_band:.2f} deg/s in this band: no reduction by 99 %",
             ),
         ]
-    rows.append(
-        Row(
-            "000, Table 2.4",
-            "3G-3A, variance of omega",
-            "deg^2/s^2",
-            "ADXRS150, 15 Hz",
-            0.563,
-            0.75**2,
-            "equal",
-            "exact",
-            tolerance=5e-4,
-        )
-    )
     known = _alpha_known(placement) * 1e3
     at_centre = point_noise(placement, NOISE_000, placement.positions.mean(axis=0)) * 1e3
     at_front = point_noise(placement, NOISE_000, placement.positions[4]) * 1e3

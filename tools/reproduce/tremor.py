@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf
-from pathlib import Path
 
 from firmware_py.tremor.config import Method, TremorConfig
 from tools.reproduce import tremor_hands
+from tools.reproduce.recordings import data_folder
 from tools.reproduce.rows import Row, Table, build
 from tools.tremor.cases import case_of, emulated_hand
-from tools.tremor.evaluate import ORACLE, Summary, evaluate, summarise
+from tools.tremor.evaluate import ORACLE, OTHERS, Summary, evaluate, summarise
 from tools.tremor.published import published_case
 from tools.tremor.report_published import TUNED_ALONE, TUNED_MIXED, left, tuned
 from tools.tremor.signals import load_signals
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
 HANDS = (101, 102, 103)
 SEEDS = (201, 202, 203)
 LOOP_MS = 2
@@ -66,7 +65,7 @@ def _emulated() -> list[Row]:
             "emulated",
         ),
         Row(
-            "issue 5",
+            "goal of the project",
             "error of the best method over WFLC-FLC's, 8-12 Hz",
             "1",
             f"horizon of the loop, {LOOP_MS} ms; {HELD}",
@@ -81,28 +80,38 @@ def _emulated() -> list[Row]:
 
 
 def _limits(lines: Sequence[Summary], kind: str, condition: str) -> list[Row]:
+    """The adaptive method over two limits: behind the filter that lifts the band it is designed for, and plain."""
     best = _one(lines, "adaptive", LOOP_MS)
     rows: list[Row] = []
-    for name, ratio in (("trained on other hands", best.to_others), ("trained on the record itself", best.to_oracle)):
-        rows.append(
-            Row(
-                "issue 5",
-                f"residual over that of the best causal linear filter {name}",
-                "1",
-                f"{LOOP_MS} ms; {condition}",
-                1.15,
-                ratio,
-                "lower",
-                "recording" if kind == "recording" else "emulated",
+    for name, limit in (("trained on other hands", OTHERS), ("trained on the record itself", ORACLE)):
+        least = _one(lines, limit, LOOP_MS)
+        for measure, ours, theirs in (
+            ("2-20 Hz behind a filter that lifts 8-12 Hz", best.lifted_percent, least.lifted_percent),
+            ("plain 2-20 Hz", best.all_percent, least.all_percent),
+        ):
+            rows.append(
+                Row(
+                    "goal of the project",
+                    f"residual over that of the best causal linear filter {name}, {measure}",
+                    "1",
+                    f"{LOOP_MS} ms; {condition}",
+                    1.15,
+                    ours / theirs,
+                    "lower",
+                    "recording" if kind == "recording" else "emulated",
+                    why=""
+                    if measure != "plain 2-20 Hz"
+                    else "the limit's filter, too, is fitted behind the lifting "
+                    "filter: 8 to 12 Hz is what both are asked to make small",
+                )
             )
-        )
     return rows
 
 
 def _recorded() -> list[Row]:
     names = [f"tremor_mouse_lsm9ds1#{p}/gyro#20:55" for p in ("01", "03", "05", "12", "14", "23")]
     try:
-        signals = [s for name in names for s in load_signals(DATA / name)]
+        signals = [s for name in names for s in load_signals(data_folder() / name)]
     except ValueError:
         return []
     cases = [case_of(signal, seed) for seed, signal in enumerate(signals)]
@@ -181,6 +190,6 @@ def _tasks() -> list[Row]:
 def table() -> Table:
     """Return what ``micron reproduce tremor`` prints."""
     notes = ["residual and reduction: rms over all axes from 5 s on; the first 5 s are adaptation"]
-    if not DATA.is_dir():
-        notes.append(f"{DATA} is not there: rows on recorded hands are left out")
+    if not data_folder().is_dir():
+        notes.append(f"{data_folder()} is not there: rows on recorded hands are left out")
     return build("tremor", (_emulated, _recorded, _tasks, tremor_hands.inspection, tremor_hands.cascade), notes)

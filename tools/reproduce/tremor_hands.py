@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
+from tools.reproduce.recordings import data_folder
 from tools.reproduce.rows import Row
 from tools.tremor.signal import TremorSignal
 from tools.tremor.signals import load_data_sets
 
-DATA = Path(__file__).resolve().parents[2].parent / "shared" / "data"
-
 
 def _signals() -> list[TremorSignal]:
-    return load_data_sets(DATA) if DATA.is_dir() else []
+    return load_data_sets(data_folder()) if data_folder().is_dir() else []
 
 
 def inspection() -> list[Row]:
@@ -27,7 +24,7 @@ def inspection() -> list[Row]:
     shaker = shaker_figures(signals)
     (wrist,) = (s for s in signals if s.reference.windows is not None)
     figures, _ = wrist_figures(wrist)
-    source = "issue 5, inspection"
+    source = "goal of the project, inspection"
     few = f"{figures.windows} windows of 4 s, {figures.with_tremor} with tremor; limit judged where it was not chosen"
     return [
         Row(
@@ -85,7 +82,8 @@ def cascade() -> list[Row]:
     done = main_study(signals, lambda _: None)
     condition = f"{len(done.results)} recorded hands, error above 2 Hz, pseudo-voluntary motion as in 5.3.3"
     why = "other hands than the published ones; the error above 2 Hz holds no drift, which makes it easier"
-    pairs = len(done.results) * (len(done.results) - 1)
+    cross = done.cross_percent[~np.eye(len(done.results), dtype=bool)]
+    pairs = len(cross)
     figures: tuple[tuple[str, str, float, float], ...] = (
         (
             "000, Table 5.2",
@@ -94,14 +92,29 @@ def cascade() -> list[Row]:
             _mean([r.own_percent for r in done.results]),
         ),
         ("000, Table 5.2", "NN_err, mean rms reduction", 29.9, _mean([r.own_percent for r in done.error_results])),
-        # mean of the twelve entries of the published table
-        ("000, Table 5.3", "mean rms reduction, other persons", PUBLISHED_CROSS, done.cross_mean_percent),
-        ("issue 5", "mean rms reduction, trained on all other persons", 39.5, _mean(done.held_out_percent)),
+        # two printed entries (-243.1 and -85.5 %) make the mean -12.6 %, which is nothing to compare with
+        (
+            "000, Table 5.3",
+            "median rms reduction, other persons",
+            float(np.median(PUBLISHED_CROSS)),
+            float(np.median(cross)),
+        ),
+        ("goal of the project", "mean rms reduction, trained on all other persons", 39.5, _mean(done.held_out_percent)),
     )
     rows = [Row(s, q, "%", condition, p, o, "higher", "recording", why=why) for s, q, p, o in figures]
     harmed = 100.0 * done.worse_than_raw / pairs
     rows.append(
-        Row("000, Table 5.3", "pairs that do harm", "%", condition, 100 * 4 / 12, harmed, "lower", "recording", why=why)
+        Row(
+            "000, Table 5.3",
+            "pairs that do harm",
+            "%",
+            condition,
+            100.0 * float(np.mean(np.array(PUBLISHED_CROSS) < 0.0)),
+            harmed,
+            "lower",
+            "recording",
+            why=why,
+        )
     )
     name, making = CONDITIONS[2]
     harder = study(subjects(signals, making), making, windows=((50, 4),), motions=1, with_error_target=False)
@@ -121,7 +134,8 @@ def cascade() -> list[Row]:
     return rows
 
 
-PUBLISHED_CROSS = (26.2 + 38.1 + 45.1 - 85.5 + 28.6 - 243.1 + 0.0 + 15.4 - 0.9 + 32.7 - 30.8 + 22.7) / 12
+PUBLISHED_CROSS = (26.2, 38.1, 45.1, -85.5, 28.6, -243.1, 0.0, 15.4, -0.9, 32.7, -30.8, 22.7)
+"""The twelve entries of 000, Table 5.3 that are of different persons, %."""
 
 
 def _mean(values: list[float] | tuple[float, ...]) -> float:

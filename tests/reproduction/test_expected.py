@@ -1,0 +1,83 @@
+"""Rows of ``micron reproduce`` keep the outcome that ``tools/reproduce/expected.json`` pins.
+
+A row that is met for the first time, or no longer, is a finding: look at it, then change the file and say why in the
+commit. The quick part runs with every ``make test``, whole tables with the slow tests.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+from tools.reproduce import endoscope, real_sensors, sensing_static, sensing_variance
+from tools.reproduce.names import reproduce_table
+from tools.reproduce.recordings import data_folder
+from tools.reproduce.rows import Row, Table, expected_misses, keys, surprises
+
+TABLES = ("sensing", "real-sensors", "endoscope", "tremor", "actuation")
+
+
+def row(ours: float, quantity: str = "q") -> Row:
+    return Row("s", quantity, "1", "c", 1.0, ours, "equal", "exact")
+
+
+@pytest.fixture
+def pinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    misses = {"t": {"s: q (2)"}}
+    monkeypatch.setattr("tools.reproduce.rows.expected_misses", misses.get)
+
+
+@pytest.mark.usefixtures("pinned")
+def test_a_row_that_changes_its_outcome_is_named() -> None:
+    assert surprises("t", [row(1.0), row(2.0), row(1.0, "other")]) == []
+    assert surprises("t", [row(1.0), row(1.0)]) == ["s: q (2): met (1, published 1), not expected"]
+    assert surprises("t", [row(3.0)]) == ["s: q: missed (3, published 1), not expected"]
+    assert surprises("not pinned", [row(3.0)]) == []
+
+
+@pytest.mark.usefixtures("pinned")
+def test_the_json_says_what_was_expected() -> None:
+    rows = Table("t", (row(1.0), row(1.0)), 0.0).as_dict()["rows"]
+    assert [(r["meets"], r["expected"]) for r in rows] == [(True, True), (True, False)]
+    assert Table("not pinned", (row(1.0),), 0.0).as_dict()["rows"][0]["expected"] is None
+
+
+def test_rows_of_one_name_are_numbered() -> None:
+    assert keys([row(1.0), row(2.0), row(1.0, "other")]) == ["s: q", "s: q (2)", "s: other"]
+
+
+QUICK: tuple[tuple[str, Callable[[], Sequence[Row]]], ...] = (
+    ("sensing", sensing_variance.placement_tables),
+    ("sensing", sensing_variance.table_2_4),
+    ("sensing", sensing_static.table_4_1),
+    ("endoscope", endoscope.settling),
+)
+RECORDED: tuple[tuple[str, Callable[[], Sequence[Row]]], ...] = (
+    ("real-sensors", real_sensors.xsens),
+    ("real-sensors", real_sensors.mpu6050),
+    ("real-sensors", real_sensors.adis16405),
+    ("real-sensors", real_sensors.qmc5883l),
+    ("real-sensors", real_sensors.gyroscopes),
+    ("endoscope", endoscope.broad),
+)
+
+
+@pytest.mark.parametrize(("table", "section"), QUICK)
+def test_outcomes_of_documents(table: str, section: Callable[[], Sequence[Row]]) -> None:
+    assert surprises(table, section()) == []
+
+
+@pytest.mark.parametrize(("table", "section"), RECORDED)
+def test_outcomes_on_recordings(shared_data: Path, table: str, section: Callable[[], Sequence[Row]]) -> None:
+    assert surprises(table, section()) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", TABLES)
+def test_outcomes_of_whole_tables(name: str) -> None:
+    rows = reproduce_table(name).rows
+    assert surprises(name, rows) == []
+    if data_folder().is_dir():
+        assert (expected_misses(name) or set()) <= set(keys(rows))
