@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -29,13 +29,23 @@ class Split:
     initialization: int | None = None
 
 
+Simulate = Callable[[Mapping[str, Array], Mapping[str, Any], float], "Mapping[str, Array] | Array"]
+"""``simulate(inputs, parameters, dt)``: each input (n,) by name, parameters by name, the time step in s; returns each
+output (n,) by name, or the array alone where there is one output."""
+
+
 @dataclass(frozen=True)
 class TwinText:
-    """The ``[twin]`` table: kind, the engineer's parameters, effects of a corrected twin."""
+    """The ``[twin]`` table: kind, the engineer's parameters, effects of a corrected twin.
+
+    ``simulate`` is the twin itself where it was given as a function; its parameters ``fixed`` are not fitted.
+    """
 
     kind: str
     parameters: Mapping[str, Any]
     effects: tuple[Mapping[str, Any], ...] = ()
+    simulate: Simulate | None = None
+    fixed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -47,19 +47,32 @@ def load(path: Path | str) -> Recording:
     path = Path(path)
     if path.is_dir():
         path = path / "recording.toml"
-    text = _toml(path)
+    return from_table(path, _toml(path))
+
+
+def from_table(
+    path: Path, text: Mapping[str, Any], columns: Mapping[str, Array] | None = None, twin: TwinText | None = None
+) -> Recording:
+    """The recording that a descriptor's table describes, checked and converted. ``path`` is what messages name.
+
+    ``columns`` (n,) by name stand for the data file, ``twin`` for the table ``[twin]``, where they are given.
+    Raises RecordingError for everything that is wrong with it.
+    """
     where = str(path)
     if text.get("format") != 1:
         raise RecordingError(f"{where}: format must be 1, got {text.get('format')!r}")
     if "channels" not in text:
         raise RecordingError(f"{where}: no [[channels]]; describe each column that is used")
     data_name = text.get("data")
-    if not isinstance(data_name, str):
+    if columns is None and not isinstance(data_name, str):
         raise RecordingError(f"{where}: 'data' must name the data file ({', '.join(SUFFIXES)}), got {data_name!r}")
-    twin, words = _twin(where, _twin_table(path, text.get("twin")))
+    if twin is None:
+        twin, words = _twin(where, _twin_table(path, text.get("twin")))
+    else:
+        words = Vocabulary(open_ended=True)
     notes = [f"key '{k}' is unknown and not used" for k in text if k not in _TOP]
-    data_path = path_inside(path, data_name)
-    in_file = column_units(data_path) if data_path.is_file() else {}
+    data_path = path if columns is not None else path_inside(path, str(data_name))
+    in_file = column_units(data_path) if columns is None and data_path.is_file() else {}
     channels = _channels(where, text["channels"], words, twin.kind, notes, in_file)
     rate = _number(where, "rate_hz", text.get("rate_hz"))
     time_column = text.get("time_column")
@@ -73,7 +86,7 @@ def load(path: Path | str) -> Recording:
             raise RecordingError(f"{where}: time_column must be a column name, got {time_column!r}")
         if time_column not in names:
             names.append(time_column)
-    columns = read_columns(data_path, names)
+    columns = read_columns(data_path, names) if columns is None else {name: columns[name] for name in names}
     n = columns[names[0]].size
     if n < MIN_SAMPLES:
         raise RecordingError(
@@ -352,6 +365,21 @@ def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[
     if rate is not None and abs(rate * dt - 1) > 1e-3:
         notes.append(f"rate_hz {rate:g} differs from the time column ({1 / dt:.6g} Hz); the time column is used")
     return dt, grid
+
+
+def uniform(
+    path: Path, columns: Mapping[str, Array], time_column: str | None, rate_hz: float | None
+) -> tuple[float, dict[str, Array]]:
+    """The time step in s, and the columns (n,) at that step. Raises RecordingError for a broken time column."""
+    if time_column is None:
+        if rate_hz is None or not 0 < rate_hz < np.inf:
+            raise RecordingError(f"{path}: neither 'rate_hz' nor 'time'; give one of them")
+        return 1.0 / rate_hz, dict(columns)
+    stamps = columns[time_column]
+    dt, grid = _step(path, time_column, stamps, rate_hz, [])
+    if grid is None:
+        return dt, dict(columns)
+    return dt, {name: on_grid(grid, dt, stamps, x) for name, x in columns.items()}
 
 
 def on_grid(grid: Array, dt: float, stamps: Array, x: Array) -> Array:

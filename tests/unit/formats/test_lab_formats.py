@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.writer import RecordingWriter
 from tests.unit.recording.samples import COLUMNS, METADATA, make_rows, same_bits
+from tools.bench import open_run
 from tools.calibrate.logs import load_log
 from tools.cli.main import app
 from tools.errors import InputError
@@ -133,6 +134,12 @@ class TestNetcdf:
         export(run, tmp_path / "out.nc")
         with xarray.open_dataset(tmp_path / "out.nc", engine="h5netcdf") as file:
             xarray.testing.assert_identical(file.load(), dataset(run))
+
+    def test_a_run_is_opened_as_that_dataset(self, run: Recording):
+        need("nc")
+        found = open_run(str(run.path))
+        assert same_bits(found.volts_0.values, run.column("volts_0"))
+        assert found.identical(dataset(run))
 
     def test_it_says_what_it_holds_as_cf_asks(self, run: Recording):
         need("nc")

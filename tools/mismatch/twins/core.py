@@ -11,7 +11,7 @@ from tools.mismatch.twins.columns import columns_twin
 from tools.mismatch.twins.fmu import fmu_twin
 from tools.mismatch.twins.ode_matrices import physical_twin
 from tools.mismatch.twins.ode_text import ode_twin
-from tools.mismatch.twins.opaque import user_twin
+from tools.mismatch.twins.opaque import function_twin, user_twin
 from tools.mismatch.twins.state_space import read_matrices, state_space_twin
 from tools.mismatch.twins.static import static_twin
 from tools.mismatch.twins.vocabulary import user_kinds
@@ -21,6 +21,8 @@ def core(recording: Recording) -> Twin:
     """The twin as if it had no effects (``simulate_text.restore`` adds those). Unknown kinds and parameters are
     RecordingErrors."""
     kind = recording.twin.kind
+    if recording.twin.simulate is not None:
+        return function_twin(recording, recording.twin.simulate)
     match kind:
         case "piezo_stack" | "accelerometer" | "magnetometer":
             return static_twin(recording)

@@ -17,7 +17,7 @@ from hal import plugins
 from hal.trust import require_package
 from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
 from tools.guest.host import GuestError, GuestProcess
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording, RecordingError, Simulate
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 
 
@@ -33,7 +33,7 @@ class UserTwin(Protocol):
         ...
 
 
-Simulate = Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]]
+Call = Callable[[Mapping[str, Array], Mapping[str, Any]], Mapping[str, Array]]
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class OpaqueTwin:
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
     units: Mapping[str, str]
-    call: Simulate
+    call: Call
     free: tuple[str, ...]
     given: Mapping[str, Any]
     parameters: tuple[Parameter, ...]
@@ -129,7 +129,7 @@ class OpaqueTwin:
         return out | {k: float(v) for k, v in zip(self.free, theta, strict=True)}
 
 
-def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:
+def opaque_twin(recording: Recording, call: Call, source: str, fixed: Sequence[str] = ()) -> OpaqueTwin:
     """Every number in ``[twin.parameters]`` may be re-fitted, except names in ``fixed``."""
     given = recording.twin.parameters
     free = tuple(
@@ -147,6 +147,35 @@ def opaque_twin(recording: Recording, call: Simulate, source: str, fixed: Sequen
         parameters,
         source=source,
     )
+
+
+def function_twin(recording: Recording, simulate: Simulate) -> OpaqueTwin:
+    """The twin that a function is, which runs in this process."""
+    call = FunctionRun(simulate, recording.dt, tuple(recording.inputs), tuple(recording.outputs))
+    return opaque_twin(recording, call, getattr(simulate, "__name__", "simulate"), recording.twin.fixed)
+
+
+@dataclass(frozen=True)
+class FunctionRun:
+    """One free run of a function per call. RecordingError tells what it raised."""
+
+    simulate: Simulate
+    dt: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __call__(self, inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
+        name = getattr(self.simulate, "__name__", "simulate")
+        try:
+            # copies: the engine keeps its arrays
+            found = self.simulate({s: inputs[s].copy() for s in self.inputs}, dict(parameters), self.dt)
+        except Exception as error:
+            raise RecordingError(f"{name}(inputs, parameters, dt) failed: {type(error).__name__}: {error}") from error
+        if isinstance(found, Mapping):
+            return found
+        if len(self.outputs) > 1:
+            raise RecordingError(f"{name} returned one array; return each of {', '.join(self.outputs)} by name")
+        return dict.fromkeys(self.outputs, np.asarray(found))
 
 
 def user_twin(recording: Recording, entry: Any) -> OpaqueTwin:
