@@ -23,6 +23,9 @@ def hands(
     data: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the real recordings.")] = Path(
         "../shared/data"
     ),
+    heldout: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Score every recorded hand of this folder instead.")
+    ] = None,
     seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
     out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
     json_file: JsonOption = None,
@@ -30,22 +33,35 @@ def hands(
     """Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.
 
     Example: micron hands --out docs/first-results.md
+
+    Hands that no setting has seen, with the bench's estimator: micron hands --heldout recordings
     """
     from tools.reports.hands import HandRow, markdown, run_hands
+    from tools.reports.hands_heldout import find_recordings, heldout_page, run_heldout
 
     with clear_errors():
         check_writable(json_file, out)
-        if not data.is_dir():
-            raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
         file = load_bench(bench_path(bench))
+        folder = None if heldout is None else find_recordings(heldout, file)
+        if folder is None and not data.is_dir():
+            raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
         rows: list[HandRow] = []
         with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
+
+            def show(text: str) -> None:
+                progress.update(task, description=text)
+
             with keep_what_is_there():
-                for row in run_hands(file, data, seconds, lambda text: progress.update(task, description=text)):
+                if folder is None:
+                    found = run_hands(file, data, seconds, show)
+                else:
+                    found = run_heldout(file, folder, seconds, show)
+                for row in found:
                     rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
         need_some(rows)
-        page = markdown(rows, seconds, revision_and_day())
+        stamp = revision_and_day()
+        page = markdown(rows, seconds, stamp) if folder is None else heldout_page(folder, rows, seconds, stamp)
         if out is not None:
             write_text_atomic(out, page)
         if json_file != "-":

@@ -83,18 +83,23 @@ class Bounds:
 
 
 def wiener_bounds(
-    cases: Sequence[Case], horizons: Sequence[int], config: TremorConfig, elsewhere: Sequence[Case] = ()
+    cases: Sequence[Case],
+    horizons: Sequence[int],
+    config: TremorConfig,
+    elsewhere: Sequence[Case] = (),
+    *,
+    lifted: bool = True,
 ) -> list[Bounds]:
-    """Bounds of every case; hands of the same subject are not trained on.
+    """Bounds of every case; hands of the same subject are not trained on. ``lifted`` False: for the plain error.
 
     ``elsewhere``: hands of other sets, which stand in where ``cases`` are of one subject. Without them there are no
     ``others`` of such a set.
     """
     design = design_adaptive(config)
     features = [_features(case, design) for case in cases]
-    sums = [_all_sums(case, f, horizons, design) for case, f in zip(cases, features, strict=True)]
+    sums = [_all_sums(case, f, horizons, design if lifted else None) for case, f in zip(cases, features, strict=True)]
     far = list(elsewhere) if len({case.subject for case in cases}) == 1 else []
-    far_sums = [_all_sums(case, _features(case, design), horizons, design) for case in far]
+    far_sums = [_all_sums(case, _features(case, design), horizons, design if lifted else None) for case in far]
     out: list[Bounds] = []
     for n, case in enumerate(cases):
         bounds = Bounds({}, {}, {})
@@ -122,10 +127,11 @@ def _features(case: Case, design: AdaptiveDesign) -> list[Array]:
 
 
 def _all_sums(
-    case: Case, features: Sequence[Array], horizons: Sequence[int], design: AdaptiveDesign
+    case: Case, features: Sequence[Array], horizons: Sequence[int], design: AdaptiveDesign | None
 ) -> dict[int, list[_Sums]]:
-    truth = lift(case.truth, design)
-    lifted = [lift(f, design) for f in features]
+    """``design`` None: nothing is lifted."""
+    truth = case.truth if design is None else lift(case.truth, design)
+    lifted = list(features) if design is None else [lift(f, design) for f in features]
     return {ticks: [_sums(f, truth[:, i], ticks) for i, f in enumerate(lifted)] for ticks in horizons}
 
 
