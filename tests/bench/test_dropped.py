@@ -128,7 +128,7 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
     code, said = put(still, "a.csv", csv, still.token)
     assert code == 200, said
     for name, body, part in (
-        ("a.exe", csv, "must be .csv, .npz or .mcap"),
+        ("a.exe", csv, "must be .csv"),
         ("torn.npz", b"PK\x03\x04 and no more", "not a readable npz"),
         ("torn.mcap", b"\x89MCAP0\r\n" + bytes(40), "torn.mcap"),
         ("words.csv", b"a,b\nx,y\n", "is not a number"),

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.guess import POINTS, guess, guess_role, main, split_unit
+from tools.mismatch.guess import POINTS, guess, main
+from tools.mismatch.guess_roles import guess_role, split_unit
 from tools.mismatch.recording import RecordingError
 
 

@@ -23,6 +23,7 @@ from tools.bench.session import Session
 from tools.errors import InputError
 from tools.mismatch.cut import toml_text
 from tools.mismatch.key_tables import of_kind
+from tools.mismatch.recording_columns import SUFFIXES
 from tools.mismatch.twins.vocabulary import KINDS
 from tools.output import write_text_atomic
 
@@ -174,7 +175,8 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
 
     async def kinds(_: Request) -> Any:
         files = {kind: list(files_of(session, kind)) for kind in NEEDS_FILE}
-        return {"kinds": [_kind(kind, files.get(kind)) for kind in OFFERED], "most_bytes": MAX_UPLOAD_BYTES}
+        kinds = [_kind(kind, files.get(kind)) for kind in OFFERED]
+        return {"kinds": kinds, "most_bytes": MAX_UPLOAD_BYTES, "suffixes": SUFFIXES}
 
     return [
         Route("/api/upload/{name}", clear(upload), methods=["PUT"]),

@@ -8,8 +8,8 @@ import tempfile
 from pathlib import Path
 
 from tools.errors import InputError
+from tools.mismatch.recording_columns import SUFFIXES
 
-SUFFIXES = (".csv", ".npz", ".mcap")
 MOST_KEPT = 4
 
 
@@ -25,7 +25,7 @@ class Dropped:
         """Return the number of a new file and where it goes."""
         suffix = Path(name).suffix.lower()
         if suffix not in SUFFIXES:
-            raise InputError(f"{name}: a file must be .csv, .npz or .mcap")
+            raise InputError(f"{name}: a file must be {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
         if self._root is None:
             self._root = Path(tempfile.mkdtemp(prefix=".dropped-", dir=self._recordings))
         while len(self.files) >= MOST_KEPT:

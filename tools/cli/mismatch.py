@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,6 +20,7 @@ from tools.terminal import task_name
 
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
+    from tools.mismatch.new import NewRecording
 
 # what a command needs is imported inside it: `micron --help` shall not wait for the engine
 
@@ -182,6 +184,69 @@ def _diagnose_folder(
     if bad:
         print_error(f"{len(bad)} of {len(rows)} recordings have no report")
         raise typer.Exit(Exit.BAD_INPUT if all(row.bad_input for row in bad) else Exit.FAILED)
+
+
+@app.command()
+def new(
+    data: Annotated[Path, typer.Argument(metavar="DATA", help="A data file: .csv, .txt, .npz, .mat and others.")],
+    twin: Annotated[str, typer.Option("--twin", metavar="KIND", help="The kind of twin; default: guessed.")] = "",
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.toml", help="Default: recording.toml beside DATA.")
+    ] = None,
+    rate: Annotated[float | None, typer.Option(metavar="HZ", help="Rate of a file without a time column.")] = None,
+    resample: Annotated[
+        float | None, typer.Option(metavar="HZ", help="Bring the columns to even steps at this rate.")
+    ] = None,
+    cut: Annotated[bool, typer.Option("--cut", help="Cut at gaps into runs that are diagnosed together.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Make a recording.toml for a data file: guess time, roles, units and the twin, and draw the columns.
+
+    What it could not know is printed and stands in the file as a comment. When nothing is unknown, 'micron mismatch
+    diagnose' runs on it at once.
+
+    Example: micron mismatch new rig/data.csv
+    """
+    with _clear_errors():
+        _check_targets(json_file)
+        for option, hertz in (("--rate", rate), ("--resample", resample)):
+            if hertz is not None and not 0.0 < hertz < 1e9:
+                raise InputError(f"{option} {hertz:g}: must be a number of samples per second")
+        from tools.mismatch.new import new_recording
+
+        made = new_recording(data, out, twin, rate, resample, cut, force)
+        _show_new(made, json_file)
+
+
+def _show_new(made: NewRecording, json_file: str | None) -> None:
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for heading in ("column", "role", "signal", "unit", "from", "to"):
+        table.add_column(heading, overflow="fold")
+    for c in made.guess.columns:
+        signal = c.signal if c.role in ("input", "output", "context") else ""
+        table.add_row(c.name, c.role or "not used", signal, c.unit or "?", f"{min(c.low):.4g}", f"{max(c.high):.4g}")
+    (console() if json_file == "-" else data_console()).print(table)
+    write_json(made.to_json(), json_file)
+    for heading, said in (("assumed", made.guess.assumed), ("note", made.guess.notes)):
+        for one in said:
+            console().print(f"{heading}: {one}", soft_wrap=True)
+    rate = made.to_json()["rate_hz"]
+    at = f" at {rate:.6g} Hz" if rate else ""
+    runs = f" in {made.stretch.kept} runs" if made.stretch is not None and made.stretch.kept > 1 else ""
+    console().print(
+        f"{made.path}: {made.to_json()['samples']} samples{at}{runs}, twin {made.guess.kind or 'unknown'};"
+        f" the columns are drawn in {made.picture}",
+        soft_wrap=True,
+    )
+    if made.guess.unknown:
+        print_error(f"{made.path}: complete what could not be known:")
+        for one in made.guess.unknown:
+            console().print(f"  {one}", soft_wrap=True)
+        return
+    console().print(f"next: micron mismatch diagnose {shlex.quote(str(made.path))}", soft_wrap=True)
 
 
 @app.command()

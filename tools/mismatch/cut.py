@@ -22,7 +22,8 @@ from tools.mismatch.recording_load import LONGEST_GAP, MIN_SAMPLES, MIN_SPAN, de
 @dataclass(frozen=True)
 class Stretch:
     """What was kept: ``samples`` on a uniform clock of ``rate_hz``, from ``start_s`` to ``stop_s`` of the original;
-    ``filled`` of them stand where the original had none; ``parts``: how many stretches there were, ``kept`` of them.
+    ``filled`` of them stand where the original had none; ``parts``: how many stretches there were, ``kept`` of them;
+    ``segments``: the samples at which the second and later ones begin.
     """
 
     samples: int
@@ -32,6 +33,7 @@ class Stretch:
     filled: int
     parts: int
     kept: int = 1
+    segments: tuple[int, ...] = ()
 
 
 def cut(
@@ -59,43 +61,114 @@ def cut(
         t = np.arange(n) / float(text["rate_hz"])
     else:
         raise InputError(f"{path}: neither 'rate_hz' nor 'time_column'; give one of them")
-    good = np.isfinite(t) & np.all([np.isfinite(columns[c]) for c in names], axis=0)
+    begins = text.get("segments")
+    written, kept = cut_columns(
+        data, t, {c: columns[c] for c in names}, begins if isinstance(begins, list) else [], (start_s, stop_s), every
+    )
+    _write(path, text, out, written, kept.rate_hz, list(kept.segments))
+    return kept
+
+
+def cut_columns(
+    data: Path,
+    t: Array,
+    columns: Mapping[str, Array],
+    begins: Sequence[int] = (),
+    span_s: tuple[float | None, float | None] = (None, None),
+    every: bool = False,
+    rate_hz: float | None = None,
+) -> tuple[dict[str, Array], Stretch]:
+    """Return the columns on a uniform clock, without gaps: the longest stretch, or every one behind the other.
+
+    ``t``: time stamps in seconds, (n,); ``columns``: (n,) each; ``begins``: samples at which a new run begins. A time
+    that jumps back further than a gap begins a new run, too. ``rate_hz``: another rate than the usual one; values are
+    then means over the new step, or straight lines where the new step is not longer. ``data`` is for messages.
+    Raises InputError where too little is left.
+    """
+    good = np.isfinite(t) & np.all([np.isfinite(x) for x in columns.values()], axis=0)
+    start_s, stop_s = span_s
     good &= (t >= (-np.inf if start_s is None else start_s)) & (t < (np.inf if stop_s is None else stop_s))
-    order = np.flatnonzero(good)[np.argsort(t[good], kind="stable")]
-    order = order[np.diff(t[order], prepend=-np.inf) > 0]
+    where = np.flatnonzero(good)
+    if where.size < MIN_SAMPLES:
+        raise InputError(f"{data}: {where.size} usable samples between these times; at least {MIN_SAMPLES} are needed")
+    run = np.searchsorted(np.array(begins, np.int64), where, side="right") + np.cumsum(_restarts(t[where]))
+    sorted_by_time = np.lexsort((t[where], run))
+    order, run = where[sorted_by_time], run[sorted_by_time]
+    new_run = np.diff(run, prepend=run[0] - 1) > 0
+    distinct = new_run | (np.diff(t[order], prepend=-np.inf) > 0)
+    order, run = order[distinct], run[distinct]
     if order.size < MIN_SAMPLES:
         raise InputError(f"{data}: {order.size} usable samples between these times; at least {MIN_SAMPLES} are needed")
     steps = np.diff(t[order])
-    usual = float(np.median(steps))
-    begins = text.get("segments")
-    run = np.searchsorted(np.array(begins if isinstance(begins, list) else [], np.int64), order, side="right")
-    edges = np.r_[0, np.flatnonzero((steps > LONGEST_GAP * usual) | (np.diff(run) > 0)) + 1, order.size]
+    inside = np.diff(run) == 0
+    usual = float(np.median(steps[inside]))
+    edges = np.r_[0, np.flatnonzero((steps > LONGEST_GAP * usual) | ~inside) + 1, order.size]
     long_s = t[order[edges[1:] - 1]] - t[order[edges[:-1]]]
     chosen = [int(np.argmax(long_s))]
     if every:
-        chosen = [k for k in range(edges.size - 1) if edges[k + 1] - edges[k] >= MIN_SPAN] or chosen
+        least_s = 0.0 if rate_hz is None else (MIN_SPAN - 1) / rate_hz
+        wide = np.diff(edges) >= MIN_SPAN
+        chosen = [k for k in range(edges.size - 1) if wide[k] and long_s[k] >= least_s] or chosen
     kept = np.concatenate([order[edges[k] : edges[k + 1]] for k in chosen])
     if kept.size < MIN_SAMPLES:
         raise InputError(f"{data}: the longest stretch has {kept.size} samples; at least {MIN_SAMPLES} are needed")
-    close = steps[steps <= 1.5 * usual]
-    dt = float(np.mean(close)) if close.size else usual
+    close = steps[inside & (steps <= 1.5 * usual)]
+    dt = 1.0 / rate_hz if rate_hz is not None else float(np.mean(close)) if close.size else usual
     parts: list[dict[str, Array]] = []
     filled, sizes = 0, []
     for k in chosen:
         one = order[edges[k] : edges[k + 1]]
         stamps = t[one]
-        count = max(1, round(float(stamps[-1] - stamps[0]) / dt))
-        # one stretch sets its own step; several share one
-        dt = float(stamps[-1] - stamps[0]) / count if len(chosen) == 1 else dt
-        grid = stamps[0] + dt * np.arange(count + 1)
-        parts.append({c: on_grid(grid, dt, stamps, columns[c][one]) for c in names})
-        nearest = np.abs(stamps[np.clip(np.searchsorted(stamps, grid - 0.5 * dt), 0, stamps.size - 1)] - grid)
-        filled += int(np.sum(nearest > 0.75 * dt))
+        span = float(stamps[-1] - stamps[0])
+        if rate_hz is not None:
+            count = int(np.floor(span / dt * (1 + 1e-9)))
+            grid = stamps[0] + dt * np.arange(count + 1)
+            parts.append({c: resample(grid, dt, stamps, x[one]) for c, x in columns.items()})
+        else:
+            count = max(1, round(span / dt))
+            # one stretch sets its own step; several share one
+            dt = span / count if len(chosen) == 1 else dt
+            grid = stamps[0] + dt * np.arange(count + 1)
+            parts.append({c: on_grid(grid, dt, stamps, x[one]) for c, x in columns.items()})
+        nearest = np.abs(stamps[np.clip(np.searchsorted(stamps, grid - 0.5 * usual), 0, stamps.size - 1)] - grid)
+        filled += int(np.sum(nearest > 0.75 * max(dt, usual)))
         sizes.append(count + 1)
-    written = {c: np.concatenate([p[c] for p in parts]) for c in names}
-    _write(path, text, out, written, 1.0 / dt, [int(k) for k in np.cumsum(sizes)[:-1]])
-    whole = sum(sizes)
-    return Stretch(whole, 1.0 / dt, float(t[kept[0]]), float(t[kept[-1]]), filled, edges.size - 1, len(chosen))
+    if sum(sizes) < MIN_SAMPLES:
+        raise InputError(f"{data}: {sum(sizes)} samples at {1 / dt:g} Hz; at least {MIN_SAMPLES} are needed")
+    segments = tuple(int(k) for k in np.cumsum(sizes)[:-1])
+    return {c: np.concatenate([p[c] for p in parts]) for c in columns}, Stretch(
+        sum(sizes), 1.0 / dt, float(t[kept[0]]), float(t[kept[-1]]), filled, edges.size - 1, len(chosen), segments
+    )
+
+
+def _restarts(t: Array) -> Array:
+    """Whether the clock starts anew at a sample: it jumps back by more than a gap, and does not return at once."""
+    steps = np.diff(t, prepend=t[0])
+    forward = steps[steps > 0]
+    gap = LONGEST_GAP * float(np.median(forward)) if forward.size else np.inf
+    later = np.r_[t[1:], t[-1]]
+    before = np.r_[t[0], t[:-1]]
+    return (steps < -gap) & (later < before)
+
+
+def resample(grid: Array, dt: float, stamps: Array, x: Array) -> Array:
+    """Return the means of ``x`` over the steps ``dt`` around the points of ``grid``, (points,).
+
+    Between samples ``x`` runs straight. Where ``dt`` is hardly longer than the usual step of ``stamps`` (n,), the value
+    at the point itself is returned.
+    """
+    if dt <= 1.25 * float(np.median(np.diff(stamps))):
+        return np.interp(grid, stamps, x)
+    area = np.r_[0.0, np.cumsum(0.5 * (x[1:] + x[:-1]) * np.diff(stamps))]
+    slope = np.diff(x) / np.diff(stamps)
+    begin, end = (np.clip(grid + side * dt, stamps[0], stamps[-1]) for side in (-0.5, 0.5))
+
+    def integral(at: Array) -> Array:
+        i = np.clip(np.searchsorted(stamps, at, side="right") - 1, 0, stamps.size - 2)
+        h = at - stamps[i]
+        return area[i] + h * (x[i] + 0.5 * slope[i] * h)
+
+    return (integral(end) - integral(begin)) / (end - begin)
 
 
 def _write(

@@ -1,8 +1,9 @@
 """Guesses what the columns of a data file are: time, input, output or context, signal and unit, and the kind of twin.
 
-A guess is a proposal that a person corrects. Units are read from the names of columns (``force_N``, ``x [mm]``), roles
-from names and units. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a
-descriptor as ``micron mismatch diagnose`` would and prints nothing where it is good.
+A guess is a proposal that a person corrects; it lists what it could not know. Units are read from the names of columns
+(``force_N``, ``x [mm]``) or a row of units, roles from names and units. The bench page and ``micron mismatch new``
+share it. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a descriptor as
+``micron mismatch diagnose`` would and prints nothing where it is good.
 """
 
 from __future__ import annotations
@@ -11,42 +12,42 @@ import argparse
 import json
 import re
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from tools.errors import InputError
 from tools.mismatch import units
+from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit
 from tools.mismatch.recording import RecordingError
-from tools.mismatch.recording_columns import Array, column_names, read_columns
+from tools.mismatch.recording_columns import Array, column_names, column_units, first_line, read_blocks, read_scalars
+from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES
-from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
+from tools.mismatch.stamps import StampReader, Stamps
+from tools.mismatch.text_table import BLOCK_ROWS
+from tools.mismatch.twins.vocabulary import KINDS, vocabulary
 
-GuessedRole = Literal["time", "input", "output", "context", ""]
 POINTS = 240
 """Smallest and largest values of so many parts of each column are returned, for drawing."""
 MOST_COLUMNS = 200
-_SUFFIX = re.compile(
-    r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
-)
-_TIME = re.compile(r"^(t|time|timestamp|seconds|sec|zeit)$", re.IGNORECASE)
-_WORDS: tuple[tuple[GuessedRole, str], ...] = (
-    ("context", r"temp|supply|ambient|humid|status|flag|state"),
-    ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|volt"),
-    ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|u$"),
-)
-_BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
-    ("context", "degC"), ("input", "N"), ("input", "N m"), ("output", "m"), ("output", "m/s"), ("output", "rad"),
-    ("output", "rad/s"), ("output", "m/s^2"), ("input", "V"), ("input", "A"),
-)  # fmt: skip
+_PART = 256
+"""Rows per part of a file that is longer than one block."""
+_TIME = re.compile(r"^(t|time|time[ _-]?stamps?|seconds|secs?|zeit|elapsed([ _-]?time)?|.*log_time)$", re.IGNORECASE)
+_NUMBER = re.compile(r"^(i|k|n|index|idx|samples?|sample[ _]?(no|number|index)|no|nr|row|count)\.?$", re.IGNORECASE)
+_RATE = re.compile(r"^(.*\.)?(fs|f_s|rate|sampl(e|ing)_?(rate|freq|frequency))(_?hz)?$", re.IGNORECASE)
+_STEP = re.compile(r"^(.*\.)?(ts|t_s|dt|sampl(e|ing)_?(time|period))(_s)?$", re.IGNORECASE)
+_UNNAMED = re.compile(r"^column_\d+$")
 
 
 @dataclass(frozen=True)
 class GuessedColumn:
-    """One column. ``unit`` is empty where the name tells none; ``low`` and ``high`` are for drawing, [<= POINTS]."""
+    """One column. ``unit`` is empty where nothing tells it; ``low`` and ``high`` are for drawing, [<= POINTS].
+
+    ``missing``: values that are not finite; ``first_missing``: the sample of the first of them, or -1.
+    """
 
     name: str
     role: GuessedRole
@@ -54,121 +55,277 @@ class GuessedColumn:
     unit: str
     low: list[float]
     high: list[float]
+    missing: int = 0
+    first_missing: int = -1
 
 
 @dataclass(frozen=True)
 class Guess:
-    """``time_column`` is empty without one; ``rate_hz`` is then None, too. ``kind`` is empty where none fits."""
+    """A proposal for a recording.
+
+    ``time_column`` is empty without one in seconds; ``rate_hz`` is None where nothing tells it. ``kind`` is empty where
+    none fits. ``unknown``: what a person has to say before it can be diagnosed; ``broken``: what has to be repaired
+    first; ``assumed``: what nothing tells and was taken for granted; ``notes``: what was left out and why. ``clock``:
+    the column of time in any unit, ``clock_unit``; ``row_of_first``: the line of the first sample of a text file, or 0.
+    """
 
     samples: int
     time_column: str
     rate_hz: float | None
     kind: str
     columns: list[GuessedColumn]
+    unknown: list[str]
+    broken: list[str]
+    assumed: list[str]
+    notes: list[str]
+    clock: str = ""
+    clock_unit: str = "s"
+    row_of_first: int = 0
 
 
-def split_unit(name: str) -> tuple[str, str]:
-    """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
-    found = _SUFFIX.match(name.strip())
-    if found is None:
-        return name.strip(), ""
-    unit = found["inside"] or found["after"]
-    try:
-        units.parse(unit)
-    except units.UnitError:
-        return name.strip(), ""
-    if not found["inside"] and unit.isdigit():
-        return name.strip(), ""
-    return found["name"].strip(), unit
+@dataclass
+class _Column:
+    """What the blocks say of one column."""
+
+    low: list[Array] = field(default_factory=list[Array])
+    high: list[Array] = field(default_factory=list[Array])
+    missing: int = 0
+    first_missing: int = -1
+    smallest: float = float("inf")
+    largest: float = float("-inf")
+
+    def add(self, values: Array, at: int, parts: int) -> None:
+        finite = np.isfinite(values)
+        if not finite.all():
+            if self.first_missing < 0:
+                self.first_missing = at + int(np.argmin(finite))
+            self.missing += int(values.size - finite.sum())
+        low, high = extremes(values, parts)
+        self.low.append(low)
+        self.high.append(high)
+        self.smallest = min(self.smallest, float(np.nanmin(low, initial=np.inf)))
+        self.largest = max(self.largest, float(np.nanmax(high, initial=-np.inf)))
 
 
-def guess_role(name: str, unit: str) -> GuessedRole:
-    """Return the role that a name, or else a unit, suggests; empty for no idea."""
-    for role, pattern in _WORDS:
-        if re.search(pattern, name, re.IGNORECASE):
-            return role
-    for role, of in _BY_UNIT:
-        if unit and units.same_dimension(unit, of):
-            return role
-    return ""
+def guess(path: Path, kind: str = "") -> Guess:
+    """Read a data file in blocks and propose what its columns are; ``kind`` is the twin where a person named one.
 
-
-def guess(path: Path) -> Guess:
-    """Read a data file and propose what its columns are. Raises RecordingError."""
+    Raises RecordingError.
+    """
     names = column_names(path)
     if not names:
-        raise RecordingError(f"{path}: no columns of numbers; a csv needs one header row, an npz one array per column")
+        raise RecordingError(
+            f"{path}: no columns of numbers; a csv needs lines of numbers, an npz one array per column"
+        )
     if len(names) > MOST_COLUMNS:
         raise RecordingError(f"{path}: {len(names)} columns; at most {MOST_COLUMNS} are looked at, keep those you need")
-    columns = read_columns(path, names)
-    n = next(iter(columns.values())).size
+    told = column_units(path)
+    parts = {k: (k, told[k]) if told.get(k) else split_unit(k) for k in names}
+    words = words_in(path)
+    notes = [f"column '{name}' is not used: it holds words ('{first}')" for name, first in words]
+    row = first_line(path)
+    seen, stamps, clock, n, assumed = _scan(path, names, parts, row)
     if n < 2:
         raise RecordingError(f"{path}: {n} samples; a recording needs at least {MIN_SAMPLES}")
-    parts = {name: split_unit(name) for name in names}
-    clock = next((name for name in names if _is_time(columns[name], *parts[name])), "")
-    roles: dict[str, GuessedRole] = {k: "time" if k == clock else guess_role(*parts[k]) for k in names}
-    left = [k for k in names if not roles[k]]
-    for name in left:  # without any idea: the first drives, the others answer
-        roles[name] = "input" if "input" not in roles.values() else "output"
-    rate_hz = None
-    if clock and n > 2:
-        step_s = float(np.median(np.diff(columns[clock]))) * units.parse(parts[clock][1] or "s").factor
-        rate_hz = 1.0 / step_s if step_s > 0 else None
-    kind = _guess_kind(roles, {k: parts[k][1] for k in names})
-    found = [
-        GuessedColumn(k, roles[k], _signal(k, parts[k], roles[k], kind), parts[k][1], *_extremes(columns[k]))
+    left = _candidates(names, parts, seen, clock, n, notes)
+    if len(left) < 2:
+        said = f" ({'; '.join(notes)})" if notes else ""
+        raise RecordingError(
+            f"{path}: columns of numbers beside the time: {len(left)}; a recording needs one that drives and one that"
+            f" answers{said}"
+        )
+    given = kind
+    kinds = [kind] if kind else choose_kinds(left, parts)
+    kind = kinds[0] if len(kinds) == 1 else ""
+    found = assign(kind, left, parts)
+    if found is None and given and not _is_open(given):
+        raise RecordingError(f"{path}: no columns are an input and an output of a {given}; {_words_of(given)}")
+    if found is None:
+        raise RecordingError(f"{path}: nothing but context beside the time; rename what drives and what answers")
+    notes += found.notes
+    assumed += found.assumed
+    unknown = [] if kind else [_no_kind(kinds, left, parts, found)]
+    for name in left:
+        if found.roles[name] in ("input", "output") and not parts[name][1]:
+            taken = _assumed_unit(kind, found, name)
+            assumed.append(f"the unit of '{name}' is {taken or '1'}")
+    broken = [
+        f"column '{k}' has {seen[k].missing} missing values, the first at {place(seen[k].first_missing, row)}"
+        for k in left
+        if found.roles[k] and seen[k].missing
+    ]
+    clock_unit = parts[clock][1] or "s" if clock else "s"
+    time_column, rate_hz = clock, None
+    if stamps is not None:
+        rate_hz = stamps.rate_hz
+        if units.parse(clock_unit).factor != 1.0:
+            time_column = ""
+        usable = stamps.is_usable if time_column else stamps.is_even
+        if not usable:
+            broken.append(_broken_clock(clock, stamps))
+        elif not time_column:
+            notes.append(f"column '{clock}' is the time in {clock_unit}: its even steps are written as rate_hz")
+        elif stamps.faults:
+            notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
+    else:
+        rate_hz = _rate_beside(path, notes)
+        if rate_hz is None:
+            unknown.append("the rate: no column is a time that runs forwards; set rate_hz, or repeat with --rate HZ")
+    columns = [
+        GuessedColumn(
+            k,
+            ("time" if k == time_column else "") if k == clock else found.roles.get(k, ""),
+            found.signals.get(k, "t" if k == clock else ""),
+            parts[k][1],
+            *_drawn(seen[k]),
+            seen[k].missing,
+            seen[k].first_missing,
+        )
         for k in names
     ]
-    return Guess(n, clock, rate_hz, kind, found)
+    return Guess(n, time_column, rate_hz, kind, columns, unknown, broken, assumed, notes, clock, clock_unit, row)
 
 
-def _is_time(values: Array, name: str, unit: str) -> bool:
-    seconds = unit != "" and units.same_dimension(unit, "s")
-    return bool((_TIME.match(name) or (seconds and name == "")) and values.size > 1 and (np.diff(values) > 0).all())
+def place(sample: int, row_of_first: int) -> str:
+    """Return where a sample is: its line in a text file, else its number."""
+    return f"line {sample + row_of_first}" if row_of_first else f"sample {sample}"
 
 
-def _guess_kind(roles: dict[str, GuessedRole], unit_of: dict[str, str]) -> str:
-    """Return the kind whose vocabulary takes the unit of every input and output; empty for none or no units."""
-    wanted = [(role, unit_of[k]) for k, role in roles.items() if role in ("input", "output")]
-    if not all(unit for _, unit in wanted):
-        return ""
-    for kind, words in KINDS.items():
-        if words.open_ended:
+def _scan(
+    path: Path, names: list[str], parts: Parts, row: int
+) -> tuple[dict[str, _Column], Stamps | None, str, int, list[str]]:
+    """All blocks once: what every column holds, the time stamps, their column, samples, and what was assumed."""
+    seen = {name: _Column() for name in names}
+    reader: StampReader | None = None
+    clock, n = "", 0
+    assumed: list[str] = []
+    for block in _slices(path, names):
+        size = block[names[0]].size
+        if n == 0:
+            clock, taken = _find_clock(names, parts, block)
+            if clock:
+                reader = StampReader(row)
+            if taken:
+                assumed.append(taken)
+        for name in names:
+            seen[name].add(block[name], n, POINTS if n == 0 and size < BLOCK_ROWS else -(-size // _PART))
+        if reader is not None:
+            reader.add(block[clock] * units.parse(parts[clock][1] or "s").factor)
+        n += size
+    return seen, None if reader is None else reader.stamps(), clock, n, assumed
+
+
+def _slices(path: Path, names: list[str]) -> Iterator[dict[str, Array]]:
+    for block in read_blocks(path, names):
+        size = block[names[0]].size
+        for a in range(0, size, BLOCK_ROWS):
+            yield {name: values[a : a + BLOCK_ROWS] for name, values in block.items()}
+
+
+def _find_clock(names: Sequence[str], parts: Parts, head: dict[str, Array]) -> tuple[str, str]:
+    """The column of time, and what had to be assumed for that; both empty for none."""
+    for name in names:
+        plain, unit = parts[name]
+        seconds = unit != "" and units.same_dimension(unit, "s")
+        if unit and not seconds:
             continue
-        of = {"input": words.inputs, "output": words.outputs}
-        fits = all(any(units.same_dimension(unit, u) for _, known in of[role] for u in known) for role, unit in wanted)
-        if fits and {role for role, _ in wanted} == {"input", "output"}:
-            return kind
-    return ""
+        forward = _forward(head[name])
+        if (_TIME.match(plain) and forward > 0.5) or (seconds and forward > 0.9):
+            return name, "" if unit or plain.lower().startswith("sec") else f"the time in '{name}' is in s"
+    first = names[0]
+    if _UNNAMED.match(first) and _forward(head[first]) == 1.0:
+        steps = np.diff(head[first])
+        if np.ptp(steps) < 0.1 * np.median(steps) and not (np.median(steps) == 1.0 and np.ptp(steps) == 0.0):
+            return first, f"'{first}' is the time in s, because it rises in even steps"
+    return "", ""
 
 
-def _signal(name: str, parts: tuple[str, str], role: GuessedRole, kind: str) -> str:
-    """Return the twin's own word for a column, else the column's name as a word."""
-    plain, unit = parts
-    own = re.sub(r"\W+", "_", plain).strip("_") or "signal"
-    if role == "context":
-        return next((s for s in CONTEXT_UNITS if s[:4] in plain.lower()), own)
-    words = KINDS.get(kind)
-    for pattern, known in (words.inputs if role == "input" else words.outputs) if words else ():
-        if re.fullmatch(pattern, own):
-            return own
-        if unit and any(units.same_dimension(unit, u) for u in known):
-            axis = plain[-1:].lower()
-            if pattern.endswith("[xyz]"):
-                return (
-                    f"{pattern.removesuffix('[xyz]')}{axis if axis in 'xyz' else 'x'}" if "\\" not in pattern else own
-                )
-            return pattern
-    return own
+def _forward(values: Array) -> float:
+    """The share of steps that rise."""
+    return float(np.mean(np.diff(values) > 0)) if values.size > 1 else 0.0
 
 
-def _extremes(values: Array) -> tuple[list[float], list[float]]:
-    if not values.size:
-        return [], []
-    starts = np.unique(np.linspace(0, values.size, POINTS, endpoint=False).astype(int))
-    finite = np.where(np.isfinite(values), values, np.nan)
-    low, high = np.fmin.reduceat(finite, starts), np.fmax.reduceat(finite, starts)
+def _candidates(
+    names: Sequence[str], parts: Parts, seen: dict[str, _Column], clock: str, n: int, notes: list[str]
+) -> list[str]:
+    """The columns that may have a role. What counts the samples or never changes has none."""
+    left: list[str] = []
+    for name in names:
+        column = seen[name]
+        counts = column.missing == 0 and column.largest - column.smallest == n - 1 and (
+            _NUMBER.match(parts[name][0]) or (_UNNAMED.match(name) and name == names[0])
+        )  # fmt: skip
+        if name == clock:
+            continue
+        if counts:
+            notes.append(f"column '{name}' is not used: it counts the samples")
+        elif not column.smallest < column.largest:
+            notes.append(f"column '{name}' is not used: it never changes")
+        else:
+            left.append(name)
+    return left
+
+
+def _rate_beside(path: Path, notes: list[str]) -> float | None:
+    for name, value in read_scalars(path).items():
+        if value > 0 and (_RATE.match(name) or _STEP.match(name)):
+            notes.append(f"'{name}' = {value:g} of the file is taken as the {'rate' if _RATE.match(name) else 'step'}")
+            return value if _RATE.match(name) else 1.0 / value
+    return None
+
+
+def _broken_clock(clock: str, stamps: Stamps) -> str:
+    more = f" and {stamps.faults - len(stamps.places)} more" if stamps.faults > len(stamps.places) else ""
+    said = "; ".join(stamps.places) or f"the stamps leave an even grid by {stamps.wander:.3g} steps"
+    return f"the time in '{clock}' (usual step {stamps.step_s:.4g} s) is uneven: {said}{more}"
+
+
+def _no_kind(kinds: Sequence[str], left: Sequence[str], parts: Parts, found: Assignment) -> str:
+    if kinds:
+        return f"the twin: the columns fit a {' and a '.join(kinds)}; set its kind, or repeat with --twin KIND"
+    said = {
+        role: [parts[k][1] or f"'{k}' (no unit)" for k in left if found.roles[k] == role]
+        for role in ("input", "output")
+    }
+    return (
+        f"the twin: no kind is told by {', '.join(said['input'])} in and {', '.join(said['output'])} out;"
+        f" set its kind, or repeat with --twin KIND ({', '.join(KINDS)})"
+    )
+
+
+def _is_open(kind: str) -> bool:
+    words = vocabulary(kind)
+    return words is None or words.open_ended
+
+
+def _words_of(kind: str) -> str:
+    words = KINDS[kind]
+    return "; ".join(
+        f"{role}s: " + ", ".join(f"{p} ({' or '.join(u)})" for p, u in known)
+        for role, known in (("input", words.inputs), ("output", words.outputs))
+    )
+
+
+def _assumed_unit(kind: str, found: Assignment, name: str) -> str:
+    words = vocabulary(kind) if kind else None
+    role = found.roles[name]
+    if words is None or role not in ("input", "output"):
+        return ""
+    return next(iter(words.units(role, found.signals[name]) or ()), "")
+
+
+def _drawn(column: _Column) -> tuple[list[float], list[float]]:
+    low, high = np.concatenate(column.low), np.concatenate(column.high)
+    if low.size > POINTS:
+        low, high = extremes(low, POINTS)[0], extremes(high, POINTS)[1]
     return np.nan_to_num(low).tolist(), np.nan_to_num(high).tolist()
+
+
+def extremes(values: Array, parts: int) -> tuple[Array, Array]:
+    """The smallest and the largest values of so many parts, or of fewer where there are fewer values."""
+    starts = np.unique(np.linspace(0, values.size, parts, endpoint=False).astype(int))
+    finite = np.where(np.isfinite(values), values, np.nan)
+    return np.fmin.reduceat(finite, starts), np.fmax.reduceat(finite, starts)
 
 
 def as_json(found: Guess) -> dict[str, Any]:

@@ -6,11 +6,17 @@
 from __future__ import annotations
 
 import argparse
+import os
+import re
+import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from tools.mismatch import key_tables as keys
 from tools.mismatch.keys import Key
+from tools.mismatch.new import new_recording
+from tools.mismatch.recording_columns import SUFFIXES
+from tools.mismatch.text_table import SUFFIXES as TEXT
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 
 PAGE = Path("docs/own-data.md")
@@ -42,44 +48,50 @@ table[:, 2] += np.random.default_rng(1).normal(0, 0.02, t.size)
 np.savetxt("data.csv", table, delimiter=",", header="t_s,force_N,x_mm", comments="")
 ```
 
-## 1. Say what the columns are
+The five commands:
 
-``` { .toml title="recording.toml" }
-format = 1
-data = "data.csv"
-time_column = "t_s"
-
-[twin]
-kind = "mechanical_axis"
-[twin.parameters] # what you believe today
-mass = 2.1
-damping = 5.0
-stiffness = 120.0
-
-[[channels]]
-column = "force_N"
-role = "input"
-signal = "force"
-unit = "N"
-
-[[channels]]
-column = "x_mm"
-role = "output"
-signal = "position"
-unit = "mm"
-noise_rms = 0.02 # of your instrument, if you know it: a wrong noise floor is the usual cause of a wrong verdict
-```
-
-## 2. Diagnose, correct, run again
-
-``` { .bash }
+``` { .bash title="five commands" }
+micron mismatch new data.csv
 micron mismatch diagnose . --html report.html --json report.json
 micron mismatch apply . report.json --out twin.toml
 micron mismatch apply . report.json --out twin.py
 micron mismatch simulate twin.py . --out simulated.csv
 ```
 
-The report says where the two differ and which physics is missing ([how to read it](mismatch.md#reading-a-report)).
+## 1. Say what the columns are
+
+`micron mismatch new data.csv` guesses the time, roles, units and the twin from names and values, draws the columns in
+`recording.png`, and writes `recording.toml`:
+
+``` { .toml title="recording.toml" }
+{written}```
+
+It reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
+{endings}.
+What it could not know is printed and stands in the file as a comment; when nothing is unknown, `diagnose` runs on it at
+once.
+`--twin KIND` names the twin, `--rate HZ` the rate of a file without time.
+
+Where the time is uneven or values are missing, it says in which line, and writes nothing. `--cut` then brings the
+columns to even steps at their usual rate and cuts them at gaps; `--resample HZ` does so at another rate (means over the
+new step, straight lines where that is not longer). The runs stand one behind the other in `recording.npz`, `segments`
+says where each begins, and one diagnosis holds for all of them.
+
+Put in what you believe, before you ask what is missing:
+
+``` { .toml title="in recording.toml" }
+mass = 2.1
+damping = 5.0
+stiffness = 120.0
+noise_rms = 0.02
+```
+
+A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
+
+## 2. Diagnose, correct, run again
+
+`micron mismatch diagnose` says where the two differ and which physics is missing
+([how to read it](mismatch.md#reading-a-report)).
 `apply` writes the corrected twin in the form that the ending asks for:
 
 {formats}
@@ -119,7 +131,9 @@ def page() -> str:
     from tools.mismatch.export.write import FORMATS
 
     formats = "\n".join(f"- `{ending}`: {what}" for ending, what in FORMATS.items())
-    lines = [_GUIDE.replace("{formats}", formats), "## Every key of `recording.toml`", ""]
+    endings = ", ".join(f"`{s}`" for s in SUFFIXES if s not in TEXT)
+    guide = _GUIDE.replace("{formats}", formats).replace("{endings}", endings).replace("{written}", written())
+    lines = [guide, "## Every key of `recording.toml`", ""]
     for heading, table in keys.tables():
         lines += [f"### {heading}", "", *_rows(table), ""]
     lines += ["## Every kind of twin", ""]
@@ -139,6 +153,20 @@ def page() -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def written() -> str:
+    """What ``micron mismatch new`` writes for the data of the page."""
+    source = re.findall(r"^``` \{ \.python[^\n]*\n(.*?)^```", _GUIDE, flags=re.S | re.M)[0]
+    with tempfile.TemporaryDirectory() as name:
+        before = Path.cwd()
+        os.chdir(name)
+        try:
+            exec(source, {})
+        finally:
+            os.chdir(before)
+        new_recording(Path(name) / "data.csv")
+        return (Path(name) / "recording.toml").read_text(encoding="utf-8")
 
 
 def _rows(table: Sequence[Key]) -> Iterator[str]:

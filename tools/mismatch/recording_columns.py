@@ -62,6 +62,16 @@ def column_units(path: Path) -> dict[str, str]:
     return units(path) if units is not None else {}
 
 
+def word_columns(path: Path) -> list[tuple[str, str]]:
+    """Columns of a text file that hold words, each with the first of them. Raises RecordingError."""
+    return list(text_table.text_table(path).text) if path.suffix.lower() in text_table.SUFFIXES else []
+
+
+def first_line(path: Path) -> int:
+    """The line of the first sample of a text file; 0 for other files. Raises RecordingError."""
+    return text_table.text_table(path).first if path.suffix.lower() in text_table.SUFFIXES else 0
+
+
 @dataclass(frozen=True)
 class _Format:
     """How the columns of one kind of file are listed and read, and their units, where the format has any."""
@@ -80,7 +90,7 @@ def _format(path: Path) -> _Format:
     if suffix not in SUFFIXES:
         raise RecordingError(f"{path}: data must be {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}, not '{path.suffix}'")
     if suffix in text_table.SUFFIXES:
-        return _Format(_text_names, lambda p, names: text_table.text_table(p).read(names))
+        return _Format(_text_names, lambda p, names: text_table.text_table(p).read(names), _text_units)
     return {
         ".npz": _Format(_npz_names, _npz),
         ".mat": _Format(_mat_names, _mat),
@@ -95,10 +105,16 @@ def _text_names(path: Path) -> list[str]:
     return text_table.text_table(path).columns
 
 
+def _text_units(path: Path) -> dict[str, str]:
+    table = text_table.text_table(path)
+    return {name: unit for name, unit in zip(table.names, table.units, strict=True) if unit}
+
+
 def _npz_names(path: Path) -> list[str]:
     try:
         with open_npz(path) as data:
-            return [k for k in data.files if (a := data[k]).ndim == 1 and a.dtype.kind in "fiub"]
+            sizes = {k: a.size for k in data.files if (a := data[k]).ndim == 1 and a.dtype.kind in "fiub"}
+            return [k for k, size in sizes.items() if size == max(sizes.values())]
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: not a readable npz file ({error})") from None
 

@@ -104,6 +104,13 @@ def diagnosed() -> None:
     assert done.exit_code == 0, done.output
 
 
+def rig() -> None:
+    """Somebody's measurement: a force and where it moved something."""
+    t = np.arange(400) / 100.0
+    Path("rig").mkdir()
+    np.savetxt("rig/data.csv", np.column_stack([t, np.sin(t), np.cos(t)]), delimiter=";", header="t_s;force_N;x_mm")
+
+
 def pages() -> None:
     """The pages that a result is put into."""
     for page in ("long-runs", "tremor-on-real-hands"):
@@ -123,6 +130,7 @@ MADE: dict[str, Callable[[], object]] = {
     "mismatch simulate": lambda: (diagnosed(), call("mismatch apply")),
     "mismatch cut": lambda: recorded_stack("rec"),
     "mismatch diagnose": lambda: recorded_stack("recordings/stack"),
+    "mismatch new": rig,
     "noise": logs,
     "read": lambda: shutil.copy(CHIP / "bench.toml", "lab.toml"),
     "soak": pages,

@@ -21,10 +21,11 @@ export function wordsOf(kind, role, outputs = []) {
 export function newRecording(link, done) {
   let file = null; // what the server said of the dropped file
   let kinds = [];
+  let suffixes = [];
   let most = 200 * 2 ** 20;
   let busy = false;
   const problem = h("p.bad", { role: "alert" });
-  const pick = h("input", { type: "file", accept: ".csv,.npz,.mcap", hidden: true, "aria-label": "Data file", onchange: () => { const [f] = pick.files; pick.value = ""; take(f); } });
+  const pick = h("input", { type: "file", hidden: true, "aria-label": "Data file", onchange: () => { const [f] = pick.files; pick.value = ""; take(f); } });
   const open = h("button", { onclick: () => pick.click() }, "Open a file …");
   const form = h("section.panel.new-recording", { hidden: true, "aria-label": "Describe the file" });
   const fail = (error) => { problem.textContent = error.message; };
@@ -33,7 +34,10 @@ export function newRecording(link, done) {
     problem.textContent = "";
     if (!chosen || busy) return;
     if (!link.mayOrder) { fail(new Error("View only: a file needs the address that “micron bench” printed.")); return; }
-    if (!/\.(csv|npz|mcap)$/i.test(chosen.name)) { fail(new Error(`${chosen.name}: a file must be .csv, .npz or .mcap.`)); return; }
+    try {
+      ({ kinds, most_bytes: most, suffixes } = await get("/api/mismatch/kinds"));
+    } catch (error) { fail(error); return; }
+    if (!suffixes.some((s) => chosen.name.toLowerCase().endsWith(s))) { fail(new Error(`${chosen.name}: a file must be ${suffixes.join(", ")}.`)); return; }
     if (chosen.size > most) {
       fail(new Error(`${chosen.name} has ${bytes(chosen.size)}; the page takes ${bytes(most)}. Put it into a folder of the recordings with a recording.toml beside it.`));
       return;
@@ -43,7 +47,6 @@ export function newRecording(link, done) {
     try {
       const found = await put(`/api/upload/${encodeURIComponent(chosen.name)}`, chosen);
       if (found.recording) { done(found.recording); return; }
-      ({ kinds, most_bytes: most } = await get("/api/mismatch/kinds"));
       file = found;
       build();
     } catch (error) { fail(error); } finally {
@@ -130,9 +133,14 @@ export function newRecording(link, done) {
       } catch (error) { wrong.textContent = error.message; }
     }
 
+    /** What the guess could not know, assumed and left out. */
+    const remarks = () => [["Repair the file first, or let “micron mismatch new FILE --cut” do it: ", file.broken], ["Say what could not be known: ", file.unknown], ["Assumed: ", file.assumed], ["", file.notes]]
+      .filter(([, said]) => said.length).map(([head, said]) => h("p.note", {}, `${head}${said.join("; ")}.`));
+
     showKind();
     form.hidden = false;
     form.replaceChildren(h("h2", {}, `${file.name} `, h("small", {}, `${file.samples} samples`), h("span.grow"), h("button.quiet", { onclick: () => { form.hidden = true; file = null; } }, "Discard")),
+      ...remarks(),
       h("table.cards", {}, h("thead", {}, h("tr", {}, ["column", "", "role", "signal", "unit", "noise, rms"].map((t) => h("th", {}, t || h("span.unseen", {}, "picture"))))), h("tbody", {}, rows.map((r) => r.element))), lists,
       h("div.row", {}, h("label", {}, "twin", kind), h("label", {}, "rate without a time column, Hz", rate)), known, parameters,
       h("div.row", {}, h("label", {}, "name", name), h("button.primary", { onclick: make }, "Make the recording and diagnose")), wrong);

@@ -1,0 +1,259 @@
+"""Roles, signals and units of columns, and the kind of twin, from their names and units alone."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from tools.mismatch import units
+from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS, Role, vocabulary
+
+GuessedRole = Literal["time", "input", "output", "context", ""]
+Parts = Mapping[str, tuple[str, str]]
+"""The name without its unit, and the unit, of each column."""
+Fits = Callable[[str, str, str, tuple[str, ...]], bool]
+_SUFFIX = re.compile(
+    r"^(?P<name>.*?)(?:\s*[\[(](?P<inside>[^\[\]()]+)[\])]|[_ /](?P<after>[^_ /\[\]()]+(?:/[^_ ]+)?))$"
+)
+_ORDINARY_WORDS = ("in", "min", "h")
+"""Units that are words, too (``x_in``, ``x_min``): they count in brackets only."""
+_WORDS: tuple[tuple[GuessedRole, str], ...] = (
+    ("context", r"temp|supply|ambient|humid|status|flag|state"),
+    ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
+    ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|kraft|u$"),
+)
+_BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
+    ("context", "degC"), ("input", "N"), ("input", "N m"), ("output", "m"), ("output", "m/s"), ("output", "rad"),
+    ("output", "rad/s"), ("output", "m/s^2"), ("input", "V"), ("input", "A"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Assignment:
+    """What each column is. ``signals`` has those with a role; ``named``: how many of them a name or a unit told.
+
+    ``notes`` says which columns are not used, ``assumed`` which roles nothing tells.
+    """
+
+    roles: dict[str, GuessedRole]
+    signals: dict[str, str]
+    named: int
+    notes: tuple[str, ...] = ()
+    assumed: tuple[str, ...] = ()
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Return the name without its unit, and the unit; the unit is empty where the name ends in none."""
+    found = _SUFFIX.match(name.strip())
+    if found is None:
+        return name.strip(), ""
+    unit = (found["inside"] or found["after"]).strip()
+    plain = found["name"].strip().rstrip(",").strip()
+    if unit in ("C", "F") and "temp" in plain.lower():
+        unit = f"deg{unit}"
+    try:
+        units.parse(unit)
+    except units.UnitError:
+        return name.strip(), ""
+    if not found["inside"] and (unit.isdigit() or unit in _ORDINARY_WORDS):
+        return name.strip(), ""
+    return plain, unit
+
+
+def role_of_name(name: str) -> GuessedRole:
+    """Return the role that a name suggests; empty for no idea."""
+    for role, pattern in _WORDS:
+        if re.search(pattern, name, re.IGNORECASE):
+            return role
+    return ""
+
+
+def guess_role(name: str, unit: str) -> GuessedRole:
+    """Return the role that a name, or else a unit, suggests; empty for no idea."""
+    if role := role_of_name(name):
+        return role
+    for role, of in _BY_UNIT:
+        if unit and units.same_dimension(unit, of):
+            return role
+    return ""
+
+
+def choose_kinds(names: Sequence[str], parts: Parts) -> list[str]:
+    """Return the kinds of twins whose vocabulary takes most columns by name or unit, both ways; several fit equally."""
+    fits: dict[str, int] = {}
+    for kind, words in KINDS.items():
+        if not words.open_ended and (found := assign(kind, names, parts, by_order=False)) is not None:
+            fits[kind] = found.named
+    return [kind for kind, named in fits.items() if named == max(fits.values())]
+
+
+def assign(kind: str, names: Sequence[str], parts: Parts, by_order: bool = True) -> Assignment | None:
+    """Give every column a role and a signal of a twin of ``kind``; None where an input or an output is left without.
+
+    With ``by_order`` columns whose name and unit tell nothing take the places that are left, in their order.
+    """
+    words = vocabulary(kind) if kind else None
+    if words is None or words.open_ended:
+        return _assign_freely(names, parts)
+    found = _Places(kind, parts)
+    hints: dict[str, GuessedRole] = {name: role_of_name(parts[name][0]) for name in names}
+    for name in names:  # the twin's own words
+        found.take_if(name, hints[name], lambda own, _, pattern, __: re.fullmatch(pattern, own) is not None)
+    for name in names:  # a unit of the twin
+        found.take_if(
+            name,
+            hints[name],
+            lambda _, unit, __, known: unit != "" and any(units.same_dimension(unit, u) for u in known),
+        )
+    named = len(found.roles)
+    assumed: list[str] = []
+    if by_order:
+        for name in names:
+            if name not in found.roles and not parts[name][1] and hints[name] != "context":
+                before = len(found.roles)
+                turn: GuessedRole = "output" if "input" in found.roles.values() else "input"
+                found.take_if(name, hints[name] or turn, lambda *_: True)
+                if len(found.roles) > before:
+                    assumed.append(f"'{name}' is {_article(found.roles[name])}, {found.signals[name]}")
+    dropped = found.drop_what_does_not_fit()
+    if not {"input", "output"} <= set(found.roles.values()):
+        return None
+    notes = [f"column '{name}' is not used: {why}" for name, why in dropped.items()]
+    for name in names:
+        if name in found.roles or name in dropped:
+            continue
+        plain, unit = parts[name]
+        rival = found.rival(unit) if unit else ""
+        if rival:
+            found.roles[name] = ""
+            notes.append(f"column '{name}' is not used: '{rival}' is the {found.signals[rival]} already")
+            continue
+        found.roles[name] = "context"
+        found.signals[name] = _unused(_context_signal(plain, unit), found.signals)
+        if hints[name] != "context":
+            notes.append(f"column '{name}' is context: a {kind} has no other place for it")
+    for name in dropped:
+        found.roles[name] = ""
+    return Assignment(found.roles, found.signals, named, tuple(notes), tuple(assumed))
+
+
+class _Places:
+    """The signals of a closed kind, and which columns have taken them."""
+
+    def __init__(self, kind: str, parts: Parts) -> None:
+        words = KINDS[kind]
+        self.kind = kind
+        self.of: dict[Role, tuple[tuple[str, tuple[str, ...]], ...]] = {"input": words.inputs, "output": words.outputs}
+        self.parts = parts
+        self.roles: dict[str, GuessedRole] = {}
+        self.signals: dict[str, str] = {}
+
+    def take_if(self, name: str, hint: GuessedRole, fits: Fits) -> None:
+        """Give a column the first free signal for which ``fits(own, unit, pattern, units)`` holds."""
+        if name in self.roles or hint == "context":
+            return
+        plain, unit = self.parts[name]
+        own = word(plain)
+        for role, patterns in self.of.items():
+            if hint and hint != role:
+                continue
+            for pattern, known in patterns:
+                if unit and not any(units.same_dimension(unit, u) for u in known):
+                    continue
+                signal = self._signal(own, pattern)
+                if signal and signal not in self.signals.values() and fits(own, unit, pattern, known):
+                    self.roles[name], self.signals[name] = role, signal
+                    return
+
+    def _signal(self, own: str, pattern: str) -> str:
+        if re.fullmatch(pattern, own):
+            return own
+        if not pattern.endswith("[xyz]"):
+            return pattern
+        axis = own[-1].lower()
+        if "\\" in pattern:  # any place, then the axis
+            return f"{pattern.split(chr(92))[0]}{own}" if axis in "xyz" else ""
+        if axis not in "xyz":
+            return next((s for a in "xyz" if (s := pattern.replace("[xyz]", a)) not in self.signals.values()), "")
+        return pattern.replace("[xyz]", axis)
+
+    def drop_what_does_not_fit(self) -> dict[str, str]:
+        """Take places back that the loader would refuse beside the others; return the columns, each with the reason."""
+        dropped: dict[str, str] = {}
+        inputs = [n for n, r in self.roles.items() if r == "input"]
+        outputs = [n for n, r in self.roles.items() if r == "output"]
+        if self.kind == "mechanical_axis" and inputs:
+            for name in inputs[1:]:
+                dropped[name] = f"'{inputs[0]}' drives the axis already"
+            turns = self.signals[inputs[0]] == "torque"
+            for name in outputs:
+                unit = self.parts[name][1]
+                if unit and (units.parse(unit).dimension[5] != 0) != turns:
+                    dropped[name] = f"its unit {unit} does not go with a {self.signals[inputs[0]]}"
+        prefix = {"accelerometer": "specific_force", "accelerometer_cluster": "specific_force", "magnetometer": "field"}
+        if self.kind in prefix:
+            driven = {self.signals[n] for n in inputs}
+            for name in outputs:
+                needed = f"{prefix[self.kind]}_{self.signals[name][-1]}"
+                if needed not in driven:
+                    dropped[name] = f"no column is its input {needed}"
+        for name in dropped:
+            del self.roles[name], self.signals[name]
+        return dropped
+
+    def rival(self, unit: str) -> str:
+        """The column of the same dimension that has an input or output, or empty."""
+        return next(
+            (n for n, r in self.roles.items()
+             if r in ("input", "output") and self.parts[n][1] and units.same_dimension(self.parts[n][1], unit)),
+            "",
+        )  # fmt: skip
+
+
+def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
+    """Roles for a twin that takes any signal: the columns' own names, or the first drives and the others answer."""
+    roles: dict[str, GuessedRole] = {name: guess_role(*parts[name]) for name in names}
+    used = [name for name in names if roles[name] != "context"]
+    if len(used) < 2:
+        return None
+    assumed: list[str] = []
+    for role, name in (("input", used[0]), ("output", used[-1])):
+        if role not in (roles[k] for k in used):
+            free = next((k for k in (used if role == "input" else used[::-1]) if not roles[k]), name)
+            roles[free] = "input" if role == "input" else "output"
+            assumed.append(f"'{free}' is {_article(role)}")
+    for name in used:
+        if not roles[name]:
+            roles[name] = "output"
+            assumed.append(f"'{name}' is {_article('output')}")
+    signals: dict[str, str] = {}
+    for name in names:
+        plain, unit = parts[name]
+        own = _context_signal(plain, unit) if roles[name] == "context" else word(plain)
+        signals[name] = _unused(own, signals)
+    return Assignment(roles, signals, sum(bool(guess_role(*parts[k])) for k in used), (), tuple(assumed))
+
+
+def word(plain: str) -> str:
+    """Return a column's name as a signal: letters, digits and underscores."""
+    return re.sub(r"\W+", "_", plain).strip("_") or "signal"
+
+
+def _context_signal(plain: str, unit: str) -> str:
+    """Return the signal of the contract that the name means, where the unit goes with it, else the name."""
+    for signal, known in CONTEXT_UNITS.items():
+        if signal[:4] in plain.lower() and (not unit or any(units.same_dimension(unit, u) for u in known)):
+            return signal
+    own = word(plain)
+    return f"{own}_beside" if own in CONTEXT_UNITS else own
+
+
+def _unused(own: str, signals: Mapping[str, str]) -> str:
+    taken = set(signals.values())
+    return next(s for k in range(len(taken) + 1) if (s := own if k == 0 else f"{own}_{k + 1}") not in taken)
+
+
+def _article(role: str) -> str:
+    return f"an {role}" if role else "not used"
