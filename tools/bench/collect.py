@@ -204,7 +204,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         if out.is_symlink():
             raise InputError(f"{out} is a symbolic link; remove it first")
         times = ("--from", f"{from_s!r}", "--to", f"{to_s!r}", "--overwrite")
-        command = ["tools.cli.main", "export", str(path), "--out", str(out), *times]
+        raw = ("--raw",) if out.suffix == SUFFIX else ()
+        command = ["tools.cli.main", "export", str(path), "--out", str(out), *raw, *times]
         jobs.start("export", f"span of {path.stem}", [command], folder)
         return {"file": out.name, "recording": out.name if kind == "mismatch" else ""}
 

@@ -13,6 +13,7 @@ from firmware_py.recording.cut import cut
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
 from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.errors import InputError
 from tools.formats.export import ExportReport
 from tools.formats.export import export as export_recording
 from tools.output import check_writable, write_json
@@ -41,11 +42,15 @@ def recover(
 
 
 def export(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A recording (.mcap).")],
-    out: Annotated[
-        Path,
-        typer.Option(metavar="PATH", help="name.csv, .npz, .parquet, .nc, .mf4, .mcap, or a folder."),
-    ],
+    file: Annotated[Path, typer.Argument(metavar="RUN", help="A recording (.mcap).")],
+    to: Annotated[
+        Path | None,
+        typer.Argument(metavar="OUT", help="name.csv, .npz, .parquet, .nc, .mf4, .mcap for viewers, or a folder."),
+    ] = None,
+    out: Annotated[Path | None, typer.Option(metavar="PATH", help="The same as OUT.")] = None,
+    raw: Annotated[
+        bool, typer.Option("--raw", help="To .mcap: a recording as it was written, which can be replayed.")
+    ] = False,
     from_s: Annotated[float | None, typer.Option("--from", metavar="S", help="First time, s. Default: all.")] = None,
     to_s: Annotated[float | None, typer.Option("--to", metavar="S", help="End of the span, s.")] = None,
     overwrite: Overwrite = False,
@@ -53,19 +58,22 @@ def export(
 ) -> None:
     """Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.
 
-    Example: micron export out/run.mcap --out out/run.csv
+    An .mcap is for viewers: Foxglove, PlotJuggler and rerun plot it. With --raw it is a recording for 'micron replay'.
+
+    Example: micron export out/run.mcap out/view.mcap
     """
     with clear_errors():
+        out = _target(to, out, raw)
         check_writable(json_file)
         check_writable(out, folders=True)
         recording = Recording(file)
         with tempfile.TemporaryDirectory(prefix="micron-") as scratch:
-            if from_s is not None or to_s is not None or out.suffix == ".mcap":
+            if from_s is not None or to_s is not None or raw:
                 span = (-math.inf if from_s is None else from_s, math.inf if to_s is None else to_s)
-                part = out if out.suffix == ".mcap" else Path(scratch) / file.name
+                part = out if raw else Path(scratch) / file.name
                 cut(recording, part, *span, overwrite=overwrite)
                 recording = Recording(part)
-            if out.suffix == ".mcap":
+            if raw:
                 report = ExportReport(out, "mcap", recording.n_rows, len(recording.columns))
             else:
                 report = export_recording(recording, out, overwrite=overwrite)
@@ -87,3 +95,14 @@ def export(
             for line in recording.health.lines():
                 console().print(line, soft_wrap=True)
             raise typer.Exit(Exit.DATA_LOST)
+
+
+def _target(to: Path | None, out: Path | None, raw: bool) -> Path:
+    """Return where an export goes. Raises ``InputError`` for no place, two places, or ``--raw`` to another format."""
+    if (to is None) == (out is None):
+        raise InputError("name one file or folder to write, as in: micron export RUN OUT")
+    found = to or out
+    assert found is not None
+    if raw and found.suffix != ".mcap":
+        raise InputError(f"{found}: --raw writes a recording; name a file that ends in .mcap")
+    return found

@@ -22,8 +22,9 @@ from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import new_file, new_folder, refuse_existing
 from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
-from tools.formats import mdf, netcdf, parquet
+from tools.formats import mdf, netcdf, parquet, view
 
+LAYOUTS = Path(__file__).with_name("layouts")
 _ROLES = (("command", "input"), ("volts", "output"))  # what the instrument twin computes
 _FLAGS_UNIT = "bits"
 
@@ -53,7 +54,10 @@ def export(recording: Recording, out: Path, format: str | None = None, *, overwr
         raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(WRITERS)} or folder")
     with new_file(out, overwrite=overwrite) as part:
         WRITERS[chosen](recording, part)
-    return ExportReport(out, chosen, recording.n_rows, len(recording.columns))
+    notes = ()
+    if chosen == "mcap":
+        notes = (f"for viewers; layouts for Foxglove and PlotJuggler are in {LAYOUTS}; --raw writes one to replay",)
+    return ExportReport(out, chosen, recording.n_rows, len(recording.columns), notes)
 
 
 def export_folder(
@@ -171,8 +175,8 @@ def _little_endian(column: Float64Array) -> bytes:
     return column.astype("<f8", copy=False).tobytes()
 
 
-Writer = Callable[[Recording, Path], None]
+Writer = Callable[[Recording, Path], object]
 WRITERS: Mapping[str, Writer] = MappingProxyType(
-    {"csv": _csv, "npz": _npz, "parquet": parquet.write, "nc": netcdf.write, "mf4": mdf.write}
+    {"csv": _csv, "npz": _npz, "parquet": parquet.write, "nc": netcdf.write, "mf4": mdf.write, "mcap": view.write}
 )
 """Writers by the ending of a name."""

@@ -20,7 +20,7 @@ from firmware_py.frame import LAYOUT, Clip, FrameStatus
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
 from tools.errors import InputError
-from tools.formats.blocks import batches
+from tools.formats.blocks import batches, event_times_ns
 from tools.formats.columns import Array, as_numbers, check_size
 from tools.formats.packages import need
 from tools.mismatch.recording import RecordingError
@@ -114,9 +114,7 @@ def _text(value: object) -> str:
 
 
 def _events(recording: Recording) -> tuple[Array, list[str]]:
-    times = [event.content.get("t_ns", event.time_ns) for event in recording.events]
-    seconds = [t if isinstance(t, int | float) else e.time_ns for t, e in zip(times, recording.events, strict=True)]
-    return np.array(seconds, np.float64) * 1e-9, [_text(event.content) for event in recording.events]
+    return np.array(event_times_ns(recording), np.float64) * 1e-9, [_text(event.content) for event in recording.events]
 
 
 def _time_attributes(recording: Recording) -> dict[str, str]:

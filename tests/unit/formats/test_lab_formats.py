@@ -38,7 +38,7 @@ def run(tmp_path: Path) -> Recording:
     writer = RecordingWriter(tmp_path / "run.mcap", COLUMNS, METADATA)
     for start in range(0, len(rows), 100):
         writer.write_block(start, rows[start : start + 100])
-    writer.write_event(0, {"event": "mark", "t_ns": 1_500_000})
+    writer.write_event(0, {"event": "mark", "t_ns": 1_500_000, "tick": 123})
     writer.finish({"ended": "stopped", "rows_pushed": len(rows), "rows_dropped": 0, "events_pushed": 1})
     return Recording(tmp_path / "run.mcap")
 
@@ -151,7 +151,7 @@ class TestNetcdf:
         assert found.volts_0.attrs == {"units": "V", "long_name": "converter inputs, 0"}
         assert found.status.attrs["units"] == "1"  # UDUNITS has no bits
         assert "1 GAP, 2 STALE" in found.status.attrs["comment"]
-        assert float(found.event_t[0]) == pytest.approx(1.5e-3)
+        assert float(found.event_t[0]) == pytest.approx(0.123)  # when its tick was
 
     def test_packed_values_missing_ones_dates_and_two_dimensions(self, tmp_path: Path):
         need("nc")

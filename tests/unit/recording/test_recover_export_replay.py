@@ -181,7 +181,7 @@ class TestExport:
 
     def test_an_unknown_format_names_the_known_ones(self, write_file: WriteFile, tmp_path: Path) -> None:
         path, _ = write_file(100)
-        with pytest.raises(RecordingError, match="'xlsx' is unknown; use csv, npz, parquet, nc, mf4 or folder"):
+        with pytest.raises(RecordingError, match="'xlsx' is unknown; use csv, npz, parquet, nc, mf4, mcap or folder"):
             export(Recording(path), tmp_path / "run.xlsx")
 
 
