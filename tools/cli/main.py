@@ -102,6 +102,7 @@ COMMANDS = {
     "imu": ("imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
     "manipulator": ("manipulator:app", "The three-legged manipulator at the tip."),
     "mismatch": ("mismatch:app", "Where simulation and recording differ, and which physics is missing."),
+    "data": ("data:data", "Public recordings: what there is, under which licence, and how to get it."),
     "sensing": ("sensing:app", "Error budgets of the sensing stage on emulated sensors."),
     "tremor": ("tremor:app", "Recorded hands: inspect them, train on them, evaluate estimators."),
 }

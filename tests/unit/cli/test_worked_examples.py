@@ -1,7 +1,8 @@
 """The worked example of each command's help does what it says: run to the letter, on inputs made as the guides say.
 
 Options are added in two cases: virtual time where the example means the bench in front of you, and less of the same
-(seconds, cases, kinds of fault). The two that need a running bench page are run where one is, in ``tests/bench``.
+(seconds, cases, kinds of fault). The two that need a running bench page are run where one is, in ``tests/bench``; the
+one that needs a server of files in ``tests/unit/cli/test_data.py``.
 """
 
 from __future__ import annotations
@@ -64,6 +65,7 @@ SLOW = (
     "tremor train",
 )
 WITH_A_PAGE = ("bench", "log follow")
+WITH_A_SERVER = ("data fetch",)
 
 
 def example(name: str) -> str:
@@ -161,7 +163,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 LONG = (pytest.mark.slow, pytest.mark.timeout(900))
 MARKS = {"latency": pytest.mark.realtime, **dict.fromkeys(SLOW, LONG)}
-RUN = [pytest.param(name, marks=MARKS.get(name, ())) for name in sorted(set(ALL) - set(WITH_A_PAGE))]
+RUN = [pytest.param(name, marks=MARKS.get(name, ())) for name in sorted(set(ALL) - {*WITH_A_PAGE, *WITH_A_SERVER})]
 
 
 @pytest.mark.parametrize("name", RUN)

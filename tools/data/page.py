@@ -1,0 +1,57 @@
+"""``docs/data.md``: the public recordings, their licences and origins, from the list that ``micron data`` reads.
+
+``python -m tools.data.page`` writes the page; a test compares.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from tools.data.registry import PublicSet, public_sets
+
+PAGE = Path("docs/data.md")
+_HEAD = """# Public recordings
+
+Made by `python -m tools.data.page`; do not edit. These recordings are other people's: none is part of this project, and
+what they ask for (licence, citation) is yours to keep.
+
+```
+micron data list                # names, sizes, licences, what is here already
+micron data fetch emps          # to the cache, with a checksum (extra `data`)
+```
+
+Files are kept in `~/.cache/micron-bench/data/NAME` (`XDG_CACHE_HOME` holds; `MICRON_DATA` names another folder), as
+their repository has them at one commit. A file whose SHA-256 is not the listed one is not kept. Without a network, one
+message says which file to put where; `--mirror URL` takes `URL/NAME/FILE` from a server of your own.
+
+`.csv` and `.mat` files among them are described by `micron mismatch new FILE` ([your own data](own-data.md)). The
+folders that the tests use (`shared_data`) hold the same measurements re-packed, one array per column, with a
+`recording.toml` each; `micron data` does not make them.
+
+The checksums were computed from stored copies of the repositories; the downloads themselves were tried against a local
+server only. One of the 49 recordings of `tremor_duke_adxl345` (`older_2hz_t1`, from an older commit) is not listed.
+
+| name | what | licence | size | from |
+|---|---|---|---|---|
+"""
+
+
+def page() -> str:
+    """Return the text of the page."""
+    sets = public_sets().values()
+    rows = "\n".join(_row(s) for s in sets)
+    citations = "\n".join(f"- `{s.name}`: {s.citation}" for s in sets)
+    return f"{_HEAD}{rows}\n\n## Citations that the originators ask for\n\n{citations}\n"
+
+
+def _row(s: PublicSet) -> str:
+    origin = f"[{s.repository.split('/')[-1][:40]}](https://github.com/{s.repository}/tree/{s.commit})"
+    return f"| `{s.name}` | {s.title} | {s.licence} | {len(s.files)} files, {s.bytes / 1e6:.1f} MB | {origin} |"
+
+
+def main() -> None:
+    PAGE.write_text(page(), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
