@@ -1,4 +1,5 @@
-"""Public recordings that the documents and tests mention: what there is, under which licence, and how to get it.
+"""Public recordings that the documents and tests mention.
 
-Only ``fetch`` goes to the network, and only when it is called. Nothing here knows what a recording means.
+What lives here: the list with licences and checksums, the downloads, the page of them. Only ``fetch`` goes to the
+network, and only when it is called. What must not: the recordings themselves, and what they mean.
 """
