@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -148,6 +149,9 @@ def _opened(path: Path) -> Iterator[Any]:
     if head != _MAGIC:
         raise RecordingError(f"{path}: not an MDF 4 file; export it again as ASAM MDF 4")
     (mdf,) = need(path, EXTRA, "asammdf")
+    # it prints what it finds wrong, beside the one message that a person shall get
+    logger = logging.getLogger("asammdf")
+    was_disabled, logger.disabled = logger.disabled, True
     try:
         with mdf.MDF(path, use_display_names=False) as file:
             yield file
@@ -157,3 +161,5 @@ def _opened(path: Path) -> Iterator[Any]:
         _close_halfway(error)
         first = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise RecordingError(f"{path}: not a readable MDF file ({first}); export it again as ASAM MDF 4") from None
+    finally:
+        logger.disabled = was_disabled

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 from pathlib import Path
 from typing import Any
@@ -237,6 +238,19 @@ class TestMdf:
             assert same_bits(signal.timestamps, run.column("t"))
             assert same_bits(signal.samples, run.column("volts_0"))
             assert '"event": "mark"' in html.unescape(file.header.comment)
+
+    def test_the_library_prints_nothing_beside_our_message(
+        self, run: Recording, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+    ):
+        need("mf4")
+        export(run, tmp_path / "out.mf4")
+        data = (tmp_path / "out.mf4").read_bytes()
+        assert b"##FH" in data
+        for block in (b"##FH", b"##MD", b"##CG"):
+            (tmp_path / "bad.mf4").write_bytes(data.replace(block, b"\0\0\0\0"))
+            with contextlib.suppress(RecordingError):  # a file without its history is sound
+                read_columns(tmp_path / "bad.mf4", ["volts_0"])
+        assert capfd.readouterr() == ("", "")
 
     def test_an_unfinished_file_says_so(self, tmp_path: Path):
         (tmp_path / "a.mf4").write_bytes(b"UnFinMF 4.10    " + bytes(100))
