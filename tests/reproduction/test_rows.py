@@ -113,10 +113,3 @@ def test_settings_are_the_fixed_one_and_its_neighbours() -> None:
     ratios = {round(float(s["still_density"][0] / fixed["still_density"][0]), 6) for s in all_of_them}
     assert ratios == {0.25, 1.0, 4.0}  # an amplitude's square
     assert len({s.tobytes() for s in all_of_them}) == 27
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not real_sensors.data_folder().is_dir(), reason="the shared recordings are not here")
-def test_broad_stays_below_its_peers() -> None:
-    for found in broad.rows():
-        assert found.meets or found.why, found

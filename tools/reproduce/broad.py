@@ -84,6 +84,9 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
             ("1.1 x vqf 2.1.2, run side by side", GOAL * vqf[0], ours[0], "total"),
             ("1.1 x vqf 2.1.2, run side by side", GOAL * vqf[2], ours[2], "inclination"),
         ]
+    parts = f"heading {ours[1]:.2f}, inclination {ours[2]:.2f} deg"
+    if vqf is not None:
+        parts += f"; vqf {vqf[1]:.2f} and {vqf[2]:.2f}"
     found = [
         Row(
             f"BROAD, {peer}",
@@ -94,6 +97,7 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
             value,
             "lower",
             "recording",
+            why=parts if what == "total" else "",
         )
         for peer, published, value, what in peers
     ]
