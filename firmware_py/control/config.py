@@ -23,6 +23,8 @@ from hal.errors import BenchError
 from hal.toml_file import parse_toml, read_text
 from hal.validation import validate_table
 
+TAPS_HZ = 1000.0
+"""Rate for which `micron calibrate piezo` makes the taps of a feedforward."""
 STAGES = ("sensing", "tremor", "actuation")
 
 
@@ -76,7 +78,30 @@ def load_firmware_config(
         tables["sensing"].update(noise_table(bench.resolve(config.noise), sensing))
     if method is not None:
         tables["tremor"]["method"] = method
+    _design_for_tick(tables, float(bench.description.clock.tick_hz), where)
     return config, StageConfigs.from_dict(tables, where)
+
+
+def _design_for_tick(tables: dict[str, dict[str, Any]], tick_hz: float, where: str) -> None:
+    """Give every stage the rate of the bench's clock: filters and estimators are designed for it.
+
+    Raises ``BenchError`` for a stage that names another rate, and for taps of a feedforward, which are a tick apart and
+    were made for 1000 Hz unless [firmware.actuation] says which rate they are for.
+    """
+    taps = tables["actuation"].get("feedforward", ())
+    filters = taps if taps and isinstance(taps[0], list | tuple) else (taps,)
+    if tick_hz != TAPS_HZ and "tick_hz" not in tables["actuation"] and any(len(t) > 1 for t in filters):
+        raise BenchError(
+            f"{where}: firmware.actuation: the taps of feedforward are for ticks of {TAPS_HZ:g} Hz, this bench has "
+            f"{tick_hz:g} Hz: calibrate the stacks at that rate and name it there (tick_hz), or set feedforward = [1.0]"
+        )
+    for name in STAGES:
+        given = tables[name].setdefault("tick_hz", tick_hz)
+        if given != tick_hz:
+            raise BenchError(
+                f"{where}: firmware.{name}: tick_hz = {given!r}, but [clock] tick_hz is {tick_hz:g}: leave it out, it "
+                "follows the clock"
+            )
 
 
 def _check_tasks(bench: BenchFile, config: FirmwareConfig) -> None:

@@ -1,0 +1,46 @@
+"""A bench's tick reaches every stage, or is refused with one message."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from firmware_py.control.config import load_firmware_config
+from firmware_py.control.stages import Stages
+from hal.bench import load_bench
+from hal.errors import BenchError
+from tests.conftest import DEFAULT_BENCH
+
+
+def bench_at(tmp_path: Path, tick_hz: int, more: str = "") -> Path:
+    """The default bench at another rate, without its calibration."""
+    text = DEFAULT_BENCH.read_text()
+    text = text.replace("tick_hz = 1000", f"tick_hz = {tick_hz}").replace("rate_hz = 1000", f"rate_hz = {tick_hz}")
+    lines = [line for line in text.splitlines() if not line.startswith(("calibration = ", "loop_delay_s = "))]
+    path = tmp_path / "bench.toml"
+    path.write_text("\n".join(lines) + "\n" + more)
+    return path
+
+
+@pytest.mark.parametrize("tick_hz", [500, 1000])
+def test_every_stage_is_designed_for_the_clock(tmp_path: Path, tick_hz: int) -> None:
+    _, configs = load_firmware_config(load_bench(bench_at(tmp_path, tick_hz)), {})
+    stages = Stages(configs)
+    assert stages.sensing.params["attitude"]["dt_s"][0] == pytest.approx(1.0 / tick_hz)
+    assert stages.actuation.params["tick_hz"][0] == tick_hz
+    assert configs.tremor.tick_hz == tick_hz
+
+
+def test_a_stage_that_names_another_rate_is_refused(tmp_path: Path) -> None:
+    path = bench_at(tmp_path, 500, "[firmware.actuation]\ntick_hz = 1000.0\n")
+    with pytest.raises(BenchError, match=r"firmware\.actuation: tick_hz = 1000\.0, but \[clock\] tick_hz is 500"):
+        load_firmware_config(load_bench(path), {})
+
+
+def test_taps_of_another_rate_are_refused(tmp_path: Path) -> None:
+    path = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\n")
+    with pytest.raises(BenchError, match=r"the taps of feedforward are for ticks of 1000 Hz, this bench has 500 Hz"):
+        load_firmware_config(load_bench(path), {})
+    same = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\ntick_hz = 500.0\n")
+    assert load_firmware_config(load_bench(same), {})[1].actuation.feedforward[0] == (1.2, -0.2)
