@@ -9,22 +9,18 @@ from typing import Any
 import pytest
 
 from tests.bench.conftest import Server, go, opened_tab
+from tests.bench.test_every_size import READY, VIEWS
 
 pytestmark = pytest.mark.timeout(400)
 
-VIEWS = ("scope", "attitude", "tremor", "latency", "actuators", "targets", "collect", "mismatch", "calibrate", "setup")
 
-
-@pytest.mark.parametrize("theme", ["dark", "light"])
+@pytest.mark.parametrize("theme", ["dark", pytest.param("light", marks=pytest.mark.slow)])
 def test_every_view_opens(page: Any, artefacts: Path, theme: str):
     page.evaluate(f"document.documentElement.dataset.theme === '{theme}' || document.getElementById('theme').click()")
     for number, view in enumerate(VIEWS, 1):
-        if theme == "dark":
-            page.keyboard.press(str(number % 10))
-        else:
-            go(page, view)
+        page.keyboard.press(str(number % 10))
         page.wait_for_function(f"document.getElementById('view').dataset.view === '{view}'")
-        page.wait_for_timeout(800)
+        page.wait_for_selector(f"#view {READY[view]}", state="attached")
         assert page.locator("#view").inner_text().strip() or page.locator("#view canvas").count()
         assert page.locator("#safe").is_visible()
         overflow = page.evaluate("document.documentElement.scrollWidth - innerWidth")

@@ -202,6 +202,53 @@ def test_a_csv_becomes_a_recording_that_is_diagnosed(page: Any, still: Still, tm
     assert [c["unit"] for c in text["channels"]] == ["N", "mm", "degC"]
 
 
+def stiff_axis(path: Path) -> Path:
+    """A mass of 2 kg with dry friction of 3 N that its twin lacks, on a force of two tones, 100 Hz, 1 um of noise."""
+    step_s, steps, mass, damping, friction = 0.01, 50, 2.0, 5.0, 3.0
+    t_s = np.arange(3000) * step_s
+    force = 12 * np.sin(2 * np.pi * 0.31 * t_s) + 8 * np.sin(2 * np.pi * 0.83 * t_s)
+    x = v = 0.0
+    position = np.empty_like(t_s)
+    for k, f in enumerate(force):
+        position[k] = x
+        for _ in range(steps):
+            drive = f - damping * v - 40.0 * x
+            pushed = v + step_s / steps * drive / mass
+            slowed = step_s / steps * friction / mass
+            v = 0.0 if abs(pushed) <= slowed else pushed - np.copysign(slowed, pushed)
+            x += step_s / steps * v
+    position += 1e-6 * np.random.default_rng(4).standard_normal(t_s.size)
+    table = np.column_stack([t_s, force, 1e3 * position])
+    np.savetxt(path, table, delimiter=",", header="t_s,force_N,x_mm", comments="", fmt="%.9g")
+    return path
+
+
+@pytest.mark.slow
+def test_from_a_dropped_csv_to_the_corrected_twin_that_is_downloaded(page: Any, tmp_path: Path, artefacts: Path):
+    page.set_input_files(FILE, stiff_axis(tmp_path / "dry axis.csv"))
+    form = page.locator(".new-recording")
+    form.wait_for()
+    for name, value in (("mass", "2.0"), ("damping", "5.0"), ("stiffness", "40"), ("Noise of x_mm", "0.001")):
+        form.locator(f"[aria-label='{name}']").fill(value)
+    page.screenshot(path=artefacts / "dropped-form.png")
+    form.locator("text=Make the recording").click()
+    page.wait_for_selector("iframe.report", timeout=300_000)
+    files = page.locator("button", has_text="Corrected twin")
+    files.wait_for(timeout=120_000)
+    page.screenshot(path=artefacts / "dropped-report.png")
+    with page.expect_download() as download:
+        files.click()
+    download.value.save_as(tmp_path / "twin.toml")
+    twin = tomllib.loads((tmp_path / "twin.toml").read_text())
+    print(twin)
+    assert "friction" in json.dumps(twin)
+    with page.expect_download() as download:
+        page.locator("button", has_text="report.json").click()
+    download.value.save_as(tmp_path / "report.json")
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert "friction" in json.dumps(report)
+
+
 def test_a_file_that_is_dropped_is_taken(page: Any, tmp_path: Path):
     page.evaluate(
         """(text) => {

@@ -88,7 +88,8 @@ def files_of(session: Session, kind: str) -> dict[str, Path]:
         "instrument": (session.home, "*.toml"),
         "fmu": (session.recorder.folder, "*.fmu"),
     }[kind]
-    return {path.name: path for path in sorted(folder.glob(pattern)) if is_own_file(path)}
+    files = sorted(folder.glob(pattern), key=lambda path: (path != session.choice.bench, path.name))
+    return {path.name: path for path in files if is_own_file(path)}  # the running bench comes first
 
 
 def description(table: dict[str, Any], data: str) -> dict[str, Any]:

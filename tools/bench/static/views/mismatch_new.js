@@ -85,7 +85,7 @@ export function newRecording(link, done) {
       const signal = h("input", { type: "text", value: column.signal, maxLength: 100, "aria-label": `Signal of ${column.name}` });
       signal.setAttribute("list", `words-${column.role}`);
       const unit = h("input.unit-field", { type: "text", value: column.unit, maxLength: 30, placeholder: "V, um, N …", "aria-label": `Unit of ${column.name}` });
-      const noise = h("input.unit-field", { type: "number", step: "any", min: 0, placeholder: "if known", "aria-label": `Noise of ${column.name}` });
+      const noise = h("input.unit-field", { type: "number", step: "any", min: 0, placeholder: "if any", "aria-label": `Noise of ${column.name}` });
       const showRole = () => {
         signal.setAttribute("list", `words-${role.value}`);
         for (const e of [signal, unit]) e.disabled = ["", "time"].includes(role.value);
