@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from pathlib import Path
 
 import numpy as np
@@ -29,6 +30,7 @@ def cut(recording: Recording, out: Path, from_s: float, to_s: float, *, overwrit
     rows = events = first_row = stop_row = 0
     with new_file(out, overwrite=overwrite) as part:
         writer = RecordingWriter(part, recording.columns, kept)
+        waiting = deque(event for event in recording.events if from_s <= event.time_ns * 1e-9 < to_s)
         for block in recording.blocks():
             t_s = block.data[time_row]
             inside = np.flatnonzero((t_s >= from_s) & (t_s < to_s))
@@ -38,12 +40,16 @@ def cut(recording: Recording, out: Path, from_s: float, to_s: float, *, overwrit
             if not rows:
                 first_row = block.row0 + first
             stop_row = block.row0 + stop
-            writer.write_block(block.row0 + first - first_row, np.ascontiguousarray(block.data[:, first:stop].T))
-            rows += stop - first
-        for event in recording.events:
-            if from_s <= event.time_ns * 1e-9 < to_s:
+            # beside the ticks of their time: an index whose chunks are not in order of time cannot be searched
+            while waiting and waiting[0].time_ns * 1e-9 <= t_s[stop - 1]:
+                event = waiting.popleft()
                 writer.write_event(events, event.content, event.time_ns)
                 events += 1
+            writer.write_block(block.row0 + first - first_row, np.ascontiguousarray(block.data[:, first:stop].T))
+            rows += stop - first
+        for event in waiting:
+            writer.write_event(events, event.content, event.time_ns)
+            events += 1
         if not rows:
             raise RecordingError(f"{recording.path} has no ticks between {from_s:g} and {to_s:g} s")
         end = {"ended": "cut out of a longer recording", "rows_pushed": stop_row - first_row, "rows_written": rows}

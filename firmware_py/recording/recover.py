@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections import deque
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,10 +61,17 @@ def recover(path: Path, out: Path, *, overwrite: bool = False) -> RecoverReport:
     early = {name: value for name, value in recording.metadata.items() if name not in late}
     with new_file(out, overwrite=overwrite) as part:
         writer = RecordingWriter(part, recording.columns, {**early, "recovered": health.as_dict()})
-        for event in recording.events:
-            writer.write_event(event.number, event.content, event.time_ns)
+        waiting = deque(recording.events)
+        time_row = recording.names.index(fmt.TIME_COLUMN) if fmt.TIME_COLUMN in recording.names else None
         for block in recording.blocks():
+            # beside the ticks of their time: an index whose chunks are not in order of time cannot be searched
+            end_s = math.inf if time_row is None else float(block.data[time_row, -1])
+            while waiting and not waiting[0].time_ns * 1e-9 > end_s:
+                event = waiting.popleft()
+                writer.write_event(event.number, event.content, event.time_ns)
             writer.write_block(block.row0, block.data.T)
+        for event in waiting:
+            writer.write_event(event.number, event.content, event.time_ns)
         if fmt.STATISTICS_METADATA in recording.metadata:
             writer.write_metadata(fmt.STATISTICS_METADATA, recording.metadata[fmt.STATISTICS_METADATA])
         missing = (

@@ -16,6 +16,7 @@ from firmware_py.recording.cut import cut
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.index import IndexedRecording
 from firmware_py.recording.reader import Recording
+from firmware_py.recording.recover import recover
 from firmware_py.recording.writer import RecordingWriter
 from tests.bench.conftest import go, opened_tab
 from tests.bench.still import Still, made_up_rows, still_server
@@ -142,6 +143,13 @@ def test_a_span_is_a_recording_of_its_own(recording: tuple[Path, np.ndarray], tm
     assert np.array_equal(span.array(NAMES), inside)
     assert [event.content["event"] for event in span.events] == ["hold begins", "note"]
     assert span.metadata["tick_hz"] == "1000.0"
+    for made in (tmp_path / "span.mcap", tmp_path / "recovered.mcap"):
+        if made.stem == "recovered":
+            (tmp_path / "torn.mcap").write_bytes(path.read_bytes()[:-3000])
+            assert recover(tmp_path / "torn.mcap", made).rows > 15_000
+        opened = RecordedHistory(made)  # its events lie beside the ticks of their time: the index can be searched
+        assert opened.n_rows == Recording(made).n_rows
+        opened.close()
     with pytest.raises(RecordingError, match="no ticks between 90 and 91 s"):
         cut(Recording(path), tmp_path / "none.mcap", 90, 91)
     assert not (tmp_path / "none.mcap").exists()
