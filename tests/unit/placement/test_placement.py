@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tools.errors import InputError
+from tools.placement import optimise as optimise_module
 from tools.placement.configurations import cube_004, micron_000, micron_004, micron_004_turned, proposed_004
 from tools.placement.optimise import cost_and_gradient, optimise, weakest_direction, weight_matrix
 from tools.placement.propositions import check_pairs
@@ -65,7 +66,9 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
             assert (up - down) / (2 * h) == pytest.approx(gradient[index], rel=2e-3, abs=1e-3 * np.abs(gradient).max())
 
 
-def test_three_packages_in_the_papers_space() -> None:
+def test_three_packages_in_the_papers_space(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optimise_module, "DRAWS", 60)
+    monkeypatch.setattr(optimise_module, "REFINED", 3)
     space = space_004()
     best = optimise(space)
     assert best.noise[3] == pytest.approx(0.4073, abs=5e-5)  # another program's optimum with the same limits
@@ -83,14 +86,18 @@ def test_three_packages_in_the_papers_space() -> None:
     assert angular_noise(proposed_004(), 0.01)[3] > angular_noise(micron_004_turned(), 0.01)[3] > best.noise[3]
 
 
-def test_without_a_limit_translation_is_given_up() -> None:
+def test_without_a_limit_translation_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
     """That is why there is one: the angular noise hardly falls, and a direction is seen by a third of an axis."""
+    monkeypatch.setattr(optimise_module, "DRAWS", 40)
+    monkeypatch.setattr(optimise_module, "REFINED", 1)
     free = optimise(space_004().model_copy(update={"least_translation": 0.0}))
     assert 0.40 < free.noise[3] < 0.4073
     assert weakest_direction(free.placement.axes)[0] < 0.35
 
 
-def test_limits_that_no_placement_keeps_are_named() -> None:
+def test_limits_that_no_placement_keeps_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(optimise_module, "DRAWS", 2)
+    monkeypatch.setattr(optimise_module, "REFINED", 1)
     tight = space_004().model_copy(update={"largest_force_noise_m_s2": 1e-3})
     with pytest.raises(ValueError, match=r"no placement in this space keeps the force at the tip to 0\.001"):
         optimise(tight)
