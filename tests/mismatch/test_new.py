@@ -45,7 +45,9 @@ def csv(path: Path, header: str, *columns: np.ndarray, delimiter: str = ",", dec
     return path
 
 
-@pytest.mark.parametrize("form", ["csv", "decimal comma", "milliseconds", "units in a row", "npz", "mat"])
+@pytest.mark.parametrize(
+    "form", ["csv", "decimal comma", "milliseconds", "units in a row", "npz", "mat", "nc", "parquet"]
+)
 def test_what_is_written_loads_at_once(tmp_path: Path, form: str):
     data = tmp_path / "data.csv"
     if form == "decimal comma":
@@ -60,6 +62,17 @@ def test_what_is_written_loads_at_once(tmp_path: Path, form: str):
     elif form == "mat":
         data = tmp_path / "data.mat"
         savemat(data, {"rig": {"force_N": FORCE[:, None], "pos_mm": X[:, None]}, "Ts": 1 / RATE})
+    elif form == "nc":
+        xarray = pytest.importorskip("xarray")
+        data = tmp_path / "data.nc"
+        units = {"force": "N", "pos": "mm"}
+        columns = {k: ("time", v, {"units": units[k]}) for k, v in (("force", FORCE), ("pos", X))}
+        xarray.Dataset(columns, {"time": ("time", T, {"units": "s"})}).to_netcdf(data, engine="h5netcdf")
+    elif form == "parquet":
+        pyarrow = pytest.importorskip("pyarrow")
+        parquet = pytest.importorskip("pyarrow.parquet")
+        data = tmp_path / "data.parquet"
+        parquet.write_table(pyarrow.table({"t_s": T, "force_N": FORCE, "pos_mm": X}), data)
     else:
         csv(data, "t_s,force_N,pos_mm", T, FORCE, X)
     result = call(data)
@@ -114,6 +127,17 @@ def test_a_header_less_file_and_a_named_twin(tmp_path: Path):
     assert result.exit_code == 0, result.output
     assert "'column_1' is the time in s" in result.stderr
     assert load(tmp_path).n == N
+
+
+def test_letters_of_system_identification_and_a_step_in_one_cell(tmp_path: Path):
+    rows = [f"{u:.9g},{y:.9g},{0.005 if k == 0 else ''}" for k, (u, y) in enumerate(zip(FORCE, X, strict=True))]
+    (tmp_path / "a.csv").write_text("\n".join(["uEst,yEst,Ts", *rows]))
+    result = call(tmp_path / "a.csv", "--twin", "piezo_stack")
+    assert result.exit_code == 0, result.output
+    found = load(tmp_path)
+    assert (1 / found.dt, found.column) == (
+        pytest.approx(RATE), {"command": "uEst", "displacement": "yEst"},
+    )  # fmt: skip
 
 
 def test_a_twin_that_needs_more_says_so(tmp_path: Path):

@@ -145,10 +145,9 @@ def guess(path: Path, kind: str = "") -> Guess:
     notes += found.notes
     assumed += found.assumed
     unknown = [] if kind else [_no_kind(kinds, left, parts, found)]
-    for name in left:
-        if found.roles[name] in ("input", "output") and not parts[name][1]:
-            taken = _assumed_unit(kind, found, name)
-            assumed.append(f"the unit of '{name}' is {taken or '1'}")
+    bare = [k for k in left if found.roles[k] in ("input", "output") and not parts[k][1]]
+    if bare:
+        assumed.append("units: " + ", ".join(f"'{k}' in {_assumed_unit(kind, found, k) or '1'}" for k in bare))
     broken = [
         f"column '{k}' has {seen[k].missing} missing values, the first at {place(seen[k].first_missing, row)}"
         for k in left
@@ -168,7 +167,8 @@ def guess(path: Path, kind: str = "") -> Guess:
         elif stamps.faults:
             notes.append(_broken_clock(clock, stamps) + ": short gaps, which are filled by straight lines")
     else:
-        rate_hz = _rate_beside(path, notes)
+        constants = {k: c.smallest for k, c in seen.items() if c.smallest == c.largest}
+        rate_hz = _rate_beside({**constants, **read_scalars(path)}, notes)
         if rate_hz is None:
             unknown.append("the rate: no column is a time that runs forwards; set rate_hz, or repeat with --rate HZ")
     columns = [
@@ -266,8 +266,9 @@ def _candidates(
     return left
 
 
-def _rate_beside(path: Path, notes: list[str]) -> float | None:
-    for name, value in read_scalars(path).items():
+def _rate_beside(numbers: dict[str, float], notes: list[str]) -> float | None:
+    """The rate among single numbers of a file, by its name."""
+    for name, value in numbers.items():
         if value > 0 and (_RATE.match(name) or _STEP.match(name)):
             notes.append(f"'{name}' = {value:g} of the file is taken as the {'rate' if _RATE.match(name) else 'step'}")
             return value if _RATE.match(name) else 1.0 / value

@@ -22,8 +22,10 @@ _ORDINARY_WORDS = ("in", "min", "h")
 _WORDS: tuple[tuple[GuessedRole, str], ...] = (
     ("context", r"temp|supply|ambient|humid|status|flag|state"),
     ("output", r"pos|disp|stroke|angle|vel|speed|meas|out|sensor|response|level|height|accel|path|weg"),
-    ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|kraft|u$"),
+    ("input", r"command|cmd|input|drive|force|torque|current|set|demand|reference|excit|field|specific|kraft"),
 )
+_LETTERS: tuple[tuple[GuessedRole, str], ...] = (("input", r"u(\d|_|[A-Z]|$)"), ("output", r"y(\d|_|[A-Z]|$)"))
+"""The letters of system identification: ``u``, ``u1``, ``uEst``, ``y_val``."""
 _BY_UNIT: tuple[tuple[GuessedRole, str], ...] = (
     ("context", "degC"), ("input", "N"), ("input", "N m"), ("output", "m"), ("output", "m/s"), ("output", "rad"),
     ("output", "rad/s"), ("output", "m/s^2"), ("input", "V"), ("input", "A"),
@@ -66,6 +68,9 @@ def role_of_name(name: str) -> GuessedRole:
     """Return the role that a name suggests; empty for no idea."""
     for role, pattern in _WORDS:
         if re.search(pattern, name, re.IGNORECASE):
+            return role
+    for role, pattern in _LETTERS:
+        if re.match(pattern, name):
             return role
     return ""
 
@@ -218,16 +223,15 @@ def _assign_freely(names: Sequence[str], parts: Parts) -> Assignment | None:
     used = [name for name in names if roles[name] != "context"]
     if len(used) < 2:
         return None
-    assumed: list[str] = []
+    told = dict(roles)
     for role, name in (("input", used[0]), ("output", used[-1])):
         if role not in (roles[k] for k in used):
             free = next((k for k in (used if role == "input" else used[::-1]) if not roles[k]), name)
             roles[free] = "input" if role == "input" else "output"
-            assumed.append(f"'{free}' is {_article(role)}")
     for name in used:
-        if not roles[name]:
-            roles[name] = "output"
-            assumed.append(f"'{name}' is {_article('output')}")
+        roles[name] = roles[name] or "output"
+    guessed = {role: [k for k in used if roles[k] == role != told[k]] for role in ("input", "output")}
+    assumed = [f"{role}s are {_quoted(of)}" for role, of in guessed.items() if of]
     signals: dict[str, str] = {}
     for name in names:
         plain, unit = parts[name]
@@ -253,6 +257,10 @@ def _context_signal(plain: str, unit: str) -> str:
 def _unused(own: str, signals: Mapping[str, str]) -> str:
     taken = set(signals.values())
     return next(s for k in range(len(taken) + 1) if (s := own if k == 0 else f"{own}_{k + 1}") not in taken)
+
+
+def _quoted(names: Sequence[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
 
 
 def _article(role: str) -> str:
