@@ -45,6 +45,10 @@ class HandFileError(BenchError):
     """A hand recording cannot be used: the message says which, where and what to do."""
 
 
+class NoHandError(HandFileError):
+    """A file can be read, but no column of it is a motion."""
+
+
 @dataclass(frozen=True)
 class HandRecording:
     """One recorded motion on a uniform time base: arrays (n, 3) in SI, absent quantities ``None``.
@@ -217,7 +221,7 @@ def _signals(path: Path, columns: dict[str, Array], units: dict[str, str]) -> di
     if missing and not found:
         raise HandFileError(f"{path}: column '{missing[0]}' is missing")
     if not found:
-        raise HandFileError(
+        raise NoHandError(
             f"{path}: no column is an acceleration, a displacement or an angular rate; "
             f"columns: {', '.join(columns)}; names end in a unit (_g, _m_s2, _um, _deg_s) or meta.toml tells it"
         )

@@ -17,7 +17,7 @@ import numpy as np
 from hal.bench import BenchFile
 from hal.npz import open_npz
 from sim_devices.config import emulation_config
-from sim_devices.plant.hand_file import HandFileError, load_hand
+from sim_devices.plant.hand_file import HandFileError, NoHandError, load_hand
 from sim_devices.plant.recorded_hand import RecordedHand
 from tools.errors import InputError
 from tools.reports.hands import GOAL_PERCENT, SETTLE_S, HandRow, explain_miss, run_hand
@@ -40,11 +40,15 @@ class Source:
 
 @dataclass(frozen=True)
 class Folder:
-    """Recordings of a folder in the order of their names; ``development``: files that were left out as seen."""
+    """Recordings of a folder in the order of their names.
+
+    Left out: ``development``, files that settings were chosen on; ``no_hands``, files without a column of motion.
+    """
 
     path: Path
     sources: tuple[Source, ...]
     development: tuple[str, ...]
+    no_hands: tuple[str, ...] = ()
 
 
 def development_sums() -> dict[str, str]:
@@ -62,7 +66,8 @@ def find_recordings(folder: Path, bench: BenchFile) -> Folder:
         raise InputError(
             f"{folder}: no such folder; --heldout takes a folder of recorded hands (docs/hand-recordings.md)"
         )
-    seen, sources, left_out = development_sums(), list[Source](), list[str]()
+    seen, sources = development_sums(), list[Source]()
+    left_out, no_hands = list[str](), list[str]()
     hand = emulation_config(bench.description.model_dump())
     for file in _files(folder):
         name = str(file.relative_to(folder))
@@ -78,13 +83,17 @@ def find_recordings(folder: Path, bench: BenchFile) -> Folder:
                     start = np.floor(0.5 * (seconds - LONGEST_S))
                     address += f"#{start:g}:{start + LONGEST_S:g}"
                 RecordedHand(hand.hand, hand.seed, load_hand(address))
+            except NoHandError:
+                no_hands.append(name)
+                break
             except HandFileError as error:
                 raise InputError(f"{error} (docs/hand-recordings.md; move it elsewhere to leave it out)") from error
             sources.append(Source(f"{name}#{part}" if part else name, address, seconds))
     if not sources:
         what = f"only recordings that settings were chosen on ({', '.join(left_out)})" if left_out else "no recording"
+        what += f" (no motion in {', '.join(no_hands)})" if no_hands else ""
         raise InputError(f"{folder} holds {what}: put .npz, .csv or .toml recordings of hands there")
-    return Folder(folder, tuple(sources), tuple(left_out))
+    return Folder(folder, tuple(sources), tuple(left_out), tuple(no_hands))
 
 
 def _files(folder: Path) -> list[Path]:
@@ -194,6 +203,8 @@ def heldout_page(folder: Folder, rows: Sequence[HandRow], seconds: float, revisi
     ]
     if folder.development:
         lines += [f"Left out, because settings were chosen on them: {', '.join(folder.development)}.", ""]
+    if folder.no_hands:
+        lines += [f"Left out, because no column is a motion: {', '.join(folder.no_hands)}.", ""]
     for row in missed:
         lines += [*explain_miss(row), ""]
     for row in others:
