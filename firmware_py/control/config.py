@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -16,8 +17,10 @@ from firmware_py.control.tasks import Works, task_table
 from firmware_py.control.wiring import bus_plan
 from firmware_py.scheduler.check import check_table
 from firmware_py.scheduler.task import TickInfo
+from firmware_py.sensing.attitude_params import tip_lever
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.noise_file import noise_table
+from firmware_py.tremor.config import LeverConfig
 from hal.bench import BenchFile
 from hal.errors import BenchError
 from hal.toml_file import parse_toml, read_text
@@ -79,7 +82,19 @@ def load_firmware_config(
     if method is not None:
         tables["tremor"]["method"] = method
     _design_for_tick(tables, float(bench.description.clock.tick_hz), where)
-    return config, StageConfigs.from_dict(tables, where)
+    return config, _with_lever(StageConfigs.from_dict(tables, where))
+
+
+def _with_lever(configs: StageConfigs) -> StageConfigs:
+    """The tremor estimator is told what the accelerometers' places say of the tip's noise."""
+    tremor = configs.tremor
+    if tremor.lever is not None or tremor.sees != "acceleration" or tremor.adaptive.lever_share == 0.0:
+        return configs
+    arm, turning, tip = (tuple(part.tolist()) for part in tip_lever(configs.sensing))
+    if not any(arm):
+        return configs
+    lever = LeverConfig.model_validate({"arm_m": arm, "noise_m_s2_rtHz": turning, "tip_noise_m_s2_rtHz": tip})
+    return replace(configs, tremor=tremor.model_copy(update={"lever": lever}))
 
 
 def _design_for_tick(tables: dict[str, dict[str, Any]], tick_hz: float, where: str) -> None:

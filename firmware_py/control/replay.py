@@ -31,8 +31,10 @@ def recorded_configs(recording: Recording) -> StageConfigs:
         raise RecordingError(f"{recording.path}: its stage configuration cannot be read: {error}") from error
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise RecordingError(f"{recording.path}: its stage configuration is not a table for every stage")
-    # a recording that does not name the penalty was made before there was one
-    tables.setdefault("tremor", {}).setdefault("adaptive", {}).setdefault("quiet", 0.0)
+    # a recording that does not name one of these was made before there was such a thing
+    adaptive = tables.setdefault("tremor", {}).setdefault("adaptive", {})
+    adaptive.setdefault("quiet", 0.0)
+    adaptive.setdefault("ease_s", 0.0)
     tables.setdefault("sensing", {}).setdefault("kinematics_guard", False)
     return StageConfigs.from_dict(tables, str(recording.path))
 

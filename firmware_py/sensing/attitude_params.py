@@ -63,6 +63,25 @@ def quiet_point(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.
     return r, carry @ p @ carry.T
 
 
+def tip_lever(config: SensingConfig) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return the arm (3,) m from the quiet point to the tip, and the noise (3,) m/s^2/sqrt(Hz) of what a turn gives the
+    tip along each axis and of the tip itself.
+    """
+    densities = motion_densities(config)
+    arm = np.asarray(config.tip_m) - quiet_point(config)[0]
+    arm[np.abs(arm) < 1e-6] = 0.0
+    turn, tip = (_cross(r) for r in (arm, np.asarray(config.tip_m)))
+    turning = 2.0 * np.diag(turn @ densities[3:, 3:] @ turn.T)
+    whole = 2.0 * np.diag(np.hstack([np.eye(3), tip]) @ densities @ np.hstack([np.eye(3), tip]).T)
+    return arm, np.sqrt(turning), np.sqrt(whole)
+
+
+def _cross(r: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3): alpha x r = _cross(r) @ alpha."""
+    x, y, z = r
+    return np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])
+
+
 def tremor_notch(tick_hz: float, middle_hz: float, width_hz: float) -> NDArray[np.float64]:
     """(5,) b0 b1 b2 a1 a2 of a band stop, -3 dB ``width_hz`` apart; none where the band is beyond the sampling."""
     if width_hz == 0.0 or middle_hz >= 0.45 * tick_hz:

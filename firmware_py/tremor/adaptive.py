@@ -22,16 +22,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record, new_record
-from firmware_py.tremor.adaptive_design import LEVELS, OUTPUTS, AdaptiveDesign, design_adaptive
+from firmware_py.tremor.adaptive_design import AXES, LEVELS, OUTPUTS, AdaptiveDesign, design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from hal.compiled import kernel
 
 Array = NDArray[np.float64]
-AXES = 3
 
 
 def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
     m, n, slow, taps = design.bank.size, len(design.bank.pole), len(design.bank.slow), design.taps.shape[1]
+    channels = design.bank.channels
     return np.dtype(
         [
             ("pole_re", "f8", (n,)),
@@ -41,35 +41,36 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("taps", "f8", (OUTPUTS, taps)),
             ("weight", "f8", (5,)),
             ("gate", "f8", (5,)),
-            ("gate_power", "f8"),
+            ("gate_power", "f8", (AXES,)),
             ("gate_smoothing", "f8"),
             ("tremor", "f8", (LEVELS, m, m)),
-            ("rest", "f8", (m, m)),
-            ("quiet", "f8", (m, m)),
+            ("rest", "f8", (AXES, m, m)),
+            ("quiet", "f8", (AXES, m, m)),
             ("cross", "f8", (LEVELS, OUTPUTS, m)),
-            ("noise_cross", "f8", (OUTPUTS, m)),
-            ("noise_power", "f8"),
+            ("noise_cross", "f8", (AXES, OUTPUTS, m)),
+            ("noise_power", "f8", (AXES,)),
             ("weighted_power", "f8", (LEVELS,)),
             ("least_power", "f8"),
-            ("start", "f8", (LEVELS, OUTPUTS, m)),
-            ("onward", "f8", (m,)),
+            ("start", "f8", (AXES, LEVELS, OUTPUTS, m)),
+            ("onward", "f8", (AXES, channels, m)),
             ("block_ticks", "i8"),
             ("keep", "f8"),
             ("prior_blocks", "f8", (LEVELS,)),
-            ("share", "f8"),
+            ("share", "f8", (AXES, AXES)),  # what the first axis takes from the second
             ("outlier", "f8"),
+            ("ease", "f8"),  # share of the way to the solved filter in one tick
         ]
     )
 
 
 def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
-    m, taps = design.bank.size, design.taps.shape[1]
+    m, taps, channels = design.bank.size, design.taps.shape[1], design.bank.channels
     return np.dtype(
         [
             ("bank", "f8", (AXES, m)),
-            ("pending", "f8", (AXES,)),  # the sample that the bank holds for this tick, measured or predicted
+            ("pending", "f8", (AXES, channels)),  # the samples that the bank holds for this tick, measured or predicted
             ("running", "i8"),
-            ("weigh", "f8", (AXES, 2)),
+            ("weigh", "f8", (AXES, channels, 2)),
             ("weighted", "f8", (AXES, m)),
             ("gate", "f8", (AXES, 2)),
             ("gate_power", "f8", (AXES,)),
@@ -85,6 +86,7 @@ def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("power", "f8", (AXES, LEVELS)),
             ("count", "f8", (AXES, LEVELS)),
             ("filter", "f8", (AXES, LEVELS, OUTPUTS, m)),
+            ("solved", "f8", (AXES, LEVELS, OUTPUTS, m)),  # where ``filter`` goes
             ("work", "f8", (m, m)),
             ("scale", "f8", (m,)),
             ("target", "f8", (OUTPUTS,)),
@@ -122,62 +124,79 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         block_ticks=d.block_ticks,
         keep=exp(-block_s / a.memory_s),
         prior_blocks=np.array([a.prior_s, a.burst_prior_s]) / block_s,
-        share=a.share,
+        share=_shares(config),
         outlier=a.outlier,
+        ease=1.0 - exp(-1.0 / (a.ease_s * config.tick_hz)) if a.ease_s > 0.0 else 1.0,
     )
+
+
+def _shares(config: TremorConfig) -> Array:
+    """(3, 3): axes tell each other the less, the less alike their noise is."""
+    noise = np.ones(AXES) if config.lever is None else np.square(config.lever.tip_noise_m_s2_rtHz)
+    alike = np.minimum.outer(noise, noise) / np.maximum.outer(noise, noise)
+    return config.adaptive.share * alike * (1.0 - np.eye(AXES)) + np.eye(AXES)
 
 
 def adaptive_state(design: AdaptiveDesign) -> Record:
     """Return the state before the first sample, which holds the prior hands' filters."""
-    return new_record(adaptive_state_dtype(design), filter=np.tile(design.start, (AXES, 1, 1, 1)))
+    return new_record(adaptive_state_dtype(design), filter=design.start, solved=design.start)
 
 
 @kernel
 def bank_turn(bank: Array, params: Record) -> None:
-    """Advance ``bank`` (m,) by one tick without its input."""
+    """Advance ``bank`` (m,) by one tick without its inputs."""
     n = len(params.pole_re)
-    for r in range(n):
-        re, im = bank[2 * r], bank[2 * r + 1]
-        bank[2 * r] = params.pole_re[r] * re - params.pole_im[r] * im
-        bank[2 * r + 1] = params.pole_re[r] * im + params.pole_im[r] * re
-    for r in range(len(params.slow)):
-        bank[2 * n + r] *= params.slow[r]
-    bank[len(bank) - 1] = 0.0
+    slow = len(params.slow)
+    for at in range(0, len(bank), 2 * n + slow + 1):
+        for r in range(n):
+            re, im = bank[at + 2 * r], bank[at + 2 * r + 1]
+            bank[at + 2 * r] = params.pole_re[r] * re - params.pole_im[r] * im
+            bank[at + 2 * r + 1] = params.pole_re[r] * im + params.pole_im[r] * re
+        for r in range(slow):
+            bank[at + 2 * n + r] *= params.slow[r]
+        bank[at + 2 * n + slow] = 0.0
 
 
 @kernel
-def bank_add(bank: Array, sample: float, params: Record) -> None:
-    """Add the input of one tick to the bank, after ``bank_turn``."""
+def bank_add(bank: Array, channel: int, sample: float, params: Record) -> None:
+    """Add a channel's input of one tick to the bank, after ``bank_turn``."""
     n = len(params.pole_re)
+    slow = len(params.slow)
+    at = channel * (2 * n + slow + 1)
     for r in range(n):
-        bank[2 * r] += params.pole_gain[r] * sample
-    for r in range(len(params.slow)):
-        bank[2 * n + r] += (1.0 - params.slow[r]) * sample
-    bank[len(bank) - 1] += sample
+        bank[at + 2 * r] += params.pole_gain[r] * sample
+    for r in range(slow):
+        bank[at + 2 * n + r] += (1.0 - params.slow[r]) * sample
+    bank[at + 2 * n + slow] += sample
 
 
 @kernel
 def adaptive_predict(state: Record, params: Record) -> None:
-    """Advance to the next tick: learn from the last tick's data, and run the bank on with a predicted sample."""
+    """Advance to the next tick: learn from the last tick's data, and run the bank on with predicted samples."""
     if state.running:
         _learn(state, params)
+        _ease(state, params)
     state.running = 1
-    m = len(params.onward)
+    _, channels, m = params.onward.shape
     for i in range(AXES):
         bank = state.bank[i]
-        sample = 0.0
-        for j in range(m):
-            sample += params.onward[j] * bank[j]
+        for c in range(channels):
+            sample = 0.0
+            for j in range(m):
+                sample += params.onward[i, c, j] * bank[j]
+            state.pending[i, c] = sample
         bank_turn(bank, params)
-        bank_add(bank, sample, params)
-        state.pending[i] = sample
+        for c in range(channels):
+            bank_add(bank, c, state.pending[i, c], params)
 
 
 @kernel
-def adaptive_correct(state: Record, axis: int, sample: float, params: Record) -> None:
-    """Replace the predicted sample by the tick's own sample."""
-    bank_add(state.bank[axis], sample - state.pending[axis], params)
-    state.pending[axis] = sample
+def adaptive_correct(state: Record, axis: int, sample: float, turned: float, params: Record) -> None:
+    """Replace the predicted samples by the tick's own: of the tip, and what of it is the turn about the quiet point."""
+    for c in range(params.onward.shape[1]):
+        own = turned if c else sample
+        bank_add(state.bank[axis], c, own - state.pending[axis, c], params)
+        state.pending[axis, c] = own
 
 
 @kernel
@@ -204,14 +223,16 @@ def biquad_step(sample: float, memory: Array, c: Array) -> float:
 def _learn(state: Record, params: Record) -> None:
     """Weighted bank and block sums take the last sample; at the end of a block the regression takes its row."""
     for i in range(AXES):
-        sample = state.pending[i]
-        lifted = biquad_step(sample, state.weigh[i], params.weight)
+        sample = state.pending[i, 0]
         bank_turn(state.weighted[i], params)
-        bank_add(state.weighted[i], lifted, params)
-        state.sum[i] += lifted
+        for c in range(params.onward.shape[1]):
+            lifted = biquad_step(state.pending[i, c], state.weigh[i, c], params.weight)
+            bank_add(state.weighted[i], c, lifted, params)
+            if c == 0:
+                state.sum[i] += lifted
         gated = biquad_step(sample, state.gate[i], params.gate)
         state.gate_power[i] += params.gate_smoothing * (gated * gated - state.gate_power[i])
-        state.burst[i] = state.gate_power[i] / (state.gate_power[i] + params.gate_power)
+        state.burst[i] = state.gate_power[i] / (state.gate_power[i] + params.gate_power[i])
     state.in_block += 1
     if state.in_block < params.block_ticks:
         return
@@ -231,6 +252,17 @@ def _learn(state: Record, params: Record) -> None:
     axis = at % AXES  # one system a block: no tick has to solve more
     if at >= 2 * n_taps:
         _solve(state, axis, (at // AXES) % LEVELS, params)
+
+
+@kernel
+def _ease(state: Record, params: Record) -> None:
+    """Let the filters in use approach the solved ones: at once, they would step the tip at every solution."""
+    for axis in range(AXES):
+        for level in range(LEVELS):
+            used, solved = state.filter[axis, level], state.solved[axis, level]
+            for o in range(OUTPUTS):
+                for j in range(used.shape[1]):
+                    used[o, j] += params.ease * (solved[o, j] - used[o, j])
 
 
 @kernel
@@ -281,9 +313,9 @@ def _take(state: Record, axis: int, level: int, share: float, own: float, params
     factor, back = share * ratio, share * (1.0 - ratio) * count
     for i in range(state.work.shape[0]):
         for j in range(i + 1):
-            state.work[i, j] += factor * normal[i, j] + back * params.rest[i, j]
+            state.work[i, j] += factor * normal[i, j] + back * params.rest[axis, i, j]
         for o in range(OUTPUTS):
-            state.solution[o, i] += factor * (right[o, i] - count * params.noise_cross[o, i])
+            state.solution[o, i] += factor * (right[o, i] - count * params.noise_cross[axis, o, i])
 
 
 @kernel
@@ -295,17 +327,18 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
     n0 = params.prior_blocks[level]
     rows = n0
     for other in range(AXES):
-        rows += (1.0 if other == axis else params.share) * state.count[other, level]
-    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power * count
+        rows += params.share[axis, other] * state.count[other, level]
+    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power[axis] * count
     power = max(known / (count + n0), params.least_power)
     for i in range(m):
         for j in range(i + 1):
-            a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[i, j]) + rows * params.quiet[i, j]
+            a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[axis, i, j])
+            a[i, j] += rows * params.quiet[axis, i, j]
         for o in range(OUTPUTS):
             right[o, i] = n0 * power * params.cross[level, o, i]
     for other in range(AXES):
-        share = 1.0 if other == axis else params.share
-        _take(state, other, level, share, 1e300 if other == axis else power, params)
+        if params.share[axis, other] > 0.0:
+            _take(state, other, level, params.share[axis, other], 1e300 if other == axis else power, params)
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])
@@ -336,4 +369,4 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
                 total -= a[k, i] * x[k]
             x[i] = total / a[i, i]
         for i in range(m):
-            state.filter[axis, level, o, i] = x[i] * scale[i]
+            state.solved[axis, level, o, i] = x[i] * scale[i]

@@ -13,7 +13,7 @@ that instant: band, double integration and the sensor's filter in one set of tap
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import isfinite, pi
 from typing import Any
 
@@ -28,26 +28,33 @@ Complex = NDArray[np.complex128]
 
 GRID_STEP_HZ = 0.02
 GRID_STOP_HZ = 250.0
+AXES = 3
 OUTPUTS = 3  # now, ahead, the part of ahead in the core band
 LEVELS = 2  # calm, burst
 
 
 @dataclass(frozen=True)
 class Bank:
-    """Resonators z <- p z + (1 - |p|) y (two states each), low-passes, and the sample itself."""
+    """Resonators z <- p z + (1 - |p|) y (two states each), low-passes, and the sample itself; of each channel."""
 
     pole: Complex
     slow: Array
+    channels: int = 1
+
+    @property
+    def one(self) -> int:
+        """Number of features of one channel."""
+        return 2 * len(self.pole) + len(self.slow) + 1
 
     @property
     def size(self) -> int:
-        return 2 * len(self.pole) + len(self.slow) + 1
+        return self.channels * self.one
 
     def response(self, z: Complex) -> Complex:
-        """(size, len(z)) from sample to feature, z = exp(j w / rate)."""
+        """(one, len(z)) from a channel's sample to its features, z = exp(j w / rate)."""
         p, gain = self.pole[:, None], 1.0 - np.abs(self.pole[:, None])
         one, other = gain / (1.0 - p / z), gain / (1.0 - np.conj(p) / z)
-        out = np.ones((self.size, len(z)), dtype=np.complex128)
+        out = np.ones((self.one, len(z)), dtype=np.complex128)
         n = 2 * len(self.pole)
         out[0:n:2], out[1:n:2] = 0.5 * (one + other), (one - other) / 2j
         out[n:-1] = (1.0 - self.slow[:, None]) / (1.0 - self.slow[:, None] / z)
@@ -58,11 +65,11 @@ class Bank:
 class AdaptiveDesign:
     """``taps`` (3, L) on block means: the outputs' targets ``L // 2`` blocks ago. ``weight``, ``gate``: b0 b1 b2 a1 a2.
 
-    Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m); ``rest`` (m, m) is what does not
-    scale with the tremor, ``quiet`` (m, m) the penalty on what the filter passes above the band; ``noise_cross`` (3, m)
-    and ``noise_power`` are the sensor noise's share in learning. All are of weighted signals except ``quiet``,
-    ``start`` (2, 3, m), the priors' filters, and ``onward`` (m,), next sample from present features.
-    ``gate_power``: of the gate's output, where both levels count the same.
+    Prior of unit tremor power per level: ``tremor`` (2, m, m), ``cross`` (2, 3, m). Of each axis: ``rest`` (3, m, m)
+    does not scale with the tremor, ``quiet`` (3, m, m) is the penalty on what the filter passes above the band;
+    ``noise_cross`` (3, 3, m) and ``noise_power`` (3,) are the sensor noise's share in learning. All are of weighted
+    signals except ``quiet``, ``start`` (3, 2, 3, m), the priors' filters, and ``onward`` (3, C, m), next samples from
+    present features. ``gate_power`` (3,): of the gate's output, where both levels count the same.
     """
 
     bank: Bank
@@ -70,13 +77,13 @@ class AdaptiveDesign:
     taps: Array
     weight: Array
     gate: Array
-    gate_power: float
+    gate_power: Array
     tremor: Array
     rest: Array
     quiet: Array
     cross: Array
     noise_cross: Array
-    noise_power: float
+    noise_power: Array
     weighted_power: Array  # (2,) of the priors' tremor, m^2
     least_power: float
     start: Array
@@ -85,7 +92,10 @@ class AdaptiveDesign:
 
 @dataclass(frozen=True)
 class _Spectra:
-    """One-sided densities over ``hz``: unit tremor m^2/Hz per level, the rest as seen, noise of the sensor as seen."""
+    """One-sided densities over ``hz``: unit tremor m^2/Hz per level, the rest as seen, noise of the sensor as seen.
+
+    All are of the tip; ``channel_matrix`` says how much of them the lever's channel sees.
+    """
 
     hz: Array
     seen: Complex  # from displacement to sample
@@ -94,10 +104,28 @@ class _Spectra:
     noise: Array
 
 
-def bank_of(config: AdaptiveConfig, tick_hz: float) -> Bank:
+def bank_of(config: AdaptiveConfig, tick_hz: float, channels: int = 1) -> Bank:
     centre = np.asarray(config.centres_hz)
     pole = np.exp((-pi * config.bandwidth_hz + 2j * pi * centre) / tick_hz)
-    return Bank(pole, np.exp(-2.0 * pi * np.asarray(config.slow_hz) / tick_hz))
+    return Bank(pole, np.exp(-2.0 * pi * np.asarray(config.slow_hz) / tick_hz), channels)
+
+
+def motion_in_channels(config: TremorConfig) -> Array:
+    """(C, C): covariance of the channels for a motion of the tip of unit variance.
+
+    The prior hand's turn about the point that is known best is independent of that point's own motion and has
+    ``lever_share`` of the variance.
+    """
+    share = config.adaptive.lever_share
+    return np.array([[1.0, share], [share, share]]) if config.lever else np.ones((1, 1))
+
+
+def noise_in_channels(config: TremorConfig, axis: int = 0) -> Array:
+    """(C, C): covariance of the channels' noise for noise of the tip of unit variance: all of the lever's is in it."""
+    if config.lever is None:
+        return np.ones((1, 1))
+    turning = (config.lever.noise_m_s2_rtHz[axis] / config.lever.tip_noise_m_s2_rtHz[axis]) ** 2
+    return np.array([[1.0, turning], [turning, turning]])
 
 
 def sensor_response(config: TremorConfig, hz: Array) -> Complex:
@@ -108,16 +136,17 @@ def sensor_response(config: TremorConfig, hz: Array) -> Complex:
     return _complex(-(w**2) * low_pass if config.sees == "acceleration" else low_pass)
 
 
-def sensor_noise(config: TremorConfig, hz: Array) -> Array:
+def sensor_noise(config: TremorConfig, hz: Array, axis: int = 0) -> Array:
     """Return the one-sided density of the sensor's noise in a sample, in the sample's unit squared per Hz."""
     a, per_sample = config.adaptive, 2.0 / config.tick_hz
     if config.sees == "displacement":
         return np.full(len(hz), a.reading_noise_m**2 * per_sample)
     low_pass = np.abs(sensor_response(config, hz) / (2.0 * pi * hz) ** 2) ** 2
-    return np.asarray(low_pass * a.sensor_noise_m_s2_rtHz**2 + a.reading_noise_m_s2**2 * per_sample)
+    density = (a.sensor_noise_m_s2_rtHz if config.lever is None else config.lever.tip_noise_m_s2_rtHz[axis]) ** 2
+    return np.asarray(low_pass * density + a.reading_noise_m_s2**2 * per_sample)
 
 
-def _penalty_above_band(config: TremorConfig, bank: Bank) -> Array:
+def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
     """(m, m): the bank's covariance under ``quiet`` times the sensor's noise above the cancelled band.
 
     The penalty rises over one octave from the upper edge of the band and holds up to half the tick rate. A tip has
@@ -127,11 +156,11 @@ def _penalty_above_band(config: TremorConfig, bank: Bank) -> Array:
     hz = np.arange(a.cancel_to_hz[1], 0.5 * config.tick_hz, 0.5)
     above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
     features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
-    density = a.quiet * above * sensor_noise(config, hz)
-    return np.asarray(np.real((features * density) @ features.conj().T) * 0.5)
+    density = a.quiet * above * sensor_noise(config, hz, axis)
+    return np.asarray(np.kron(noise_in_channels(config, axis), np.real((features * density) @ features.conj().T) * 0.5))
 
 
-def spectra(config: TremorConfig) -> _Spectra:
+def spectra(config: TremorConfig, axis: int = 0) -> _Spectra:
     """The prior hand in the sensor's eyes."""
     a = config.adaptive
     hz = np.arange(GRID_STEP_HZ, min(GRID_STOP_HZ, 0.5 * config.tick_hz), GRID_STEP_HZ)
@@ -146,7 +175,7 @@ def spectra(config: TremorConfig) -> _Spectra:
     mixed = a.burst_share * burst + (1.0 - a.burst_share) * narrow
     slow = a.voluntary_m**2 / a.voluntary_hz / (1.0 + (hz / a.voluntary_hz) ** 6)
     slow += a.unsteadiness_m**2 * 0.6 / (1.0 + hz**2) ** 2
-    noise = sensor_noise(config, hz)
+    noise = sensor_noise(config, hz, axis)
     rest = noise + _drift(config, hz) + np.abs(seen) ** 2 * slow
     return _Spectra(hz, seen, np.stack([narrow, mixed]), rest, noise)
 
@@ -223,11 +252,21 @@ def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
 
 
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
-    """Return everything that follows from ``config``."""
+    """Return everything that follows from ``config``: the axes' designs, stacked."""
+    if config.lever is None:
+        axes = [_design_axis(config, 0)] * AXES
+    else:
+        axes = [_design_axis(config, axis) for axis in range(AXES)]
+    own = ("gate_power", "rest", "quiet", "noise_cross", "noise_power", "start", "onward")
+    return replace(axes[0], **{name: np.stack([getattr(each, name) for each in axes]) for name in own})
+
+
+def _design_axis(config: TremorConfig, axis: int) -> AdaptiveDesign:
     a = config.adaptive
-    bank = bank_of(a, config.tick_hz)
+    moving, noisy = motion_in_channels(config), noise_in_channels(config, axis)
+    bank = bank_of(a, config.tick_hz, len(moving))
     block = max(1, round(a.block_s * config.tick_hz))
-    s = spectra(config)
+    s = spectra(config, axis)
     w = 2.0 * pi * s.hz
     z = _complex(np.exp(1j * w / config.tick_hz))
     back = _complex(1.0 / z)
@@ -245,33 +284,39 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     in_blocks = np.exp(-1j * w[None, :] * block / config.tick_hz * (np.arange(len(taps[0])) - half)[:, None])
     target = (taps @ in_blocks) * block_response(s.hz, block, config.tick_hz)
 
-    def covariance(features: Complex, density: Array) -> Array:
-        return np.asarray(np.real((features * density) @ features.conj().T) * GRID_STEP_HZ)
+    def covariance(features: Complex, density: Array, channels: Array = moving) -> Array:
+        return np.asarray(np.kron(channels, np.real((features * density) @ features.conj().T) * GRID_STEP_HZ))
 
-    def cross(features: Complex, density: Complex | Array) -> Array:
-        return np.asarray(np.real(np.conj(features) @ density) * GRID_STEP_HZ)
+    def rest_of(features: Complex) -> Array:
+        return covariance(features, s.rest - s.noise) + covariance(features, s.noise, noisy)
+
+    def cross(features: Complex, density: Complex | Array, channels: Array = moving, of: int = 0) -> Array:
+        return np.asarray(np.kron(channels[of], np.real(np.conj(features) @ density) * GRID_STEP_HZ))
 
     wanted = [band(s.hz, edges) * np.exp(1j * w * h) for h, edges in outputs]
     as_seen = np.abs(s.seen) ** 2 * s.tremor
     power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
-    quiet = _penalty_above_band(config, bank)
+    quiet = _penalty_above_band(config, bank, axis)
     plain_sum = [
-        p * covariance(plain, seen) + covariance(plain, s.rest) + quiet for p, seen in zip(power, as_seen, strict=True)
+        p * covariance(plain, seen) + rest_of(plain) + quiet for p, seen in zip(power, as_seen, strict=True)
     ]
     plain_cross = [
         p * np.stack([cross(plain * s.seen, t * e) for e in wanted]) for p, t in zip(power, s.tremor, strict=True)
     ]
-    next_sample = cross(plain, (power[0] * as_seen[0] + s.rest) * z)
+    next_sample = [
+        cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, of=c) + cross(plain, s.noise * z, noisy, c)
+        for c in range(bank.channels)
+    ]
     return AdaptiveDesign(
         bank=bank,
         block_ticks=block,
         taps=taps,
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         gate=np.array([*gate_b, *gate_a[1:]]) / gate_a[0],
-        gate_power=a.gate_ratio * float(np.sum(s.rest * np.abs(through_gate) ** 2) * GRID_STEP_HZ),
+        gate_power=np.asarray(a.gate_ratio * np.sum(s.rest * np.abs(through_gate) ** 2) * GRID_STEP_HZ),
         tremor=np.stack([covariance(phi, seen) / u for seen, u in zip(as_seen, unit, strict=True)]),
-        rest=covariance(phi, s.rest),
+        rest=rest_of(phi),
         quiet=quiet,
         cross=np.stack(
             [
@@ -279,10 +324,10 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
                 for t, u in zip(s.tremor, unit, strict=True)
             ]
         ),
-        noise_cross=np.stack([cross(phi, s.noise * weight * t) for t in target]),
-        noise_power=float(np.sum(s.noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ),
+        noise_cross=np.stack([cross(phi, s.noise * weight * t, noisy) for t in target]),
+        noise_power=np.asarray(np.sum(s.noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ),
         weighted_power=power * unit,
         least_power=a.least_rms_m**2 * float(unit[0]),
         start=np.stack([solve_scaled(m, r) for m, r in zip(plain_sum, plain_cross, strict=True)]),
-        onward=solve_scaled(plain_sum[0], next_sample[None, :])[0],
+        onward=solve_scaled(plain_sum[0], np.stack(next_sample)),
     )

@@ -14,6 +14,7 @@ from hal.plugins import ESTIMATORS, offered
 from hal.validation import validate_table
 
 Positive = Annotated[float, Field(gt=0.0)]
+NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Edge = tuple[Positive, Positive]
 
@@ -114,8 +115,10 @@ class AdaptiveConfig(_Table):
     ``cancel_from_hz``, ``cancel_to_hz``: where what is cancelled fades in and out; ``core_hz``: the part of it that
     does not yield when the manipulator runs out of stroke. Two filters are learned, for a calm hand and for a burst,
     and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
-    all that is no tremor. ``share``: what an axis takes from the others. ``quiet``: above the band, sensor noise counts
-    for so many times its power, so that the filter does not shake the tip there.
+    all that is no tremor. ``share``: what an axis takes from the others. ``lever_share``: part of the
+    prior hand's motion (variance) that is a turn about the quiet point. ``quiet``: above the band, sensor noise counts
+    for so many times its power, so that the filter does not shake the tip there. ``ease_s``: time constant with which
+    a filter in use approaches the one that was solved last.
     """
 
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
@@ -133,12 +136,14 @@ class AdaptiveConfig(_Table):
     prior_s: Positive = 2.0
     burst_prior_s: Positive = 0.1
     share: Share = 0.3
+    lever_share: Share = 0.5
     outlier: Positive = 16.0
     gate_hz: Positive = 6.3
     gate_q: Positive = 0.5
     gate_s: Positive = 0.05
     gate_ratio: Positive = 150.0
     quiet: Annotated[float, Field(ge=0.0, le=1e6)] = 100.0
+    ease_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.1
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
     least_rms_m: Positive = 2e-6
@@ -171,6 +176,21 @@ class AdaptiveConfig(_Table):
         return self
 
 
+class LeverConfig(_Table):
+    """What the instrument knows of its own turning (``firmware_py.sensing.quiet_point``).
+
+    Accelerometers know the acceleration of one point best; from there to the tip the noise of the angular acceleration
+    counts with the arm. The adaptive method sees that part by itself and trusts it as far as this hand turns.
+    """
+
+    arm_m: tuple[float, float, float]
+    """From the quiet point to the tip, body frame."""
+    noise_m_s2_rtHz: tuple[NotNegative, NotNegative, NotNegative]
+    """Of angular acceleration times arm, along each axis."""
+    tip_noise_m_s2_rtHz: tuple[Positive, Positive, Positive]
+    """Of the tip: with the noise of the quiet point."""
+
+
 class TremorConfig(_Table):
     """Estimator, its horizon, what it sees and when it counts as settled.
 
@@ -186,6 +206,8 @@ class TremorConfig(_Table):
     # from the instant a scan is taken to the middle of the interval in which its command moves the tip
     loop_delay_s: Annotated[float, Field(ge=0.0, le=0.05)] = 0.0021  # tuned against the emulated tip, one seed
     filter_cutoff_rad_s: Annotated[float, Field(gt=0.0, le=inf)] = 1.0 / (32_000.0 * 0.33e-6)
+    lever: LeverConfig | None = None
+    """Without one the acceleration of the tip is all that is known; a bench's own sensors give it."""
     settle_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.7
     smoothing_s: Positive = 0.5
     floor_m: Positive = 0.3e-6

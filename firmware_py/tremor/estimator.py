@@ -102,6 +102,7 @@ def estimator_params(config: TremorConfig) -> Record:
             ("delay_ticks", "i8"),
             ("settle_ticks", "f8"),
             ("max_gap_ticks", "f8"),
+            ("arm", "f8", (AXES,)),  # m, from the quiet point to the tip
             ("smoothing", "f8"),
             ("floor2", "f8"),  # m^2
         ]
@@ -121,6 +122,7 @@ def estimator_params(config: TremorConfig) -> Record:
         delay_ticks=min(HISTORY - 1, round(config.loop_delay_s * config.tick_hz)),
         settle_ticks=config.settle_s * config.tick_hz,
         max_gap_ticks=float(config.max_gap_ticks),
+        arm=config.lever.arm_m if config.lever else np.zeros(AXES),
         smoothing=1.0 - exp(-1.0 / (config.smoothing_s * config.tick_hz)),
         floor2=config.floor_m**2,
     )
@@ -142,6 +144,7 @@ def _fresh_state(config: TremorConfig, design: AdaptiveDesign) -> Record:
             ("ticks", "f8"),  # since the start
             ("last_tick", "f8"),  # of the stage that reads frames
             ("samples", "f8", (AXES,)),
+            ("turned", "f8", (AXES,)),  # part of the samples that is the turn about the quiet point
             ("out", "f8", (ROWS, AXES)),
         ]
     )
@@ -195,7 +198,7 @@ def estimator_samples(state: Record, param: Record) -> None:
         sample = state.samples[i]
         combiner_step(sample, state.combiner[i], param.combiner)
         if param.family == ADAPTIVE:
-            adaptive_correct(state.adaptive, i, sample, param.adaptive)
+            adaptive_correct(state.adaptive, i, sample, state.turned[i], param.adaptive)
         elif param.family == KALMAN:
             kalman_correct(state.kalman[i], sample, param.kalman)
         elif param.family == AUTOREGRESSIVE:
@@ -280,13 +283,13 @@ class Estimate:
 
 
 class Estimator:
-    """Any method on its own, one to three axes; the instrument's stage uses the same kernels."""
+    """Any method on its own, one to three axes of the tip alone; the instrument's stage uses the same kernels."""
 
     def __init__(self, config: TremorConfig, axes: int = AXES) -> None:
         if not 1 <= axes <= AXES:
             raise ValueError(f"{axes} axes; an estimator has 1 to {AXES}")
-        self.config, self.axes = config, axes
-        self.params = estimator_params(config)
+        self.config, self.axes = config.model_copy(update={"lever": None}), axes
+        self.params = estimator_params(self.config)
         self.state = estimator_state(self.params)
 
     def reset(self) -> None:

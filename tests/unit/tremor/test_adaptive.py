@@ -87,7 +87,7 @@ def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
     spd = gram @ gram.T + np.diag(10.0 ** np.arange(-6, 6, 2))
     right = rng.standard_normal((2, 6))
     np.testing.assert_allclose(solve_scaled(spd, right) @ spd, right, rtol=1e-4, atol=1e-6)
-    assert np.all(np.linalg.eigvalsh(d.rest) > -1e-12 * np.linalg.norm(d.rest))
+    assert np.all(np.linalg.eigvalsh(d.rest[0]) > -1e-12 * np.linalg.norm(d.rest[0]))
     # the mean square error written out as an integral over frequency: every step away from the filter makes it larger
     config = TremorConfig()
     hand = spectra(config)
@@ -98,10 +98,10 @@ def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
         through = row @ phi
         missed = np.abs(through * hand.seen - wanted) ** 2 * hand.tremor[level] * rms_m**2
         mean_square = float(np.sum(missed + np.abs(through) ** 2 * hand.rest)) * GRID_STEP_HZ
-        return mean_square + float(row @ d.quiet @ row)
+        return mean_square + float(row @ d.quiet[0] @ row)
 
     for level, rms_m in enumerate((config.adaptive.tremor_rms_m, config.adaptive.burst_rms_m)):
-        row = d.start[level, 0]
+        row = d.start[0, level, 0]
         best = error(row, level, rms_m)
         assert best < 0.5 * error(0.0 * row, level, rms_m)
         for step in (1e-2, -1e-2):
@@ -111,7 +111,7 @@ def test_the_prior_filter_is_the_wiener_filter_of_its_hand() -> None:
                 assert error(moved, level, rms_m) > best * (1.0 - 1e-6)
     # the calm hand's filter lets a steady tone in the middle of the band through nearly whole and in phase
     z = np.array([np.exp(2j * np.pi * 10.0 / RATE_HZ)])
-    through = d.start[0, 0] @ d.bank.response(z)[:, 0] * sensor_response(TremorConfig(), np.array([10.0]))[0]
+    through = d.start[0, 0, 0] @ d.bank.response(z)[:, 0] * sensor_response(TremorConfig(), np.array([10.0]))[0]
     assert abs(through - 1.0) < 0.15
 
 
@@ -207,13 +207,13 @@ def test_learning_is_least_squares_with_the_prior() -> None:
     for level in range(2):
         count, n0 = state.count[0, level], param.prior_blocks[level]
         assert count > 10.0
-        known = state.power[0, level] + n0 * param.weighted_power[level] - count * param.noise_power
+        known = state.power[0, level] + n0 * param.weighted_power[level] - count * param.noise_power[0]
         power = known / (count + n0)
         normal = np.tril(state.normal[0, level]) + np.tril(state.normal[0, level], -1).T
-        matrix = normal + n0 * (power * param.tremor[level] + param.rest) + (n0 + count) * param.quiet
-        right = state.right[0, level] - count * param.noise_cross + n0 * power * param.cross[level]
+        matrix = normal + n0 * (power * param.tremor[level] + param.rest[0]) + (n0 + count) * param.quiet[0]
+        right = state.right[0, level] - count * param.noise_cross[0] + n0 * power * param.cross[level]
         direct = solve_scaled(matrix, np.asarray(right))
-        found = np.array(state.filter[0, level])
+        found = np.array(state.solved[0, level])
         # the last solution is a few blocks old
         np.testing.assert_allclose(found @ matrix, direct @ matrix, rtol=0.05, atol=0.02 * np.abs(right).max())
 
@@ -230,7 +230,7 @@ def _noise_above_band_um(quiet: float) -> float:
     config = TremorConfig(adaptive=AdaptiveConfig(quiet=quiet))
     d = design_adaptive(config)
     hz = np.arange(40.0, 500.0, 0.5)
-    response = d.start[0, 1] @ d.bank.response(np.exp(2j * np.pi * hz / config.tick_hz).astype(np.complex128))
+    response = d.start[0, 0, 1] @ d.bank.response(np.exp(2j * np.pi * hz / config.tick_hz).astype(np.complex128))
     return 1e6 * float(np.sqrt(np.sum(np.abs(response) ** 2 * sensor_noise(config, hz)) * 0.5))
 
 
