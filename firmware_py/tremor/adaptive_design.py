@@ -298,9 +298,7 @@ def _design_axis(config: TremorConfig, axis: int) -> AdaptiveDesign:
     power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
     quiet = _penalty_above_band(config, bank, axis)
-    plain_sum = [
-        p * covariance(plain, seen) + rest_of(plain) + quiet for p, seen in zip(power, as_seen, strict=True)
-    ]
+    plain_sum = [p * covariance(plain, seen) + rest_of(plain) + quiet for p, seen in zip(power, as_seen, strict=True)]
     plain_cross = [
         p * np.stack([cross(plain * s.seen, t * e) for e in wanted]) for p, t in zip(power, s.tremor, strict=True)
     ]

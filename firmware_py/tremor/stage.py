@@ -68,7 +68,9 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
         for i in range(AXES):
             state.samples[i] = frame[TIP_ACCELERATION + i]
             j, k = (i + 1) % AXES, (i + 2) % AXES  # angular acceleration x arm
-            state.turned[i] = frame[ANGULAR_ACCELERATION + j] * param.arm[k] - frame[ANGULAR_ACCELERATION + k] * param.arm[j]
+            state.turned[i] = (
+                frame[ANGULAR_ACCELERATION + j] * param.arm[k] - frame[ANGULAR_ACCELERATION + k] * param.arm[j]
+            )
         estimator_samples(state, param)
     estimator_output(state, param)
     for i in range(AXES):

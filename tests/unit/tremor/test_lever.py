@@ -1,0 +1,137 @@
+"""What the instrument knows of its own turning: where it comes from, and what it is worth."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from firmware_py.control.config import load_firmware_config
+from firmware_py.frame import ANGULAR_ACCELERATION, LAYOUT, TICK, TIP_ACCELERATION, TREMOR_AHEAD
+from firmware_py.sensing.attitude_params import tip_lever
+from firmware_py.sensing.config import SensingConfig
+from firmware_py.tremor.adaptive_design import design_adaptive
+from firmware_py.tremor.config import LeverConfig, TremorConfig
+from firmware_py.tremor.estimator import Estimator, peek
+from firmware_py.tremor.stage import Tremor
+from hal.bench import load_bench
+from tests.conftest import DEFAULT_BENCH
+from tests.unit.tremor.synthetic import RATE_HZ, rc_filter
+
+ARM_M = 0.1
+POINT, TURN = 0.8e-3, 2.8e-3  # m/s^2/sqrt(Hz), about those of the default bench
+LEVER = LeverConfig(
+    arm_m=(0.0, 0.0, ARM_M),
+    noise_m_s2_rtHz=(TURN, TURN, 0.0),
+    tip_noise_m_s2_rtHz=(float(np.hypot(POINT, TURN)), float(np.hypot(POINT, TURN)), POINT),
+)
+
+
+def frames(share: float, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """(n, Layout.size) of a hand with ``share`` of its tremor along x a turn about y; its tremor (n,) m."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(n) / RATE_HZ
+    size = 20e-6 * (1.0 + 0.3 * np.sin(2 * np.pi * 0.7 * t))
+    own = [size * np.sin(2 * np.pi * hz * t + p) for hz, p in ((9.1, 0.0), (9.8, 1.0))]
+    still, turning = (1.0 - share) ** 0.5 * own[0], share**0.5 * own[1]
+    white = rng.standard_normal((2, n)) * np.sqrt(RATE_HZ / 2)
+
+    def seen(motion_m: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return rc_filter(np.gradient(np.gradient(motion_m, t), t) + noise)
+
+    turned = seen(turning, TURN * white[1])
+    rows = np.zeros((n, LAYOUT.size))
+    rows[:, TICK] = np.arange(n)
+    rows[:, TIP_ACCELERATION] = seen(still, POINT * white[0]) + turned
+    rows[:, ANGULAR_ACCELERATION + 1] = turned / ARM_M
+    return rows, still + turning
+
+
+def residual(config: TremorConfig, rows: np.ndarray, tremor: np.ndarray) -> tuple[float, float]:
+    """(error against the tremor, motion above 25 Hz) of the prediction, um rms."""
+    stage = Tremor(config)
+    ahead = np.empty(len(rows))
+    for k, frame in enumerate(rows.copy()):
+        stage.step(frame)
+        ahead[k] = frame[TREMOR_AHEAD]
+    keep = slice(-5000, None)
+    delay = round(config.loop_delay_s * RATE_HZ)
+    error = (np.roll(ahead, delay) - tremor)[keep]
+    spectrum = np.fft.rfft(ahead[keep] * np.hanning(5000)) / 5000
+    hz = np.fft.rfftfreq(5000, 1 / RATE_HZ)
+    above = np.sqrt(2 * np.sum(np.abs(spectrum[hz > 25.0]) ** 2) / 0.375)
+    return 1e6 * float(np.sqrt(np.mean(error**2))), 1e6 * float(above)
+
+
+def test_a_hand_that_hardly_turns_is_known_better_and_shakes_the_tip_less() -> None:
+    rows, tremor = frames(0.05, 20_000, 1)
+    alone, above = residual(TremorConfig(), rows, tremor)
+    told, above_told = residual(TremorConfig(lever=LEVER), rows, tremor)
+    assert told < 0.75 * alone
+    assert above_told < 0.6 * above
+
+
+def test_a_hand_that_only_turns_is_not_known_worse() -> None:
+    rows, tremor = frames(1.0, 20_000, 2)
+    alone, _ = residual(TremorConfig(), rows, tremor)
+    told, _ = residual(TremorConfig(lever=LEVER), rows, tremor)
+    assert told < 1.1 * alone
+
+
+def test_without_an_arm_it_is_the_estimator_alone() -> None:
+    rows, _ = frames(0.5, 3000, 3)
+    stage = Tremor(TremorConfig())
+    samples = rows[:, TIP_ACCELERATION : TIP_ACCELERATION + 3].copy()
+    for frame in rows:
+        stage.step(frame)
+    found = Estimator(TremorConfig()).run(samples).ahead_m
+    np.testing.assert_array_equal(rows[:, TREMOR_AHEAD : TREMOR_AHEAD + 3], found)
+
+
+def test_noise_of_the_tip_is_that_of_the_point_and_of_the_turn() -> None:
+    """At the quiet point the two are independent, along the axes that a turn moves: variances add."""
+    config = SensingConfig()
+    arm, turn, tip = tip_lever(config)
+    observe = config.observation() / (np.array(config.noise_ug_per_rtHz)[:, None] * 9.80665e-6)
+    covariance = np.linalg.inv(observe.T @ observe)
+    force_alpha = np.random.default_rng(0).multivariate_normal(np.zeros(6), covariance, 400_000)
+    force, alpha = force_alpha[:, :3], force_alpha[:, 3:]
+    at_tip = force + np.cross(alpha, np.asarray(config.tip_m))
+    np.testing.assert_allclose(np.std(at_tip, axis=0), tip, rtol=0.01)
+    np.testing.assert_allclose(np.std(np.cross(alpha, arm), axis=0), turn, rtol=0.01)
+    point = at_tip - np.cross(alpha, arm)
+    for axis in range(2):
+        assert abs(np.corrcoef(point[:, axis], np.cross(alpha, arm)[:, axis])[0, 1]) < 0.1
+
+
+def test_a_bench_gives_the_lever_unless_the_hand_shall_not_be_split(tmp_path: Path) -> None:
+    _, configs = load_firmware_config(load_bench(DEFAULT_BENCH), {}, None)
+    assert configs.tremor.lever is not None
+    assert configs.tremor.lever.arm_m[2] == pytest.approx(0.097, abs=0.02)
+    assert design_adaptive(configs.tremor).bank.channels == 2
+    text = DEFAULT_BENCH.read_text().replace("adaptive = { ", "adaptive = { lever_share = 0.0, ")
+    other = tmp_path / "bench.toml"
+    other.write_text(text.replace('"calibration/', f'"{DEFAULT_BENCH.parent}/calibration/'))
+    assert load_firmware_config(load_bench(other), {}, None)[1].tremor.lever is None
+
+
+def test_a_solved_filter_is_eased_in() -> None:
+    """No tick moves the filter in use by more than its share of the way to the solved one."""
+    estimator = Estimator(TremorConfig(), axes=1)
+    rng = np.random.default_rng(5)
+    t = np.arange(6000) / RATE_HZ
+    samples = rc_filter(-((2 * np.pi * 9.0) ** 2) * 20e-6 * np.sin(2 * np.pi * 9.0 * t)) + 0.05 * rng.standard_normal(
+        6000
+    )
+    estimator.run(samples[:, None])
+    share = float(peek(estimator.params).adaptive.ease)
+    assert share == pytest.approx(1.0 - np.exp(-1.0 / 100.0))
+    for _ in range(20):
+        state = peek(estimator.state).adaptive
+        used = np.array(state.filter[0])
+        estimator.run(samples[:1, None])
+        state = peek(estimator.state).adaptive
+        np.testing.assert_allclose(
+            np.array(state.filter[0]), used + share * (np.array(state.solved[0]) - used), rtol=1e-9
+        )
