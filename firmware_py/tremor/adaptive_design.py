@@ -157,7 +157,8 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
     above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
     features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
     density = a.quiet * above * sensor_noise(config, hz, axis)
-    return np.asarray(np.kron(noise_in_channels(config, axis), np.real((features * density) @ features.conj().T) * 0.5))
+    of_tip = np.real((features * density) @ features.conj().T) * 0.5
+    return np.asarray(np.kron(noise_in_channels(config, axis), of_tip), dtype=np.float64)
 
 
 def spectra(config: TremorConfig, axis: int = 0) -> _Spectra:
@@ -285,7 +286,8 @@ def _design_axis(config: TremorConfig, axis: int) -> AdaptiveDesign:
     target = (taps @ in_blocks) * block_response(s.hz, block, config.tick_hz)
 
     def covariance(features: Complex, density: Array, channels: Array = moving) -> Array:
-        return np.asarray(np.kron(channels, np.real((features * density) @ features.conj().T) * GRID_STEP_HZ))
+        of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
+        return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
 
     def rest_of(features: Complex) -> Array:
         return covariance(features, s.rest - s.noise) + covariance(features, s.noise, noisy)

@@ -34,7 +34,7 @@ def test_report_without_recordings(tmp_path: Path) -> None:
 
 
 def test_published_mean_of_table_5_3() -> None:
-    assert pytest.approx(-12.633, abs=0.01) == PUBLISHED_CROSS
+    assert np.mean(PUBLISHED_CROSS) == pytest.approx(-12.633, abs=0.01)
 
 
 def test_limit_is_judged_where_it_was_not_chosen() -> None:
