@@ -214,7 +214,10 @@ class Recording:
 
     def _known_layout(self) -> tuple[ColumnInfo, ...]:
         if self._layout is None:
-            raise RecordingError(f"{self.path} is not a recording of this instrument: it has no column layout")
+            raise RecordingError(
+                f"{self.path} is not a recording of this instrument: it has no column layout. What 'micron export' made for"
+                " viewers has none; export with --raw to replay"
+            )
         return self._layout
 
     def _take_chunk(self, chunk: ChunkRecord, scanner: Scanner) -> None:

@@ -14,6 +14,7 @@ from mcap.reader import SeekingReader, make_reader
 from typer.testing import CliRunner
 
 from firmware_py.frame import LAYOUT
+from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.writer import RecordingWriter
 from tests.unit.recording.samples import METADATA
@@ -147,6 +148,8 @@ def test_the_command_writes_a_view_or_with_raw_a_recording(run: Recording, tmp_p
     assert micron("--out", str(tmp_path / "part.mcap"), "--raw", "--from", "1", "--to", "1.5").exit_code == 0
     part = Recording(tmp_path / "part.mcap")
     assert np.array_equal(part.array(part.names), run.array(run.names)[500:1000], equal_nan=True)
+    with pytest.raises(RecordingError, match="made for viewers has none; export with --raw"):
+        Recording(tmp_path / "view.mcap")
     for wrong in ([], [str(tmp_path / "a.csv"), "--out", "b.csv"], [str(tmp_path / "a.csv"), "--raw"]):
         assert micron(*wrong).exit_code == 2
 
