@@ -215,8 +215,8 @@ class Recording:
     def _known_layout(self) -> tuple[ColumnInfo, ...]:
         if self._layout is None:
             raise RecordingError(
-                f"{self.path} is not a recording of this instrument: it has no column layout. What 'micron export' made for"
-                " viewers has none; export with --raw to replay"
+                f"{self.path} is not a recording of this instrument: it has no column layout. What 'micron export'"
+                " made for viewers has none; export with --raw to replay"
             )
         return self._layout
 
