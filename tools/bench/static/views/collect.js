@@ -53,7 +53,7 @@ export function mount(root, context) {
     const path = `/api/recordings/${encodeURIComponent(r.name)}`;
     const formats = h("select", { "aria-label": `Export ${r.name}`, onchange: () => { (formats.value === "recover" ? recover(path) : exportAs(path, formats.value)); formats.value = ""; } },
       h("option", { value: "" }, "export …"), ["csv", "npz", "parquet"].map((f) => h("option", { value: f }, f)),
-      link.mayOrder ? h("option", { value: "recover" }, "recover: make a torn file whole") : null);
+      link.mayOrder ? h("option", { value: "recover", title: "Makes a torn file whole, beside it" }, "recover") : null);
     let sure = false;
     const remove = h("button.quiet", { disabled: !link.mayOrder, onclick: () => {
       if (sure) act(() => post(`${path}/delete`));
