@@ -1,4 +1,4 @@
-"""Columns of MATLAB files: versions 4 to 7 by scipy, version 7.3 (an HDF5 file) by h5py (extra ``lab``).
+"""Columns of MATLAB files: versions 4 to 7, and version 7.3 (an HDF5 file) by h5py (extra ``lab``).
 
 Vectors are columns, a matrix is one column per shorter dimension (``name_1``), fields of structs are ``name.field``.
 Sizes that a file claims are checked before anything is allocated.
@@ -6,11 +6,12 @@ Sizes that a file claims are checked before anything is allocated.
 
 from __future__ import annotations
 
+import math
 import struct
-import warnings
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,13 @@ MOST_DEPTH = 8
 MOST_ACROSS = 64
 """Columns of one matrix, at most: a larger one is no table."""
 _HDF5 = b"\x89HDF\r\n\x1a\n"
-_COMPRESSED = 15
+_MATRIX, _COMPRESSED = 14, 15
+_STRUCT = 2
+_NUMBERS = range(6, 16)
+_COMPLEX = 0x0800
+_TYPES = MappingProxyType({1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"})
+"""Types of a part of a matrix (MAT-File Level 5, table of data types) as numpy writes them."""
+_TYPES_LAST = 9
 _HEADER_BYTES = 128
 
 
@@ -40,34 +47,31 @@ def read_mat(path: Path) -> dict[str, Array]:
     is_hdf5 = head.startswith(_HDF5) or head[512:].startswith(_HDF5)
     if not is_hdf5 and head.startswith(b"MATLAB 7.3"):
         raise RecordingError(f"{path}: torn: a MATLAB 7.3 file without its HDF5 part; copy or export it again")
-    found = _hdf5(path) if is_hdf5 else _classic(path, head)
-    return dict(found)
+    if is_hdf5:
+        return dict(_hdf5(path))
+    return dict(_version_5(path, head) if head.startswith(b"MATLAB 5.0") else _version_4(path))
 
 
-def _classic(path: Path, head: bytes) -> Iterator[tuple[str, Array]]:
+def _version_4(path: Path) -> Iterator[tuple[str, Array]]:
     from scipy.io import loadmat
 
-    if head.startswith(b"MATLAB 5.0"):
-        _check_elements(path, head)
-    elif path.stat().st_size > MOST_BYTES:
+    if path.stat().st_size > MOST_BYTES:
         raise RecordingError(f"{path}: larger than {MOST_BYTES >> 30} GiB; save fewer variables")
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of duplicate and unreadable variables, which are not columns
-            content = loadmat(path, struct_as_record=True, squeeze_me=False, verify_compressed_data_integrity=True)
+        content = loadmat(path)
     except Exception as error:  # scipy raises whatever its parser stumbles upon
         raise RecordingError(
             f"{path}: not a readable MATLAB file ({type(error).__name__}: {error}); export it again"
         ) from None
     for name, value in content.items():
-        if not name.startswith("__"):
-            yield from _flat(name, value, 0)
+        if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+            yield from _columns(name, value)
 
 
-def _check_elements(path: Path, head: bytes) -> None:
-    """Refuse a file whose last variable is cut off, or whose variables claim more than can be read."""
+def _version_5(path: Path, head: bytes) -> Iterator[tuple[str, Array]]:
+    """Versions 5 to 7, read here: scipy's compiled reader ends the process where a type is damaged."""
     order = "<" if head[126:128] == b"IM" else ">"
-    size, at, total = path.stat().st_size, _HEADER_BYTES, 0
+    size, at, left = path.stat().st_size, _HEADER_BYTES, MOST_BYTES
     if size < _HEADER_BYTES:
         raise RecordingError(f"{path}: torn: {size} bytes, the header alone has {_HEADER_BYTES}; export it again")
     with path.open("rb") as file:
@@ -80,25 +84,88 @@ def _check_elements(path: Path, head: bytes) -> None:
                     f"{path}: torn: the variable at byte {at} should have {count} bytes, {size - at - len(tag)} are"
                     " left; copy or export the file again"
                 )
-            if kind == _COMPRESSED:
-                try:
-                    inner = zlib.decompressobj().decompress(file.read(min(count, 4096)), 8)
-                except zlib.error as error:
-                    raise RecordingError(f"{path}: the variable at byte {at} is damaged ({error})") from None
-                total += struct.unpack(f"{order}II", inner)[1] if len(inner) == 8 else 0
-            total += count
-            if total > MOST_BYTES:
-                raise RecordingError(f"{path}: unpacks to more than {MOST_BYTES >> 30} GiB; save fewer variables")
+            try:
+                body = file.read(count)
+                if kind == _COMPRESSED:
+                    body = _unpacked(body, order, left)
+                left -= len(body)
+                if left < 0:
+                    raise _TooLargeError
+                if kind in (_MATRIX, _COMPRESSED):
+                    yield from _matrix(body, order, "", 0)
+            except _TooLargeError:
+                raise RecordingError(
+                    f"{path}: unpacks to more than {MOST_BYTES >> 30} GiB; save fewer variables"
+                ) from None
+            except (zlib.error, struct.error, ValueError, LookupError, OverflowError, MemoryError) as error:
+                raise RecordingError(
+                    f"{path}: the variable at byte {at} is damaged ({error}); export the file again"
+                ) from None
             at += 8 + count
 
 
-def _flat(name: str, value: Any, depth: int) -> Iterator[tuple[str, Array]]:
-    """A variable of scipy as columns. Cells, texts and arrays of structs are none."""
-    if isinstance(value, np.ndarray) and value.dtype.names and value.size == 1 and depth < MOST_DEPTH:
-        for field in value.dtype.names:
-            yield from _flat(f"{name}.{field}", value.reshape(-1)[0][field], depth + 1)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        yield from _columns(name, value)
+class _TooLargeError(Exception):
+    """More than may be unpacked."""
+
+
+def _unpacked(body: bytes, order: str, most: int) -> bytes:
+    """The content of the one matrix in a compressed element."""
+    stream = zlib.decompressobj()
+    tag = stream.decompress(body, 8)
+    kind, count = struct.unpack(f"{order}II", tag)
+    if count > most:
+        raise _TooLargeError
+    if kind != _MATRIX:
+        return b""
+    content = stream.decompress(stream.unconsumed_tail, count) if count else b""
+    if len(content) < count:
+        raise ValueError(f"{len(content)} of {count} bytes")
+    return content
+
+
+def _elements(body: bytes, order: str) -> Iterator[tuple[int, bytes]]:
+    """(type, data) of each part of a matrix."""
+    at = 0
+    while at + 8 <= len(body):
+        first, count = struct.unpack_from(f"{order}II", body, at)
+        if first >> 16:  # up to four bytes stand in the tag itself
+            kind, count, begin, after = first & 0xFFFF, first >> 16, at + 4, at + 8
+            if count > 4:
+                raise ValueError(f"a part of {count} bytes in its tag")
+        else:
+            kind, begin, after = first, at + 8, at + 8 + -(-count // 8) * 8
+        if begin + count > len(body):
+            raise ValueError(f"a part of {count} bytes in {len(body)}")
+        yield kind, body[begin : begin + count]
+        at = after
+
+
+def _matrix(body: bytes, order: str, name: str, depth: int) -> Iterator[tuple[str, Array]]:
+    """A variable as columns: numbers, and the fields of a single struct. Cells, texts and complex numbers are none."""
+    parts = _elements(body, order)
+    _, flags = next(parts, (0, b""))
+    if not flags:
+        return
+    (word,) = struct.unpack_from(f"{order}I", flags)
+    shape = np.frombuffer(next(parts, (0, b""))[1], f"{order}i4")
+    own = next(parts, (0, b""))[1].decode("latin-1")
+    name, kind = name or own, word & 0xFF
+    if kind in _NUMBERS and not word & _COMPLEX:
+        code, raw = next(parts, (_TYPES_LAST, b""))
+        values = np.frombuffer(raw, f"{order}{_TYPES[code]}")
+        if shape.size < 2 or (shape < 0).any() or math.prod(map(int, shape)) != values.size:
+            raise ValueError(f"'{name}' has {values.size} values for a shape of {shape.tolist()}")
+        yield from _columns(name, values.reshape(shape, order="F"))
+    elif kind == _STRUCT and math.prod(map(int, shape)) == 1 and depth < MOST_DEPTH:
+        (length,) = struct.unpack_from(f"{order}i", next(parts, (0, b""))[1])
+        words = next(parts, (0, b""))[1]
+        if length <= 0:
+            raise ValueError(f"names of {length} bytes")
+        for begin in range(0, len(words), length):
+            field = words[begin : begin + length].split(b"\0")[0].decode("latin-1")
+            code, inner = next(parts, (0, b""))
+            if code == _MATRIX:
+                yield from _matrix(inner, order, f"{name}.{field}", depth + 1)
 
 
 def _columns(name: str, value: NDArray[Any]) -> Iterator[tuple[str, Array]]:

@@ -83,3 +83,25 @@ def test_a_claim_of_gigabytes_is_refused_before_it_is_believed(tmp_path: Path):
 def test_other_files_come_in_one_block(tmp_path: Path):
     (block,) = read_blocks(v5(tmp_path / "a.mat"), ["t"])
     np.testing.assert_array_equal(block["t"], T)
+
+
+@pytest.mark.parametrize("seed", range(200))
+def test_a_damaged_file_never_ends_the_process(tmp_path: Path, seed: int):
+    """Any bytes of the variables may be wrong: they are read as other numbers, or there is one message."""
+    rng = np.random.default_rng(seed)
+    data = bytearray(v5(tmp_path / "a.mat", compressed=seed % 4 == 0).read_bytes())
+    for at in rng.integers(128, 600, rng.integers(1, 4)):
+        data[int(at)] = int(rng.integers(256))
+    (tmp_path / "a.mat").write_bytes(data)
+    try:
+        read_columns(tmp_path / "a.mat", column_names(tmp_path / "a.mat")[:1])
+    except RecordingError as error:
+        assert "a.mat" in str(error)
+
+
+def test_a_type_that_does_not_exist_is_damage(tmp_path: Path):
+    data = v5(tmp_path / "a.mat").read_bytes()
+    at = data.index(T.tobytes()) - 8
+    (tmp_path / "a.mat").write_bytes(data[:at] + b"\x4a\x00\x00\x00" + data[at + 4 :])
+    with pytest.raises(RecordingError, match="is damaged"):
+        column_names(tmp_path / "a.mat")
