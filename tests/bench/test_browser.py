@@ -36,7 +36,11 @@ def test_live_data_move(page: Any):
     picture = page.locator(".plot canvas").first.screenshot()
     page.wait_for_function(f"{newest} > {first} + 1.0")
     assert page.evaluate("micron.link.frames") > frames
-    assert page.locator(".plot canvas").first.screenshot() != picture
+    for _ in range(100):  # data are there before they are drawn
+        if page.locator(".plot canvas").first.screenshot() != picture:
+            return
+        page.wait_for_timeout(100)
+    pytest.fail("the data moved, the picture did not")
 
 
 def test_a_spike_of_two_milliseconds_is_seen_at_full_zoom_out(page: Any, server: Server, artefacts: Path):
