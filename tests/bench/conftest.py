@@ -163,6 +163,8 @@ def server(session_server: Server) -> Iterator[Server]:
     session_server.wait_running()
     yield session_server
     assert session_server.request("POST", "/api/safe", b"{}")[0] == 200
+    # the next module looks whether it has to start one
+    session_server.wait_for(lambda s: s["phase"] not in ("starting", "running"), "the safe state", START_S)
 
 
 def go(page: Any, view: str) -> None:
