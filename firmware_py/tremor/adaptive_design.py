@@ -94,7 +94,7 @@ class AdaptiveDesign:
 class _Spectra:
     """One-sided densities over ``hz``: unit tremor m^2/Hz per level, the rest as seen, noise of the sensor as seen.
 
-    All are of the tip; ``channel_matrix`` says how much of them the lever's channel sees.
+    All are of the tip; ``motion_in_channels`` and ``noise_in_channels`` say how much of them the lever's channel sees.
     """
 
     hz: Array
