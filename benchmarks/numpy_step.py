@@ -186,27 +186,30 @@ class NumpyStep:
     # -- tremor -------------------------------------------------------------------------------------------
 
     def turned(self, bank: Array, sample: Array) -> Array:
-        """``bank`` (3, m) one tick on, with the ``sample`` (3,) of that tick."""
+        """``bank`` (3, m) one tick on, with the ``sample`` (3, channels) of that tick."""
         p = self.ep.adaptive
         n = len(p.pole_re)
-        poles = bank[:, : 2 * n : 2] + 1j * bank[:, 1 : 2 * n : 2]
-        poles = poles * (p.pole_re + 1j * p.pole_im) + p.pole_gain * sample[:, None]
-        slow = p.slow * bank[:, 2 * n : -1] + (1.0 - p.slow) * sample[:, None]
-        return np.concatenate([poles.view(np.float64), slow, sample[:, None]], axis=1)
+        own, sample = bank.reshape(*sample.shape, -1), sample[..., None]
+        poles = own[..., : 2 * n : 2] + 1j * own[..., 1 : 2 * n : 2]
+        poles = poles * (p.pole_re + 1j * p.pole_im) + p.pole_gain * sample
+        slow = p.slow * own[..., 2 * n : -1] + (1.0 - p.slow) * sample
+        return np.concatenate([poles.view(np.float64), slow, sample], axis=2).reshape(3, -1)
 
     def estimate(self) -> None:
         f, e, p = self.frame, self.e, self.ep
-        a = e.adaptive
+        a, q = e.adaptive, p.adaptive
         e.last_tick = f[AT["tick"]]
         e.ticks += 1.0
         e.at = (e.at + 1) % e.predicted.shape[1]
         if a.running:
             self.learn()
+            a.filter += q.ease * (a.solved - a.filter)
         a.running = 1
         sample = f[AT["tip_acceleration"]].copy()
-        a.bank[:] = self.turned(a.bank, sample)
-        a.pending[:] = sample
         e.samples[:] = sample
+        e.turned[:] = np.cross(f[AT["angular_acceleration"]], p.arm)
+        a.pending[:] = np.stack([e.samples, e.turned], axis=1)[:, : q.onward.shape[1]]
+        a.bank[:] = self.turned(a.bank, a.pending)
         self.combine(sample)
         calm, burst = np.einsum("alom,am->loa", a.filter, a.bank)
         now, ahead, core = calm + a.burst * (burst - calm)
@@ -225,10 +228,11 @@ class NumpyStep:
 
     def learn(self) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
-        lifted = biquads(a.pending, a.weigh[:, None, :], q.weight[None, :])
-        a.weighted[:] = self.turned(a.weighted, lifted)
-        a["sum"] += lifted
-        gated = biquads(a.pending, a.gate[:, None, :], q.gate[None, :])
+        channels = range(a.pending.shape[1])
+        lifted = [biquads(a.pending[:, c], a.weigh[:, c, None, :], q.weight[None, :]) for c in channels]
+        a.weighted[:] = self.turned(a.weighted, np.stack(lifted, axis=1))
+        a["sum"] += lifted[0]
+        gated = biquads(a.pending[:, 0], a.gate[:, None, :], q.gate[None, :])
         a.gate_power += q.gate_smoothing * (gated**2 - a.gate_power)
         a.burst[:] = a.gate_power / (a.gate_power + q.gate_power)
         a.in_block += 1
@@ -264,22 +268,22 @@ class NumpyStep:
     def solve(self, axis: int, level: int) -> None:
         a, q = self.e.adaptive, self.ep.adaptive
         count, n0 = a.count[axis, level], q.prior_blocks[level]
-        known = a.power[axis, level] + n0 * q.weighted_power[level] - q.noise_power * count
+        known = a.power[axis, level] + n0 * q.weighted_power[level] - q.noise_power[axis] * count
         power = max(known / (count + n0), q.least_power)
-        counts = sum((1.0 if other == axis else q.share) * a.count[other, level] for other in range(3))
-        matrix = n0 * (power * q.tremor[level] + q.rest) + (n0 + counts) * q.quiet
+        counts = sum(q.share[axis, other] * a.count[other, level] for other in range(3))
+        matrix = n0 * (power * q.tremor[level] + q.rest[axis]) + (n0 + counts) * q.quiet[axis]
         right = n0 * power * q.cross[level]
         for other in range(3):
             rows, seen = a.count[other, level], a.power[other, level]
             if rows > 0.0 and seen > 0.0:
-                share = 1.0 if other == axis else q.share
+                share = q.share[axis, other]
                 ratio = 1.0 if other == axis else min(1.0, power * rows / seen)
-                matrix = matrix + share * (ratio * a.normal[other, level] + (1.0 - ratio) * rows * q.rest)
-                right = right + share * ratio * (a.right[other, level] - rows * q.noise_cross)
+                matrix = matrix + share * (ratio * a.normal[other, level] + (1.0 - ratio) * rows * q.rest[other])
+                right = right + share * ratio * (a.right[other, level] - rows * q.noise_cross[other])
         scale = 1.0 / np.sqrt(np.diag(matrix))
         lower = np.tril(matrix) * np.outer(scale, scale)
         whole = lower + np.tril(lower, -1).T + 1e-9 * np.eye(len(scale))
-        a.filter[axis, level] = np.linalg.solve(whole, (right * scale).T).T * scale
+        a.solved[axis, level] = np.linalg.solve(whole, (right * scale).T).T * scale
 
     def combine(self, sample: Array) -> None:
         c, p = self.e.combiner.view(np.recarray), self.ep.combiner

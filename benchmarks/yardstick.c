@@ -328,7 +328,9 @@ static int sense(double *f, sense_state *s, const sense_params *p)
 
 typedef estimate_params_adaptive Filter;
 typedef estimate_state_adaptive Adaptive;
-#define BANK ((int)(sizeof(((Filter *)0)->onward) / sizeof(double)))
+#define BANK ((int)(sizeof(((Filter *)0)->onward[0][0]) / sizeof(double)))
+#define CHANNELS ((int)(sizeof(((Filter *)0)->onward[0]) / sizeof(((Filter *)0)->onward[0][0])))
+#define ONE (BANK / CHANNELS)
 #define POLES ((int)(sizeof(((Filter *)0)->pole_re) / sizeof(double)))
 #define SLOW ((int)(sizeof(((Filter *)0)->slow) / sizeof(double)))
 #define TAPS_ ((int)(sizeof(((Filter *)0)->taps) / sizeof(double) / OUTPUTS))
@@ -336,22 +338,25 @@ typedef estimate_state_adaptive Adaptive;
 #define OUTPUTS 3 /* now, ahead, core */
 #define LEVELS 2
 
-static void bank_turn(double *b, const Filter *p)
+static void bank_turn(double *bank, const Filter *p)
 {
-    for (int r = 0; r < POLES; r++) {
-        double re = b[2 * r], im = b[2 * r + 1];
-        b[2 * r] = p->pole_re[r] * re - p->pole_im[r] * im;
-        b[2 * r + 1] = p->pole_re[r] * im + p->pole_im[r] * re;
+    for (double *b = bank; b < bank + BANK; b += ONE) {
+        for (int r = 0; r < POLES; r++) {
+            double re = b[2 * r], im = b[2 * r + 1];
+            b[2 * r] = p->pole_re[r] * re - p->pole_im[r] * im;
+            b[2 * r + 1] = p->pole_re[r] * im + p->pole_im[r] * re;
+        }
+        for (int r = 0; r < SLOW; r++) b[2 * POLES + r] *= p->slow[r];
+        b[ONE - 1] = 0.0;
     }
-    for (int r = 0; r < SLOW; r++) b[2 * POLES + r] *= p->slow[r];
-    b[BANK - 1] = 0.0;
 }
 
-static void bank_add(double *b, double sample, const Filter *p)
+static void bank_add(double *bank, int channel, double sample, const Filter *p)
 {
+    double *b = bank + channel * ONE;
     for (int r = 0; r < POLES; r++) b[2 * r] += p->pole_gain[r] * sample;
     for (int r = 0; r < SLOW; r++) b[2 * POLES + r] += (1.0 - p->slow[r]) * sample;
-    b[BANK - 1] += sample;
+    b[ONE - 1] += sample;
 }
 
 static void regress(Adaptive *s, int axis, int at, const Filter *p)
@@ -381,24 +386,24 @@ static void regress(Adaptive *s, int axis, int at, const Filter *p)
 static void solve(Adaptive *s, int axis, int l, const Filter *p)
 {
     double a[BANK][BANK], scale[BANK], count = s->count[axis][l], n0 = p->prior_blocks[l];
-    double(*x)[sizeof(((Filter *)0)->onward) / sizeof(double)] = s->solution;
-    double power = (s->power[axis][l] + n0 * p->weighted_power[l] - p->noise_power * count) / (count + n0);
+    double(*x)[sizeof(((Filter *)0)->onward[0][0]) / sizeof(double)] = s->solution;
+    double power = (s->power[axis][l] + n0 * p->weighted_power[l] - p->noise_power[axis] * count) / (count + n0);
     if (power < p->least_power) power = p->least_power;
     double all = n0;
-    for (int other = 0; other < 3; other++) all += (other == axis ? 1.0 : p->share) * s->count[other][l];
+    for (int other = 0; other < 3; other++) all += p->share[axis][other] * s->count[other][l];
     for (int i = 0; i < BANK; i++) {
         for (int j = 0; j <= i; j++)
-            a[i][j] = n0 * (power * p->tremor[l][i][j] + p->rest[i][j]) + all * p->quiet[i][j];
+            a[i][j] = n0 * (power * p->tremor[l][i][j] + p->rest[axis][i][j]) + all * p->quiet[axis][i][j];
         for (int o = 0; o < OUTPUTS; o++) x[o][i] = n0 * power * p->cross[l][o][i];
     }
     for (int other = 0; other < 3; other++) {
-        double rows = s->count[other][l], seen = s->power[other][l], share = other == axis ? 1.0 : p->share;
-        if (rows <= 0.0 || seen <= 0.0) continue;
+        double rows = s->count[other][l], seen = s->power[other][l], share = p->share[axis][other];
+        if (rows <= 0.0 || seen <= 0.0 || share <= 0.0) continue;
         double ratio = other == axis || power * rows > seen ? 1.0 : power * rows / seen;
         double factor = share * ratio, back = share * (1.0 - ratio) * rows;
         for (int i = 0; i < BANK; i++) {
-            for (int j = 0; j <= i; j++) a[i][j] += factor * s->normal[other][l][i][j] + back * p->rest[i][j];
-            for (int o = 0; o < OUTPUTS; o++) x[o][i] += factor * (s->right[other][l][o][i] - rows * p->noise_cross[o][i]);
+            for (int j = 0; j <= i; j++) a[i][j] += factor * s->normal[other][l][i][j] + back * p->rest[other][i][j];
+            for (int o = 0; o < OUTPUTS; o++) x[o][i] += factor * (s->right[other][l][o][i] - rows * p->noise_cross[other][o][i]);
         }
     }
     for (int i = 0; i < BANK; i++) scale[i] = 1.0 / sqrt(a[i][i]);
@@ -421,7 +426,7 @@ static void solve(Adaptive *s, int axis, int l, const Filter *p)
             for (int k = i + 1; k < BANK; k++) total -= a[k][i] * x[o][k];
             x[o][i] = total / a[i][i];
         }
-        for (int i = 0; i < BANK; i++) s->filter[axis][l][o][i] = x[o][i] * scale[i];
+        for (int i = 0; i < BANK; i++) s->solved[axis][l][o][i] = x[o][i] * scale[i];
     }
 }
 
@@ -436,13 +441,16 @@ static double section(double x, double *memory, const double *b)
 static void learn(Adaptive *s, const Filter *p)
 {
     for (int i = 0; i < 3; i++) {
-        double sample = s->pending[i], lifted = section(sample, s->weigh[i], p->weight);
+        double sample = s->pending[i][0];
         bank_turn(s->weighted[i], p);
-        bank_add(s->weighted[i], lifted, p);
-        s->sum[i] += lifted;
+        for (int c = 0; c < CHANNELS; c++) {
+            double lifted = section(s->pending[i][c], s->weigh[i][c], p->weight);
+            bank_add(s->weighted[i], c, lifted, p);
+            if (c == 0) s->sum[i] += lifted;
+        }
         double gated = section(sample, s->gate[i], p->gate);
         s->gate_power[i] += p->gate_smoothing * (gated * gated - s->gate_power[i]);
-        s->burst[i] = s->gate_power[i] / (s->gate_power[i] + p->gate_power);
+        s->burst[i] = s->gate_power[i] / (s->gate_power[i] + p->gate_power[i]);
     }
     if (++s->in_block < p->block_ticks) return;
     s->in_block = 0;
@@ -499,17 +507,28 @@ static int estimate(double *f, estimate_state *s, const estimate_params *p)
     s->last_tick = f[TICK];
     s->ticks += 1.0;
     s->at = (s->at + 1) % 64;
-    if (a->running) learn(a, q);
+    if (a->running) {
+        learn(a, q);
+        double *used = &a->filter[0][0][0][0], *solved = &a->solved[0][0][0][0];
+        for (int n = 0; n < 3 * LEVELS * OUTPUTS * BANK; n++) used[n] += q->ease * (solved[n] - used[n]);
+    }
     a->running = 1;
     for (int i = 0; i < 3; i++) {
-        double predicted = 0.0, sample = f[TIP_ACCELERATION + i];
-        for (int j = 0; j < BANK; j++) predicted += q->onward[j] * a->bank[i][j];
-        bank_turn(a->bank[i], q);
-        bank_add(a->bank[i], predicted, q);
+        int k = (i + 1) % 3, l = (i + 2) % 3;
+        double sample = f[TIP_ACCELERATION + i], predicted[CHANNELS];
         s->samples[i] = sample;
+        s->turned[i] = f[ANGULAR_ACCELERATION + k] * p->arm[l] - f[ANGULAR_ACCELERATION + l] * p->arm[k];
+        for (int c = 0; c < CHANNELS; c++) {
+            predicted[c] = 0.0;
+            for (int j = 0; j < BANK; j++) predicted[c] += q->onward[i][c][j] * a->bank[i][j];
+        }
+        bank_turn(a->bank[i], q);
+        for (int c = 0; c < CHANNELS; c++) bank_add(a->bank[i], c, predicted[c], q);
         combine(sample, &s->combiner[i], &p->combiner);
-        bank_add(a->bank[i], sample - predicted, q);
-        a->pending[i] = sample;
+        for (int c = 0; c < CHANNELS; c++) {
+            a->pending[i][c] = c ? s->turned[i] : sample;
+            bank_add(a->bank[i], c, a->pending[i][c] - predicted[c], q);
+        }
     }
     for (int i = 0; i < 3; i++) {
         double sum[LEVELS][OUTPUTS] = {{0.0}}, out[OUTPUTS];

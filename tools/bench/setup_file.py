@@ -127,6 +127,10 @@ def _inputs(given: Any) -> dict[str, int]:
     return found
 
 
+STILL_TIP = "adaptive = { cancel_from_hz = [3.0, 6.0], cancel_to_hz = [14.0, 18.0], emphasis = 3.0, quiet = 300.0 }"
+"""As in the project's own benches whose output takes a command a tick (docs/tremor.md)."""
+
+
 def bench_text(draft: Draft, calibrations: list[str]) -> str:
     """Return the bench file as a text with comments."""
     uris, inputs = draft.uris, draft.inputs
@@ -194,6 +198,7 @@ def bench_text(draft: Draft, calibrations: list[str]) -> str:
         "positions_m = [[0.0101, -0.0101, 0.0], [-0.0101, 0.0101, 0.0], [0.0042, 0.0042, 0.116]]",
         "tip_m = [0.0, 0.0, 0.155]", "",
         "[firmware.tremor]", f"loop_delay_s = {delay_s} # sample to what the command does, on the emulated bench",
+        *(() if draft.output == "e727" else (STILL_TIP,)),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
