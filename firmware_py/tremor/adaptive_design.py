@@ -13,7 +13,8 @@ that instant: band, double integration and the sensor's filter in one set of tap
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import lru_cache
 from math import isfinite, pi
 from typing import Any
 
@@ -252,22 +253,15 @@ def _peak(hz: float, q: float, tick_hz: float) -> tuple[Array, Array]:
     return b, denominator
 
 
+@lru_cache(maxsize=8)
 def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
-    """Return everything that follows from ``config``: the axes' designs, stacked."""
-    if config.lever is None:
-        axes = [_design_axis(config, 0)] * AXES
-    else:
-        axes = [_design_axis(config, axis) for axis in range(AXES)]
-    own = ("gate_power", "rest", "quiet", "noise_cross", "noise_power", "start", "onward")
-    return replace(axes[0], **{name: np.stack([getattr(each, name) for each in axes]) for name in own})
-
-
-def _design_axis(config: TremorConfig, axis: int) -> AdaptiveDesign:
+    """Return everything that follows from ``config``: the axes' designs, stacked. A run asks for it several times, so
+    it is kept, read-only. Without a lever the axes are one."""
     a = config.adaptive
-    moving, noisy = motion_in_channels(config), noise_in_channels(config, axis)
+    moving = motion_in_channels(config)
     bank = bank_of(a, config.tick_hz, len(moving))
     block = max(1, round(a.block_s * config.tick_hz))
-    s = spectra(config, axis)
+    s = spectra(config)
     w = 2.0 * pi * s.hz
     z = _complex(np.exp(1j * w / config.tick_hz))
     back = _complex(1.0 / z)
@@ -285,49 +279,66 @@ def _design_axis(config: TremorConfig, axis: int) -> AdaptiveDesign:
     in_blocks = np.exp(-1j * w[None, :] * block / config.tick_hz * (np.arange(len(taps[0])) - half)[:, None])
     target = (taps @ in_blocks) * block_response(s.hz, block, config.tick_hz)
 
-    def covariance(features: Complex, density: Array, channels: Array = moving) -> Array:
-        of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
-        return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
-
-    def rest_of(features: Complex) -> Array:
-        return covariance(features, s.rest - s.noise) + covariance(features, s.noise, noisy)
-
-    def cross(features: Complex, density: Complex | Array, channels: Array = moving, of: int = 0) -> Array:
-        return np.asarray(np.kron(channels[of], np.real(np.conj(features) @ density) * GRID_STEP_HZ))
-
     wanted = [band(s.hz, edges) * np.exp(1j * w * h) for h, edges in outputs]
     as_seen = np.abs(s.seen) ** 2 * s.tremor
     power = np.array([a.tremor_rms_m**2, a.burst_rms_m**2])
     unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
-    quiet = _penalty_above_band(config, bank, axis)
-    plain_sum = [p * covariance(plain, seen) + rest_of(plain) + quiet for p, seen in zip(power, as_seen, strict=True)]
+    tremor = [p * _covariance(plain, seen, moving) for p, seen in zip(power, as_seen, strict=True)]
     plain_cross = [
-        p * np.stack([cross(plain * s.seen, t * e) for e in wanted]) for p, t in zip(power, s.tremor, strict=True)
+        p * np.stack([_cross(plain * s.seen, t * e, moving[0]) for e in wanted])
+        for p, t in zip(power, s.tremor, strict=True)
     ]
-    next_sample = [
-        cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, of=c) + cross(plain, s.noise * z, noisy, c)
-        for c in range(bank.channels)
-    ]
-    return AdaptiveDesign(
+    plain_rest, phi_rest = (_covariance(features, s.rest - s.noise, moving) for features in (plain, phi))
+    next_motion = np.stack([_cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, row) for row in moving])
+
+    def of_axis(axis: int) -> dict[str, Any]:
+        """What the sensor's noise along ``axis`` has a part in."""
+        noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
+        quiet = _penalty_above_band(config, bank, axis)
+        rest = plain_rest + _covariance(plain, noise, noisy)
+        sums = [part + rest + quiet for part in tremor]
+        gate = np.sum((s.rest + (noise - s.noise)) * np.abs(through_gate) ** 2) * GRID_STEP_HZ
+        return {
+            "gate_power": a.gate_ratio * gate,
+            "rest": phi_rest + _covariance(phi, noise, noisy),
+            "quiet": quiet,
+            "noise_cross": np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]),
+            "noise_power": np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ,
+            "start": np.stack([solve_scaled(m, r) for m, r in zip(sums, plain_cross, strict=True)]),
+            "onward": solve_scaled(sums[0], next_motion + np.stack([_cross(plain, noise * z, row) for row in noisy])),
+        }
+
+    first = of_axis(0)
+    axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
+    found = AdaptiveDesign(
         bank=bank,
         block_ticks=block,
         taps=taps,
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
         gate=np.array([*gate_b, *gate_a[1:]]) / gate_a[0],
-        gate_power=np.asarray(a.gate_ratio * np.sum(s.rest * np.abs(through_gate) ** 2) * GRID_STEP_HZ),
-        tremor=np.stack([covariance(phi, seen) / u for seen, u in zip(as_seen, unit, strict=True)]),
-        rest=rest_of(phi),
-        quiet=quiet,
+        tremor=np.stack([_covariance(phi, seen, moving) / u for seen, u in zip(as_seen, unit, strict=True)]),
         cross=np.stack(
             [
-                np.stack([cross(phi * s.seen, weight * t * e) for e in wanted]) / u
+                np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
                 for t, u in zip(s.tremor, unit, strict=True)
             ]
         ),
-        noise_cross=np.stack([cross(phi, s.noise * weight * t, noisy) for t in target]),
-        noise_power=np.asarray(np.sum(s.noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ),
         weighted_power=power * unit,
         least_power=a.least_rms_m**2 * float(unit[0]),
-        start=np.stack([solve_scaled(m, r) for m, r in zip(plain_sum, plain_cross, strict=True)]),
-        onward=solve_scaled(plain_sum[0], np.stack(next_sample)),
+        **{name: np.stack([each[name] for each in axes]) for name in first},
     )
+    for array in vars(found).values():
+        if isinstance(array, np.ndarray):
+            array.flags.writeable = False
+    return found
+
+
+def _covariance(features: Complex, density: Array, channels: Array) -> Array:
+    of_tip = np.real((features * density) @ features.conj().T) * GRID_STEP_HZ
+    return np.asarray(np.kron(channels, of_tip), dtype=np.float64)
+
+
+def _cross(features: Complex, density: Complex | Array, channel: Array) -> Array:
+    """(m,): features of all channels with a signal that ``channel`` (C,) relates to each of them."""
+    of_tip = np.real(np.conj(features) @ density) * GRID_STEP_HZ
+    return np.asarray(np.kron(channel, of_tip), dtype=np.float64)

@@ -221,6 +221,9 @@ class TremorConfig(_Table):
     """Options of a method that an installed package offers."""
     detectors: DetectorConfig = DetectorConfig()
 
+    def __hash__(self) -> int:  # of equal configurations it is equal; ``own`` has none
+        return hash((self.tick_hz, self.loop_delay_s, self.filter_cutoff_rad_s, self.adaptive, self.lever))
+
     @field_validator("method")
     @classmethod
     def _known(cls, method: str) -> str:
