@@ -109,7 +109,12 @@ def test_a_bench_gives_the_lever_unless_the_hand_shall_not_be_split(tmp_path: Pa
     _, configs = load_firmware_config(load_bench(DEFAULT_BENCH), {}, None)
     assert configs.tremor.lever is not None
     assert configs.tremor.lever.arm_m[2] == pytest.approx(0.097, abs=0.02)
-    assert design_adaptive(configs.tremor).bank.channels == 2
+    design = design_adaptive(configs.tremor)
+    assert design.bank.channels == 2
+    # a run asks twice; what it is given may not be changed, and another delay is another design
+    assert design_adaptive(configs.tremor.model_copy(deep=True)) is design
+    assert not any(array.flags.writeable for array in (design.taps, design.start, design.onward, design.quiet))
+    assert design_adaptive(configs.tremor.model_copy(update={"loop_delay_s": 0.002})) is not design
     text = DEFAULT_BENCH.read_text().replace("adaptive = { ", "adaptive = { lever_share = 0.0, ")
     other = tmp_path / "bench.toml"
     other.write_text(text.replace('"calibration/', f'"{DEFAULT_BENCH.parent}/calibration/'))
