@@ -22,9 +22,10 @@ def child_command(module: str, *arguments: str) -> list[str]:
 
 
 def child_environment() -> dict[str, str]:
-    """The environment for ``child_command``: from a source tree, this tree comes first on the import path."""
+    """The environment for ``child_command``: our packages come first on the import path where they did so here, and
+    from a source tree."""
     environment = dict(os.environ)
-    if (ROOT / "pyproject.toml").exists():
+    if str(ROOT) in sys.path[:1] or (ROOT / "pyproject.toml").exists():
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), environment.get("PYTHONPATH"))))
     return environment
 

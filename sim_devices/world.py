@@ -295,6 +295,8 @@ class World:
         self._rest_at(controller.output_V)
 
     def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        if device.get("address") is None:
+            raise BenchError(f"[device.{name}] has no address; a part on an I2C bus needs one, such as address = 0x0C")
         try:
             self.buses.i2c[device["bus"]].attach(int(device["address"]), face)
         except ValueError as error:

@@ -22,9 +22,8 @@ from firmware_py.recording import format as fmt
 from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.errors import RecorderFailed, RecordingError
 from firmware_py.recording.ring import EventRing, RowRing
-from hal.children import child_command
+from hal.children import child_command, child_environment
 
-_ROOT = Path(__file__).resolve().parents[2]
 _PAUSE_S = 0.0005
 
 
@@ -101,13 +100,12 @@ class RecorderProcess:
         path = Path(path).absolute()
         rows = RowRing.create(len(columns), capacity_rows)
         events = EventRing.create(capacity_event_bytes)
-        environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(_ROOT), *_inherited_path()])}
         process = subprocess.Popen(
             child_command("firmware_py.recording.recorder", str(rows.fd), str(events.fd)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=(rows.fd, events.fd),
-            env=environment,
+            env=child_environment(),
             start_new_session=True,  # Ctrl-C is for the firmware, which then stops the recorder
         )
         handle = cls(path, process, rows, events, metadata.get("clock") == "virtual" if lossless is None else lossless)
@@ -221,11 +219,6 @@ class RecorderProcess:
     def _close_rings(self) -> None:
         self._rows.close()
         self._events.close()
-
-
-def _inherited_path() -> list[str]:
-    inherited = os.environ.get("PYTHONPATH")
-    return [inherited] if inherited else []
 
 
 if __name__ == "__main__":

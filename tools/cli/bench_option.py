@@ -1,4 +1,4 @@
-"""``--bench FILE``, the same in every command."""
+"""``--bench``, the same in every command."""
 
 from __future__ import annotations
 
@@ -10,7 +10,10 @@ import typer
 from hal.clock import Pace
 
 BenchOption = Annotated[
-    Path | None, typer.Option("--bench", metavar="FILE", help="Bench file; the default is the emulated bench.")
+    Path | None,
+    typer.Option(
+        "--bench", metavar="FILE|NAME", help="Bench file, or a name that ships; the default is micron, emulated."
+    ),
 ]
 VirtualOption = Annotated[
     bool, typer.Option("--virtual", help="Virtual time: emulated benches only, deterministic, as fast as it can.")
@@ -23,14 +26,13 @@ def pace_of(virtual: bool) -> Pace | None:
 
 
 def bench_path(chosen: Path | None) -> Path:
-    """The chosen bench, or the one that ships with the package. Where a chosen one names code that is not ours, the
-    command goes on in a process of its own, and this call ends with its status.
+    """The chosen bench, by its path or by the name of one that ships. Where its file names code that is not ours, the
+    command goes on in a process of its own, and this call ends with its status. Raises ``InputError``.
     """
-    import benches
-
-    if chosen is None:
-        return Path(benches.__file__).with_name("micron.toml")
     from tools.cli.supervise import supervise
+    from tools.emulate.shipped import bench_file
 
-    supervise(chosen)
-    return chosen
+    file = bench_file("micron" if chosen is None else str(chosen))
+    if chosen is not None:
+        supervise(file)
+    return file

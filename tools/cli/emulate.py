@@ -54,7 +54,6 @@ def emulate(
 
     Example: micron emulate imus -- printenv MICRON_I2C0
     """
-    from tools.emulate.shipped import bench_file
     from tools.emulate.stimulus import read_stimulus
     from tools.emulate.world import serve
 
@@ -64,7 +63,7 @@ def emulate(
         program = None if not command else shutil.which(command[0])
         if command and program is None:
             raise InputError(f"{command[0]}: no such program; name one that is on the PATH, or its path")
-        file = load_bench(bench_path(None if bench is None else bench_file(bench)))
+        file = load_bench(bench_path(bench))
         columns = [read_stimulus(text) for text in stimulus or ()]
         with serve(file, tcp_port=tcp, can=can, stimuli=columns, needs_shim=bool(command)) as served:
             write_json(served.as_dict(), json_file)

@@ -52,7 +52,7 @@ def test_an_empty_project_has_the_fixtures(tmp_path: Path) -> None:
     shutil.copy(EXAMPLE, tmp_path / "test_dac.py")
     (tmp_path / "test_more.py").write_text(EVERYTHING, encoding="utf-8")
     is_installed = any(entry.name == "micron" for entry in entry_points(group="pytest11"))
-    plugin = [] if is_installed else ["-p", "tools.emulate.plugin"]
+    plugin = [] if is_installed else ["-p", "micron_pytest"]
     command = [sys.executable, "-m", "pytest", *plugin, "-q", "-p", "no:cacheprovider", "-W", "error"]
     environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
@@ -66,10 +66,16 @@ def test_the_example_has_ten_lines() -> None:
 
 
 def test_the_plugin_imports_nothing_heavy() -> None:
-    program = "import sys, pytest; old = set(sys.modules); import tools.emulate.plugin; print(*set(sys.modules) - old)"
-    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    program = "import sys, pytest; old = set(sys.modules); import micron_pytest; print(*set(sys.modules) - old)"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT / "tools" / "start")}
     done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    assert set(done.stdout.split()) <= {"tools", "tools.emulate", "tools.emulate.plugin"}
+    assert set(done.stdout.split()) <= {
+        "micron_start",
+        "micron_pytest",
+        "importlib.machinery",
+        "importlib.abc",
+        "importlib",
+    }
 
 
 @pytest.mark.slow
@@ -144,6 +150,8 @@ def test_the_serial_shape() -> None:
 def test_what_cannot_be_emulated_is_said() -> None:
     with pytest.raises(BenchError, match="there is no driver 'abacus'"):
         open_part("abacus")
+    with pytest.raises(BenchError, match=r"\[device.ad5696r\] has no address"):
+        open_part("ad5696r")
     with pytest.raises(InputError, match="these do: endoscope"):
         open_named("nowhere")
     bench = open_named(ROOT / "tests" / "wire" / "emulators" / "emulated.toml")

@@ -1,6 +1,7 @@
 """The pytest plugin ``micron``: emulated devices in the tests of other projects, in virtual time.
 
-It costs nothing until a fixture is used: what the fixtures need is imported by them.
+It costs nothing until a fixture is used: what the fixtures need is imported by them. A project that has packages
+``tools`` or ``hal`` of its own keeps them.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pytest
+from micron_start import put_ours_first
 
 if TYPE_CHECKING:
     from tools.emulate.virtual import VirtualBench
@@ -21,6 +23,7 @@ def micron_bench() -> Iterator[Callable[[str | Path], VirtualBench]]:
     opened: list[VirtualBench] = []
 
     def open_one(bench: str | Path) -> VirtualBench:
+        put_ours_first()
         from tools.emulate.virtual import open_named
 
         opened.append(open_named(bench))
@@ -37,6 +40,7 @@ def emulated() -> Iterator[Callable[..., VirtualBench]]:
     opened: list[VirtualBench] = []
 
     def open_one(part: str, **options: Any) -> VirtualBench:
+        put_ours_first()
         from tools.emulate.virtual import open_part
 
         opened.append(open_part(part, **options))
