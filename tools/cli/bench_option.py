@@ -25,7 +25,7 @@ def pace_of(virtual: bool) -> Pace | None:
     return "virtual" if virtual else None
 
 
-def bench_path(chosen: Path | None) -> Path:
+def bench_path(chosen: Path | str | None) -> Path:
     """The chosen bench, by its path or by the name of one that ships. Where its file names code that is not ours, the
     command goes on in a process of its own, and this call ends with its status. Raises ``InputError``.
     """
