@@ -6,10 +6,10 @@ What lives here: the frame table and its loading. What must not: what a frame ma
 
 from __future__ import annotations
 
-from importlib import resources
+from importlib import import_module, resources
 from typing import Protocol, cast
 
-import cantools.database
+from hal.backends.can_package import import_can
 
 
 class DbcMessage(Protocol):
@@ -28,5 +28,7 @@ class DbcDatabase(Protocol):
 
 def load_database() -> DbcDatabase:
     """A fresh database object (about 10 ms); decoded signals are numbers, choices stay numbers too."""
+    import_can()  # before cantools does it
+    cantools = import_module("cantools.database")
     text = resources.files("drivers.dbc").joinpath("micron.dbc").read_text(encoding="ascii")
-    return cast(DbcDatabase, cantools.database.load_string(text, "dbc"))
+    return cast(DbcDatabase, cantools.load_string(text, "dbc"))

@@ -10,13 +10,13 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import importlib
 import os
 import select
 import socket
 import time
 from typing import Any
 
+from hal.backends.can_package import import_can
 from hal.contracts import Clock
 from hal.errors import BenchError, BusError, Closed, DeviceNotFound, Disconnected, HalError, HalTimeout
 from hal.types import CanFrame, CanStats, PortInfo, TimeSource
@@ -67,7 +67,7 @@ def open_udp_multicast(group: str, port: int, clock: Clock) -> PythonCan:
 
 
 def _open(uri: str, clock: Clock, *, marked: bool = False, **options: Any) -> PythonCan:
-    can: Any = importlib.import_module("can")
+    can = import_can()
     try:
         bus: Any = can.Bus(**options)
     except ValueError as error:

@@ -8,10 +8,10 @@ of the loop). ``hop_limit=0`` keeps the frames on this machine.
 
 from __future__ import annotations
 
-import importlib
 import socket
 from typing import Any
 
+from hal.backends.can_package import import_can
 from hal.errors import BenchError
 from sim_devices.transports.can_hub import EXTENDED, CanHub
 
@@ -32,7 +32,7 @@ class CanCarrier:
 
     def __init__(self, hub: CanHub, bus: Any, uri: str, *, hears_itself: bool) -> None:
         self.uri = uri
-        self._message: Any = importlib.import_module("can").Message
+        self._message: Any = import_can().Message
         self._bus = bus
         self._hub = hub
         self._hears_itself = hears_itself
@@ -60,14 +60,14 @@ class CanCarrier:
 
 def on_multicast(hub: CanHub, port: int) -> CanCarrier:
     """Join ``hub`` to UDP multicast at ``port``."""
-    bus = importlib.import_module("can").Bus(interface="udp_multicast", channel=GROUP, port=port, hop_limit=0, fd=False)
+    bus = import_can().Bus(interface="udp_multicast", channel=GROUP, port=port, hop_limit=0, fd=False)
     return CanCarrier(hub, bus, f"udp-multicast://{GROUP}:{port}", hears_itself=True)
 
 
 def on_socketcan(hub: CanHub, interface: str) -> CanCarrier:
     """Join ``hub`` to a CAN interface of the kernel. Raises ``BenchError`` when it cannot be opened."""
     try:
-        bus = importlib.import_module("can").Bus(interface="socketcan", channel=interface)
+        bus = import_can().Bus(interface="socketcan", channel=interface)
     except OSError as error:
         raise BenchError(
             f"CAN interface '{interface}' cannot be opened ({error.strerror}); make it with: "
