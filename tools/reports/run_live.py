@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfilt, sosfilt_zi
 
+from firmware_py.designs import design
 from hal.bench import BenchFile, OpenBench
 from hal.clock import Pace, VirtualClock
 from sim_devices.lockstep_world import LockstepWorld
@@ -49,8 +49,9 @@ class TipWatch:
 
     def __init__(self) -> None:
         rate_hz = 1e9 / LOOK_NS
-        self._sos = butter(2, TREMOR_BAND_HZ, btype="bandpass", fs=rate_hz, output="sos")
-        self._state: NDArray[np.float64] | None = None
+        # scipy itself would cost every run a second at its start
+        (self._sos,) = design("butter", 2, TREMOR_BAND_HZ, btype="bandpass", fs=rate_hz, output="sos")
+        self._memory: NDArray[np.float64] | None = None
         self._power = np.zeros(2)
         self._forget = LOOK_NS * 1e-9 / WINDOW_S
         self._n = 0
@@ -72,12 +73,27 @@ class TipWatch:
 
     def add(self, tips_m: NDArray[np.float64]) -> None:
         """One look (6,): the tip with the manipulator at rest, the tip, in metres."""
-        if self._state is None:
-            self._state = sosfilt_zi(self._sos)[:, :, None] * tips_m
-        out, self._state = sosfilt(self._sos, tips_m[None, :], axis=0, zi=self._state)
-        power = 1e12 * np.array([np.sum(out[0, :3] ** 2), np.sum(out[0, 3:] ** 2)])
+        if self._memory is None:
+            self._memory = self._at_rest(tips_m)
+        through = tips_m
+        for (b0, b1, b2, _, a1, a2), memory in zip(self._sos, self._memory, strict=True):
+            out = b0 * through + memory[0]
+            memory[0] = b1 * through - a1 * out + memory[1]
+            memory[1] = b2 * through - a2 * out
+            through = out
+        power = 1e12 * np.array([np.sum(through[:3] ** 2), np.sum(through[3:] ** 2)])
         self._n += 1
         self._power += max(self._forget, 1.0 / self._n) * (power - self._power)
+
+    def _at_rest(self, tips_m: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(sections, 2, 6): memory of the band-pass where the tip has always been at ``tips_m``."""
+        memory, through = np.zeros((len(self._sos), 2, len(tips_m))), tips_m
+        for (b0, b1, b2, _, a1, a2), kept in zip(self._sos, memory, strict=True):
+            out = (b0 + b1 + b2) / (1.0 + a1 + a2) * through
+            kept[1] = b2 * through - a2 * out
+            kept[0] = b1 * through - a1 * out + kept[1]
+            through = out
+        return memory
 
     def rms_um(self) -> tuple[float, float] | None:
         """Tremor without and with compensation over the last second or so; None before there is any."""

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import butter, sosfiltfilt
 
 Array = NDArray[np.float64]
 AXES = ("x", "y", "z")
@@ -72,6 +71,8 @@ def band_pass(x: Array, rate_hz: float, band_hz: tuple[float, float]) -> Array:
 
     A band that begins at 0 Hz is a low-pass, one that ends at or above half of ``rate_hz`` a high-pass.
     """
+    from scipy.signal import butter, sosfiltfilt  # a second of CPU, which a run without figures does not need
+
     low_hz, high_hz = band_hz
     if low_hz <= 0.0:
         sos = butter(4, high_hz, btype="lowpass", fs=rate_hz, output="sos")
@@ -125,8 +126,7 @@ def tremor_figures(
 
 def _voluntary_response(rigid: Array, tip: Array, rate_hz: float, keep: NDArray[np.bool_]) -> tuple[float, float]:
     """Gain and delay from the resting to the working tip below 1 Hz, by regression on path and velocity."""
-    sos = butter(4, VOLUNTARY_HZ, fs=rate_hz, output="sos")
-    slow_rigid, slow_tip = (np.asarray(sosfiltfilt(sos, x, axis=0)) for x in (rigid, tip))
+    slow_rigid, slow_tip = (band_pass(x, rate_hz, (0.0, VOLUNTARY_HZ)) for x in (rigid, tip))
     velocity = np.gradient(slow_rigid, 1.0 / rate_hz, axis=0)[keep]
     x, y = slow_rigid[keep], slow_tip[keep]
     x, y = x - x.mean(axis=0), y - y.mean(axis=0)
