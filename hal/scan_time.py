@@ -11,7 +11,9 @@ tenth of a period cannot be distinguished from the jitter of the arrivals.
 
 from __future__ import annotations
 
-from collections import deque
+from typing import Any
+
+import numpy as np
 
 SHIFT = 0.15
 """Distance of an arrival from the line that may indicate a clock step, as a fraction of the period.
@@ -25,92 +27,74 @@ SHIFT_SPREAD = 0.05
 """Largest spread of agreeing arrivals above the least late one, as a fraction of the period; a busy host has more."""
 
 
+TIMELINE = np.dtype(
+    [
+        ("dt_ns", "f8"), ("window", "i8"), ("next", "i8"), ("arrivals", "i8"), ("origin_ns", "i8"), ("offset_ns", "f8"),
+        ("skew_ns", "f8"), ("least_ns", "f8"), ("in_window", "i8"), ("off", "i8"), ("off_ns", "f8", (SHIFT_ARRIVALS,)),
+    ]
+)  # fmt: skip
+"""State of a timeline. ``next``: number of the next scan; ``off``: arrivals in a row that are off the line, whose
+lateness (ns) ``off_ns`` keeps, the newest overwriting the oldest."""
+
+
 class ScanTimeline:
     """Maps scan numbers to bench time: ``start + k * dt``, start and dt slowly corrected.
 
     Per window of scans the smallest lateness moves the start (gain 1/4) and the period (gain 1/32), which
     settles within about 20 windows for clocks that differ by 100 ppm. A whole window that is late by more
     than 3/4 of a period means scans that never came.
+    ``state`` (1,) of ``TIMELINE``: memory to use, for a driver whose kernels stamp scans themselves.
     """
 
-    def __init__(self, dt_ns: float, window: int = 128) -> None:
+    def __init__(self, dt_ns: float, window: int = 128, state: Any = None) -> None:
+        self.state = np.zeros(1, TIMELINE) if state is None else state
         self.dt_ns = dt_ns
         self._window = window
+        self._kernels: Any = None
         self.restart()
+
+    def warm_up(self) -> None:
+        """Load or compile the kernels, which the first stamp of a run must not wait for. The state does not change."""
+        from hal import scan_time_kernel  # numba: seconds, which a command that never scans does not pay
+
+        self._kernels = scan_time_kernel
+        before = self.state.copy()
+        scan_time_kernel.stamp_kernel(self.state, 1, 0)
+        scan_time_kernel.shifted_kernel(self.state)
+        self.state[:] = before
 
     def restart(self) -> None:
         """Forget everything: the next arrival begins a new count."""
-        self._next = 0
-        self._arrivals = 0
-        self._origin_ns = 0
-        self._offset_ns = 0.0
-        self._skew_ns = 0.0
-        self._least_ns = 0.0
-        self._in_window = 0
-        self._off = deque[float](maxlen=SHIFT_ARRIVALS)  # lateness of arrivals in a row that are off the line
+        self.state[:] = np.zeros(1, TIMELINE)
+        self.state["dt_ns"], self.state["window"] = self.dt_ns, self._window
 
     @property
     def shifted(self) -> bool:
         """Return True if the last arrivals were all off the line, most of them by the same amount."""
-        if len(self._off) < SHIFT_ARRIVALS:
-            return False
-        near_ns = min(self._off) + SHIFT_SPREAD * self.dt_ns
-        return sum(late_ns <= near_ns for late_ns in self._off) >= SHIFT_ALIKE
+        if self._kernels is None:
+            self.warm_up()
+        return bool(self._kernels.shifted_kernel(self.state))
 
     @property
     def next_seq(self) -> int:
         """Number that the next scan will get."""
-        return self._next
+        return int(self.state["next"][0])
 
     @property
     def skew_ppm(self) -> float:
         """Return the frequency error of the device clock in ppm; positive if it runs slower than the bench clock."""
-        return self._skew_ns / self.dt_ns * 1e6
+        return float(self.state["skew_ns"][0]) / self.dt_ns * 1e6
 
     def stamp(self, n: int, arrival_ns: int) -> tuple[int, int, int]:
         """``n`` scans have just arrived: their first time in ns, their first number, how many were lost before."""
-        last = self._next + n - 1
-        nominal_ns = last * self.dt_ns
-        if self._arrivals == 0:
-            self._origin_ns = arrival_ns
-            self._offset_ns = -nominal_ns
-        late_ns = (arrival_ns - self._origin_ns) - nominal_ns - self._offset_ns
-        if self._in_window == 0 or late_ns < self._least_ns:
-            self._least_ns = late_ns
-        if self._arrivals < self._window and late_ns < 0.0:
-            # while starting, an earlier arrival corrects the start at once
-            self._offset_ns += late_ns
-            self._least_ns = late_ns = 0.0
-        if abs(late_ns) > SHIFT * self.dt_ns:
-            self._off.append(late_ns)
-        elif self._off:
-            self._off.clear()
-        self._arrivals += n
-        self._in_window += n
-        lost = 0
-        if self._in_window >= self._window:
-            lost = self._close_window()
-        self._next += lost
-        t_last_ns = self._origin_ns + int((self._next + n - 1) * self.dt_ns + self._offset_ns)
-        t_last_ns = min(t_last_ns, arrival_ns)
-        first_seq = self._next
-        self._next += n
-        self._offset_ns += n * self._skew_ns
-        return t_last_ns - int((n - 1) * self.dt_ns), first_seq, lost
+        if self._kernels is None:
+            self.warm_up()
+        return self._kernels.stamp_kernel(self.state, n, arrival_ns)
 
     def due_by(self, now_ns: int) -> int:
         """Return the number of scans that the device should have taken by ``now_ns`` and that are not stamped yet."""
-        if self._arrivals == 0:
+        state = self.state[0]
+        if state["arrivals"] == 0:
             return 0
-        last_ns = self._origin_ns + (self._next - 1) * self.dt_ns + self._offset_ns
+        last_ns = int(state["origin_ns"]) + (int(state["next"]) - 1) * self.dt_ns + float(state["offset_ns"])
         return max(0, int((now_ns - last_ns) / self.dt_ns))
-
-    def _close_window(self) -> int:
-        least_ns = self._least_ns
-        scans = self._in_window
-        self._in_window = 0
-        if least_ns > 0.75 * self.dt_ns:
-            return round(least_ns / self.dt_ns)
-        self._offset_ns += 0.25 * least_ns
-        self._skew_ns += least_ns / (32.0 * scans)
-        return 0

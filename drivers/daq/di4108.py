@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,9 +34,6 @@ CLOCK_HZ = 60_000_000  # sample-rate dividend; rate per channel = CLOCK_HZ / (sr
 RANGE_CODES = {10.0: 0, 5.0: 1, 2.0: 2, 1.0: 3, 0.5: 4, 0.2: 5}
 SRATE_MIN, SRATE_MAX, DEC_MAX = 375, 65535, 512
 FIFO_SAMPLES = 1024
-OVERFLOW_TAIL = b"stop 01"
-MISALIGNED_LIMIT = 3  # reads in a row; a tty may split one packet
-MISALIGNED_PACKETS = 2.0  # and for so long, in times that the device takes for a packet
 BUFFER_BYTES = 1 << 18  # the device's FIFO and all that a kernel keeps of a serial line
 
 
@@ -84,22 +82,13 @@ class Di4108:
         self._digital_bits = 0
         self._buf = bytearray(BUFFER_BYTES)
         self._view = memoryview(self._buf)
-        self._words = np.frombuffer(self._buf, dtype="<i2")
+        self._bytes = np.frombuffer(self._buf, dtype=np.uint8)
         self._width = 0
-        self._scan_bytes = 0
-        self._packet_bytes = 16
-        self._byte_ns = 1e6
-        self._timeline = ScanTimeline(1e6)
         self._dt_ns = 0
-        self._arrival_ns = 0
-        self._end = 0  # bytes in the buffer
-        self._good = 0  # of these, bytes known to be aligned
-        self._received = 0  # bytes since start
-        self._misaligned = 0
-        self._misaligned_ns = 0  # arrival of the first
-        self._late_ns = 0.0  # of the last read; only its changes mean something
-        self._in_doubt = False  # a backlog's reads end anywhere: the first one after it that does not tells
-        self._overflowed = False
+        # made by configure: kernels pull in numba, which a command that never scans does not pay
+        self._kernels: Any = None
+        self._stream: Any = None
+        self._timeline = ScanTimeline(1e6)
 
     # identity and configuration
 
@@ -148,11 +137,8 @@ class Di4108:
         self._command("endo 3")
         self._command(f"dout {self._digital_bits}")
         self._width = width
-        self._scan_bytes = 2 * width
-        self._packet_bytes = 16 << code
-        self._timeline = ScanTimeline(1e9 / rate_hz)
         self._dt_ns = round(1e9 / rate_hz)
-        self._byte_ns = 1e9 / rate_hz / self._scan_bytes
+        self._load_kernels(width, 16 << code, rate_hz)
         self._info = ScanInfo(
             rate_hz=rate_hz,
             channels=tuple(channels),
@@ -162,6 +148,15 @@ class Di4108:
             simultaneous=False,
         )
         return self._info
+
+    def _load_kernels(self, width: int, packet_bytes: int, rate_hz: float) -> None:
+        """Compile or load the kernels and make their state: no read may wait for that."""
+        from drivers.daq import di4108_kernels
+
+        self._kernels = di4108_kernels
+        di4108_kernels.warm_up()
+        self._stream = di4108_kernels.new_stream(width, packet_bytes, rate_hz)
+        self._timeline = ScanTimeline(1e9 / rate_hz, state=self._stream["timeline"][0])
 
     def channels(self) -> Sequence[ChannelInfo]:
         """One voltage per configured input, in scan order."""
@@ -177,11 +172,7 @@ class Di4108:
         """Begin to scan; scan 0 is the first one after this."""
         self._require_info()
         self._port.drain_input()
-        self._end = 0
-        self._good = 0
-        self._received = 0
-        self._misaligned, self._in_doubt = 0, False
-        self._overflowed = False
+        self._kernels.restart(self._stream)
         self._timeline.restart()
         self._port.write(b"start 0\r", self._answer_timeout_s)
         self._scanning = True
@@ -192,72 +183,44 @@ class Di4108:
         Raises ``Overrun`` when the device reported a FIFO overflow and ``ProtocolError`` (framing) when bytes
         are missing: both end the scan, ``start`` begins a new one.
         """
-        if self._good < self._scan_bytes:
-            self._receive(timeout_s)
-        else:
-            self._receive(0.0)
-        n = min(self._good // self._scan_bytes, out.shape[0])
+        if out.shape[1] != self._width:
+            raise BenchError(f"room for {out.shape[1]} channels, {self._width} are scanned", device=self.name)
+        kernels, stream = self._kernels, self._stream
+        self._receive(0.0 if kernels.scans_ready(stream) else timeout_s)
+        n, t0_ns, seq0, lost, shifted = kernels.decode(stream, self._bytes, out)
         if n == 0:
-            if self._overflowed:
+            if stream["overflowed"][0]:
                 self._raise_overrun()
-            return ScanBlock(0, self._arrival_ns, 0, self._timeline.next_seq, TimeSource.DEVICE_CLOCK)
-        out[:n] = self._words[: n * self._width].reshape(n, self._width)
-        t0_ns, seq0, lost = self._timeline.stamp(n, self._arrival_ns)
-        used = n * self._scan_bytes
-        self._good -= used
-        self._end -= used
-        if self._end:
-            self._buf[: self._end] = self._buf[used : used + self._end]
+            return ScanBlock(0, int(stream["arrival_ns"][0]), 0, self._timeline.next_seq, TimeSource.DEVICE_CLOCK)
         self.scans += n
         self.lost += lost
         status = Status.GAP if lost else Status.OK
-        if self._timeline.shifted:
+        if shifted:
             status |= Status.SHIFTED
         return ScanBlock(n, t0_ns, self._dt_ns, seq0, TimeSource.DEVICE_CLOCK, status, lost)
 
     def _receive(self, timeout_s: float) -> None:
         """Read until at least one whole scan can be trusted, the time is up or the device has stopped."""
+        kernels, stream = self._kernels, self._stream
         now_ns = self._clock.now_ns()
         limit_ns = now_ns + round(timeout_s * 1e9)
-        while not self._overflowed:
-            if self._end == BUFFER_BYTES:
+        verdict = kernels.OVERFLOWED if stream["overflowed"][0] else kernels.WAIT
+        while verdict == kernels.WAIT:
+            end = int(stream["end"][0])
+            if end == BUFFER_BYTES:
                 self._raise_backlog()
-            n = self._port.read_into(self._view[self._end :], timeout_s)
+            n = self._port.read_into(self._view[end:], timeout_s)
             if n == 0:
                 return
-            self._arrival_ns = now_ns = self._clock.now_ns()
-            self._end += n
-            self._received += n
-            late_ns = now_ns - self._received * self._byte_ns
-            catching_up = late_ns < self._late_ns - self._packet_bytes * self._byte_ns
-            self._late_ns = late_ns
-            if self._received % self._packet_bytes:
-                self._read_ended_inside_a_packet(catching_up)
-            elif not (catching_up and self._in_doubt):
-                self._misaligned, self._in_doubt = 0, False
-                self._good = self._end
-                if self._good >= self._scan_bytes:
-                    return
+            now_ns = self._clock.now_ns()
+            verdict = kernels.accept(stream, self._bytes, n, now_ns)
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
-
-    def _read_ended_inside_a_packet(self, catching_up: bool) -> None:
-        if bytes(self._view[max(0, self._end - len(OVERFLOW_TAIL)) : self._end]) == OVERFLOW_TAIL:
-            self._overflowed = True
+        if verdict == kernels.OVERFLOWED:
             self._scanning = False
-            self._end -= len(OVERFLOW_TAIL)
-            self._good = self._end
-            return
-        if catching_up:
-            self._in_doubt = True
-            return
-        if self._misaligned == 0:
-            self._misaligned_ns = self._arrival_ns
-        self._misaligned += 1
-        lasted = (self._arrival_ns - self._misaligned_ns) / (self._packet_bytes * self._byte_ns)
-        if self._misaligned > MISALIGNED_LIMIT and lasted >= MISALIGNED_PACKETS:
+        elif verdict == kernels.MISALIGNED:
             raise ProtocolError(
-                f"{self._misaligned} reads in a row ended inside a packet of {self._packet_bytes} bytes: bytes "
-                "were lost and channels cannot be told apart; start the scan again",
+                f"{stream['misaligned'][0]} reads in a row ended inside a packet of {stream['packet_bytes'][0]} bytes: "
+                "bytes were lost and channels cannot be told apart; start the scan again",
                 kind=ErrorKind.FRAMING,
                 device=self.name,
             )

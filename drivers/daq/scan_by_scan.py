@@ -63,6 +63,7 @@ class ScanByScan(ABC):
     def start(self) -> None:
         self._dt_ns = round(1e9 / self._config.rate_hz)
         self._timeline, self._next, self._kept = ScanTimeline(self._dt_ns), 0, None
+        self._timeline.warm_up()
         self.begin(self._config)
 
     def read_scans(self, out: Int16Array, timeout_s: float) -> ScanBlock:

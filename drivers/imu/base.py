@@ -249,9 +249,14 @@ class FifoTimeline:
     """Times, numbers and losses of FIFO frames; ``period_ns`` apart as far as the chip's clock is good."""
 
     def __init__(self) -> None:
-        self.restart(1)
+        self._forget(1)
 
     def restart(self, period_ns: int) -> None:
+        """Begin a new count of frames that are ``period_ns`` apart, and load what the stamps need."""
+        self._forget(period_ns)
+        self._line.warm_up()
+
+    def _forget(self, period_ns: int) -> None:
         self.next_seq = 0
         self.lost = 0
         self.period_ns = period_ns

@@ -68,6 +68,7 @@ class NidaqmxScan:
         self._counts_per_V = 1.0 / np.array(lsb_V)
         self._volts = np.empty(len(lsb_V) * MAX_SCANS)
         self._timeline = ScanTimeline(1e9 / rate_hz)
+        self._timeline.warm_up()
         self._dt_ns = round(1e9 / rate_hz)
         return ScanInfo(rate_hz, tuple(config.channels), tuple(config.range_V), lsb_V, buffer_scans, simultaneous=False)
 
