@@ -112,13 +112,26 @@ def kernel(function: _Function) -> _Function:
     Division by zero gives inf or nan as in numpy instead of raising, so that a bad sample becomes a
     flagged sample and not an exception in the middle of a tick.
     """
+    return _compiled(function, nogil=False)
+
+
+def thread_kernel(function: _Function) -> _Function:
+    """Compile ``function`` as ``kernel`` does, and release the GIL while it runs: for loops that a thread enters once.
+
+    Not for calls of some microseconds: beside a busy Python thread, each would wait milliseconds for the GIL.
+    """
+    return _compiled(function, nogil=True)
+
+
+def _compiled(function: _Function, nogil: bool) -> _Function:
+    options: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": nogil}
     file = Path(function.__code__.co_filename).resolve()
     if "NUMBA_CACHE_DIR" in os.environ or not file.is_relative_to(ROOT):
-        return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+        return cast(_Function, numba.njit(**options)(function))
     config = cast(Any, numba_config)
     theirs = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
     config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = str(cache_folder(file)), f"{__name__}.AnyClone"
     try:
-        return cast(_Function, numba.njit(cache=True, error_model="numpy")(function))
+        return cast(_Function, numba.njit(**options)(function))
     finally:
         config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = theirs

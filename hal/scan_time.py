@@ -50,18 +50,24 @@ class ScanTimeline:
         self.state = np.zeros(1, TIMELINE) if state is None else state
         self.dt_ns = dt_ns
         self._window = window
-        self._kernels: Any = None
+        self._loaded: Any = None
         self.restart()
 
     def warm_up(self) -> None:
         """Load or compile the kernels, which the first stamp of a run must not wait for. The state does not change."""
         from hal import scan_time_kernel  # numba: seconds, which a command that never scans does not pay
 
-        self._kernels = scan_time_kernel
+        self._loaded = scan_time_kernel
         before = self.state.copy()
         scan_time_kernel.stamp_kernel(self.state, 1, 0)
         scan_time_kernel.shifted_kernel(self.state)
         self.state[:] = before
+
+    @property
+    def _kernels(self) -> Any:
+        if self._loaded is None:
+            self.warm_up()
+        return self._loaded
 
     def restart(self) -> None:
         """Forget everything: the next arrival begins a new count."""
@@ -71,8 +77,6 @@ class ScanTimeline:
     @property
     def shifted(self) -> bool:
         """Return True if the last arrivals were all off the line, most of them by the same amount."""
-        if self._kernels is None:
-            self.warm_up()
         return bool(self._kernels.shifted_kernel(self.state))
 
     @property
@@ -87,8 +91,6 @@ class ScanTimeline:
 
     def stamp(self, n: int, arrival_ns: int) -> tuple[int, int, int]:
         """``n`` scans have just arrived: their first time in ns, their first number, how many were lost before."""
-        if self._kernels is None:
-            self.warm_up()
         return self._kernels.stamp_kernel(self.state, n, arrival_ns)
 
     def due_by(self, now_ns: int) -> int:

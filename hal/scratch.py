@@ -64,7 +64,9 @@ def _vector(typing_context: Any, n: Any) -> Any:
 
 
 @intrinsic(prefer_literal=True)
-def _index(typing_context: Any, n: Any) -> Any:
+def stack_index(typing_context: Any, n: Any) -> Any:
+    """(n,) whole numbers like ``scratch_index``, for compiled code alone: the place is in the frame of the kernel that
+    calls this, so that a function of C may be given its address."""
     array_type = types.Array(types.int64, 1, "C")
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -93,7 +95,7 @@ def _scratch(n: Any) -> Any:
 @overload(scratch_index, prefer_literal=True, strict=False)
 def _scratch_index(n: Any) -> Any:
     if isinstance(n, types.IntegerLiteral):
-        return lambda n: _index(n)  # pyright: ignore[reportCallIssue]
+        return lambda n: stack_index(n)  # pyright: ignore[reportCallIssue]
     return None
 
 

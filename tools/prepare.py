@@ -23,7 +23,7 @@ from hal.children import child_command, child_environment
 
 WAVES: tuple[tuple[str, ...], ...] = (("sensing", "motion"), ("step",))
 """Parts that are compiled beside each other. The step calls all others and is compiled last."""
-EXPECTED: Mapping[str, int] = {"sensing": 141, "motion": 143, "step": 4}
+EXPECTED: Mapping[str, int] = {"sensing": 147, "motion": 143, "step": 4}
 """Kernels that numba compiles for each part: the scale of the progress bar and nothing else."""
 
 
@@ -57,7 +57,11 @@ def _fingerprint(bench: BenchFile, method: str | None) -> str:
 
     from hal.compiled import ROOT, source_fingerprint
 
-    sources = (ROOT / "firmware_py" / "control" / "stages.py", ROOT / "sim_devices" / "plant_factory.py")
+    sources = (
+        ROOT / "firmware_py" / "control" / "stages.py",
+        ROOT / "sim_devices" / "plant_factory.py",
+        ROOT / "drivers" / "daq" / "di4108_kernels.py",
+    )
     firmware = {key: bench.description.firmware.get(key) for key in ("sensing", "tremor", "actuation", "calibration")}
     text = repr(([source_fingerprint(file) for file in sources], firmware, method, numba.__version__, sys.version))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
@@ -94,6 +98,10 @@ def compile_part(part: str, bench: BenchFile, method: str | None) -> None:
     stages = Stages(configs)
     if part == "sensing":
         stages.warm_up_sensing()
+        if any(device.driver == "di4108" for device in bench.description.device.values()):
+            from drivers.daq import di4108_kernels
+
+            di4108_kernels.warm_up()
     elif part == "motion":
         stages.warm_up_motion()
         if bench.description.emulated_buses():
