@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from tools.cli.bench_option import bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.output import check_writable, write_calibration, write_json
 
@@ -17,7 +18,7 @@ def positions(
         Path,
         typer.Argument(metavar="RECORDING", help="Swung for a minute about the tip, which stands in a dimple."),
     ],
-    bench: Annotated[Path, typer.Option(metavar="BENCH", help="The instrument, calibrated otherwise.")],
+    bench: Annotated[Path, typer.Option(metavar="FILE|NAME", help="The instrument, calibrated otherwise.")],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Calibration file for the bench.")] = None,
     rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
     json_file: JsonOption = None,
@@ -29,7 +30,7 @@ def positions(
 
     A recording to try: python -m sim_devices.plant.lab pivot --bench benches/micron.toml --out out/pivot
 
-    Example: micron calibrate positions out/pivot --bench benches/micron.toml --out out/positions.toml
+    Example: micron calibrate positions out/pivot --bench micron --out out/positions.toml
     """
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.instrument_log import bench_sensing, instrument_readings
@@ -38,7 +39,7 @@ def positions(
 
     with clear_errors():
         check_writable(json_file, out)
-        config = bench_sensing(bench)
+        config = bench_sensing(bench_path(bench))
         log = load_log(recording, rate_hz)
         readings, field = instrument_readings(log, config)
         with console().status("fitting the swing"):

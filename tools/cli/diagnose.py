@@ -52,7 +52,7 @@ def scan(
 ) -> None:
     """Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.
 
-    Example: micron scan --bench benches/micron.toml
+    Example: micron scan --bench micron
     """
     from tools.diagnose.opened import opened_bench
     from tools.diagnose.scan import PROBES, scan_bench
@@ -296,7 +296,7 @@ def capture(
 ) -> None:
     """Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.
 
-    Example: micron capture --bench benches/micron.toml --out golden
+    Example: micron capture --bench micron --out golden
     """
     from tools.diagnose.golden import capture as record
 
@@ -325,7 +325,7 @@ def golden_diff(
     Measured values differ between any two runs ("data"); questions and the form of answers must not ("protocol",
     exit 1). The emulated bench is that of the transcript unless --bench names another.
 
-    Example: micron golden diff golden --bench benches/micron.toml
+    Example: micron golden diff golden --bench micron
     """
     from tools.diagnose.golden import diff
 

@@ -21,7 +21,7 @@ def doctor(
 ) -> None:
     """What this machine offers, what the bench asks for, what is missing and how to get it.
 
-    Example: micron doctor --bench benches/micron.toml
+    Example: micron doctor --bench micron
     """
     with clear_errors():
         check_writable(json_file)

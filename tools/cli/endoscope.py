@@ -9,6 +9,7 @@ import typer
 from rich.progress import track
 from rich.table import Table
 
+from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
@@ -44,7 +45,7 @@ def play_command(
     tolerance: Annotated[float, typer.Option(min=0.1, max=100.0, help="Pixels.")] = 9.0,
     seed: SeedOption = 1,
     bench: Annotated[
-        Path | None, typer.Option("--bench", metavar="FILE", help="Emulated bench; default the endoscope bench.")
+        Path | None, typer.Option("--bench", metavar="FILE|NAME", help="Emulated bench; default: endoscope.")
     ] = None,
     direct: Annotated[bool, typer.Option("--direct", help="Without bench: angles straight into the game.")] = False,
     limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Give up after so many seconds.")] = 300.0,
@@ -74,7 +75,14 @@ def play_command(
             healthy = True
         else:
             with console().status("the user plays on the emulated bench"):
-                outcome = play_on_bench(bench or default_bench(), person, game, seed=seed, record=record, limit_s=limit)
+                outcome = play_on_bench(
+                    default_bench() if bench is None else bench_path(bench),
+                    person,
+                    game,
+                    seed=seed,
+                    record=record,
+                    limit_s=limit,
+                )
             outcome.pop("attitudes")
             result = outcome
             healthy = outcome["samples"]["lost"] == 0 and outcome["recorder"]["dropped"] == 0

@@ -10,7 +10,7 @@ import typer
 from rich.progress import BarColumn, Progress, TimeRemainingColumn
 from rich.table import Table
 
-from tools.cli.bench_option import pace_of
+from tools.cli.bench_option import bench_path, pace_of
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.imu.series import AXES, Series
@@ -36,7 +36,7 @@ def evaluate(
     gyro_lsb: Annotated[float | None, typer.Option("--gyro-lsb-per-dps", min=1e-9, help="Of raw counts.")] = None,
     accel_factor: Annotated[float, typer.Option(min=1e-9, help="Repairs a range error of the logger.")] = 1.0,
     bench: Annotated[
-        Path | None, typer.Option("--bench", metavar="FILE", help="Measure the sensors of a bench.")
+        Path | None, typer.Option("--bench", metavar="FILE|NAME", help="Measure the sensors of a bench.")
     ] = None,
     sensor: Annotated[str | None, typer.Option("--sensor", help="Only this device of the bench.")] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="Virtual time (emulated bench).")] = False,
@@ -48,7 +48,7 @@ def evaluate(
 ) -> None:
     """Tables 5.4 to 5.8 of document 002 for a sensor: from recordings, or measured now on a bench (auto-calibrated).
 
-    Example: micron imu evaluate --bench benches/imus.toml --virtual --seconds 60
+    Example: micron imu evaluate --bench imus --virtual --seconds 60
     """
     from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_turned
     from tools.imu.picture import save_imu_picture
@@ -99,7 +99,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
 
     series: list[Series] = []
     found: list[dict[str, Any]] = []
-    described = load_bench(bench)
+    described = load_bench(bench_path(bench))
     check_devices(described.description, str(described.path))
     columns = (task_name(), BarColumn(), TimeRemainingColumn())
     with (

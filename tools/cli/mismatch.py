@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
@@ -335,7 +336,7 @@ def apply(
         Path, typer.Option("--out", metavar="FILE", help="The corrected twin: .toml, .py, .fmu, or .csv for columns.")
     ],
     bench: Annotated[
-        Path | None, typer.Option(metavar="BENCH.toml", help="Put a piezo_stack twin on this emulated bench, too.")
+        Path | None, typer.Option(metavar="FILE|NAME", help="Put a piezo_stack twin on this emulated bench, too.")
     ] = None,
     bench_out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The bench with the twin; default: bench.toml beside the twin.")
@@ -366,6 +367,7 @@ def apply(
         if bench is not None:
             from hal.bench import load_bench
 
+            bench = bench_path(bench)
             original = load_bench(bench)
             if copy.exists() and copy.samefile(bench):
                 raise InputError(f"{copy}: is the bench itself; name another file with --bench-out")

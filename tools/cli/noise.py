@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
+from tools.cli.bench_option import bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
@@ -30,7 +31,8 @@ def noise(
         typer.Option(min=0.0, help="Shortest averaging time of the fit; default: where the noise terms explain it."),
     ] = None,
     bench: Annotated[
-        Path | None, typer.Option(metavar="BENCH", help="The log is of this instrument: its calibrated axes instead.")
+        Path | None,
+        typer.Option(metavar="FILE|NAME", help="The log is of this instrument: calibrated axes instead."),
     ] = None,
     image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the deviation.")] = Path(
         "out/noise.png"
@@ -43,7 +45,7 @@ def noise(
 
     Example: micron noise rest.npz --rate-hz 100 --picture out/noise.png
 
-    For a bench: micron noise out/rest --bench benches/micron.toml --shortest-s 0.1 --json out/noise.json
+    For a bench: micron noise out/rest --bench micron --shortest-s 0.1 --json out/noise.json
     """
     from dataclasses import asdict
 
@@ -56,7 +58,7 @@ def noise(
         check_writable(json_file)
         log = load_log(recording, rate_hz)
         if bench is not None:
-            log = calibrated_log(log, bench)
+            log = calibrated_log(log, bench_path(bench))
         names = column or _columns(log)
         if log.gaps:
             console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")

@@ -37,3 +37,10 @@ def test_calibration_that_is_not_there_is_missing_before_a_run_says_so(place: Pa
     assert done.exit_code == 4
     assert done.stdout.count('"missing"') == 4  # three files, and how many
     assert "copy it beside the bench file" in done.stdout
+
+
+def test_a_bench_that_ships_is_known_by_its_name_and_another_name_is_refused() -> None:
+    assert CliRunner().invoke(app, ["doctor", "--bench", "micron-can"]).exit_code in (0, 1)  # 1: of the machine
+    done = CliRunner().invoke(app, ["doctor", "--bench", "nowhere"])
+    assert done.exit_code == 2
+    assert "nowhere: no such bench file, and none of that name ships; these do: endoscope" in done.output
