@@ -15,6 +15,7 @@ from firmware_py.recording.reader import Recording
 from tests.bench.conftest import Server, bench_server, go, opened_page
 from tests.conftest import DEFAULT_BENCH
 from tests.recording_text import stack_channels
+from tools.formats.export import FORMATS
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -53,6 +54,8 @@ def test_a_recording_is_looked_at_downloaded_and_exported(page: Any, server: Ser
     assert ticks > 300
     assert server.token not in str(recording.metadata)
     assert all(server.token.encode() not in path.read_bytes() for path in server.recordings.glob("taken away*"))
+    offered = [option.get_attribute("value") for option in row.locator("option").all()]
+    assert offered == ["", *FORMATS, "recover"]
     with page.expect_download(timeout=240_000) as download:
         row.locator("select").select_option("csv")
     download.value.save_as(tmp_path / "run.csv")

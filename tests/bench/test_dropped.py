@@ -8,6 +8,8 @@ import re
 import tomllib
 import urllib.error
 import urllib.request
+import zipfile
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -234,6 +236,40 @@ def test_from_a_dropped_csv_to_the_corrected_twin_that_is_downloaded(page: Any, 
     said = (tmp_path / "twin.toml").read_text()
     gains = [float(found) for found in re.findall(r"gain_um_per_V\s*=\s*\[?\s*([0-9.eE+-]+)", said)]
     assert gains[0] == pytest.approx(0.15, rel=0.01), said
+
+
+@pytest.fixture
+def fmu(still: Still) -> Iterator[Path]:
+    """An FMU among the recordings; what is in it is read by nobody before it is trusted."""
+    path = still.session.recorder.folder / "stage.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", "<fmiModelDescription/>")
+    yield path
+    path.unlink()
+
+
+def test_an_fmu_of_this_machine_is_chosen_with_parameters_of_its_own(page: Any, fmu: Path, tmp_path: Path):
+    page.set_input_files(FILE, motor(tmp_path / "own fmu.csv"))
+    form = page.locator(".new-recording")
+    form.locator("[aria-label='Kind of twin']").select_option("fmu")
+    assert form.locator("select[aria-label=path] option").all_inner_texts() == ["stage.fmu"]
+    assert "micron trust" in form.inner_text()
+    others = form.locator("[aria-label='Other parameters']")
+    others.fill("um_per_W 2.0")
+    form.locator("text=Make the recording").click()
+    alert = form.locator("p[role=alert]", has_text="'um_per_W 2.0' is not a new name = value")
+    alert.wait_for()
+    others.fill("um_per_W = 2.0\n\ncontroller.gain = 3\n")
+    form.locator("text=Make the recording").click()
+    # no program runs that nobody has trusted: the message says so, with the command that decides
+    page.locator(".lines", has_text="micron trust").wait_for(timeout=120_000)
+    made = fmu.with_name("own fmu")
+    text = tomllib.loads((made / "recording.toml").read_text())
+    assert text["twin"] == {
+        "kind": "fmu", "parameters": {"path": "stage.fmu", "um_per_W": 2.0, "controller.gain": 3}
+    }  # fmt: skip
+    assert (made / "stage.fmu").read_bytes() == fmu.read_bytes()
+    assert not form.is_visible()
 
 
 def test_a_file_that_is_dropped_is_taken(page: Any, tmp_path: Path):

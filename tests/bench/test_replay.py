@@ -23,6 +23,8 @@ from tests.bench.still import Still, made_up_rows, still_server
 from tools.bench.history import History
 from tools.bench.overview import EXTREMES, SPANS, summarize
 from tools.bench.replay import Recorded, RecordedHistory, Replay
+from tools.formats import netcdf
+from tools.formats.export import FORMATS
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -284,10 +286,12 @@ def test_a_marked_span_is_exported_and_sent_to_mismatch(page: Any, still: Still,
     length = page.evaluate("micron.context.bar.mark.to - micron.context.bar.mark.from")
     assert length == pytest.approx(0.5)
     with page.expect_download(timeout=120_000) as download:
-        page.select_option("[aria-label='Export the marked span']", "csv")
-    download.value.save_as(tmp_path / "span.csv")
-    t = np.genfromtxt(tmp_path / "span.csv", delimiter=",", names=True)["t"]
+        page.select_option("[aria-label='Export the marked span']", "nc")
+    download.value.save_as(tmp_path / "span.nc")
+    t = netcdf.read(tmp_path / "span.nc", ["t"])["t"]
     assert t[-1] - t[0] == pytest.approx(0.5, abs=0.003)
+    offered = page.locator("[aria-label='Export the marked span'] option").all()
+    assert [option.get_attribute("value") for option in offered] == ["", "recording", *FORMATS]
     page.click("text=To Mismatch")
     page.wait_for_function("document.getElementById('view').dataset.view === 'mismatch'", timeout=120_000)
     page.wait_for_function("document.querySelector('[aria-label=Recording]').value.startsWith('run one 3')")

@@ -23,9 +23,10 @@ from tools.bench.recorder import SUFFIX, check_name, is_own_file
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
+from tools.formats.export import FORMATS
 
-FORMATS = ("csv", "npz", "parquet")
-SPAN_FORMATS = (*FORMATS, "mcap")
+WHOLE = ("recording", "mismatch")
+"""Spans that stay recordings: to take away, and for the Mismatch view beside the others."""
 MAX_LISTED = 500
 LOOK_PIXELS = 900
 LOOK_CHANNELS = 8
@@ -145,7 +146,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
 
     async def recordings(_: Request) -> Any:
         now = recorder.name if recorder.active else ""
-        return {"folder": str(recorder.folder), "recordings": listing(recorder.folder, now)}
+        formats = [[ending, known.readers] for ending, known in FORMATS.items()]
+        return {"folder": str(recorder.folder), "recordings": listing(recorder.folder, now), "formats": formats}
 
     async def start(request: Request) -> Any:
         table = await body(request)
@@ -196,15 +198,16 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
         from_s, to_s = (_time(table, key) for key in ("from_s", "to_s"))
         if from_s >= to_s:
             raise InputError("the span has no length: mark its start and its end")
-        if kind not in (*SPAN_FORMATS, "mismatch"):
-            raise InputError(f"{kind!r} is not a format; there are {', '.join(SPAN_FORMATS)}, or mismatch")
+        if kind not in (*FORMATS, *WHOLE):
+            raise InputError(f"{kind!r} is not a format; there are {', '.join((*FORMATS, *WHOLE))}")
         title = f"{path.stem[:50]} {from_s:.2f}-{to_s:.2f} s"
         folder = jobs.new_folder()
-        out = recorder.path(title) if kind == "mismatch" else folder / f"{title}.{kind}"
+        ending = SUFFIX if kind in WHOLE else f".{kind}"
+        out = recorder.path(title) if kind == "mismatch" else folder / f"{title}{ending}"
         if out.is_symlink():
             raise InputError(f"{out} is a symbolic link; remove it first")
         times = ("--from", f"{from_s!r}", "--to", f"{to_s!r}", "--overwrite")
-        raw = ("--raw",) if out.suffix == SUFFIX else ()
+        raw = ("--raw",) if kind in WHOLE else ()
         command = ["tools.cli.main", "export", str(path), "--out", str(out), *raw, *times]
         jobs.start("export", f"span of {path.stem}", [command], folder)
         return {"file": out.name, "recording": out.name if kind == "mismatch" else ""}

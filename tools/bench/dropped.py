@@ -101,11 +101,13 @@ def description(table: dict[str, Any], data: str) -> dict[str, Any]:
     channels = table.get("channels", [])
     if not isinstance(given, dict) or not isinstance(channels, list) or not all(isinstance(c, dict) for c in channels):
         raise InputError("parameters must be an object and channels a list of objects")
-    parameters = {
-        key: parameter_value(key, said.strip())
-        for key, said in given.items()
-        if re.fullmatch(r"\w{1,60}", key) and isinstance(said, str) and said.strip()
-    }
+    typed = {key: said for key, said in given.items() if isinstance(said, str) and said.strip()}
+    for line in filter(str.strip, text(table, "others").splitlines()):
+        key, sign, said = line.partition("=")
+        if not sign or not key.strip() or key.strip() in typed:
+            raise InputError(f"other parameters: {line.strip()!r} is not a new name = value; write one a line")
+        typed[key.strip()] = said
+    parameters = {key: parameter_value(key, said.strip()) for key, said in typed.items()}
     found: dict[str, Any] = {"format": 1, "title": text(table, "title", longest=200) or data, "data": data}
     if clock := text(table, "time_column", longest=200):
         found["time_column"] = clock
@@ -201,13 +203,15 @@ def _bring_file(session: Session, twin: dict[str, Any], folder: Path) -> None:
 
 def _kind(kind: str, files: list[str] | None) -> dict[str, Any]:
     words = KINDS[kind]
+    keys = of_kind(kind)
     return {
         "kind": kind,
         "file_key": NEEDS_FILE.get(kind, ""),
         "files": files or [],
         "inputs": [[p, list(u)] for p, u in words.inputs],
         "outputs": [[p, list(u)] for p, u in words.outputs],
-        "keys": [asdict(key) for key in of_kind(kind) if key.name.isidentifier()],
+        "keys": [asdict(key) for key in keys if key.name.isidentifier()],
+        "others": next((key.name for key in keys if not key.name.isidentifier()), ""),
     }
 
 

@@ -14,7 +14,7 @@ from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover as recover_recording
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.errors import InputError
-from tools.formats.export import ExportReport
+from tools.formats.export import FORMATS, ExportReport
 from tools.formats.export import export as export_recording
 from tools.output import check_writable, write_json
 
@@ -45,7 +45,7 @@ def export(
     file: Annotated[Path, typer.Argument(metavar="RUN", help="A recording (.mcap).")],
     to: Annotated[
         Path | None,
-        typer.Argument(metavar="OUT", help="name.csv, .npz, .parquet, .nc, .mf4, .mcap for viewers, or a folder."),
+        typer.Argument(metavar="OUT", help=f"name.{', .'.join(FORMATS)} for viewers, or a folder."),
     ] = None,
     out: Annotated[Path | None, typer.Option(metavar="PATH", help="The same as OUT.")] = None,
     raw: Annotated[

@@ -41,7 +41,7 @@ class ExportReport:
 
 
 def export(recording: Recording, out: Path, format: str | None = None, *, overwrite: bool = False) -> ExportReport:
-    """Write ``recording`` in one of ``WRITERS`` or as ``folder`` (None: what the name of ``out`` says, without a suffix
+    """Write ``recording`` in one of ``FORMATS`` or as ``folder`` (None: what the name of ``out`` says, without a suffix
     the folder). Columns keep their names, values every bit.
 
     Raises ``RecordingError`` when ``out`` exists, cannot be written, or the format is not there; ``InputError`` when
@@ -50,10 +50,10 @@ def export(recording: Recording, out: Path, format: str | None = None, *, overwr
     chosen = format or out.suffix.lower().removeprefix(".") or "folder"
     if chosen == "folder":
         return export_folder(recording, out)
-    if chosen not in WRITERS:
-        raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(WRITERS)} or folder")
+    if chosen not in FORMATS:
+        raise RecordingError(f"{out}: format {chosen!r} is unknown; use {', '.join(FORMATS)} or folder")
     with new_file(out, overwrite=overwrite) as part:
-        WRITERS[chosen](recording, part)
+        FORMATS[chosen].write(recording, part)
     notes = ()
     if chosen == "mcap":
         notes = (f"for viewers; layouts for Foxglove and PlotJuggler are in {LAYOUTS}; --raw writes one to replay",)
@@ -175,8 +175,22 @@ def _little_endian(column: Float64Array) -> bytes:
     return column.astype("<f8", copy=False).tobytes()
 
 
-Writer = Callable[[Recording, Path], object]
-WRITERS: Mapping[str, Writer] = MappingProxyType(
-    {"csv": _csv, "npz": _npz, "parquet": parquet.write, "nc": netcdf.write, "mf4": mdf.write, "mcap": view.write}
+@dataclass(frozen=True, slots=True)
+class Format:
+    """A file format that a recording is exported to. ``readers`` names what it is for."""
+
+    readers: str
+    write: Callable[[Recording, Path], object]
+
+
+FORMATS: Mapping[str, Format] = MappingProxyType(
+    {
+        "csv": Format("tables, any program", _csv),
+        "npz": Format("numpy", _npz),
+        "parquet": Format("pandas, polars", parquet.write),
+        "nc": Format("xarray, MATLAB: netCDF-4", netcdf.write),
+        "mf4": Format("asammdf, CANape: ASAM MDF 4", mdf.write),
+        "mcap": Format("Foxglove, PlotJuggler, rerun", view.write),
+    }
 )
-"""Writers by the ending of a name."""
+"""Formats by the ending of a name, for ``micron export`` and the page."""

@@ -54,6 +54,9 @@ export function segments(options, value, onchange, label) {
   return box;
 }
 
+/** The formats that the server exports to, with what reads them. */
+export const exportOptions = (formats) => formats.map(([ending, readers]) => h("option", { value: ending }, `${ending}: ${readers}`));
+
 /** A canvas that follows its box; `draw(context, width, height)` in CSS pixels. */
 export function canvas(draw, label) {
   const element = h("canvas.draw", { role: "img", "aria-label": label });

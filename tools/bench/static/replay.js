@@ -1,6 +1,6 @@
 // The bar of a replay: which recording the views show, where in it, what is marked, and a second run over it.
 import { download, get, post } from "./api.js";
-import { canvas, css, digits, duration, h } from "./dom.js";
+import { canvas, css, digits, duration, exportOptions, h } from "./dom.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50];
 const STEPS = 10000;
@@ -21,8 +21,7 @@ export function replayBar(link, context) {
   const shiftBox = h("label", {}, "shift, s", shift);
   const marked = h("span.num.soft");
   const toMismatch = h("button", { onclick: () => act(sendToMismatch) }, "To Mismatch");
-  const exportAs = h("select", { "aria-label": "Export the marked span", onchange: () => { const format = exportAs.value; exportAs.value = ""; if (format) act(() => exportSpan(format)); } },
-    h("option", { value: "" }, "export …"), ["csv", "npz", "parquet", "mcap"].map((f) => h("option", { value: f }, f)));
+  const exportAs = h("select", { "aria-label": "Export the marked span", onchange: () => { const format = exportAs.value; exportAs.value = ""; if (format) act(() => exportSpan(format)); } });
   const clear = h("button.quiet", { onclick: () => setMark(null) }, "Clear");
   const problem = h("span.bad", { role: "alert" });
   const words = h("span.soft.words");
@@ -79,6 +78,7 @@ export function replayBar(link, context) {
     const names = found.recordings.filter((r) => !r.recording && r.name !== link.replay?.name).map((r) => r.name);
     second.replaceChildren(h("option", { value: "" }, "nothing"), ...names.map((n) => h("option", { value: n }, n)));
     second.value = link.replay?.second || "";
+    exportAs.replaceChildren(h("option", { value: "" }, "export …"), h("option", { value: "recording" }, "recording: to open and replay"), ...exportOptions(found.formats));
   }
 
   function drawMap(g, w, hgt) {

@@ -101,7 +101,7 @@ export function mount(root, { link }) {
     for (const v of um) { low = Math.min(low, v); high = Math.max(high, v); }
     const [left, bottom] = [34, 16];
     const x = (v) => left + ((w - left - 4) * v) / 100;
-    const y = (v) => hgt - bottom - ((hgt - bottom - 6) * (v - low)) / (high - low);
+    const y = (v) => hgt - bottom - ((hgt - bottom - 14) * (v - low)) / (high - low);
     g.font = `10px ${css("--mono")}`;
     g.strokeStyle = css("--grid");
     g.fillStyle = css("--faint");
@@ -111,7 +111,7 @@ export function mount(root, { link }) {
     }
     for (const v of [low, 0, high]) {
       g.beginPath(); g.moveTo(left, y(v)); g.lineTo(w, y(v)); g.stroke();
-      g.fillText(digits(v * 1e6, 2), 2, y(v) + 3);
+      g.fillText(v === high ? `${digits(v * 1e6, 2)} µm` : digits(v * 1e6, 2), 2, y(v) + (v === high ? -3 : 3)); // above its line: the unit needs room
     }
     g.strokeStyle = colours()[c];
     g.lineWidth = 1.3;

@@ -1,6 +1,6 @@
 // Recordings: start, stop, notes, list, quick look, export. The server records; this page may be closed.
 import { download, get, post } from "../api.js";
-import { bytes, colours, duration, h, unitText } from "../dom.js";
+import { bytes, colours, duration, exportOptions, h, unitText } from "../dom.js";
 import { holdSpans } from "../holds.js";
 import { Strip } from "../plot.js";
 
@@ -44,16 +44,16 @@ export function mount(root, context) {
       h("td.soft.notes.whole", { title: r.notes.join("\n") }, r.notes.join(" · ")),
       h("td.num", { "data-label": "length" }, r.ticks === null ? "–" : duration(r.ticks / 1000)),
       h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
-      h("td.num.soft", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
-      h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r))))));
+      h("td.num.soft.when", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
+      h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r, list))))));
     if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));
   }
 
-  function actions(r) {
+  function actions(r, list) {
     const path = `/api/recordings/${encodeURIComponent(r.name)}`;
     const formats = h("select", { "aria-label": `Export ${r.name}`, onchange: () => { (formats.value === "recover" ? recover(path) : exportAs(path, formats.value)); formats.value = ""; } },
-      h("option", { value: "" }, "export …"), ["csv", "npz", "parquet"].map((f) => h("option", { value: f }, f)),
-      link.mayOrder ? h("option", { value: "recover", title: "Makes a torn file whole, beside it" }, "recover") : null);
+      h("option", { value: "" }, "export …"), exportOptions(list.formats),
+      link.mayOrder ? h("option", { value: "recover" }, "recover: a torn file made whole") : null);
     let sure = false;
     const remove = h("button.quiet", { disabled: !link.mayOrder, onclick: () => {
       if (sure) act(() => post(`${path}/delete`));

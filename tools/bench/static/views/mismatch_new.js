@@ -99,6 +99,9 @@ export function newRecording(link, done) {
         h("td", { "data-label": "role" }, role), h("td", { "data-label": "signal" }, signal), h("td", { "data-label": "unit" }, unit), h("td", { "data-label": "noise, rms" }, noise)) };
     });
     const parameters = h("div.set");
+    const others = h("textarea", { rows: 2, maxLength: 2000, placeholder: "name = value, one a line", "aria-label": "Other parameters" });
+    const othersName = h("b");
+    const othersBox = h("label", {}, h("span", {}, othersName), others);
     const known = h("p.note");
     const wrong = h("p.bad", { role: "alert" });
     let fields = [];
@@ -106,7 +109,9 @@ export function newRecording(link, done) {
     function showKind() {
       const k = chosen();
       fields = (k?.keys || []).map((key) => ({ key, field: key.name === k.file_key ? fileChoice(key, k.files) : h("input", { type: "text", maxLength: 2000, placeholder: key.default ? `if empty: ${key.default}` : "needed", title: `${key.help}: ${key.value}`, "aria-label": key.name }) }));
-      parameters.replaceChildren(...fields.map(({ key, field }) => h("label", {}, h("span", {}, h("b", {}, key.name), " ", key.help), field)));
+      parameters.replaceChildren(...fields.map(({ key, field }) => h("label", {}, h("span", {}, h("b", {}, key.name), " ", key.help), field)), othersBox);
+      othersBox.hidden = !k?.others;
+      othersName.textContent = k?.others || "";
       known.textContent = !k ? "The kind says which physics the twin starts from." : [["inputs", k.inputs], ["outputs", k.outputs]]
         .map(([role, words]) => `${role}: ${words.length ? words.map(([p, u]) => `${p} (${u.join(" or ")})`).join(", ") : "any names and units"}`).join("; ") + (NOTES[k.kind] || "");
       showWords();
@@ -124,7 +129,7 @@ export function newRecording(link, done) {
       try {
         const made = await post("/api/mismatch/new", {
           number: file.number, name: name.value.trim(), title: file.name, kind: kind.value, time_column: clock, ...(!clock && rate.value ? { rate_hz: Number(rate.value) } : {}),
-          parameters: Object.fromEntries(fields.map(({ key, field }) => [key.name, field.value])),
+          others: othersBox.hidden ? "" : others.value, parameters: Object.fromEntries(fields.map(({ key, field }) => [key.name, field.value])),
           channels: used.map((r) => ({ column: r.column.name, role: r.role.value, signal: r.signal.value.trim(), unit: r.unit.value.trim(), ...(r.noise.value ? { noise_rms: Number(r.noise.value) } : {}) })),
         });
         form.hidden = true;

@@ -78,6 +78,6 @@ export function triggerControls(settings, catalogue, changed) {
     for (const element of [channel, level]) element.disabled = !t.on || t.slope === "event";
   }
   show();
-  const element = h("div.toolbar.trigger", {}, h("label", {}, on, h("b", {}, "Trigger")), channel, h("span.soft", {}, "at"), level, unit, slopes, modes, state, warning);
+  const element = h("div.toolbar.trigger", {}, h("label", {}, on, h("b", {}, "Trigger")), channel, h("label.soft", {}, "at", level, unit), slopes, modes, state, warning);
   return { element, warn(text) { warning.textContent = text; }, say(text) { if (state.textContent !== text) state.textContent = text; } };
 }

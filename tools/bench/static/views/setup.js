@@ -40,7 +40,7 @@ export function mount(root, { link, navigate }) {
   const partRows = Object.fromEntries(PARTS.map(([part, bus, address, what]) => {
     has[part] = h("input", { type: "checkbox", checked: true, disabled: part === "piezo", "aria-label": `The bench has: ${what}`, onchange: () => showNeeded() });
     addresses[part] = h("input.unit-field", { type: "text", value: hex(address), "aria-label": `Address of the ${what}` });
-    return [part, h("div.row", {}, h("label", {}, has[part], what), h("label.faint", {}, `${bus} at`, addresses[part]))];
+    return [part, h("div.part", {}, h("label", {}, has[part], what), h("label.faint", {}, `${bus} at`, addresses[part]))];
   }));
   const telemetry = h("input", { type: "checkbox", checked: true, "aria-label": "The bench has: telemetry on CAN", onchange: () => showNeeded() });
   const parts = [h("div.set", {}, h("label", {}, h("span", {}, h("b", {}, "converter"), " of the accelerometers"), daq, cards.daq), h("label", {}, h("span", {}, h("b", {}, "outputs")), output, cards.output)),

@@ -18,7 +18,7 @@ export function mount(root, { link, navigate }) {
   const bench = h("select", { "aria-label": "Bench with the motion card", hidden: settings.source !== "card" });
   const play = h("button.primary", { id: "target-start", onclick: start }, "New game");
   const problem = h("p.bad", { role: "alert" });
-  const facts = h("table");
+  const facts = h("table", {}, h("tr", {}, h("td.faint", {}, "None was started yet.")));
   const results = h("div");
   const reports = h("div");
   const seed = () => Math.floor(Math.random() * 1e6);

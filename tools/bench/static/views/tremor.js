@@ -94,12 +94,11 @@ export function mount(root, { link }) {
     const step = [5, 10, 20, 50, 100, 200, 500].find((s) => size / s <= 4) || 1000;
     g.font = `10px ${css("--mono")}`;
     g.strokeStyle = css("--grid");
-    g.fillStyle = css("--faint");
-    for (let r = step; r <= size * 1.4; r += step) {
+    const rings = Array.from({ length: Math.floor((1.4 * size) / step) }, (_, i) => step * (i + 1));
+    for (const r of rings) {
       g.beginPath();
       g.arc(w / 2, hgt / 2, r * scale, 0, 7);
       g.stroke();
-      g.fillText(`${r} µm`, w / 2 + 4, hgt / 2 - r * scale - 3);
     }
     for (const [data, colour, width] of [[before, css("--c2"), 1.1], [after, css("--accent"), 1.8]]) {
       const x = data[a].slice(-PATH);
@@ -110,6 +109,15 @@ export function mount(root, { link }) {
       g.beginPath();
       for (let i = 0; i < x.length; i++) g.lineTo(w / 2 + x[i] * UM * scale, hgt / 2 - y[i] * UM * scale);
       g.stroke();
+    }
+    for (const r of rings) { // over the path, so that they can be read
+      const text = `${r} µm`;
+      const [x, y] = [w / 2 + 4, hgt / 2 - r * scale - 3];
+      if (y < 20) continue; // the name of the axis is there
+      g.fillStyle = css("--panel");
+      g.fillRect(x - 2, y - 9, g.measureText(text).width + 4, 12);
+      g.fillStyle = css("--faint");
+      g.fillText(text, x, y);
     }
     g.fillStyle = css("--soft");
     g.fillText(settings.plane[0], w - 12, hgt / 2 - 5);
