@@ -171,7 +171,8 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
         try:
             await run_module("tools.mismatch.guess", "--check", str(descriptor))
         except InputError as error:
-            raise InputError(str(error).replace(f"{descriptor}: ", "").replace(f"{path}: ", "")) from None
+            said = re.sub(r"\[\[channels\]\] \d+ \((.*?)\)", r"column \1", str(error))
+            raise InputError(said.replace(f"{descriptor}: ", "").replace(f"{path}: ", "")) from None
         path.parent.rename(target)
         dropped.files.pop(text(table, "number"), None)
         return {"recording": f"{title}/"}

@@ -133,7 +133,7 @@ export function mount(root, { link }) {
     cards.forEach((card, c) => {
       const v = b.last(c);
       card.volts.replaceChildren(v.toFixed(1), h("span.unit", {}, "V"));
-      card.stroke.textContent = `${digits(b.last(3 + c) * 1e6, 3)} µm`;
+      card.stroke.textContent = `${(b.last(3 + c) * 1e6).toFixed(2)} µm`;
       card.fill.style.width = `${v}%`;
       card.fill.style.background = v < 1 || v > 99 ? css("--warn") : colours()[c];
       card.loop.redraw();

@@ -87,7 +87,11 @@ export function poseWizard(link, apply, fail) {
       g.globalAlpha = depth > 0.15 ? 0.45 : 1;
       g.fillStyle = taken.has(i) ? css("--good") : css("--faint");
       g.beginPath(); g.arc(x, y, taken.has(i) ? 7 : 5, 0, 7); g.fill();
-      if (i < 6) g.fillText(`${"+-"[i % 2]}${"xyz"[i >> 1]}`, x + 9, y + 4);
+      g.globalAlpha = 1; // the names are read on the far side as well
+      if (i < 6) {
+        g.fillStyle = css("--faint");
+        g.fillText(`${"+-"[i % 2]}${"xyz"[i >> 1]}`, x + 9, y + 4);
+      }
     });
     g.globalAlpha = 1;
     if (!up) return;

@@ -135,7 +135,10 @@ export function newRecording(link, done) {
         form.hidden = true;
         file = null;
         done(made.recording);
-      } catch (error) { wrong.textContent = error.message; }
+      } catch (error) {
+        wrong.textContent = error.message;
+        wrong.scrollIntoView({ block: "nearest" });
+      }
     }
 
     /** What the guess could not know, assumed and left out. */
