@@ -18,6 +18,7 @@ import pytest
 
 from tests.bench.conftest import go
 from tests.bench.still import Still
+from tests.bench.test_replay import write
 from tools.bench.dropped import NEEDS_FILE, OFFERED, description, parameter_value
 from tools.bench.dropped_files import MOST_KEPT, Dropped
 from tools.bench.guard import MAX_UPLOAD_BYTES
@@ -130,10 +131,13 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
     assert f"{MAX_UPLOAD_BYTES >> 20} MB" in said
     code, said = put(still, "a.csv", csv, still.token)
     assert code == 200, said
+    own = tmp_path / "own.mcap"
+    write(own, 3.0)
     for name, body, part in (
         ("a.exe", csv, "must be .csv"),
         ("torn.npz", b"PK\x03\x04 and no more", "not a readable npz"),
         ("torn.mcap", b"\x89MCAP0\r\n" + bytes(40), "torn.mcap"),
+        ("own.mcap", own.read_bytes()[:-3000], "micron recover"),
         ("words.csv", b"a,b\nx,y\n", "is not a number"),
         ("empty.csv", b"", "empty"),
     ):

@@ -99,7 +99,10 @@ def export_folder(
         notes.append(f"{computed} columns that the firmware computed are in the data, but no channels")
     for role in ("input", "output"):
         if not any(channel["role"] == role for channel in channels):
-            raise RecordingError(f"{recording.path}: no column has the role {role!r}; say which with 'roles'")
+            raise RecordingError(
+                f"{recording.path}: no column has the role {role!r}: is it a recording of another instrument? "
+                "Export it as csv and describe that with 'micron mismatch new'"
+            )
     bench = recording.metadata.get("bench")
     twin: dict[str, object] = dict(parameters or {})
     with new_folder(out) as folder:
