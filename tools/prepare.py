@@ -61,6 +61,7 @@ def _fingerprint(bench: BenchFile, method: str | None) -> str:
         ROOT / "firmware_py" / "control" / "stages.py",
         ROOT / "sim_devices" / "plant_factory.py",
         ROOT / "drivers" / "daq" / "di4108_kernels.py",
+        ROOT / "drivers" / "piezo" / "e727_kernels.py",
     )
     firmware = {key: bench.description.firmware.get(key) for key in ("sensing", "tremor", "actuation", "calibration")}
     text = repr(([source_fingerprint(file) for file in sources], firmware, method, numba.__version__, sys.version))
@@ -98,16 +99,26 @@ def compile_part(part: str, bench: BenchFile, method: str | None) -> None:
     stages = Stages(configs)
     if part == "sensing":
         stages.warm_up_sensing()
-        if any(device.driver == "di4108" for device in bench.description.device.values()):
-            from drivers.daq import di4108_kernels
-
-            di4108_kernels.warm_up()
+        _compile_drivers({device.driver for device in bench.description.device.values()})
     elif part == "motion":
         stages.warm_up_motion()
         if bench.description.emulated_buses():
             _compile_plant(bench)
     else:
         stages.warm_up()
+
+
+def _compile_drivers(drivers: set[str]) -> None:
+    if "di4108" in drivers:
+        from drivers.daq import di4108_kernels
+
+        di4108_kernels.warm_up()
+    if "e727" in drivers:
+        import numpy as np
+
+        from drivers.piezo import e727_kernels
+
+        e727_kernels.encode(np.zeros(e727_kernels.TEXT_BYTES, np.uint8), False, np.zeros(3), 1.0)
 
 
 def _compile_plant(bench: BenchFile) -> None:

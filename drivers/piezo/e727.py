@@ -9,7 +9,7 @@ values go out at ``rate_hz`` at most, and errors are asked for now and then with
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -70,6 +70,8 @@ class E727:
         self._period_ns = round(1e9 / rate_hz)
         self._due_ns = 0
         self._position_known = False
+        self._kernels: Any = None
+        self._text = np.zeros(0, np.uint8)
 
     def probe(self) -> str:
         """Identity, axes and limits; the servo is switched as ``mode`` says. Raises ``WrongDevice``."""
@@ -93,11 +95,12 @@ class E727:
         """Ramp to neutral, ask for errors, compare with what the controller says it was told."""
         if not self._position_known:
             self.probe()
+        self._command()  # the kernel is compiled or loaded before anything moves
         self._position_known = False
         while not self.safe_step():
             wait_s(self._clock, TICK_S)
         self._link.settle()
-        self._link.command(f"{self._verb} {self._values()}")
+        self._link.command(self._command().decode().rstrip())
         told = [v / self._per_V for v in self._link.values(f"{self._verb}?", CHANNELS)]
         neutral = [limit.safe_V for limit in self.limits]
         good = all(abs(a - b) < 0.01 for a, b in zip(told, neutral, strict=True))
@@ -165,13 +168,16 @@ class E727:
         limit = self.limits[0]
         return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, EPSILON_V) for i in range(CHANNELS)]
 
-    def _values(self) -> str:
-        a, b, c = self.guard.next_V
-        k = self._per_V
-        return f"1 {a * k:.4f} 2 {b * k:.4f} 3 {c * k:.4f}"
+    def _command(self) -> bytes:
+        if self._kernels is None:
+            from drivers.piezo import e727_kernels  # numba: seconds, which a command that moves nothing does not pay
+
+            self._kernels, self._text = e727_kernels, np.zeros(e727_kernels.TEXT_BYTES, np.uint8)
+        n = self._kernels.encode(self._text, self._servo, np.array(self.guard.next_V), self._per_V)
+        return self._text[:n].tobytes()
 
     def _send(self) -> bool:
-        if not self._link.send(f"{self._verb} {self._values()}\n".encode()):
+        if not self._link.send(self._command()):
             self.late += 1  # the line is slower than asked for: this value is given up
             return False
         self.commands += 1
