@@ -45,6 +45,7 @@ def test_every_key_and_every_kind_is_on_the_page() -> None:
         assert f"- `{ending}`: " in text
 
 
+@pytest.mark.slow
 def test_a_stranger_in_an_empty_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The blocks of the page in their order: data, what the first command writes, what a person adds, the commands, the
     module elsewhere."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+PYTEST = ["-m", "pytest", "-q", "-p", "no:cacheprovider", "-p", "micron_pytest"]
 START = Path(__file__).parents[3] / "tools" / "start"
 
 
@@ -22,7 +23,8 @@ def hers(tmp_path: Path) -> Path:
 
 
 def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), str(START)])}
+    path = os.pathsep.join([str(folder), str(START)])
+    environment = {**os.environ, "PYTHONPATH": path, "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1"}
     return subprocess.run(
         [sys.executable, *arguments], cwd=folder, env=environment, capture_output=True, text=True, check=False
     )
@@ -30,21 +32,26 @@ def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
 
 def test_a_command_and_its_children_find_ours(hers: Path) -> None:
     script = "import sys, micron_start; sys.argv[0] = 'micron'; micron_start.main()"
-    # the recorder is a child process
-    options = ["--virtual", "--seconds", "0.5", "--bench", "micron-can", "--record", "run.mcap"]
-    done = run(["-c", script, "run", *options], hers)
+    done = run(["-c", script, "data", "list"], hers)
     assert done.returncode == 0, done.stderr
-    assert (hers / "run.mcap").stat().st_size > 10_000
+    child = (
+        "import subprocess, sys, micron_start\n"
+        "micron_start.put_ours_first()\n"
+        "from hal.children import child_command, child_environment\n"
+        "sys.exit(subprocess.call(child_command('tools.cli.main', '--version'), env=child_environment()))"
+    )
+    done = run(["-c", child], hers)
+    assert done.stdout.startswith("micron "), done.stderr
 
 
 def test_her_tests_keep_her_packages_until_a_fixture_needs_ours(hers: Path) -> None:
     (hers / "test_hers.py").write_text("import hal\n\ndef test_it():\n    assert hal.OWNER == 'she'\n")
-    done = run(["-m", "pytest", "-q", "-p", "no:cacheprovider"], hers)
+    done = run(PYTEST, hers)
     assert done.returncode == 0, done.stdout
     (hers / "test_hers.py").write_text("import hal\n\ndef test_it(emulated):\n    emulated('ad5696r', address=12)\n")
-    done = run(["-m", "pytest", "-q", "-p", "no:cacheprovider"], hers)
+    done = run(PYTEST, hers)
     assert done.returncode == 1
     assert "hal: this package has the name of one of micron-bench" in done.stdout
     (hers / "test_hers.py").write_text("def test_it(emulated):\n    assert emulated('ad5696r', address=12).smbus()\n")
-    done = run(["-m", "pytest", "-q", "-p", "no:cacheprovider"], hers)
+    done = run(PYTEST, hers)  # where her tests need none of hers
     assert done.returncode == 0, done.stdout
