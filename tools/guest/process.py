@@ -92,7 +92,8 @@ class Guest:
 
         fmu = OpenFmu(Path(head["path"]), head["digest"], tuple(head["outputs"]), head["dt"])
         self._run = fmu
-        return {"names": sorted(fmu.names())}, {}
+        linear = fmu.linear(list(head["inputs"]), head["start"])
+        return {"names": sorted(fmu.names()), "kind": fmu.kind, "linear": linear}, {}
 
     def _module(self, head: dict[str, Any]) -> Callable[..., Mapping[str, Array]]:
         simulate = getattr(loaded_module(head["path"], head["source"]), "simulate", None)

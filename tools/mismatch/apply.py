@@ -18,6 +18,7 @@ from tools.mismatch.recording import Recording, RecordingError, TwinText
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
+from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make
 
 EVENTS = ("spikes", "step_shift", "random_walk", "dropped_samples")
@@ -45,7 +46,7 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
 
     Raises InputError for a report that is not one or belongs to another recording, RecordingError for the recording.
     """
-    recording = load(path)
+    recording = with_equations(load(path))
     found = _physics(report)
     _belongs(recording, report, found)
     base = dict(report["corrected_base"])

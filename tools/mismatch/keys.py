@@ -120,7 +120,8 @@ PARAMETERS: Mapping[str, tuple[Key, ...]] = MappingProxyType(
             Key("any other name", "number", "a parameter of the equations; may be re-fitted"),
         ),
         "fmu": (
-            Key("path", "file name", "the FMI 2 or 3 FMU, relative to the recording"),
+            Key("path", "file name", "the FMU beside the recording: co-simulation (FMI 2, 3), model exchange (2)"),
+            Key("hold", "zero or linear", "inputs between samples", "inferred"),
             Key("any parameter of the FMU", "number", "your value; may be re-fitted", "the FMU's"),
         ),
     }

@@ -27,6 +27,9 @@ from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
+START_PASSES = 2
+"""How often start states are sought anew behind effects at an output; each pass knows better what these made of it."""
+
 
 @dataclass(frozen=True)
 class Design:
@@ -267,22 +270,52 @@ class Model:
         if folded is not None and forces:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
-        outputs = self.twin.respond(run, inputs, theta, [*forces, *beside], join)
+        every = [*forces, *beside]
+        outputs = self.twin.respond(run, inputs, theta, every, join)
         if only is not None:
             outputs = {o: s for o, s in outputs.items() if o in only}
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
+        found, behind = self._behind(run, inputs, outputs, theta, join, folded)
+        if run.window == 0 or not behind:
+            return found
+        about = {k: v for k, v in run.memo.items() if k == ("about", run.starts)}
+        for _ in range(START_PASSES):
+            # start states were read off what was measured behind these effects: again, without what they made of it
+            before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
+            again = replace(run, measured=before, memo=dict(about))
+            outputs = self.twin.respond(again, inputs, theta, every, join)
+            found, behind = self._behind(again, inputs, {o: outputs[o] for o in found}, theta, join, folded)
+        return found
+
+    def _behind(
+        self, run: Run, inputs: Mapping[str, Signal], outputs: Mapping[str, Signal], theta: Array, join: bool,
+        folded: set[int] | None,
+    ) -> tuple[dict[str, Signal], dict[str, Array]]:  # fmt: skip
+        """The outputs behind their effects; and what effects that are driven by an output made of it, (n,), where the
+        states of equations start afresh from what was measured behind them.
+        """
+        found, change = dict(outputs), dict[str, Array]()
+        afresh = self.twin.restart and inside_of(self.twin) is not None
         for k in self.order:
             pl = self.placed[k]
             if pl.site != "output":
                 continue
             for o in pl.outputs:
-                if o not in outputs:
+                if o not in found:
                     continue
                 drive = self.twin.drive(o)
                 by = inputs[drive] if self.twin.static and drive else None
-                outputs[o] = self._pass(run, k, outputs[o], by, o, theta, join, folded)
-        return outputs
+                was = found[o]
+                now = self._pass(run, k, was, by, o, theta, join, folded)
+                if afresh and pl.effect.driven:
+                    # the start states depend on its weights
+                    if folded is not None:
+                        folded.update(now.columns)
+                    now = fold(now, theta)
+                    change[o] = change.get(o, 0.0) + now.value - fold(was, theta).value
+                found[o] = now
+        return found, change
 
     def _driven(
         self, run: Run, theta: Array, join: bool, folded: set[int] | None, given: Mapping[str, Signal] | None = None

@@ -71,6 +71,14 @@ def _stage(twin: Twin, effect: Effect) -> Stage:
     return fitting[0] if fitting else effect.stages[0]
 
 
+def _commutes(twin: Twin) -> bool:
+    """Return whether a linear effect before the twin is the same as behind it.
+
+    It is not where the twin's equations may be nonlinear, or where each stretch starts from measured states.
+    """
+    return not hasattr(twin, "places")
+
+
 def _behind(twin: Twin, effect: Effect, stage: Stage) -> Stage:
     """The first stage behind the mechanics that an effect may have in a chain, else ``stage``."""
     late: list[Stage] = [s for s in effect.stages if s in twin.chain and STAGES.index(s) > STAGES.index("mechanics")]
@@ -93,7 +101,7 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         return [Placed(effect, "output", "+".join(g), stage, g) for g in _groups(twin, effect, usable)]
     if effect.name in _WHOLE_RECORD:
         late = [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs, note=SAME)]
-        if effect.name == "dead_time" and not twin.static and len(twin.inputs) > 1:
+        if effect.name == "dead_time" and not twin.static and (len(twin.inputs) > 1 or not _commutes(twin)):
             # one command may be late while the other inputs are not
             late = [replace(late[0], note="")]
             drives: list[Stage] = [d for d in _DRIVES if d in twin.chain]
@@ -111,8 +119,7 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         behind = stage if effect.kind == "linear" else _behind(twin, effect, stage)
         found += [Placed(effect, "output", o, behind, (o,)) for o in usable]
     if inputs and effect.driven:
-        if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present:
-            # a linear operator commutes with a linear twin of one input
+        if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present and _commutes(twin):
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
         found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]
     if inputs and effect.driven and effect.kind != "linear" and hasattr(twin, "inside"):

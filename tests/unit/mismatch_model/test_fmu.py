@@ -60,15 +60,25 @@ def of(path: Path, **more: object) -> Recording:
     return replace(made, path=path.parent / "made.toml")
 
 
-def truth(gain: float, tau: float) -> np.ndarray:
+def truth(gain: float, tau: float, over_the_step: np.ndarray = POWER) -> np.ndarray:
     a, y = np.exp(-DT / tau), np.zeros(N)
     for k in range(N - 1):
-        y[k + 1] = a * y[k] + (1 - a) * gain * POWER[k]
+        y[k + 1] = a * y[k] + (1 - a) * gain * over_the_step[k]
     return y
 
 
-def test_runs_with_its_parameters_and_from_its_own_start(fmu: Path) -> None:
+def test_linear_inputs_reach_a_co_simulation_as_their_mean_over_a_step(fmu: Path) -> None:
+    """They are assumed where nothing is declared; ``hold = "zero"`` gives each step its first sample."""
     rec = of(fmu)
+    got = Model(make(rec)).simulate(View.whole(rec), np.array([2.0, 0.5]))["position"]
+    np.testing.assert_allclose(got, truth(2.0, 0.5, 0.5 * (POWER + np.roll(POWER, -1))), atol=1e-12)
+    assert make(rec).hold == "linear"  # type: ignore[attr-defined]
+    with pytest.raises(RecordingError, match="hold must be 'zero' or 'linear'"):
+        make(of(fmu, hold="smooth"))
+
+
+def test_runs_with_its_parameters_and_from_its_own_start(fmu: Path) -> None:
+    rec = of(fmu, hold="zero")
     model = Model(make(rec))
     assert [p.name for p in model.parameters] == ["um_per_W", "time_constant_s"]
     for gain, tau in ((2.0, 0.5), (3.0, 0.5), (2.0, 0.1), (2.0, 0.5)):

@@ -38,6 +38,7 @@ from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.corrected import CorrectedTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
+from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.ode import OdeTwin
 
@@ -175,7 +176,7 @@ def _diagnose(
     effects: Iterable[Effect] | None,
     rule: Rule,
 ) -> Report:
-    recording, was_joined = joined(recording)
+    recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
     if effects is None and not isinstance(make(recording), CascadeTwin):

@@ -30,7 +30,10 @@ def not_tried(twin: Twin) -> str:
         "fmu": "An FMU for co-simulation shows its inputs and outputs alone",
         "instrument": "The emulated bench shows its inputs and outputs alone",
     }.get(core.kind, "A twin in Python shows its inputs and outputs alone")
-    return f"{what}: {_INSIDE}. A twin of kind 'ode' (the equations as text or a function of derivatives) allows it."
+    more = " So does an FMU for model exchange with linear equations." if core.kind == "fmu" else ""
+    return (
+        f"{what}: {_INSIDE}. A twin of kind 'ode' (the equations as text or a function of derivatives) allows it.{more}"
+    )
 
 
 def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[str, float]) -> bool:

@@ -17,7 +17,7 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.recording_load import load, load_twin
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
-from tools.mismatch.twins.fmu import FmuRun
+from tools.mismatch.twins.fmu import FmuRun, with_equations
 from tools.mismatch.twins.make import make
 
 KINDS = (".toml", ".py", ".fmu")
@@ -65,6 +65,7 @@ def simulate_file(twin: Path | str, recording: Path | str) -> dict[str, Array]:
         raise RecordingError(f"{path}: no such twin; give a file that 'micron mismatch apply' wrote")
     match path.suffix.lower():
         case ".toml":
+            rec = with_equations(rec)
             other = replace(rec, twin=load_twin(path))
             if other.twin.kind != rec.twin.kind:
                 raise RecordingError(f"{path}: is a {other.twin.kind}, {rec.path} is recorded for a {rec.twin.kind}")

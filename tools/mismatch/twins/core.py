@@ -8,7 +8,7 @@ from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import cascade_twin
 from tools.mismatch.twins.cluster import cluster_twin
 from tools.mismatch.twins.columns import columns_twin
-from tools.mismatch.twins.fmu import fmu_twin
+from tools.mismatch.twins.fmu import fmu_twin, with_equations
 from tools.mismatch.twins.ode_matrices import physical_twin
 from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.opaque import function_twin, user_twin
@@ -41,7 +41,8 @@ def core(recording: Recording) -> Twin:
         case "ode":
             return ode_twin(recording)
         case "fmu":
-            return fmu_twin(recording)
+            known = with_equations(recording)
+            return fmu_twin(recording) if known is recording else core(known)
         case "instrument":
             from tools.mismatch.twins.instrument import instrument_twin
 

@@ -1,4 +1,6 @@
-"""An FMI 2 or 3 co-simulation FMU as a twin. It is opened and run in a process of its own (``tools.guest``)."""
+"""An FMU as a twin: co-simulation (FMI 2, 3) or model exchange (FMI 2). It runs in a process of its own
+(``tools.guest``). One for model exchange whose equations are linear becomes the state space that it is.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +10,7 @@ import struct
 import sys
 import zipfile
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -17,17 +20,23 @@ from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
 
+OWN_KEYS = ("path", "hold")
+"""Keys of ``[twin.parameters]`` that are not parameters of the FMU."""
 MOST_BYTES, MOST_FILES = 1 << 30, 10_000
 
 
 class FmuRun:
     """One free run per call. A copy in another process starts a process of its own for the FMU.
 
-    ``named_by``: the file that names it, for messages. ``NotTrusted`` for an FMU that the user has not trusted,
-    ``RecordingError`` for a file that is no co-simulation FMU and for a run that fails, ``GuestDied`` for a crash.
+    ``named_by``: the file that names it, for messages; ``inputs`` and ``start`` (parameters) are what its matrices are
+    asked for with. ``NotTrusted`` for an FMU that the user has not trusted, ``RecordingError`` for a file that cannot
+    be opened as an FMU and for a run that fails, ``GuestDied`` for a crash.
     """
 
-    def __init__(self, path: Path, outputs: tuple[str, ...], dt: float, named_by: Path | None = None) -> None:
+    def __init__(
+        self, path: Path, outputs: tuple[str, ...], dt: float, named_by: Path | None = None,
+        inputs: tuple[str, ...] = (), start: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
         self.path = path
         _check_fmpy(path)
         check_archive(path)
@@ -38,13 +47,26 @@ class FmuRun:
             "digest": digest,
             "outputs": outputs,
             "dt": dt,
+            "inputs": inputs,
+            "start": dict(start or {}),
         }
         self.guest = GuestProcess(str(path), opening)
 
     def names(self) -> set[str]:
         """Return the variables of the FMU."""
+        return set(self._said("names"))
+
+    def kind(self) -> str:
+        """Return ``CoSimulation`` or ``ModelExchange``."""
+        return str(self._said("kind"))
+
+    def linear(self) -> Mapping[str, Any] | None:
+        """The matrices, states and start of an FMU for model exchange whose equations are linear, else None."""
+        return self._said("linear")
+
+    def _said(self, key: str) -> Any:
         try:
-            return set(self.guest.opened()[0]["names"])
+            return self.guest.opened()[0][key]
         except GuestError as error:
             raise RecordingError(f"{self.path}: {error}") from error
 
@@ -82,8 +104,8 @@ def _check_fmpy(where: Path) -> None:
         raise RecordingError(f"{where}: [twin] kind 'fmu' needs FMPy: install this package with its extra 'fmu'")
 
 
-def fmu_twin(recording: Recording) -> OpaqueTwin:
-    """An FMI 2 or 3 co-simulation FMU; ``[twin.parameters] path`` names it beside the descriptor."""
+def opened_fmu(recording: Recording) -> tuple[Path, FmuRun]:
+    """The FMU that ``[twin.parameters] path`` names beside the descriptor. RecordingError says what does not fit."""
     where = f"{recording.path}: [twin.parameters]"
     name = recording.twin.parameters.get("path")
     if not isinstance(name, str):
@@ -91,10 +113,40 @@ def fmu_twin(recording: Recording) -> OpaqueTwin:
     path = path_inside(recording.path, name)
     if not path.is_file():
         raise RecordingError(f"{where} path: {path} does not exist")
-    run = FmuRun(path, tuple(recording.outputs), recording.dt, recording.path)
+    start = {k: v for k, v in recording.twin.parameters.items() if k not in OWN_KEYS}
+    if recording.twin.parameters.get("hold", "linear") not in ("zero", "linear"):
+        raise RecordingError(f"{where} hold must be 'zero' or 'linear', got {recording.twin.parameters['hold']!r}")
+    run = FmuRun(path, tuple(recording.outputs), recording.dt, recording.path, tuple(recording.inputs), start)
     known = run.names()
-    lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
-    lost += [k for k in recording.twin.parameters if k != "path" and k not in known]
+    lost = [s for s in (*recording.inputs, *recording.outputs, *start) if s not in known]
     if lost:
         raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
-    return opaque_twin(recording, run, str(path), fixed=("path",))
+    return path, run
+
+
+def fmu_twin(recording: Recording) -> OpaqueTwin:
+    """An FMU for co-simulation as a program that runs freely: nothing is known of its inside."""
+    path, run = opened_fmu(recording)
+    twin = opaque_twin(recording, run, str(path), fixed=OWN_KEYS)
+    hold = str(recording.twin.parameters.get("hold", "linear"))
+    return replace(twin, hold=hold, given={**twin.given, "hold": hold})
+
+
+def with_equations(recording: Recording) -> Recording:
+    """The recording with an FMU for model exchange as the state space that its equations are: forces then reach each of
+    its states. Any other recording comes back as it is. RecordingError where the equations are not linear.
+    """
+    if recording.twin.kind != "fmu":
+        return recording
+    path, run = opened_fmu(recording)
+    if run.kind() == "CoSimulation":
+        return recording
+    found = run.linear()
+    if found is None:
+        raise RecordingError(
+            f"{path}: an FMU for model exchange is read when its equations are linear, without constant terms, time and"
+            " events; export this one for co-simulation, or write its equations as a twin of kind 'ode'"
+        )
+    parameters = dict(found) if any(found["x0"]) else {k: v for k, v in found.items() if k != "x0"}
+    parameters |= {k: v for k, v in recording.twin.parameters.items() if k == "hold"}
+    return replace(recording, twin=replace(recording.twin, kind="state_space", parameters=parameters))

@@ -54,6 +54,11 @@ class OdeTwin(Head):
     apart: bool = False
     counted: Counted = ""
 
+    @property
+    def hold(self) -> str:
+        """What the inputs do between their samples: "zero" or "linear"."""
+        return "zero" if self.held else "linear"
+
     def start(self, recording: Recording) -> Array:
         """See Twin."""
         return np.array([float(self.given[self.names[i]]) for i in self.free])

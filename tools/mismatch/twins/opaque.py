@@ -55,6 +55,8 @@ class OpaqueTwin:
     feedback_on: str = ""
     counted: Counted = ""
     source: str = field(default="", compare=False)
+    hold: str = ""
+    """What the inputs do between their samples ("zero", "linear"), where the program asks for that."""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
