@@ -19,7 +19,7 @@ from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.one_way import one_way
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.reach import not_tried, out_of_reach, tempered
+from tools.mismatch.engine.reach import imitable, not_tried, out_of_reach, tempered
 from tools.mismatch.engine.report import (
     BaseShift,
     Checks,
@@ -86,7 +86,9 @@ def assemble(
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
-    if out_of_reach(physics, twin, {o: hi for o, (_, hi) in decision.floors.items()}):
+    off = imitable(physics, twin)
+    physics = [tempered([f])[0] if it else f for f, it in zip(physics, off, strict=True)]
+    if (off and all(off)) or out_of_reach(physics, twin, {o: hi for o, (_, hi) in decision.floors.items()}):
         verdict, physics = "unexplained", tempered(physics)
         decision = replace(decision, verdict=verdict, meaning=decision.meaning or "place_not_reachable")
     looked = fitted if verdict == "unexplained" else base

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.report import PhysicsFound
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.opaque import OpaqueTwin
@@ -21,8 +22,9 @@ def not_tried(twin: Twin) -> str:
     core = getattr(twin, "core", twin)
     if core.kind == "columns":
         return (
-            "This twin is columns of simulated output: only effects at outputs and late outputs were tried, and"
-            f" {_INSIDE}. A twin of kind 'ode' (the equations as text) allows it."
+            "This twin is columns of simulated output: only effects at outputs and late outputs were tried,"
+            f" {_INSIDE}, and its parameters could not be re-fitted (a delay or a lag may be one of them that is off)."
+            " A twin of kind 'ode' (the equations as text) allows it."
         )
     if not isinstance(core, OpaqueTwin):
         return ""
@@ -41,6 +43,15 @@ def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[st
     return bool(not_tried(twin)) and any(
         p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics
     )
+
+
+def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
+    """For each effect, whether a parameter of the simulation that is off could be what it was taken for: a linear
+    effect behind columns of simulated output, whose parameters nobody can re-fit here.
+    """
+    columns = getattr(twin, "core", twin).kind == "columns"
+    linear = {name for name, effect in EFFECTS.items() if effect.kind == "linear"}
+    return [columns and p.name in linear for p in physics]
 
 
 def tempered(physics: Sequence[PhysicsFound]) -> list[PhysicsFound]:

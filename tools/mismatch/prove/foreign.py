@@ -24,7 +24,8 @@ from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.report import Report
 from tools.mismatch.recording_load import load
 
-EXAMPLE, DOC = Path("examples/motor"), Path("docs/mismatch-foreign.md")
+EXAMPLE = Path(__file__).parents[3] / "examples" / "motor"
+DOC = Path("docs/mismatch-foreign.md")
 FRICTION = ("coulomb_friction", "stribeck_friction")
 TRUTH: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "nothing": (),
@@ -119,9 +120,9 @@ def page(runs: Sequence[Mapping[str, Any]]) -> str:
         "",
         "Made by `python -m tools.mismatch.prove.foreign`; do not edit. The motor of `examples/motor` integrates"
         " itself; each seed draws all its values, and its data sheet is a few per cent off. `right`: every name and no"
-        " other is surer than 50 %; `part`: some of the names; `advice`: `unexplained`, with the kind of twin that would"
-        " say more; `unsure`: no name is surer than 50 %; `missed`: no difference seen; `wrong`: another name is surer"
-        " than 50 %.",
+        " other is surer than 50 %; `part`: some of the names; `advice`: `unexplained`, with the kind of twin that"
+        " would say more; `unsure`: no name is surer than 50 %; `missed`: no difference seen; `wrong`: another name"
+        " is surer than 50 %.",
         "",
         f"{len(rows)} cases: " + ", ".join(f"{w} {k}" for w, k in {**tally, **bad}.items() if k or w in bad) + ".",
     ]
