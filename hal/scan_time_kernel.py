@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 from hal.compiled import kernel
-from hal.scan_time import SHIFT, SHIFT_ALIKE, SHIFT_ARRIVALS, SHIFT_SPREAD
+from hal.scan_time_state import SHIFT, SHIFT_ALIKE, SHIFT_ARRIVALS, SHIFT_SPREAD
 
 Record = Any
 
@@ -16,7 +16,7 @@ Record = Any
 @kernel
 def stamp_kernel(timeline: Record, n: int, arrival_ns: int) -> tuple[int, int, int]:
     """Stamp ``n`` scans that have just arrived. Return the time of the first (ns), its number, and the scans
-    lost before. ``timeline`` (1,) is of ``hal.scan_time.TIMELINE``.
+    lost before. ``timeline`` (1,) is of ``hal.scan_time_state.TIMELINE``.
     """
     t = timeline[0]
     nominal_ns = (t.next + n - 1) * t.dt_ns

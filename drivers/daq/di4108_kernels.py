@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.compiled import kernel
-from hal.scan_time import TIMELINE, ScanTimeline
+from hal.scan_time import ScanTimeline
 from hal.scan_time_kernel import shifted_kernel, stamp_kernel
+from hal.scan_time_state import TIMELINE
 
 Record = Any
 
