@@ -20,7 +20,8 @@ class EndoscopeConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    fusion: FusionConfig = FusionConfig()
+    fusion: FusionConfig = FusionConfig(method="error-state")
+    """Mahony, which document 002 chose, follows every acceleration; see docs/endoscope.md."""
     game: GameConfig = GameConfig()
     steered_by: str = ""
     silent_ms: float = Field(default=500.0, ge=20.0, le=60_000.0)

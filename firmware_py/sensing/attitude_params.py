@@ -20,6 +20,12 @@ METHODS = {
     "quaternion-kalman": QUATERNION_KALMAN_METHOD,
 }
 TREMOR_RAD_S2 = 0.5
+GYRO_WHITE = 0.006
+"""deg/s/sqrt(Hz): Allan deviation of the gyroscope of BROAD at rest, 0.1 to 1 s (one-sided, as a turn's growth)."""
+GYRO_WALK = 0.0005
+"""deg/s/sqrt(s): random walk of its bias, from the bias at rest before and after a trial."""
+GYRO_SCALE_ERROR = 0.002
+"""Share of the rate by which scale and alignment of a calibrated consumer gyroscope are off."""
 
 
 def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
@@ -113,6 +119,8 @@ def error_state_params(config: SensingConfig) -> Record:
         start_bias_variance=density[3:] / config.align_s + TREMOR_RAD_S2**2,
         field_tolerance=0.2,
         dip_tolerance_rad=radians(15.0),
+        field_learn_s=5.0,
+        field_accept_s=10.0,
         gravity=config.gravity_m_s2,
     )
 
@@ -121,15 +129,19 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
     """The same filter for a consumer gyroscope, accelerometer and magnetometer on a moving person (BROAD).
 
     A sample of such a gyroscope is the mean over the interval before it, so it turns the whole interval (``lead`` 1).
+    Noise and bias are the Allan deviation of the gyroscope at rest. Its scale and alignment turn the attitude by a
+    share of the rate; the error changes sign as the body turns, about once a radian, so the variance grows by
+    2 share^2 x 1 rad x rate. Without that term the heading becomes too certain on a body that keeps turning.
+    How a believed field is followed and a new one accepted is as in VQF (Laidig and Seel 2023, section 3.5).
     """
     deg = radians(1.0)
     return new_record(
         ERROR_STATE,
-        turn_density=(0.003 * deg) ** 2,
+        turn_density=(GYRO_WHITE * deg) ** 2,
         lead=1.0,
-        turn_per_rate=1e-7,
+        turn_per_rate=2.0 * GYRO_SCALE_ERROR**2,
         notch=np.array([1.0, 0.0, 0.0, 0.0, 0.0]),
-        rate_density=(0.01 * deg) ** 2,
+        rate_density=(GYRO_WALK * deg) ** 2,
         force_density=0.01**2,
         still_density=0.1**2,
         rest_density=(0.03 * deg) ** 2,
@@ -140,6 +152,9 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
         start_variance=np.array([(5.0 * deg) ** 2, (10.0 * deg) ** 2, (0.5 * deg) ** 2, 0.1**2]),
         field_tolerance=0.1,
         dip_tolerance_rad=10.0 * deg,
+        field_learn_s=20.0,
+        field_accept_s=20.0,
+        field_turn_rad_s=20.0 * deg,
         rest_rate_rad_s=2.0 * deg,
         rest_force_m_s2=0.5,
         rest_s=1.5,

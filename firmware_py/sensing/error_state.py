@@ -31,9 +31,6 @@ from firmware_py.sensing.quaternion import rotate_by, to_matrix
 from hal.compiled import kernel
 from hal.scratch import scratch
 
-FIELD_LEARN_S = 5.0
-FIELD_ACCEPT_S = 10.0
-"""A new field that stays this long is accepted as the environment."""
 FIELD_REGAIN_S = 0.5
 """After a refused field: a body that turns near a magnet passes through attitudes where all looks well."""
 REST_SMOOTHING_S = 0.5
@@ -116,7 +113,7 @@ def propagate_errors(
         p[i, DISTURBANCE] = fade * w[i, DISTURBANCE]
         for j in range(i):  # symmetric to the last bit, whatever rounding did
             p[j, i] = p[i, j]
-    spin = params.turn_per_rate * (rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
+    spin = params.turn_per_rate * sqrt(rate[0] ** 2 + rate[1] ** 2 + rate[2] ** 2)
     for i in range(3):
         for k in range(3):
             turned = 0.0
@@ -296,7 +293,7 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
     if known and e.regained_s < FIELD_REGAIN_S:
         return
     if known:
-        learn = min(1.0, since / FIELD_LEARN_S)
+        learn = min(1.0, since / params.field_learn_s)
         e.field_size += learn * (size - e.field_size)
         e.field_dip += learn * (dip - e.field_dip)
         e.field_wait_s = 0.0
@@ -314,11 +311,13 @@ def _heading(state: Record, params: Record, field: NDArray[np.float64], x: NDArr
         and abs(dip - e.candidate_dip) < params.dip_tolerance_rad
     )
     if alike:
-        e.candidate_s += since
-        learn = min(1.0, since / FIELD_LEARN_S)
+        turning = state.rate[0] ** 2 + state.rate[1] ** 2 + state.rate[2] ** 2
+        if turning >= params.field_turn_rad_s**2:
+            e.candidate_s += since
+        learn = min(1.0, since / params.field_learn_s)
         e.candidate_size += learn * (size - e.candidate_size)
         e.candidate_dip += learn * (dip - e.candidate_dip)
-        if e.candidate_s > FIELD_ACCEPT_S:
+        if e.candidate_s > params.field_accept_s:
             e.field_size = e.candidate_size
             e.field_dip = e.candidate_dip
     else:

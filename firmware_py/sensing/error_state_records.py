@@ -11,7 +11,7 @@ ERROR_STATE = np.dtype(
     [
         ("turn_density", "f8", (3,)),  # rad^2/s, body axes: white noise of the rate
         ("lead", "f8"),  # where in the interval the rate is taken, in intervals: 1/2 its middle, 1 its end
-        ("turn_per_rate", "f8"),  # s: the same grows by this times the squared rate (scale errors of the source)
+        ("turn_per_rate", "f8"),  # rad: the same grows by this times the rate (scale and alignment of the source)
         ("rate_density", "f8", (3,)),  # (rad/s)^2/s, body axes: white noise of alpha
         ("bias_density", "f8", (3,)),  # (rad/s^2)^2/s
         ("force_density", "f8"),  # (m/s)^2/s: white noise of the specific force
@@ -28,6 +28,9 @@ ERROR_STATE = np.dtype(
         ("start_bias_variance", "f8", (3,)),
         ("field_tolerance", "f8"),  # relative deviation of the field's size that is still used
         ("dip_tolerance_rad", "f8"),
+        ("field_learn_s", "f8"),  # time constant with which a believed field's size and dip are followed
+        ("field_accept_s", "f8"),  # a new field that stays this long is accepted as the environment
+        ("field_turn_rad_s", "f8"),  # least rate of the body at which that time counts; 0: always
         ("rest_rate_rad_s", "f8"),
         ("rest_force_m_s2", "f8"),
         ("rest_s", "f8"),

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.records import Record, new_record
+from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.fusion_filters import (
     COMPLEMENTARY,
     FUSION,
@@ -22,11 +23,13 @@ from firmware_py.sensing.fusion_filters import (
     run_fusion,
     step_fusion,
 )
+from firmware_py.sensing.gyroscope_filter import KALMAN_MEMORY, begin_gyroscope, run_gyroscope, step_gyroscope
 from hal.compiled import kernel
 from hal.errors import BenchError
 
 Array = NDArray[np.float64]
-Method = Literal["tilt", "gyroscope", "complementary", "madgwick", "mahony", "vqf"]
+ALIGN_S = 0.1
+Method = Literal["tilt", "gyroscope", "complementary", "madgwick", "mahony", "error-state", "vqf"]
 NATIVE = {
     "tilt": TILT,
     "gyroscope": GYROSCOPE,
@@ -37,7 +40,10 @@ NATIVE = {
 
 
 class FusionConfig(BaseModel):
-    """Selects the filter and its parameters. The defaults are document 002's printed choice (sections 3.3, 3.4)."""
+    """Selects the filter and its parameters. The defaults are document 002's printed choice (sections 3.3, 3.4).
+
+    ``error-state`` is the Kalman filter of ``error_state.py``: it finds the gyroscope's bias and needs force in m/s^2.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -52,7 +58,7 @@ class FusionConfig(BaseModel):
     kp: float = Field(default=1.4, ge=0.0)
     ki: float = Field(default=0.002, ge=0.0)
     """Integral gain of Mahony's filter, 1/s^2. ``kp`` is the proportional gain, 1/s."""
-    align_s: float = Field(default=0.1, ge=0.0, le=10.0)
+    align_s: float = Field(default=ALIGN_S, ge=0.0, le=10.0)
     """The attitude starts from the mean of so long; 0: from level, heading zero, as the document's tests do."""
 
 
@@ -103,7 +109,13 @@ class Fusion:
             ki=config.ki,
             align_samples=round(config.align_s * rate_hz),
         )
-        self._memory = new_record(MEMORY, params=params)
+        self._kalman = config.method == "error-state"
+        if self._kalman:
+            self._memory = new_record(KALMAN_MEMORY)
+            self._memory["params"]["error_state"] = gyroscope_error_state()
+            self._memory["params"]["align_samples"] = round(config.align_s * rate_hz)
+        else:
+            self._memory = new_record(MEMORY, params=params)
         self._state, self._params = (self._memory[name][0] for name in ("state", "params"))
         self._rate, self._force, self._field, self._dt_s = (
             self._memory[name][0] for name in ("rate", "force", "field", "dt_s")
@@ -117,11 +129,15 @@ class Fusion:
         return bool(self._state["aligned"][0])
 
     def restart(self, start: Array | None = None) -> None:
-        """Forget everything; the next samples align anew, or ``start`` (4,) is the attitude (not with "vqf")."""
-        _begin(self._state, self._params)
+        """Forget everything; the next samples align anew, or ``start`` (4,) is the attitude (not with "vqf" and
+        "error-state")."""
+        if self._kalman:
+            begin_gyroscope(self._memory)
+        else:
+            _begin(self._state, self._params)
         if self._vqf is not None:
             self._vqf.resetState()
-        elif start is not None:
+        elif start is not None and not self._kalman:
             self.quaternion[:] = np.asarray(start) / np.linalg.norm(start)
             self._state["aligned"] = 1
 
@@ -131,7 +147,9 @@ class Fusion:
         self._force[:] = force
         self._field[:] = np.nan if field is None else field
         self._dt_s[0] = self._period_s if dt_s is None else dt_s
-        if self._vqf is None:
+        if self._kalman:
+            step_gyroscope(self._memory)
+        elif self._vqf is None:
             _step_one(self._memory)
         else:
             self._state["aligned"] = 1
@@ -148,7 +166,9 @@ class Fusion:
         out = np.empty((n, 4))
         if n:
             w, f, b, dt = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, b, dt))
-            if self._vqf is None:
+            if self._kalman:
+                run_gyroscope(self._memory, w, f, b, dt, out)
+            elif self._vqf is None:
                 run_fusion(self._state, self._params, w, f, b, dt, out)
             else:
                 for k in range(n):

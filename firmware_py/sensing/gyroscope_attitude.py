@@ -1,7 +1,4 @@
-"""Runs every attitude filter that a gyroscope drives over a whole recording in one compiled call.
-
-This module holds the Kalman filters; ``fusion`` holds those of document 002, which also run live.
-"""
+"""Runs every attitude filter that a gyroscope drives over a whole recording in one compiled call."""
 
 from __future__ import annotations
 
@@ -11,14 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record, new_record
-from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, begin_filter, restart, step_attitude
-from firmware_py.sensing.attitude_params import METHODS, gyroscope_error_state, gyroscope_quaternion_kalman
-from firmware_py.sensing.fusion import Fusion, FusionConfig, Method
+from firmware_py.sensing.attitude import ATTITUDE, ATTITUDE_STATE, restart
+from firmware_py.sensing.attitude_params import gyroscope_error_state, gyroscope_quaternion_kalman
+from firmware_py.sensing.fusion import ALIGN_S, Fusion, FusionConfig, Method
+from firmware_py.sensing.gyroscope_filter import KALMAN_MEMORY, begin_gyroscope, run_gyroscope
 from firmware_py.sensing.quaternion import from_matrix
+from firmware_py.sensing.quaternion_kalman import quaternion_kalman_step, start_quaternion_kalman
 from firmware_py.sensing.triad import triad
 from hal.compiled import kernel
-
-ALIGN_S = 0.1
 
 
 @kernel
@@ -31,7 +28,8 @@ def run_kernel(
     state: Record,
     out: NDArray[np.float64],
 ) -> None:
-    """``out`` (n, 4) from rate rad/s, force m/s^2, field (any unit; a row of nan: no conversion), all (n, 3)."""
+    """The quaternion filter: ``out`` (n, 4) from rate rad/s, force m/s^2, field (any unit; a row of nan: no
+    conversion), all (n, 3)."""
     s, p = state[0], params[0]
     restart(s)
     motion = np.zeros(6)
@@ -46,14 +44,16 @@ def run_kernel(
     for i in range(3):
         s.field[i] = sums[1, i]
         s.rate[i] = rate[0, i]
-    begin_filter(s, p, s.field)
+    start_quaternion_kalman(s, p.quaternion_kalman, 0.0)
     for k in range(len(rate)):
         for i in range(3):
             motion[i] = force[k, i]
             change = (rate[k, i] - rate[max(k - 1, 0), i]) / p.dt_s
             motion[3 + i] = change
             s.previous[i] = change
-        step_attitude(s, p, motion, field[k], np.isfinite(field[k, 0]), 1)
+        if np.isfinite(field[k, 0]):
+            s.field[:] = field[k]
+        quaternion_kalman_step(s, p.quaternion_kalman, motion[:3], motion[3:], s.field, p.dt_s)
         for i in range(4):
             out[k, i] = s.quaternion[i]
 
@@ -73,17 +73,18 @@ def gyroscope_attitude(
     """
     if not len(rate) == len(force) == len(field) or len(rate) < 2:
         raise ValueError(f"rate, force and field have {len(rate)}, {len(force)} and {len(field)} rows")
-    if method not in ("error-state", "quaternion-kalman"):
+    if method != "error-state" and method != "quaternion-kalman":
         return Fusion(FusionConfig(method=method), rate_hz).run(rate, force, field)
-    params = new_record(
-        ATTITUDE,
-        dt_s=1.0 / rate_hz,
-        method=METHODS[method],
-        error_state=gyroscope_error_state(gravity_m_s2) if setting is None else setting,
-        quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2),
-    )
     out = np.empty((len(rate), 4))
     w, f, b = (np.ascontiguousarray(a, dtype=np.float64) for a in (rate, force, field))
     align = max(1, min(len(rate), round(ALIGN_S * rate_hz)))
+    if method == "error-state":
+        memory = new_record(KALMAN_MEMORY)
+        memory["params"]["error_state"] = gyroscope_error_state(gravity_m_s2) if setting is None else setting
+        memory["params"]["align_samples"] = align
+        begin_gyroscope(memory)
+        run_gyroscope(memory, w, f, b, np.full(len(w), 1.0 / rate_hz), out)
+        return out
+    params = new_record(ATTITUDE, dt_s=1.0 / rate_hz, quaternion_kalman=gyroscope_quaternion_kalman(gravity_m_s2))
     run_kernel(w, f, b, align, params, np.zeros(1, ATTITUDE_STATE), out)
     return out

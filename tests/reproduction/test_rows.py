@@ -110,6 +110,6 @@ def test_settings_are_the_fixed_one_and_its_neighbours() -> None:
     all_of_them = broad.settings(2.0)
     fixed = broad.gyroscope_error_state()
     assert sum(s.tobytes() == fixed.tobytes() for s in all_of_them) == 1
-    ratios = {round(float(s["still_density"][0] / fixed["still_density"][0]), 6) for s in all_of_them}
+    ratios = {round(float(s["heading_density"][0] / fixed["heading_density"][0]), 6) for s in all_of_them}
     assert ratios == {0.25, 1.0, 4.0}  # an amplitude's square
     assert len({s.tobytes() for s in all_of_them}) == 27

@@ -22,6 +22,7 @@ from tools.calibrate.piezo_feedforward import Answers, Feedforward, for_tip
 from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import simulate
 from tools.calibrate.piezo_regression import Axes, Piece, Shape, Solution, axes_of, fit, play_states, residual, stack_of
+from tools.calibrate.piezo_start import begins_with_step, fit_lag, from_rest
 from tools.calibrate.piezo_steps import fit_steps, is_steps
 from tools.errors import InputError
 from tools.mismatch.recording import Recording
@@ -68,12 +69,16 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
     basic = Shape(FAMILIES["8 plays"])
     dynamics = Dynamics()
     # on loops of one size and rate a lag is just a wider loop
-    if one_loop(drives):
+    if len(given) == 1 and one_loop(drives) and begins_with_step(drives[0], zs[0], dt):
+        notes.append("all loops are alike; the lag is that of the step from 0 V with which the recording begins")
+        whole = replace(pieces[0], rows=slice(0, pieces[0].rows.stop))
+        pieces, dynamics = fit_lag([from_rest(p) for p in (whole, pieces[1])], replace(basic, zones=ZONES[0]), centre_V)
+    elif one_loop(drives):
         notes.append("all loops are alike, so a lag cannot be told from hysteresis: taken as none")
     else:
         pieces, dynamics = _lag(pieces, basic, centre_V)
     pieces = rates_of(pieces, basic, centre_V)
-    shape, axes, _, _, parts = _select(pieces, folds, centre_V)
+    shape, axes, _, _, parts = _select(pieces, folds, centre_V, not one_loop(drives))
     if held:
         better, mode = _mode(pieces, drives, len(given) == 1, shape, axes)
         before = float(np.nanmean(fit(pieces, shape, axes, folds)[1]))
@@ -82,7 +87,7 @@ def identify_stack(recordings: Recording | Sequence[Recording]) -> PiezoFit:
         if after < before:
             pieces, dynamics = better, mode
             pieces = rates_of(pieces, basic, centre_V)
-            shape, axes, _, _, again = _select(pieces, folds, centre_V)
+            shape, axes, _, _, again = _select(pieces, folds, centre_V, not one_loop(drives))
             parts = (*parts, *again)
     partials: list[Solution] = []
     solution, unseen = fit(pieces, shape, axes, folds, partials)
@@ -159,9 +164,13 @@ def rate_of(x: Array, dt: float) -> Array:
 
 
 def _select(
-    pieces: list[Piece], folds: list[list[int]], centre_V: float
+    pieces: list[Piece], folds: list[list[int]], centre_V: float, by_rate: bool
 ) -> tuple[Shape, Axes, Solution, float, tuple[tuple[str, float, bool], ...]]:
-    """Thresholds and parts by what they leave in recordings that were not seen."""
+    """Thresholds and parts by what they leave in recordings that were not seen.
+
+    ``by_rate``: whether a law of the rate is tried. Where all loops are alike the rate only tells where in the loop
+    a sample is.
+    """
 
     def score(shape: Shape) -> tuple[Axes, Solution, float]:
         axes = axes_of(pieces, shape, centre_V)
@@ -186,7 +195,7 @@ def _select(
         *families,
     ]
     for name, change in steps:
-        if name.startswith("law") and not shape.rate:
+        if (name.startswith("law") and not shape.rate) or (name == "slopes by rate" and not by_rate):
             continue
         candidate = replace(shape, **change)
         if candidate == shape:

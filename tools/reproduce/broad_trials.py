@@ -27,6 +27,11 @@ class Trial:
     counts: NDArray[np.bool_]
     published: dict[str, Any]
 
+    @property
+    def disturbed(self) -> bool:
+        """Whether the set's authors disturbed it (taps or magnets)."""
+        return "_disturbed_" in str(self.published["name"])
+
     def errors_deg(self, attitude: Array) -> tuple[float, float, float]:
         """Total, heading, inclination rms of quaternions (n, 4) whose world has x to magnetic north."""
         return rms_errors_deg(east_north_up(attitude), self.truth, self.counts)

@@ -75,6 +75,39 @@ def test_a_magnet_does_not_turn_the_heading() -> None:
     assert np.max(errors_deg(q, attitude)[near]) < 0.5
 
 
+def turning_body(seconds: float, scale_error: float):
+    """A body that lies still for 10 s and then turns about the vertical, and back a fifth as fast: attitudes (n), and
+    rate, force, field of a gyroscope whose scale is off."""
+    n = round(seconds * RATE_HZ)
+    t = np.arange(n) / RATE_HZ
+    rate = np.where(t < 10.0, 0.0, np.where(t % 12.0 < 2.0, -0.4, 2.0))
+    heading = np.cumsum(rate) / RATE_HZ
+    attitude = Rotation.from_rotvec(heading[:, None] * np.array([0.0, 0.0, 1.0]))
+    gyro = (1.0 + scale_error) * rate[:, None] * np.array([0.0, 0.0, 1.0])
+    return attitude, gyro, np.tile([0.0, 0.0, G], (n, 1)), attitude.inv().apply(np.tile(FIELD, (n, 1)))
+
+
+def test_a_scale_error_of_the_gyroscope_does_not_walk_the_heading_off() -> None:
+    """0.3 % of 1.6 rad/s on average is 16 degrees a minute; the field must stop it, however certain rest was.
+
+    A drift d against a heading of density r (noise and slow disturbance) and a turn of density q leaves d sqrt(r / q).
+    """
+    attitude, rate, force, field = turning_body(100.0, 0.003)
+    settings = gyroscope_error_state(), gyroscope_error_state()
+    settings[1]["turn_per_rate"] = 0.0
+    away, certain = (
+        errors_deg(gyroscope_attitude(rate, force, field, RATE_HZ, setting=setting), attitude)[-2000:]
+        for setting in settings
+    )
+    setting = attributes(settings[0])[0]
+    rate_rad_s = float(np.mean(np.abs(rate[2000:, 2])))
+    noise = setting.heading_density + 2.0 * setting.disturbance_rad**2 * setting.disturbance_s
+    turn = setting.turn_density[2] + setting.turn_per_rate * rate_rad_s
+    limit = np.degrees(0.003 * rate_rad_s * np.sqrt(noise / turn))
+    assert np.max(away) < limit
+    assert np.min(certain) > limit
+
+
 def test_the_covariance_follows_the_dense_equation() -> None:
     """P <- F P F^T + Q with F written out as a matrix."""
     rng = np.random.default_rng(5)
@@ -90,7 +123,7 @@ def test_the_covariance_follows_the_dense_equation() -> None:
     f[12, 12] = np.exp(-dt / params["disturbance_s"][0])
     q = np.zeros((ERRORS, ERRORS))
     q[0:3, 0:3] = dt * (
-        c @ np.diag(params["turn_density"][0]) @ c.T + params["turn_per_rate"][0] * rate @ rate * np.eye(3)
+        c @ np.diag(params["turn_density"][0]) @ c.T + params["turn_per_rate"][0] * np.linalg.norm(rate) * np.eye(3)
     )
     q[3:6, 3:6] = dt * np.diag(params["rate_density"][0])
     q[9:12, 9:12] = dt * params["force_density"][0] * np.eye(3)
@@ -110,13 +143,13 @@ def test_triad_covariance_is_that_of_drawn_errors() -> None:
     truth = Rotation.from_rotvec([0.7, -0.4, 1.2])
     up, field = truth.inv().apply([0.0, 0.0, 1.0]), truth.inv().apply(FIELD / np.linalg.norm(FIELD))
     a, b = 2e-3, 5e-3
-    found, c = [], np.empty((3, 3))
-    for _ in range(4000):
+    drawn = np.empty((4000, 3, 3))
+    for c in drawn:
         triad(up + a * rng.standard_normal(3), field + b * rng.standard_normal(3), c)
-        found.append((truth.inv() * Rotation.from_matrix(c)).as_rotvec())
+    found = (truth.inv() * Rotation.from_matrix(drawn)).as_rotvec()
     expected = np.empty((3, 3))
     triad_covariance(up, field, a * a, b * b, expected)
-    np.testing.assert_allclose(np.cov(np.array(found).T), expected, atol=0.06 * np.max(expected))
+    np.testing.assert_allclose(np.cov(found.T), expected, atol=0.06 * np.max(expected))
 
 
 def test_rows_must_match() -> None:

@@ -32,7 +32,7 @@ def still(n: int, roll_deg: float, pitch_deg: float = 0.0) -> tuple[Array, Array
     return np.zeros((n, 3)), np.tile(gravity(roll_deg, pitch_deg), (n, 1))
 
 
-@pytest.mark.parametrize("method", [*FILTERS, "vqf"])
+@pytest.mark.parametrize("method", [*FILTERS, "error-state", "vqf"])
 def test_starts_from_the_mean_of_the_first_tenth_of_a_second(method: str) -> None:
     fusion = Fusion(FusionConfig(method=method), RATE_HZ)  # type: ignore[arg-type]
     rate, force = still(200, 30.0, -20.0)
@@ -43,7 +43,7 @@ def test_starts_from_the_mean_of_the_first_tenth_of_a_second(method: str) -> Non
         assert angles_deg(q[9]) == pytest.approx((30.0, -20.0, 0.0), abs=1e-9)
 
 
-@pytest.mark.parametrize("method", FILTERS)
+@pytest.mark.parametrize("method", [*FILTERS, "error-state"])
 def test_live_and_batch_are_the_same_numbers(method: str) -> None:
     rng = np.random.default_rng(1)
     rate, force = rng.normal(0.0, 0.5, (60, 3)), gravity(10.0, 5.0) + rng.normal(0.0, 1.0, (60, 3))
@@ -155,6 +155,17 @@ def test_a_magnetometer_holds_the_heading(method: str) -> None:
     assert abs(angles_deg(fusion.run(rate, force, np.tile(north, (n, 1)))[-1])[2]) < 0.5
 
 
+def test_the_error_state_filter_finds_the_bias_at_rest_without_a_magnetometer() -> None:
+    bias = np.radians([0.4, -0.3, 0.5])
+    fusion = Fusion(FusionConfig(method="error-state"), RATE_HZ)
+    rate, force = still(6000, 20.0, 10.0)
+    q = fusion.run(rate + bias, force)
+    late = [angles_deg(q[k])[2] for k in (3000, 5999)]
+    # half a degree a second, unseen by gravity, would be 15 degrees in the second half
+    assert abs(late[1] - late[0]) < 0.1
+    assert angles_deg(q[-1])[:2] == pytest.approx((20.0, 10.0), abs=0.1)
+
+
 @pytest.mark.parametrize("method", FILTERS)
 def test_free_fall_and_standstill_do_not_break_it(method: str) -> None:
     fusion = Fusion(FusionConfig(method=method, align_s=0.0), RATE_HZ)  # type: ignore[arg-type]
@@ -238,6 +249,8 @@ def test_broad_errors_are_the_published_ones(shared_data: Path, trial: str) -> N
         fusion.restart(start)
         total, _, _ = read.errors_deg(fusion.run(rate, force, field))
         assert total == pytest.approx(entry[f"{method}_rmse_deg"], abs=5e-4)
+    ours = Fusion(FusionConfig(method="error-state"), 1.0 / 0.0035).run(rate, force, field)
+    assert read.errors_deg(ours)[0] < entry["madgwick_best_rmse_deg"]
     if trial == "02":
         q = gyroscope_attitude(rate, force, field, 1.0 / 0.0035, "madgwick")
         assert read.errors_deg(q)[0] < 3.0
