@@ -50,7 +50,7 @@ def tracking(fit: PiezoFit, plant: Plant, dt: float, preview_s: float) -> float:
 
     The inverse gets the path ``preview_s`` ahead; there is no feedback.
     """
-    t = np.arange(round((SCORED_S[1] + 1.0) / dt)) * dt
+    t: Array = np.arange(round((SCORED_S[1] + 1.0) / dt), dtype=np.float64) * dt
 
     def path(at: Array) -> Array:
         return PATH_UM * np.clip(at / RISE_S, 0.0, 1.0) * np.sin(2.0 * np.pi * PATH_HZ * at)
