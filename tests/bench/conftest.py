@@ -149,22 +149,44 @@ def bench_server(more_toml: str) -> Iterator[Server]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
+SERVED = pytest.StashKey["Server"]()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Tests of the one server follow one another, in one worker (``--dist loadgroup``): its firmware starts once."""
+    items.sort(key=uses_server)
+    for item in filter(uses_server, items):
+        item.add_marker(pytest.mark.xdist_group("bench server"))
+
+
+def uses_server(item: pytest.Item) -> bool:
+    return "session_server" in getattr(item, "fixturenames", ())
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """No firmware takes time from tests that need none."""
+    running = item.session.stash.get(SERVED, None)
+    if running is not None and uses_server(item) and nextitem is not None and not uses_server(nextitem):
+        assert running.request("POST", "/api/safe", b"{}")[0] == 200
+        running.wait_for(lambda s: s["phase"] not in ("starting", "running"), "the safe state", START_S)
+
+
 @pytest.fixture(scope="session")
-def session_server() -> Iterator[Server]:
+def session_server(request: pytest.FixtureRequest) -> Iterator[Server]:
     """One server for all tests of a session."""
     # the injected spike is to be seen, not to end the run: a sensor that jumps trips the firmware
     with bench_server("\n[firmware.plausibility]\njump_V = 2.0\n") as running:
+        request.session.stash[SERVED] = running
         yield running
+        del request.session.stash[SERVED]
 
 
-@pytest.fixture(scope="module")
-def server(session_server: Server) -> Iterator[Server]:
-    """The session's server with a running firmware; between modules no firmware takes time from other tests."""
+@pytest.fixture
+def server(session_server: Server) -> Server:
+    """The session's server with a running firmware."""
     session_server.wait_running()
-    yield session_server
-    assert session_server.request("POST", "/api/safe", b"{}")[0] == 200
-    # the next module looks whether it has to start one
-    session_server.wait_for(lambda s: s["phase"] not in ("starting", "running"), "the safe state", START_S)
+    return session_server
 
 
 def go(page: Any, view: str) -> None:
@@ -211,7 +233,7 @@ def opened_tab(browser: Any, address: str, ready: str = READY, **more: Any) -> I
     context = browser.new_context(**(window | more))
     context.set_default_timeout(60_000)
     tab = context.new_page()
-    errors: list[str] = []
+    tab.errors = errors = []
     tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))
     try:
         tab.goto(address)

@@ -24,13 +24,30 @@ COMMANDS = ["command_1", "command_2", "command_3"]
 FRAMES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))"
 
 
+READY = "window.micron && micron.scope && micron.scope.subscription.buckets.n > 100"
+
+
+@pytest.fixture(scope="module")
+def tab(browser: Any, still: Still) -> Iterator[Any]:
+    """One page for the tests of this module."""
+    with opened_tab(browser, still.address, READY) as opened:
+        yield opened
+
+
 @pytest.fixture
-def scope(browser: Any, still: Still) -> Iterator[Any]:
-    """The page, on the scope as it opens for somebody who was never there."""
-    ready = "window.micron && micron.scope && micron.scope.subscription.buckets.n > 100"
-    with opened_tab(browser, still.address, ready) as tab:
-        tab.evaluate(FRAMES)
-        yield tab
+def scope(tab: Any) -> Any:
+    """The page, on the scope as it opens for somebody who was never there: no setting is kept, the view is anew."""
+    tab.evaluate(
+        """() => {
+            for (const key of Object.keys(localStorage)) if (key !== "micron.token") localStorage.removeItem(key);
+            delete micron.scope;
+            micron.context.reload("scope");
+        }"""
+    )
+    tab.wait_for_function(READY)
+    tab.evaluate(FRAMES)
+    assert tab.errors == []
+    return tab
 
 
 def use(scope: Any, **settings: Any) -> None:
