@@ -19,7 +19,7 @@ run: setup
 test: lint unit realtime
 
 unit: setup
-	$(BIN)/pytest -n 2 --dist loadgroup -m "not slow and not realtime" -q
+	$(BIN)/pytest -n 2 -m "not slow and not realtime" -q
 
 realtime: setup
 	$(BIN)/pytest -m "realtime and not slow" -q

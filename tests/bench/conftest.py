@@ -153,10 +153,8 @@ SERVED = pytest.StashKey["Server"]()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Tests of the one server follow one another, in one worker (``--dist loadgroup``): its firmware starts once."""
-    items.sort(key=uses_server)
-    for item in filter(uses_server, items):
-        item.add_marker(pytest.mark.xdist_group("bench server"))
+    """Tests of the one server follow one another: its firmware starts once for them."""
+    items.sort(key=uses_server, reverse=True)
 
 
 def uses_server(item: pytest.Item) -> bool:
