@@ -28,7 +28,7 @@ from hal.children import use_one_thread
 RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
 MODULES = (
-    "step", "kinematics", "latency", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder",
+    "step", "kinematics", "latency", "wire", "loop", "world", "attitude", "noise", "hysteresis", "mismatch", "recorder",
     "memory", "start", "bench_page",
 )  # fmt: skip
 LIMIT_S = 600.0
