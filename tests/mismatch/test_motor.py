@@ -22,9 +22,13 @@ from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.score import misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import extended
+from tools.mismatch.export.module import python_module
+from tools.mismatch.export.run import whole_run, whole_view
+from tools.mismatch.export.write import runnable
 from tools.mismatch.placed import Placed
 from tools.mismatch.prove import foreign
 from tools.mismatch.recording_load import load
+from tools.mismatch.simulate import Model
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "motor"
 TRUTH = {
@@ -114,12 +118,22 @@ def test_start_states_are_sought_behind_the_play_of_the_gear(tmp_path: Path) -> 
     assert found.left < 3.0
     assert (found.place.site, found.place.target) == ("output", "angle")
     assert found.human[0].value == pytest.approx(0.3, rel=0.05)
+    # and the module that `apply` writes begins where the engine does
+    rec = load(tmp_path / "backlash" / "ode.toml")
+    start = found.model.start_states(whole_view(rec, found.model), found.theta)
+    module = runnable(python_module(rec, found.model, found.theta, rec.file_unit, "", start))
+    engine = whole_run(rec, found.model, found.theta)["angle"]
+    np.testing.assert_allclose(module(dict(rec.signals), dt=rec.dt)["angle"], engine, atol=1e-4)
+    # as much as the stretches of the fit may leave, in one free run over all of them
+    assert np.mean((engine - rec.outputs["angle"]) ** 2) < 3.0 * 0.004**2
 
 
 class Best(NamedTuple):
     left: float
     place: Placed
     human: list[Human]
+    model: Model
+    theta: np.ndarray
 
 
 def best_of(recording: Path, name: str) -> Best:
@@ -133,7 +147,7 @@ def best_of(recording: Path, name: str) -> Best:
             model, _ = extended(problem, base, candidate.placed)
             fitted = fit(problem, model, candidate.starts, iterations=20, tolerance=1e-4)
             human = fitted.model.human(fitted.theta)[candidate.placed.label]
-            found.append(Best(misfits(problem, fitted)["angle"], candidate.placed, list(human)))
+            found.append(Best(misfits(problem, fitted)["angle"], candidate.placed, list(human), model, fitted.theta))
     return min(found, key=lambda f: f.left)
 
 

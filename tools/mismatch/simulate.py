@@ -277,15 +277,11 @@ class Model:
         if forces and folded is not None:
             folded.update(j for s in inputs.values() for j in s.columns)
         found, behind = self._behind(run, inputs, outputs, theta, join, folded)
-        if run.window == 0 or not behind:
-            return found
-        about = {k: v for k, v in run.memo.items() if k == ("about", run.starts)}
-        for _ in range(START_PASSES):
-            # start states were read off what was measured behind these effects: again, without what they made of it
-            before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
-            again = replace(run, measured=before, memo=dict(about))
-            outputs = self.twin.respond(again, inputs, theta, every, join)
-            found, behind = self._behind(again, inputs, {o: outputs[o] for o in found}, theta, join, folded)
+        recorded = run
+        for _ in range(START_PASSES if run.window and behind else 0):
+            run = before_effects(recorded, behind)
+            outputs = self.twin.respond(run, inputs, theta, every, join)
+            found, behind = self._behind(run, inputs, {o: outputs[o] for o in found}, theta, join, folded)
         return found
 
     def _behind(
@@ -338,6 +334,13 @@ class Model:
         run = view_run(self.twin, view)
         inputs, forces = self._driven(run, theta, True, None)
         used = {s: fold(x, theta) for s, x in inputs.items()}
+        recorded = run
+        for _ in range(START_PASSES if run.window else 0):
+            outputs = self.twin.respond(run, inputs, theta, forces, True)
+            behind = self._behind(run, inputs, outputs, theta, True, None)[1]
+            if not behind:
+                break
+            run = before_effects(recorded, behind)
         return inside.states(run, used, theta, forces)[0][0]
 
     def _force(self, k: int, theta: Array) -> Force:
@@ -414,6 +417,14 @@ class Model:
             flow = self._flow(run, theta, False, folded)
         found = {j for s in flow.values() for j in s.columns}
         return found - folded
+
+
+def before_effects(run: Run, behind: Mapping[str, Array]) -> Run:
+    """The run as measured in front of effects at its outputs, which made ``behind`` (n,) of them: start states are read
+    off that.
+    """
+    before = {o: x - behind[o] if o in behind else x for o, x in run.measured.items()}
+    return replace(run, measured=before, memo={k: v for k, v in run.memo.items() if k == ("about", run.starts)})
 
 
 def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
