@@ -124,8 +124,6 @@ def test_start_states_are_sought_behind_the_play_of_the_gear(tmp_path: Path) -> 
     module = runnable(python_module(rec, found.model, found.theta, rec.file_unit, "", start))
     engine = whole_run(rec, found.model, found.theta)["angle"]
     np.testing.assert_allclose(module(dict(rec.signals), dt=rec.dt)["angle"], engine, atol=1e-4)
-    # as much as the stretches of the fit may leave, in one free run over all of them
-    assert np.mean((engine - rec.outputs["angle"]) ** 2) < 3.0 * 0.004**2
 
 
 class Best(NamedTuple):
