@@ -19,7 +19,7 @@ from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.one_way import one_way
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.reach import imitable, not_tried, out_of_reach, tempered
+from tools.mismatch.engine.reach import imitable, much_left, not_tried, out_of_reach, tempered
 from tools.mismatch.engine.report import (
     BaseShift,
     Checks,
@@ -41,6 +41,7 @@ from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio,
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
+from tools.mismatch.twins.ode import inside_of
 
 Array = NDArray[np.float64]
 
@@ -87,6 +88,9 @@ def assemble(
     labels = [p.label for p in fitted.model.placed]
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]
     off = imitable(physics, twin)
+    if inside_of(twin) is not None and much_left(physics, {o: hi for o, (_, hi) in decision.floors.items()}):
+        # a page that says "not the whole account" cannot be sure of the account
+        physics = tempered(physics)
     physics = [tempered([f])[0] if it else f for f, it in zip(physics, off, strict=True)]
     if (off and all(off)) or out_of_reach(physics, twin, {o: hi for o, (_, hi) in decision.floors.items()}):
         verdict, physics = "unexplained", tempered(physics)

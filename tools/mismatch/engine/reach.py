@@ -13,7 +13,7 @@ from tools.mismatch.twins.opaque import OpaqueTwin
 MUCH_LEFT = 3.0
 """Residual over noise floor above which what was named is not the whole account."""
 NO_RIVAL = 0.5
-"""Most that a name is sure where much is left and the forces that could explain it could not be tried."""
+"""Most that a name is sure where much is left: the one that explains it all was not tried, or was not found."""
 _INSIDE = "friction, springs, play, flows and limits inside its equations could not be tried"
 
 
@@ -38,11 +38,14 @@ def not_tried(twin: Twin) -> str:
     )
 
 
+def much_left(physics: Sequence[PhysicsFound], floors: Mapping[str, float]) -> bool:
+    """Return whether what the named effects leave is far above the noise: they are not the whole account."""
+    return any(p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics)
+
+
 def out_of_reach(physics: Sequence[PhysicsFound], twin: Twin, floors: Mapping[str, float]) -> bool:
     """Return whether the named effects leave much that may sit where this kind of twin lets nothing be tried."""
-    return bool(not_tried(twin)) and any(
-        p.residual_rms_after > MUCH_LEFT * floors.get(p.output, p.residual_rms_after) for p in physics
-    )
+    return bool(not_tried(twin)) and much_left(physics, floors)
 
 
 def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
