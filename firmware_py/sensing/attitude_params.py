@@ -132,8 +132,8 @@ def gyroscope_error_state(gravity_m_s2: float = 9.81) -> Record:
     Noise and bias are the Allan deviation of the gyroscope at rest. Its scale and alignment turn the attitude by a
     share of the rate; the error changes sign as the body turns, about once a radian, so the variance grows by
     2 share^2 x 1 rad x rate. Without that term the heading becomes too certain on a body that keeps turning.
-    A believed field is followed with 20 s, a new one accepted after 20 s above 20 deg/s: the defaults of VQF (Laidig and
-    Seel 2023; magRefTau, magNewTime, magNewMinGyr of the package vqf 2.1).
+    A believed field is followed with 20 s, a new one accepted after 20 s above 20 deg/s: the defaults of VQF (Laidig
+    and Seel 2023; magRefTau, magNewTime, magNewMinGyr of the package vqf 2.1).
     """
     deg = radians(1.0)
     return new_record(
