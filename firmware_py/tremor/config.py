@@ -237,6 +237,8 @@ class TremorConfig(_Table):
             raise ValueError("wflc: low_hz < start_hz < high_hz < tick_hz / 2 is needed")
         if not self.bmflc.low_hz < self.bmflc.high_hz < 0.5 * self.tick_hz:
             raise ValueError("bmflc: low_hz < high_hz < tick_hz / 2 is needed")
+        if not max(self.adaptive.cancel_to_hz[1], self.adaptive.core_hz[-1]) < 0.5 * self.tick_hz:
+            raise ValueError("adaptive: cancel_to_hz and core_hz must end below tick_hz / 2")
         if self.ar.order * self.ar.spacing_s > 0.25:
             raise ValueError("ar: order times spacing_s must be below 0.25 s")
         if self.isolated and self.sees != "displacement":

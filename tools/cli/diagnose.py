@@ -331,7 +331,7 @@ def golden_diff(
 
     with clear_errors():
         check_writable(json_file)
-        report = diff(folder, bench)
+        report = diff(folder, None if bench is None else bench_path(bench))
         table = Table(title=f"{report.compared} transfers", title_justify="left")
         for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
             table.add_column(heading)

@@ -17,7 +17,7 @@ BENCHES = DEFAULT_BENCH.parent
     ("arguments", "says"),
     [
         (["faults", "--only", "meteorite"], "no fault is called so"),
-        (["faults", "--bench", "nowhere.toml"], "nowhere.toml: cannot be read"),
+        (["faults", "--bench", "nowhere.toml"], "nowhere.toml: no such bench file"),
         (["faults", "--bench", str(BENCHES / "imus.toml")], "this bench has mpu6050, lsm6ds3, bmx055"),
         (["faults", "--beside", f"{BENCHES / 'endoscope.toml'}"], "this bench has imu, card"),
         (["faults", "--beside", f"{BENCHES / 'micron-eight.toml'}#meteorite"], "no fault is called so"),
@@ -26,7 +26,7 @@ BENCHES = DEFAULT_BENCH.parent
         (["faults", "--json", "."], "this is a folder; name a file in it"),
         (["soak", "--start-ns", "5", "--without-wires"], "without wires there is none"),
         (["soak", "--out", str(BENCHES.parent / "README.md")], "not a page of long runs"),
-        (["soak", "--bench", "nowhere.toml"], "nowhere.toml: cannot be read"),
+        (["soak", "--bench", "nowhere.toml"], "nowhere.toml: no such bench file"),
     ],
 )
 def test_bad_input_is_one_clear_line_and_exit_2(arguments: list[str], says: str) -> None:

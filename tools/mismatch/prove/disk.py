@@ -105,7 +105,7 @@ def _beside(case: Case, folder: Path) -> dict[str, Any]:
     """The descriptor's parameters; what a twin of somebody else needs is put where they say."""
     if case.scene.twin == guests.FMU:
         guests.build_fmu(folder / "model.fmu")
-        return {"path": "model.fmu", **case.given}
+        return {"path": "model.fmu", "hold": "zero", **case.given}  # as the generator steps it
     if case.scene.twin == guests.INSTRUMENT:
         guests.write_bench(folder / "bench.toml", int(case.given["unit"]))
         return {"bench": "bench.toml"}
