@@ -26,7 +26,7 @@ VARIANTS = {
     "saturation": ("limit",),
     "stribeck": ("friction", "breakaway"),
 }
-"""Which of the motor's quantities each recording has; the others are absent."""
+"""Each recording has these of the motor's quantities; the others are absent."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Motor:
     limit: float = 1.3  # of the amplifier, V
     told_speed_per_V: float = 20.0
     told_time_constant_s: float = 0.08
-    """What the data sheet says: the engineer's own twin has these two."""
+    """The data sheet gives these two, and the engineer's own twin has them."""
 
     @property
     def n(self) -> int:

@@ -292,7 +292,7 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
     next_motion = np.stack([_cross(plain, (power[0] * as_seen[0] + s.rest - s.noise) * z, row) for row in moving])
 
     def of_axis(axis: int) -> dict[str, Any]:
-        """What the sensor's noise along ``axis`` has a part in."""
+        """Return what the sensor's noise along ``axis`` has a part in."""
         noise, noisy = sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)
         quiet = _penalty_above_band(config, bank, axis)
         rest = plain_rest + _covariance(plain, noise, noisy)

@@ -255,7 +255,7 @@ COLOURS = """() => {
 
 
 def load_axe(tab: Any) -> bool:
-    """Whether axe-core is installed; then it is in the page."""
+    """Put axe-core into the page. Return False where it is not installed."""
     try:
         from axe_playwright_python import base
     except ImportError:

@@ -239,7 +239,7 @@ LARGER = "put it into a folder of the recordings with a recording.toml beside it
 
 
 def _is_own_recording(path: Path) -> bool:
-    """Whether a file is a recording of this program. ``InputError`` for one that was torn."""
+    """Return whether a file is a recording of this program. Raises ``InputError`` for one that was torn."""
     from firmware_py.recording.errors import RecordingError
     from firmware_py.recording.index import IndexedRecording
     from firmware_py.recording.reader import Recording

@@ -29,7 +29,7 @@ class Trial:
 
     @property
     def disturbed(self) -> bool:
-        """Whether the set's authors disturbed it (taps or magnets)."""
+        """Return whether the set's authors disturbed it (taps or magnets)."""
         return "_disturbed_" in str(self.published["name"])
 
     def errors_deg(self, attitude: Array) -> tuple[float, float, float]:

@@ -1,4 +1,4 @@
-"""What the installed scripts call: the only module of ours, with ``micron_pytest``, whose name is ours alone.
+"""The installed scripts call this module: it and ``micron_pytest`` alone have names that nobody else has.
 
 Other projects have folders ``tools`` and ``hal``, too. Where one of them lies before ours on the import path, ours is
 put first; where one has been imported already, as in a user's tests, ours cannot be.

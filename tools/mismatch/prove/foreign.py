@@ -130,7 +130,9 @@ def page(runs: Sequence[Mapping[str, Any]]) -> str:
         lines.append(f"CPU of a diagnosis: median {cpu[len(cpu) // 2]:.0f} s, longest {cpu[-1]:.0f} s.")
     for run in runs:
         found = {(r["variant"], r["twin"]): r for r in run["rows"]}
-        lines += ["", f"## Seed {run['seed']}, {run['kind']}", "", f"Tool {run['revision'][:12]}, {run['date']}.", ""]
+        ran = f"{len(run['rows'])} of {len(TRUTH) * len(TWINS)} cases were run"
+        lines += ["", f"## Seed {run['seed']}, {run['kind']}", ""]
+        lines += [f"Tool {run['revision'][:12]}, {run['date']}; {ran}.", ""]
         lines += [
             "| recording | twin | judged | verdict | names (sure) | left, times the noise | CPU s |",
             "|---" * 7 + "|",
@@ -152,15 +154,10 @@ def run_cases(
 ) -> None:
     """Diagnose what ``rows_file`` does not hold yet, until the minutes are over."""
     runs: list[dict[str, Any]] = json.loads(rows_file.read_text()) if rows_file.exists() else []
-    run = next((r for r in runs if (r["seed"], r["kind"]) == (seed, kind)), None)
+    about = {"seed": seed, "kind": kind, "revision": git_revision() or "unknown"}  # another tool makes another table
+    run = next((r for r in runs if about.items() <= r.items()), None)
     if run is None:
-        run = {
-            "seed": seed,
-            "kind": kind,
-            "revision": git_revision() or "unknown",
-            "date": time.strftime("%Y-%m-%d"),
-            "rows": [],
-        }
+        run = about | {"date": time.strftime("%Y-%m-%d"), "rows": []}
         runs.append(run)
     done = {(r["variant"], r["twin"]) for r in run["rows"]}
     until = time.monotonic() + 60.0 * minutes

@@ -56,7 +56,7 @@ class OdeTwin(Head):
 
     @property
     def hold(self) -> str:
-        """What the inputs do between their samples: "zero" or "linear"."""
+        """Return what the inputs do between their samples: "zero" or "linear"."""
         return "zero" if self.held else "linear"
 
     def start(self, recording: Recording) -> Array:

@@ -56,7 +56,7 @@ class OpaqueTwin:
     counted: Counted = ""
     source: str = field(default="", compare=False)
     hold: str = ""
-    """What the inputs do between their samples ("zero", "linear"), where the program asks for that."""
+    """The program is told that its inputs are held ("zero") or straight ("linear") between samples; empty: not told."""
 
     def start(self, recording: Recording) -> Array:
         """See Twin."""
