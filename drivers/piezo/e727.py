@@ -75,6 +75,7 @@ class E727:
 
     def probe(self) -> str:
         """Identity, axes and limits; the servo is switched as ``mode`` says. Raises ``WrongDevice``."""
+        self._load_kernels()  # from here on a ramp to neutral may be needed at once
         identity = self._link.query("*IDN?")[0]
         if "E-727" not in identity:
             raise WrongDevice(f"expected a PI E-727, found {identity!r}", device=self.name)
@@ -95,7 +96,7 @@ class E727:
         """Ramp to neutral, ask for errors, compare with what the controller says it was told."""
         if not self._position_known:
             self.probe()
-        self._command()  # the kernel is compiled or loaded before anything moves
+        self._load_kernels()
         self._position_known = False
         while not self.safe_step():
             wait_s(self._clock, TICK_S)
@@ -168,11 +169,15 @@ class E727:
         limit = self.limits[0]
         return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, EPSILON_V) for i in range(CHANNELS)]
 
-    def _command(self) -> bytes:
+    def _load_kernels(self) -> None:
         if self._kernels is None:
-            from drivers.piezo import e727_kernels  # numba: seconds, which a command that moves nothing does not pay
+            from drivers.piezo import e727_kernels  # numba: seconds, which a command that asks nothing does not pay
 
             self._kernels, self._text = e727_kernels, np.zeros(e727_kernels.TEXT_BYTES, np.uint8)
+            e727_kernels.encode(self._text, False, np.zeros(CHANNELS), 1.0)
+
+    def _command(self) -> bytes:
+        self._load_kernels()
         n = self._kernels.encode(self._text, self._servo, np.array(self.guard.next_V), self._per_V)
         return self._text[:n].tobytes()
 

@@ -1,6 +1,6 @@
 """The E-727's commands as a compiled kernel on bytes: the driver and a compiled loop call the same one.
 
-Importing this module imports numba; the driver does so when it arms the outputs.
+Importing this module imports numba; the driver does so when it asks the controller who it is, before a ramp can be due.
 """
 
 from __future__ import annotations

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -56,6 +57,15 @@ def sva(a: float, b: float, c: float) -> tuple[object, ...]:
 def test_probe_reads_identity_axes_and_sets_the_servo():
     device, port, _ = make(*PROBE)
     assert "E-727.3SDA" in device.probe()
+    port.done()
+
+
+def test_from_the_probe_on_nothing_is_loaded_or_compiled_for_a_ramp_to_neutral(monkeypatch: pytest.MonkeyPatch):
+    """A run that fails before it arms ramps outputs that another program left; that may not wait for a compiler."""
+    device, port, _ = make(*PROBE, *AT_NEUTRAL, ("w", NEUTRAL))
+    device.probe()
+    monkeypatch.setitem(sys.modules, "drivers.piezo.e727_kernels", None)  # an import fails
+    assert device.safe_step()
     port.done()
 
 
