@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -29,6 +29,9 @@ app = typer.Typer(help="Where simulation and recording differ, and which physics
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")
+]
+EngineOption = Annotated[
+    str, typer.Option(metavar="old|new", help="Which engine decides; new is an experiment beside the old one.")
 ]
 SeedOption = Annotated[int, typer.Option(min=0, help="Same recording and seed: same answer.")]
 
@@ -90,6 +93,7 @@ def diagnose(
     ] = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
+    engine: EngineOption = "old",
 ) -> None:
     """Locate the mismatch, name the physics that is missing, fit it, and show the fit improve on unseen data.
 
@@ -101,24 +105,29 @@ def diagnose(
         decide_on([recording], trust, allow_outside)
         from tools.mismatch.batch import is_folder_of_recordings
 
+        _check_engine(engine)
         processes = jobs or os.cpu_count() or 1
         if is_folder_of_recordings(recording):
+            if engine != "old":
+                raise InputError("--engine new is for one recording at a time")
             if html is not None:
                 raise InputError(f"--html is for one recording; {recording} is a folder of them: use --out FOLDER")
             _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask)
             return
         if dask is not None:
             raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
-        report = _diagnose_one(recording, held_out, seed, processes)
+        report = _diagnose_one(recording, held_out, seed, processes, engine)
         _show(report, json_file, html, out)
 
 
-def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
+def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int, engine: str = "old") -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from tools.mismatch.engine.diagnose import diagnose as engine
+    from tools.mismatch.engine.diagnose import diagnose as run_old
+    from tools.mismatch.infer import diagnose as run_new
     from tools.mismatch.recording_load import load
 
+    run = run_new if engine == "new" else run_old
     loaded = load(path)
     for note in loaded.warnings:
         print_note(note)
@@ -132,7 +141,7 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int) -> Report:
             progress.update(bar, description=what, completed=done, total=total)
 
         alone = loaded.n > MOST_SHARED
-        return engine(loaded, held_out=held_out, seed=seed, jobs=1 if alone else jobs, progress=show)
+        return run(loaded, held_out=held_out, seed=seed, jobs=1 if alone else jobs, progress=show)
 
 
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
@@ -276,6 +285,14 @@ def prove(
         Path | None,
         typer.Option(metavar="FOLDER", help="Recordings, sealed answers and reports; a stopped run goes on there."),
     ] = None,
+    corpus: Annotated[
+        str | None, typer.Option(metavar="NAME", help="calibrate, develop or sealed: exact scores on its own seeds.")
+    ] = None,
+    engine: EngineOption = "old",
+    samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording of a corpus.")] = 8000,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.0, help="With --corpus: begin no case after these; run again to go on.")
+    ] = None,
 ) -> None:
     """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
 
@@ -284,21 +301,66 @@ def prove(
     with _clear_errors():
         _check_targets(json_file)
         _check_folder(keep, "--keep")
-        from tools.mismatch.prove import prove as run_proof
-        from tools.mismatch.prove.table import show
-
         if keep is not None:
             keep.mkdir(exist_ok=True)
+        _check_engine(engine)
+        if corpus is not None:
+            if seed is not None:
+                raise InputError("--corpus has seeds of its own; leave --seed out")
+            _prove_corpus(corpus, engine, cases, samples, minutes, jobs, keep, json_file)
+            return
+        from functools import partial
+
+        from tools.mismatch.prove import prove as run_proof
+        from tools.mismatch.prove.runner import tool
+        from tools.mismatch.prove.table import show
+
         err = console()
         result = run_proof(
             cases,
             seed,
             jobs or os.cpu_count() or 1,
             keep,
+            max_samples=samples,
+            diagnose=partial(tool, engine=engine),
             progress=lambda text: err.print(text, markup=False, soft_wrap=True),
         )
         show(result, err if json_file == "-" else data_console())
         write_json(result.to_json(), json_file)
+
+
+def _check_engine(engine: str) -> None:
+    if engine not in ("old", "new"):
+        raise InputError(f"--engine {engine}: there is no such engine; use old or new")
+
+
+def _prove_corpus(
+    corpus: str,
+    engine: str,
+    cases: int,
+    samples: int,
+    minutes: float | None,
+    jobs: int | None,
+    keep: Path | None,
+    json_file: str | None,
+) -> None:
+    from contextlib import ExitStack
+    from tempfile import TemporaryDirectory
+
+    from tools.mismatch.prove.corpus import NAMES, Name
+    from tools.mismatch.prove.corpus_table import corpus_table
+    from tools.mismatch.prove.harness import Engine, Run, run_corpus
+
+    if corpus not in NAMES:
+        raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
+    limit = float("inf") if minutes is None else minutes
+    run = Run(cast(Name, corpus), cast(Engine, engine), cases, samples, limit, jobs or os.cpu_count() or 1)
+    err = console()
+    with ExitStack() as stack:
+        folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))
+        result = run_corpus(run, folder, progress=lambda text: err.print(text, markup=False, soft_wrap=True))
+    (err if json_file == "-" else data_console()).print(corpus_table(result))
+    write_json(result.to_json(), json_file)
 
 
 @app.command()

@@ -223,7 +223,7 @@ def test_physics_names_the_contract_s_vocabulary():
 def test_prove_prints_its_table_and_writes_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     asked = {}
 
-    def prove(cases, seed, jobs, folder, *, progress):
+    def prove(cases, seed, jobs, folder, *, progress, **options):
         asked.update(cases=cases, seed=seed, jobs=jobs, folder=folder)
         progress("answers sealed, sha256 [abc]")
         return ProofResult(5, "abc", (), {}, 1.0, tmp_path)
@@ -250,3 +250,17 @@ def test_help_does_not_wait_for_the_engine():
 @pytest.mark.parametrize("command", ["diagnose", "physics", "prove", "apply"])
 def test_every_command_has_an_example(command: str):
     assert f"micron mismatch {command}" in " ".join(run(command, "--help").stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--engine", "third"), "use old or new"),
+        (("--corpus", "mine"), "use calibrate, develop, sealed"),
+        (("--corpus", "develop", "--seed", 3), "leave --seed out"),
+    ],
+)
+def test_prove_says_what_is_wrong_with_a_corpus(options: tuple[object, ...], text: str):
+    result = run("prove", "--cases", 1, *options)
+    assert result.exit_code == 2
+    assert text in " ".join(result.stderr.split())

@@ -70,14 +70,15 @@ def assemble(
     jobs: int = 1,
     withheld: Sequence[Withheld] = (),
     hold: Hold | None = None,
+    decision: Decision | None = None,
 ) -> Report:
     """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
     free run, when the decisions were made on shorter stretches; ``withheld``: effects that are not named;
-    ``hold``: what the inputs do between their samples.
+    ``hold``: what the inputs do between their samples; ``decision``: the verdict, if it was reached elsewhere.
     """
     rec, twin = problem.recording, problem.twin
     fitted = selection.fitted
-    decision = judge(problem, raw, base, selection, left, rule)
+    decision = decision or judge(problem, raw, base, selection, left, rule)
     verdict, p = decision.verdict, decision.p_value
     cov = covariance(problem, fitted)
     shifts = base_shifts(raw, base, fitted, cov)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -23,13 +23,14 @@ from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.partition import SAMPLES, split_inside, splittable
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
-from tools.mismatch.engine.report import Hold, Report
+from tools.mismatch.engine.report import Hold, Report, Withheld
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
-from tools.mismatch.engine.select import search
+from tools.mismatch.engine.select import Selection, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
 from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
+from tools.mismatch.engine.verdict import Decision
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
@@ -167,7 +168,19 @@ def diagnose(
     return replace(report, seconds=time.perf_counter() - began)
 
 
-def _diagnose(
+@dataclass(frozen=True)
+class Posed:
+    """A recording ready for a search: ``raw`` is the twin as given, ``base`` the twin with its parameters re-fitted."""
+
+    recording: Recording
+    effects: tuple[Effect, ...]
+    problem: Problem
+    raw: Fit
+    base: Fit
+    hold: Hold | None
+
+
+def pose(
     recording: Recording,
     held_out: float,
     seed: int,
@@ -175,7 +188,8 @@ def _diagnose(
     progress: Progress | None,
     effects: Iterable[Effect] | None,
     rule: Rule,
-) -> Report:
+) -> Posed:
+    """Prepare everything that comes before the search: runs joined, circuits opened, hold of the inputs, noise."""
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
@@ -194,7 +208,21 @@ def _diagnose(
     elif said_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
         said = said_hold(recording)
         hold = Hold("zero" if said == "zero" else "smooth" if said == "smooth" else "linear", "declared")
-    twin = problem.twin
+    return Posed(recording, catalogue, problem, raw, base, hold)
+
+
+def _diagnose(
+    recording: Recording,
+    held_out: float,
+    seed: int,
+    jobs: int,
+    progress: Progress | None,
+    effects: Iterable[Effect] | None,
+    rule: Rule,
+) -> Report:
+    posed = pose(recording, held_out, seed, jobs, progress, effects, rule)
+    recording, catalogue, problem, raw = posed.recording, posed.effects, posed.problem, posed.raw
+    base, hold, twin = posed.base, posed.hold, posed.problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
     selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
     problem, strange = selection.problem, selection.strange
@@ -229,16 +257,37 @@ def _diagnose(
     remarks = gross(recording, twin, raw)
     if discarded:
         remarks.append(f"{discarded} It was discarded, and nothing is named.")
+    posed = replace(posed, recording=recording, problem=problem, base=base, hold=hold)
+    return conclude(posed, selection, left, rule, remarks, jobs, withheld=withheld, held_out=held_out)
+
+
+def conclude(
+    posed: Posed,
+    selection: Selection,
+    left: dict[str, Leftover],
+    rule: Rule,
+    remarks: Sequence[str],
+    jobs: int,
+    *,
+    withheld: Sequence[Withheld] = (),
+    held_out: float = 0.3,
+    decision: Decision | None = None,
+) -> Report:
+    """The report of a finished search. ``decision``: the verdict where it was reached elsewhere; else ``judge``'s."""
+    problem, raw, base, twin = posed.problem, posed.raw, posed.base, posed.problem.twin
     official = None
     if twin.restart and not problem.settle:
         # the exported twin runs through: what adds up over a whole run is fitted in one
         through = restarting(twin, False) if problem.split.own else twin
-        whole = problem.split if problem.split.own else make_split(recording, held_out, seed, True)
-        course = Problem(recording, through, whole, problem.init, seed, problem.floors)
+        whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
+        course = Problem(posed.recording, through, whole, problem.init, problem.seed, problem.floors)
         official = None if problem.split.own else course
         base = over_the_whole(problem, course, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
-    return assemble(problem, raw, base, selection, left, catalogue, rule, remarks, official, jobs, withheld, hold)
+    return assemble(
+        problem, raw, base, selection, left, posed.effects, rule, remarks, official, jobs, withheld, posed.hold,
+        decision,
+    )  # fmt: skip
 
 
 def opened(recording: Recording, held_out: float, seed: int) -> Recording:

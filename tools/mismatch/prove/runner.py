@@ -20,13 +20,16 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-def tool(path: Path) -> dict[str, Any]:
+def tool(path: Path, engine: str = "old") -> dict[str, Any]:
     """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
     from tools.mismatch.engine.diagnose import diagnose
     from tools.mismatch.recording_load import load
 
-    report = diagnose(load(path), jobs=1, seed=0)
-    return as_plain(report)
+    if engine == "new":
+        from tools.mismatch.infer import diagnose as infer
+
+        return as_plain(infer(load(path), jobs=1, seed=0))
+    return as_plain(diagnose(load(path), jobs=1, seed=0))
 
 
 def as_plain(report: Any) -> dict[str, Any]:

@@ -87,8 +87,11 @@ def fit_figures(
     return {"ratio": ratio, "explained": explained, "below_noise": below}
 
 
-def coverage(report: Mapping[str, Any], answer: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Return which figures of the answer were reported, and whether their 95 % interval holds the true value."""
+def coverage(report: Mapping[str, Any], answer: Mapping[str, Any], *, far_off: bool = False) -> list[dict[str, Any]]:
+    """Return which figures of the answer were reported, and whether their 95 % interval holds the true value.
+
+    ``far_off``: figures that are more than ten times off count, too, and a figure without an interval does not hold.
+    """
     rows: list[dict[str, Any]] = []
     for truth in answer["effects"]:
         said = [p for p in report.get("physics") or [] if p.get("name") == truth["name"]]
@@ -102,14 +105,19 @@ def coverage(report: Mapping[str, Any], answer: Mapping[str, Any]) -> list[dict[
                     same = False
                 par_unit = str(par.get("unit", ""))
                 ci = par.get("ci95")
-                if not same or par_unit not in TO_SI or home not in TO_SI or not ci or None in ci:
+                if not same or par_unit not in TO_SI or home not in TO_SI:
                     continue
                 k = TO_SI[par_unit] / TO_SI[home]
+                if not ci or None in ci:
+                    if not far_off:
+                        continue
+                    ci = (math.nan, math.nan)
                 low, high = sorted(float(c) * k for c in ci)
                 true = value
                 if high < 0 < true or true < 0 < low:  # the sign of a clock is a convention
                     true = -true
-                if 0.1 < abs(par["value"] * k / true) < 10 if true else False:
+                near = true and 0.1 < abs(par["value"] * k / true) < 10
+                if near or far_off:
                     rows.append(
                         {"effect": truth["name"], "figure": quantity, "true": value, "said": par["value"] * k,
                          "ci95": [low, high], "covered": low <= true <= high}

@@ -252,3 +252,13 @@ def why_withheld(w: Withheld, unit: str) -> str:
     without, within = number(w.residual_rms_without * factor), number(w.residual_rms_with * factor)
     instead = f"; {words(w.replaced_by)} is named instead" if w.replaced_by else ""
     return f"{why}; {without} without it, {within} with it ({scaled_unit} rms, held out){instead}"
+
+
+def rival_remark(ratio: float, as_good: bool, named: str) -> str:
+    """Why a rival is not named.
+
+    ``ratio``: its held-out residual over that of ``named``; ``as_good``: a paired test finds it within the margin.
+    """
+    if as_good:
+        return f"fits as well as {named}"
+    return f"leaves {ratio:.2f} times the residual of {named}"

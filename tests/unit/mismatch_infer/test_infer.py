@@ -1,0 +1,113 @@
+"""The score of a set of effects and what is decided from it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import t as student
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.infer import diagnose
+from tools.mismatch.infer.constants import START, Constants, learned
+from tools.mismatch.infer.decide import is_whole, log_odds, stated, surenesses
+from tools.mismatch.infer.density import DEGREES, NORMAL, student_log_density, student_scale
+from tools.mismatch.infer.store import Scored
+from tools.mismatch.recording import Recording
+
+N = 2500
+
+
+def test_the_density_is_the_one_of_scipy_and_its_scale_the_likeliest() -> None:
+    r = 0.3 * student.rvs(DEGREES, size=20_000, random_state=1)
+    s = student_scale(r, 1e-9)
+    assert s == pytest.approx(0.3, rel=0.03)
+    assert np.allclose(student_log_density(r, s), student.logpdf(r, DEGREES, scale=s))
+    best = student_log_density(r, s).mean()
+    assert all(student_log_density(r, f * s).mean() < best for f in (0.9, 1.1))
+
+
+def test_what_normal_noise_scores_at_most() -> None:
+    r = np.random.default_rng(2).standard_normal(400_000)
+    assert student_log_density(r, student_scale(r, 1e-9)).mean() == pytest.approx(NORMAL, abs=0.003)
+
+
+class _Set:
+    """The part of a scored set that its score reads."""
+
+    score = Scored.score
+
+    def __init__(self, density: float, names: set[str], parameters: int) -> None:
+        self.density, self.names, self.parameters = {"y": density}, frozenset(names), parameters
+
+
+def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_number() -> None:
+    c = replace(START, samples=200.0, per_name=5.0, per_parameter=0.5)
+    assert _Set(0.1, {"a"}, 3).score(c, 10_000) == pytest.approx(200 * 0.1 - 5 - 1.5)
+    assert _Set(0.1, {"a", "b"}, 3).score(c, 10_000) == pytest.approx(200 * 0.1 - 10 - 1.5)
+    assert _Set(0.1, set(), 0).score(c, 50) == pytest.approx(5.0)
+
+
+def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:
+    chosen = _Set(0.0, {"a", "b"}, 0)
+    sets = [(frozenset("ab"), 1.0), (frozenset("ac"), 1.0), (frozenset(), -60.0)]
+    sure = surenesses(chosen, sets, START)  # pyright: ignore[reportArgumentType]
+    assert sure["b"] == pytest.approx(0.5)
+    assert sure["a"] > 0.999
+    cautious = replace(START, sure_offset=-0.5, sure_slope=0.3)
+    values = [stated(p, cautious) for p in (0.01, 0.5, 0.9, 1.0)]
+    assert values == sorted(values)
+    assert values[-1] < 0.99
+    assert math.isfinite(log_odds(1.0))
+    assert math.isfinite(log_odds(0.0))
+
+
+def test_the_form_of_what_is_named_may_leave_its_share() -> None:
+    c = replace(START, cut=0.5, cut_share=0.05)
+    assert is_whole(0.4, 0.0, c)
+    assert not is_whole(0.6, 0.0, c)
+    assert is_whole(4.0, 100.0, c)
+    assert not is_whole(6.0, 100.0, c)
+
+
+def test_the_shipped_constants_are_complete() -> None:
+    c = learned()
+    assert Constants.of(c.to_json()) == c
+    assert min(c.samples, c.per_name, c.per_parameter, c.least_z, c.sure_slope) > 0
+
+
+def _stack(change: np.ndarray, u: np.ndarray) -> Recording:
+    y = 0.12 * u + change + 0.01 * np.random.default_rng(5).standard_normal(u.size)
+    return recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
+
+
+def test_nothing_is_named_where_nothing_is_missing() -> None:
+    u = 40.0 * wave(np.random.default_rng(3), N)
+    report = diagnose(_stack(np.zeros(N), u), jobs=1, constants=START)
+    assert report.verdict == "agrees"
+    assert not report.physics
+
+
+def test_a_clipped_amplifier_is_named_and_the_report_is_that_of_the_other_engine() -> None:
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    report = diagnose(_stack(0.12 * (np.clip(u, -22.0, 25.0) - u), u), jobs=1, constants=START)
+    assert report.verdict == "missing_physics"
+    assert {p.name for p in report.physics} == {"saturation"}
+    assert 0.0 < report.physics[0].confidence <= 1.0
+    body = report.to_json()
+    assert body["format"] == 1
+    assert body["fit"]["fitted_rms"]["displacement"] < 0.3 * body["fit"]["recalibrated_rms"]["displacement"]
+
+
+def test_an_effect_that_is_not_in_the_vocabulary_is_a_full_member() -> None:
+    """The same physics under a name of its own is named, priced and rivalled like any other."""
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    known = EFFECTS["saturation"]
+    mine = replace(known, name="clipped_by_a_stranger", variants=())
+    others = [e for e in EFFECTS.values() if e.name in ("static_nonlinearity", "first_order_lag", "dead_zone")]
+    report = diagnose(_stack(0.12 * (np.clip(u, -22.0, 25.0) - u), u), jobs=1, constants=START, effects=[*others, mine])
+    assert {p.name for p in report.physics} == {"clipped_by_a_stranger"}
+    assert {a.name for a in report.alternatives} <= {e.name for e in others}

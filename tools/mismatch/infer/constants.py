@@ -1,0 +1,50 @@
+"""The learned constants of the decision. ``micron mismatch calibrate`` alone writes ``constants.json``."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+FILE = Path(__file__).with_name("constants.json")
+
+
+@dataclass(frozen=True)
+class Constants:
+    """``samples``: independent samples per output that a held-out residual counts for at most (form errors are
+    systematic); ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of
+    every name. ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left, and follow
+    signals, before the account is no account. ``sure_offset`` and ``sure_slope``: the map of the log odds of a name to
+    those that are stated.
+    """
+
+    samples: float
+    per_name: float
+    per_parameter: float
+    least_z: float
+    cut: float
+    cut_share: float
+    sure_offset: float
+    sure_slope: float
+
+    @staticmethod
+    def of(body: Mapping[str, Any]) -> Constants:
+        """The constants of a parsed file. KeyError when one is missing."""
+        return Constants(**{f.name: float(body[f.name]) for f in fields(Constants)})
+
+    def to_json(self) -> dict[str, float]:
+        return {k: float(f"{v:.6g}") for k, v in asdict(self).items()}
+
+
+START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0)
+"""Where learning begins, and what the fits that it learns from are searched with: the middle of the ranges that a
+prototype found on cases of another generator."""
+
+
+@cache
+def learned() -> Constants:
+    """The constants in use."""
+    return Constants.of(json.loads(FILE.read_text())["constants"])

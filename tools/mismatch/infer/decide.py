@@ -1,0 +1,187 @@
+"""From scored sets to an answer: which names, how sure, what is equivalent, and whether that is the whole account."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.score import held_rms
+from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
+from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.density import log_density
+from tools.mismatch.infer.store import Scored, Store
+
+MARGIN = 1.05
+"""Residual rms of a rival over that of the named set, on held-out samples, within which it fits as well."""
+TESTED = 6
+"""Sets of names, best first, whose every name is tested."""
+CURVE = 12
+"""Parameters that a free curve of a signal is charged for: the columns of a product of a curve and a mover."""
+LEAST_LEAD = 0.1
+"""Share of a residual that a free curve must take to be a rival of effects."""
+
+
+@dataclass(frozen=True)
+class Rival:
+    """A set that has ``name`` where the answer has ``instead_of``. ``ratio``: its held-out rms over the answer's on
+    ``output``; ``as_good``: no worse than the margin by a paired test."""
+
+    scored: Scored
+    name: str
+    instead_of: str
+    output: str
+    ratio: float
+    as_good: bool
+
+
+@dataclass(frozen=True)
+class Answer:
+    """``chosen`` (the base where nothing is named); ``sure`` per name; ``rivals``; ``strange``: a recorded signal whose
+    free curve is a better account than any set; ``left`` per output; ``whole``: nothing more is left than form errors.
+    """
+
+    chosen: Scored
+    sure: Mapping[str, float]
+    rivals: tuple[Rival, ...]
+    strange: Stranger | None
+    left: Mapping[str, Leftover]
+    whole: bool
+
+
+def accepted(store: Store) -> list[Scored]:
+    """Sets of which every name passes its test, best first; at least the empty one."""
+    c = store.constants
+    out: list[Scored] = []
+    for s in store.ranked()[:TESTED]:
+        if store.least_z(s) > c.least_z:
+            out.append(s)
+        if not s.names:
+            break
+    return out if any(not s.names for s in out) else [*out, store.base]
+
+
+def surenesses(chosen: Scored, sets: Sequence[tuple[frozenset[str], float]], c: Constants) -> dict[str, float]:
+    """How sure each name of ``chosen`` is among ``sets`` (names, score): the share of the tempered posterior on sets
+    that have it, on a log odds scale that was calibrated on cases of its own.
+    """
+    top = max(v for _, v in sets)
+    weights = [(names, math.exp(v - top)) for names, v in sets]
+    total = sum(w for _, w in weights)
+    out: dict[str, float] = {}
+    for name in chosen.names:
+        p = sum(w for names, w in weights if name in names) / total
+        out[name] = stated(p, c)
+    return out
+
+
+FLOOR = 1e-6
+"""Probabilities are kept this far from zero and one before their log odds are taken."""
+
+
+def log_odds(p: float) -> float:
+    p = min(max(p, FLOOR), 1.0 - FLOOR)
+    return math.log(p / (1.0 - p))
+
+
+def stated(p: float, c: Constants) -> float:
+    """The probability that is stated for a raw one."""
+    return 1.0 / (1.0 + math.exp(-(c.sure_offset + c.sure_slope * log_odds(p))))
+
+
+def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
+    """Sets with one name of ``chosen`` replaced by another, best first: equivalence is a paired test on held-out blocks
+    with a margin, in both directions of which a rival with fewer parameters has no advantage.
+    """
+    p = store.problem
+    mine = held_rms(p, chosen.fitted)
+    out: list[Rival] = []
+    for s in store.ranked():
+        gone, new = chosen.names - s.names, s.names - chosen.names
+        if len(gone) != 1 or len(new) != 1:
+            continue
+        (name,), (instead,) = new, gone
+        touched = [o for e in s.placed if e.effect.name == name for o in e.outputs]
+        touched += [o for e in chosen.placed if e.effect.name == instead for o in e.outputs]
+        his = held_rms(p, s.fitted)
+        output = max(dict.fromkeys(touched), key=lambda o: his[o] / max(mine[o], 1e-300))
+        ratio = his[output] / max(mine[output], 1e-300)
+        worse = (chosen.blocks - s.blocks).sum(axis=1)
+        spread = float(np.std(worse, ddof=1) / math.sqrt(worse.size)) if worse.size > 1 else math.inf
+        within = float(np.mean(worse)) + 1.645 * spread < math.log(MARGIN) * len(set(touched))
+        out.append(Rival(s, name, instead, output, ratio, ratio <= MARGIN and within))
+    return tuple(out[:8])
+
+
+def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger | None:
+    """The recorded signal, about which no candidate effect is, whose free curve takes most of what ``fitted`` leaves
+    on the output that is furthest from its noise."""
+    found = (lead(problem, fitted, o, least=LEAST_LEAD) for o in problem.twin.outputs)
+    leads = [f for f in found if f is not None and f.signal not in known]
+    return max(leads, key=lambda f: f.share, default=None)
+
+
+def curve_score(store: Store, s: Scored, found: Stranger) -> float:
+    """The score of ``s`` with a free curve beside it: its gain on blocks that it has not seen, less its price."""
+    c = store.constants
+    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held)
+    room = store.room(s)[found.output]
+    return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
+
+
+def worst_left(problem: Problem, base: Fit, left: Mapping[str, Leftover]) -> tuple[float, float]:
+    """(noise variances that follow something on the output where most does, those that were explained there)."""
+    real = [v for v in left.values() if v.real]
+    if not real:
+        return 0.0, 0.0
+    worst = max(real, key=lambda v: v.ratio)
+    before = float(np.mean((base.residual[worst.output][problem.held_rows] / problem.sigma(worst.output)) ** 2))
+    return worst.ratio - 1.0, max(before - worst.ratio, 0.0)
+
+
+def is_whole(rest: float, taken: float, c: Constants) -> bool:
+    """Whether what is left and follows a signal is no more than the form of what is named may leave."""
+    return rest <= max(c.cut, c.cut_share * taken)
+
+
+def decide(store: Store, first: Sequence[Trial]) -> Answer:
+    """The answer of a finished search. ``first``: the candidates that were screened beside the base."""
+    p, c = store.problem, store.constants
+    good = accepted(store)
+    chosen = good[0]
+    known = frozenset(s for t in first for s in about(t.placed.effect))
+    strange = free_curve(p, store.base.fitted, known)
+    if strange is not None and curve_score(store, store.base, strange) > store.score(chosen):
+        chosen = store.base
+    else:
+        strange = None
+    left = {o: leftover(p, chosen.fitted, o) for o in p.twin.outputs}
+    if strange is not None:
+        left[strange.output] = left[strange.output].led_by(strange)
+    else:
+        for o in [o for o in left if left[o].real]:
+            found = lead(p, chosen.fitted, o)
+            if found is not None:
+                left[o] = left[o].led_by(found)
+    rest, taken = worst_left(p, store.base.fitted, left)
+    sets = [(s.names, store.score(s)) for s in good]
+    return Answer(
+        chosen, surenesses(chosen, sets, c), rivals_of(store, chosen), strange, left,
+        strange is None and is_whole(rest, taken, c),
+    )  # fmt: skip
+
+
+def recalibrated(store: Store, raw: Fit) -> bool:
+    """Whether re-fitted base parameters predict better than the given ones by more than their price."""
+    p, c = store.problem, store.constants
+    before = sum(float(np.mean(d[p.held_rows])) for d in log_density(p, raw).values())
+    gain = min(c.samples, store.held) * (sum(store.base.density.values()) - before)
+    return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
+
+
+__all__ = ["Answer", "Rival", "accepted", "decide", "recalibrated"]

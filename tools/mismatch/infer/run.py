@@ -1,0 +1,157 @@
+"""From a recording to a report by way of one score. The report is the same object that the other engine makes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.stats import norm
+from threadpoolctl import threadpool_limits
+
+from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.diagnose import Posed, conclude, gross, pose
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.identifiability import experiment
+from tools.mismatch.engine.noise import floor_interval
+from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.report import Alternative, Equivalent, Report
+from tools.mismatch.engine.revise import size
+from tools.mismatch.engine.score import block_energy, compare, held_rms, misfits
+from tools.mismatch.engine.screen import Candidate
+from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
+from tools.mismatch.infer.constants import Constants, learned
+from tools.mismatch.infer.decide import Answer, decide, recalibrated
+from tools.mismatch.infer.search import Found, search
+from tools.mismatch.infer.store import Scored, Store, part_of
+from tools.mismatch.recording import Recording
+from tools.mismatch.report.wording import rival_remark
+
+Progress = Callable[[str, int, int], None]
+
+
+@dataclass(frozen=True)
+class Inferred:
+    """A recording made ready, and what the search found on it: everything that a decision needs."""
+
+    posed: Posed
+    found: Found
+
+
+def infer(
+    recording: Recording, constants: Constants, *, held_out: float = 0.3, seed: int = 0, jobs: int = 1,
+    progress: Progress | None = None, effects: Iterable[Effect] | None = None,
+) -> Inferred:  # fmt: skip
+    """Prepare and search; no decision yet. The linear algebra uses one thread."""
+    with threadpool_limits(1):
+        posed = pose(recording, held_out, seed, jobs, progress, effects, Rule())
+        return Inferred(
+            posed, search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
+        )
+
+
+def diagnose(
+    recording: Recording, *, held_out: float = 0.3, seed: int = 0, jobs: int = 2, progress: Progress | None = None,
+    effects: Iterable[Effect] | None = None, constants: Constants | None = None,
+) -> Report:  # fmt: skip
+    """Locate the mismatch, name the physics and say how sure that is, with the learned constants unless given."""
+    began = time.perf_counter()
+    inferred = infer(
+        recording, constants or learned(), held_out=held_out, seed=seed, jobs=jobs, progress=progress, effects=effects
+    )
+    with threadpool_limits(1), np.errstate(all="ignore"):
+        report = report_of(inferred, decide(inferred.found.store, inferred.found.first), held_out, jobs)
+    return replace(report, seconds=time.perf_counter() - began)
+
+
+def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:
+    """The report of an answer."""
+    posed, store = inferred.posed, inferred.found.store
+    decision = verdict_of(posed, store, answer)
+    named = decision.verdict in ("missing_physics", "unexplained")
+    chosen = answer.chosen if named else store.base
+    selection = Selection(
+        store.problem, store.base.fitted, chosen.fitted,
+        tuple(trial_of(store, chosen, k) for k in range(len(chosen.placed))),
+        tuple(() for _ in chosen.placed), inferred.found.first, answer.strange,
+    )  # fmt: skip
+    remarks = gross(posed.recording, posed.problem.twin, posed.raw)
+    report = conclude(posed, selection, dict(answer.left), Rule(), remarks, jobs, held_out=held_out, decision=decision)
+    physics = [replace(p, confidence=round(answer.sure.get(p.name, p.confidence), 4)) for p in report.physics]
+    return replace(
+        report,
+        # the likeliest first; of equals the one that takes more
+        physics=tuple(sorted(physics, key=lambda p: -effect_size(store, chosen, p.name))),
+        alternatives=alternatives_of(store, answer) if chosen.placed else (),
+        equivalent=equivalents_of(store, answer) if chosen.placed else (),
+    )
+
+
+def effect_size(store: Store, chosen: Scored, name: str) -> float:
+    """Nats that a name brings to a set."""
+    small = store.without(chosen, lambda p: p.effect.name == name)
+    return sum(chosen.density.values()) - sum(small.density.values())
+
+
+def trial_of(store: Store, chosen: Scored, k: int) -> Trial:
+    """Effect ``k`` of a set in the form that the report is assembled from."""
+    p, placed = store.problem, chosen.placed[k]
+    small = store.without(chosen, lambda e: e is placed)
+    seen = store.seen.get(part_of(placed)) or Candidate(placed, 0.0, 1.0, False, ())
+    return Trial(
+        placed, seen, chosen.fitted, compare(p, small.fitted, chosen.fitted), misfits(p, chosen.fitted),
+        block_energy(p, chosen.fitted, p.held_blocks), size(placed), p.twin.outputs,
+    )  # fmt: skip
+
+
+def alternatives_of(store: Store, answer: Answer) -> tuple[Alternative, ...]:
+    rms = {id(r): held_rms(store.problem, r.scored.fitted)[r.output] for r in answer.rivals}
+    return tuple(
+        Alternative(r.name, r.output, rms[id(r)], rival_remark(r.ratio, r.as_good, r.instead_of)) for r in answer.rivals
+    )
+
+
+def equivalents_of(store: Store, answer: Answer) -> tuple[Equivalent, ...]:
+    """Names that this recording cannot tell from a named one, with the recording that would."""
+    effects = {p.effect.name: p.effect for s in store.sets.values() for p in s.placed}
+    out: list[Equivalent] = []
+    for name in sorted(answer.chosen.names):
+        alike = [r.name for r in answer.rivals if r.instead_of == name and r.as_good]
+        if alike:
+            out.append(Equivalent((name, *alike), experiment(effects[name], effects[alike[0]])))
+    return tuple(out)
+
+
+def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
+    """The verdict. Differences within a declared tolerance count as none."""
+    problem, raw, base, fitted = store.problem, posed.raw, store.base.fitted, answer.chosen.fitted
+    floors = {o: floors_of(store, fitted, o, answer) for o in problem.twin.outputs}
+    if all(within_tolerance(problem, raw).values()):
+        return Decision("agrees", 1.0, "", (), floors)
+    if not answer.whole:
+        trouble = fit_trouble(problem, raw, base, fitted)
+        p = answer.strange.p_value if answer.strange is not None else least_p(answer.left.values())
+        return Decision("unexplained", p, meaning_of(problem, dict(answer.left), trouble), trouble, floors)
+    if answer.chosen.placed:
+        z = store.least_z(answer.chosen)
+        return Decision("missing_physics", float(norm.sf(z)), "", (), floors)
+    return Decision("recalibrate" if recalibrated(store, raw) else "agrees", 1.0, "", (), floors)
+
+
+def least_p(left: Iterable[object]) -> float:
+    return min((d.p_value for v in left for d in getattr(v, "follows", ())), default=1.0)
+
+
+def floors_of(store: Store, fitted: Fit, output: str, answer: Answer) -> tuple[float, float]:
+    """The interval that the noise rms of an output lies in."""
+    problem, left = store.problem, answer.left[output]
+    follows = max((d.strength for d in left.follows), default=0.0) if left.real else 0.0
+    return floor_interval(
+        problem.floors[output], fitted.residual[output][problem.held_rows], follows, 1 / problem.recording.dt
+    )
+
+
+__all__: Sequence[str] = ["Inferred", "diagnose", "infer", "report_of"]

@@ -1,0 +1,144 @@
+"""Search over sets of effects: add one, add it everywhere, drop, swap; a beam of three, screened by the score test."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.trial import Trial, try_all
+from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.store import Key, Scored, Store, part_of
+from tools.mismatch.placed import Placed
+
+Progress = Callable[[str, int, int], None]
+
+BEAM = 3
+"""Sets that are extended at a time."""
+MOVES = 6
+"""Extensions in a row at most; the same effect on another output counts as one."""
+SWAPS = 2
+"""Rounds in which every effect of the best set is taken out and what fits beside the others is looked for."""
+FITS, FITS_LATER = (3, 6), (2, 4)
+"""(Least, most) candidates of each kind per output that the screen lets through to a fit, from the base and later."""
+HALF = 0.5
+"""A set is extended if it gains at least this share of what the best set gains over the base."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search leaves: the ``store``, and the screened candidates beside the base (``first``)."""
+
+    store: Store
+    first: tuple[Trial, ...]
+
+
+class Search:
+    """One search. ``stride`` thins the rows of a candidate's fit."""
+
+    def __init__(
+        self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
+        jobs: int = 1, progress: Progress | None = None,
+    ) -> None:  # fmt: skip
+        self.problem, self.effects, self.jobs, self.progress = problem, tuple(effects), jobs, progress
+        self.store = Store(problem, base, constants)
+        self.expanded: set[Key] = set()
+        self.stride = max(1, problem.fit_rows.size // 12000)
+        self.first: tuple[Trial, ...] = ()
+
+    def run(self) -> Found:
+        """Extend until nothing can gain, then swap; refine what the decision is between."""
+        self.expand(self.store.base)
+        self.grow()
+        for _ in range(SWAPS):
+            best = self.store.ranked()[0]
+            rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in best.names]
+            # singles were looked at from the base; what a pair left was not
+            fresh = [r for r in rests if len(best.names) > 1 and r.key not in self.expanded]
+            for rest in fresh:
+                self.expand(rest)
+            if not fresh or self.store.ranked()[0].key == best.key:
+                break
+            self.grow()
+        for s in self.store.ranked()[:BEAM]:
+            if s.placed:
+                self.store.refined(s)
+        return Found(self.store, self.first)
+
+    def grow(self) -> None:
+        """Extend the best sets that can gain."""
+        for _ in range(MOVES):
+            ranked = self.store.ranked()
+            base, best = self.store.score(self.store.base), self.store.score(ranked[0])
+            beam = [s for s in ranked[:BEAM] if s.key not in self.expanded and self.can_gain(s, best)]
+            beam = [s for s in beam if self.store.score(s) - base >= HALF * (best - base)]
+            if not beam:
+                return
+            for s in beam:
+                self.expand(s)
+
+    def can_gain(self, s: Scored, best: float) -> bool:
+        """Whether a set with one more name can be better than ``best`` if it explains everything down to the noise."""
+        c = self.store.constants
+        price = c.per_name + c.per_parameter
+        return sum(self.store.room(s).values()) > price and (
+            self.store.score(s) + sum(self.store.room(s).values()) - price > best
+        )
+
+    def expand(self, s: Scored) -> None:
+        """Every candidate beside ``s`` screened, the promising ones fitted and put into the store."""
+        self.expanded.add(s.key)
+        room, least = self.store.room(s), self.store.constants.per_parameter
+        pool = [
+            p
+            for p in places(self.problem, self.effects, s.placed)
+            if not s.placed or p.effect.test is not None or any(room[o] > least for o in p.outputs)
+        ]
+        least_fits, most_fits = FITS_LATER if s.placed else FITS
+        trials = try_all(
+            self.problem, s.fitted, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
+            what=f"{len(s.names)}", least=least_fits, most=most_fits,
+        )  # fmt: skip
+        if not s.placed:
+            self.first = tuple(trials)
+        children: list[tuple[Scored, Placed]] = []
+        for t in trials:
+            part = part_of(t.placed)
+            if part not in self.store.seen or t.candidate.share > self.store.seen[part].share:
+                self.store.seen[part] = t.candidate
+            if t.fitted is not None and not t.refused:
+                children.append((self.store.put(t.fitted), t.placed))
+        if self.problem.twin.apart and len(self.problem.twin.outputs) > 1:
+            self.spread(s, children)
+
+    def spread(self, s: Scored, children: Sequence[tuple[Scored, Placed]]) -> None:
+        """The two best new names on every other output where the same effect fits well alone: one move, one name."""
+        best = [c for c in self.store.ranked([c for c, _ in children]) if c.names - s.names][:2]
+        for child in best:
+            (name,) = child.names - s.names
+            grown = child
+            own = self.store.score(s)
+            others = sorted(
+                ((c, p) for c, p in children if p.effect.name == name and c.key != child.key),
+                key=lambda cp: -self.store.score(cp[0]),
+            )
+            free = self.store.constants.per_name
+            for c, place in others:
+                taken = {o for p in grown.placed if p.effect.name == name for o in p.outputs}
+                if taken & set(place.outputs) or self.store.score(c) + free <= own:
+                    continue
+                grown = self.store.with_one(grown, place)
+
+
+def search(
+    problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
+    jobs: int = 1, progress: Progress | None = None,
+) -> Found:  # fmt: skip
+    """The sets of effects worth a decision, fitted and scored. ``base``: the recalibrated twin."""
+    with np.errstate(all="ignore"):
+        return Search(problem, base, effects, constants, jobs=jobs, progress=progress).run()

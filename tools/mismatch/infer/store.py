@@ -1,0 +1,163 @@
+"""Sets of effects that were fitted and scored, each once, by what they consist of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.revise import added, beyond_limits, size
+from tools.mismatch.engine.score import compare
+from tools.mismatch.engine.screen import Candidate
+from tools.mismatch.infer.constants import Constants
+from tools.mismatch.infer.density import best_log_density, log_density
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
+
+Array = NDArray[np.float64]
+Part = tuple[str, ...]
+Key = frozenset[Part]
+
+
+def part_of(placed: Placed) -> Part:
+    """What tells an effect at its place from others; what it read off the data does not."""
+    return (*placed.effect.form, placed.site, placed.target)
+
+
+def key_of(placed: Sequence[Placed]) -> Key:
+    """The set that these effects make, in whatever order."""
+    return frozenset(part_of(p) for p in placed)
+
+
+@dataclass(frozen=True)
+class Scored:
+    """One set with its joint fit. ``density``: mean log density of held-out samples per output; ``blocks``
+    (blocks, outputs) the same per held-out block; ``parameters``: how many numbers the effects bring; ``proper``: the
+    fit stayed within reach and every effect within what its physics can be.
+    """
+
+    key: Key
+    fitted: Fit = field(repr=False)
+    density: dict[str, float]
+    blocks: Array = field(repr=False)
+    parameters: int
+    proper: bool
+
+    @property
+    def names(self) -> frozenset[str]:
+        return frozenset(p.effect.name for p in self.fitted.model.placed)
+
+    @property
+    def placed(self) -> tuple[Placed, ...]:
+        return self.fitted.model.placed
+
+    def score(self, c: Constants, held: int) -> float:
+        """Nats: the tempered log density (Miller and Dunson 2019: a likelihood raised to a power below one, because the
+        form of a model is never quite right) less the prices of names and parameters. ``held``: samples held out.
+        """
+        gain = min(c.samples, float(held)) * sum(self.density.values())
+        return gain - c.per_name * len(self.names) - c.per_parameter * self.parameters
+
+
+class Store:
+    """Every set that a search has fitted. ``tests``: how the screen saw an effect at its place, by its part."""
+
+    def __init__(self, problem: Problem, base: Fit, constants: Constants) -> None:
+        self.problem = problem
+        self.constants = constants
+        self.held = int(problem.held_rows.size)
+        self.sets: dict[Key, Scored] = {}
+        self.seen: dict[Part, Candidate] = {}
+        self._tests: dict[tuple[Key, str], float] = {}
+        self._best = best_log_density(problem)
+        self.base = self.put(base)
+
+    def put(self, fitted: Fit) -> Scored:
+        """The fit scored. Of two fits of one set the better one is kept."""
+        p = self.problem
+        key = key_of(fitted.model.placed)
+        every = log_density(p, fitted)
+        mean = {o: float(np.mean(d[p.held_rows])) for o, d in every.items()}
+        blocks = np.array([[float(np.mean(every[o][a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
+        proper = fitted.ok and not any(improper(fitted, e) for e in fitted.model.placed)
+        scored = Scored(key, fitted, mean, blocks, sum(size(e) for e in fitted.model.placed), proper)
+        old = self.sets.get(key)
+        if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
+            self.sets[key] = scored
+        return self.sets[key]
+
+    def score(self, s: Scored) -> float:
+        return s.score(self.constants, self.held) if s.proper else -np.inf
+
+    def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
+        """Proper sets, the best of each set of names, best first."""
+        best: dict[frozenset[str], Scored] = {}
+        for s in self.sets.values() if sets is None else sets:
+            if s.proper and (s.names not in best or self.score(s) > self.score(best[s.names])):
+                best[s.names] = s
+        return sorted(best.values(), key=lambda s: (-self.score(s), sorted(s.names)))
+
+    def room(self, s: Scored) -> dict[str, float]:
+        """Nats per output by which a larger set can be better at most: up to noise at its floor."""
+        n = min(self.constants.samples, self.held)
+        return {o: max(n * (self._best[o] - d), 0.0) for o, d in s.density.items()}
+
+    def without(self, s: Scored, drop: Callable[[Placed], bool]) -> Scored:
+        """The set less the effects that ``drop`` says, fitted again unless the store has it."""
+        kept = [p for p in s.placed if not drop(p)]
+        known = self.sets.get(key_of(kept))
+        if known is not None:
+            return known
+        model = Model(self.problem.twin, kept)
+        theta = model.carry(s.fitted.model, s.fitted.theta, self.problem.recording)
+        return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
+
+    def with_one(self, s: Scored, place: Placed) -> Scored:
+        """The set with one more effect, prepared from what the set leaves."""
+        known = self.sets.get(s.key | {part_of(place)})
+        if known is not None:
+            return known
+        with np.errstate(all="ignore"):
+            return self.put(added(self.problem, s.fitted, place))
+
+    def refined(self, s: Scored) -> Scored:
+        """The set fitted on every row until nothing moves."""
+        with np.errstate(all="ignore"):
+            return self.put(fit(self.problem, s.fitted.model, [s.fitted.theta], iterations=15))
+
+    def z_of(self, s: Scored, name: str) -> float:
+        """Whitened held-out correlation of what ``name`` does with what the set without it leaves.
+
+        An effect of events or of noise has no course that could be predicted: its own test stands in for it.
+        """
+        if (s.key, name) not in self._tests:
+            mine = [p for p in s.placed if p.effect.name == name]
+            if all(p.effect.stochastic or p.effect.claims is not None for p in mine):
+                seen = [self.seen[part_of(p)] for p in mine if part_of(p) in self.seen]
+                z = max((_z_of_p(c.p_value) for c in seen if c.tested), default=0.0)
+            else:
+                small = self.without(s, lambda p: p.effect.name == name)
+                z = compare(self.problem, small.fitted, s.fitted).z
+            self._tests[s.key, name] = z
+        return self._tests[s.key, name]
+
+    def least_z(self, s: Scored) -> float:
+        """The weakest of the names of a set; infinite for the empty set."""
+        return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+def improper(fitted: Fit, placed: Placed) -> bool:
+    """Whether a figure of a fitted effect is beyond its physics, or one without which it says nothing at its bound."""
+    stuck = any(f"{placed.label}.{n}" in fitted.at_bound for n in placed.effect.essential)
+    return stuck or beyond_limits(fitted, placed)
+
+
+def _z_of_p(p: float) -> float:
+    """Normal quantile of a p-value, of which half is given away: a test of its own is tried at many places."""
+    from scipy.stats import norm
+
+    return 0.5 * float(norm.isf(max(p, 1e-300)))
