@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from tools.mismatch.prove import corpus_page
 from tools.mismatch.prove.corpus import BLOCK, CORPORA, draw_case, first_block
 from tools.mismatch.prove.corpus_table import corpus_table
 from tools.mismatch.prove.exact import compare_paired, reliability, score_exactly, summarise
@@ -176,3 +177,23 @@ def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatc
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc-dirty")
     with pytest.raises(ValueError, match="commit first"):
         run_corpus(Run("sealed", "old", 1, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
+
+
+def test_the_page_pairs_the_cases_that_both_engines_have(tmp_path: Path) -> None:
+    right, wrong = _report("missing_physics", "creep"), _report("missing_physics", "spikes")
+    answer = _answer("single", "creep")
+    runs = []
+    for name, reports in (("old", (right, wrong, right)), ("new", (right, right))):
+        rows = [{"case": f"c{i}", "cpu_s": 1.0, **score_exactly(answer, r)} for i, r in enumerate(reports)]
+        body = {"corpus": "develop", "max_samples": 1000, "revision": "0" * 40, "date": "today", "rows": rows}
+        (tmp_path / name).write_text(json.dumps(body))
+        runs.append(corpus_page.read(tmp_path / name))
+    text = corpus_page.document(*runs, {"provenance": {"learned": False}})
+    assert "2 cases that both engines have" in text
+    assert "| set of names right | 1 | 0 | 1 | 0 |" in text
+    assert "| c1 | piezo_stack | creep (severity 4) | wrong, missing_physics: spikes | right," in text
+    with pytest.raises(ValueError, match="differ in max_samples"):
+        corpus_page.document(runs[0], {**runs[1], "max_samples": 2000}, {"provenance": {"learned": False}})
+    (tmp_path / "old").write_text("{}")
+    with pytest.raises(ValueError, match="not a run over a corpus"):
+        corpus_page.read(tmp_path / "old")

@@ -364,6 +364,38 @@ def _prove_corpus(
 
 
 @app.command()
+def calibrate(
+    keep: Annotated[Path, typer.Option("--keep", metavar="FOLDER", help="Cases and their fits; a run goes on there.")],
+    cases: Annotated[int, typer.Option(min=8, help="Cases of the calibrate corpus.")] = 120,
+    samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording.")] = 8000,
+    minutes: Annotated[float | None, typer.Option(min=0.0, help="Begin no case after these; run again.")] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Learn the constants of the new engine from the calibrate corpus and write them with their provenance.
+
+    Example: micron mismatch calibrate --keep calibration
+    """
+    with _clear_errors():
+        _check_targets(json_file)
+        _check_folder(keep, "--keep")
+        keep.mkdir(exist_ok=True)
+        from tools.mismatch.calibration import calibrate as run_calibration
+        from tools.mismatch.calibration import write_constants
+
+        err = console()
+        limit = float("inf") if minutes is None else minutes
+        body, left = run_calibration(
+            keep, cases, samples, limit, progress=lambda text: err.print(text, markup=False, soft_wrap=True)
+        )
+        if body is None:
+            err.print(f"{left} of {cases} cases are still to be done; run the same command again", soft_wrap=True)
+            return
+        file = write_constants(body)
+        err.print(f"constants written: {file}", soft_wrap=True)
+        write_json(body, json_file)
+
+
+@app.command()
 def cut(
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml).")],
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],

@@ -264,3 +264,18 @@ def test_prove_says_what_is_wrong_with_a_corpus(options: tuple[object, ...], tex
     result = run("prove", "--cases", 1, *options)
     assert result.exit_code == 2
     assert text in " ".join(result.stderr.split())
+
+
+def test_the_new_engine_writes_the_same_kind_of_report(stack: Path, tmp_path: Path):
+    result = run("diagnose", stack, "--engine", "new", "--jobs", 1, "--json", tmp_path / "r.json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads((tmp_path / "r.json").read_text())["verdict"] in ("agrees", "recalibrate")
+    many = run("diagnose", stack.parent, "--engine", "new")
+    assert many.exit_code == 2
+    assert "one recording at a time" in " ".join(many.stderr.split())
+
+
+def test_a_calibration_that_is_not_finished_says_how_to_go_on(tmp_path: Path):
+    result = run("calibrate", "--keep", tmp_path / "kept", "--cases", 8, "--samples", 1000, "--minutes", 0)
+    assert result.exit_code == 0, result.stderr
+    assert "8 of 8 cases are still to be done; run the same command again" in " ".join(result.stderr.split())

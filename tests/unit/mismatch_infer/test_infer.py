@@ -52,9 +52,8 @@ def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_numbe
 
 
 def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:
-    chosen = _Set(0.0, {"a", "b"}, 0)
     sets = [(frozenset("ab"), 1.0), (frozenset("ac"), 1.0), (frozenset(), -60.0)]
-    sure = surenesses(chosen, sets, START)  # pyright: ignore[reportArgumentType]
+    sure = surenesses(frozenset("ab"), sets, START)
     assert sure["b"] == pytest.approx(0.5)
     assert sure["a"] > 0.999
     cautious = replace(START, sure_offset=-0.5, sure_slope=0.3)

@@ -66,16 +66,16 @@ def accepted(store: Store) -> list[Scored]:
     return out if any(not s.names for s in out) else [*out, store.base]
 
 
-def surenesses(chosen: Scored, sets: Sequence[tuple[frozenset[str], float]], c: Constants) -> dict[str, float]:
-    """How sure each name of ``chosen`` is among ``sets`` (names, score): the share of the tempered posterior on sets
+def surenesses(names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], c: Constants) -> dict[str, float]:
+    """How sure each of ``names`` is among ``sets`` (names, score): the share of the tempered posterior on sets
     that have it, on a log odds scale that was calibrated on cases of its own.
     """
     top = max(v for _, v in sets)
-    weights = [(names, math.exp(v - top)) for names, v in sets]
+    weights = [(of, math.exp(v - top)) for of, v in sets]
     total = sum(w for _, w in weights)
     out: dict[str, float] = {}
-    for name in chosen.names:
-        p = sum(w for names, w in weights if name in names) / total
+    for name in names:
+        p = sum(w for of, w in weights if name in of) / total
         out[name] = stated(p, c)
     return out
 
@@ -118,6 +118,11 @@ def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
     return tuple(out[:8])
 
 
+def candidate_signals(first: Sequence[Trial]) -> frozenset[str]:
+    """Recorded signals that some candidate is about: these have effects of their own."""
+    return frozenset(s for t in first for s in about(t.placed.effect))
+
+
 def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger | None:
     """The recorded signal, about which no candidate effect is, whose free curve takes most of what ``fitted`` leaves
     on the output that is furthest from its noise."""
@@ -154,8 +159,7 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     p, c = store.problem, store.constants
     good = accepted(store)
     chosen = good[0]
-    known = frozenset(s for t in first for s in about(t.placed.effect))
-    strange = free_curve(p, store.base.fitted, known)
+    strange = free_curve(p, store.base.fitted, candidate_signals(first))
     if strange is not None and curve_score(store, store.base, strange) > store.score(chosen):
         chosen = store.base
     else:
@@ -171,7 +175,7 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     rest, taken = worst_left(p, store.base.fitted, left)
     sets = [(s.names, store.score(s)) for s in good]
     return Answer(
-        chosen, surenesses(chosen, sets, c), rivals_of(store, chosen), strange, left,
+        chosen, surenesses(chosen.names, sets, c), rivals_of(store, chosen), strange, left,
         strange is None and is_whole(rest, taken, c),
     )  # fmt: skip
 

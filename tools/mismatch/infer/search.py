@@ -21,9 +21,11 @@ Progress = Callable[[str, int, int], None]
 BEAM = 3
 """Sets that are extended at a time."""
 MOVES = 6
-"""Extensions in a row at most; the same effect on another output counts as one."""
+"""Extensions at most between two rounds of swaps."""
 SWAPS = 2
 """Rounds in which every effect of the best set is taken out and what fits beside the others is looked for."""
+RIVALS = 3
+"""Names that are tried in place of each name of the best set."""
 FITS, FITS_LATER = (3, 6), (2, 4)
 """(Least, most) candidates of each kind per output that the screen lets through to a fit, from the base and later."""
 HALF = 0.5
@@ -57,38 +59,64 @@ class Search:
         self.grow()
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
-            rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in best.names]
-            # singles were looked at from the base; what a pair left was not
-            fresh = [r for r in rests if len(best.names) > 1 and r.key not in self.expanded]
-            for rest in fresh:
-                self.expand(rest)
-            if not fresh or self.store.ranked()[0].key == best.key:
+            if len(best.names) < 2 or not self.can_be_beaten(best):
+                break
+            rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in sorted(best.names)]
+            for rest in rests:
+                if rest.key not in self.expanded:
+                    self.expand(rest)
+            if self.store.ranked()[0].key == best.key:
                 break
             self.grow()
+        if len(self.store.ranked()[0].names) > 1:
+            self.swap(self.store.ranked()[0])
         for s in self.store.ranked()[:BEAM]:
             if s.placed:
                 self.store.refined(s)
         return Found(self.store, self.first)
 
+    def swap(self, best: Scored) -> None:
+        """Every name of ``best`` replaced by those that do about as well alone on the same outputs: beside the base one
+        of two likenesses is extended, and the other has to be seen in its place.
+        """
+        alone = [s for s in self.store.sets.values() if len(s.placed) == 1 and s.proper]
+        alone.sort(key=lambda s: (-self.store.score(s), sorted(s.names)))
+        for name in sorted(best.names):
+            outputs = {o for p in best.placed if p.effect.name == name for o in p.outputs}
+            here = [s for s in alone if outputs & set(s.placed[0].outputs)]
+            mine = max((self.store.score(s) for s in here if name in s.names), default=np.inf)
+            near = [s for s in here if self.store.score(s) > mine - 2.0 * self.store.constants.per_name]
+            rest = self.store.without(best, lambda p, n=name: p.effect.name == n)
+            for rival in list(dict.fromkeys(n for s in near for n in s.names if n not in best.names))[:RIVALS]:
+                grown, left = rest, set(outputs)
+                for s in (s for s in here if rival in s.names):
+                    if left & set(s.placed[0].outputs):
+                        left -= set(s.placed[0].outputs)
+                        grown = self.store.with_one(grown, s.placed[0])
+
     def grow(self) -> None:
-        """Extend the best sets that can gain."""
+        """Extend the best of the beam that can gain, one at a time, until the best set can hardly be beaten."""
+        base = self.store.score(self.store.base)
         for _ in range(MOVES):
             ranked = self.store.ranked()
-            base, best = self.store.score(self.store.base), self.store.score(ranked[0])
-            beam = [s for s in ranked[:BEAM] if s.key not in self.expanded and self.can_gain(s, best)]
-            beam = [s for s in beam if self.store.score(s) - base >= HALF * (best - base)]
-            if not beam:
+            if not self.can_be_beaten(ranked[0]):
                 return
-            for s in beam:
-                self.expand(s)
+            best = self.store.score(ranked[0])
+            beam = [s for s in ranked[:BEAM] if s.key not in self.expanded and self.can_gain(s, best)]
+            chosen = next((s for s in beam if self.store.score(s) - base >= HALF * (best - base)), None)
+            if chosen is None:
+                return
+            self.expand(chosen)
+
+    def can_be_beaten(self, best: Scored) -> bool:
+        """Whether a set with one more name may score more than ``best``: noise at its floor is as good as it gets."""
+        c = self.store.constants
+        return sum(self.store.room(best).values()) + c.per_parameter * (best.parameters - 1) > c.per_name
 
     def can_gain(self, s: Scored, best: float) -> bool:
-        """Whether a set with one more name can be better than ``best`` if it explains everything down to the noise."""
+        """Whether ``s`` with one more name can score more than ``best`` if it explains everything down to the noise."""
         c = self.store.constants
-        price = c.per_name + c.per_parameter
-        return sum(self.store.room(s).values()) > price and (
-            self.store.score(s) + sum(self.store.room(s).values()) - price > best
-        )
+        return self.store.score(s) + sum(self.store.room(s).values()) - c.per_name - c.per_parameter > best
 
     def expand(self, s: Scored) -> None:
         """Every candidate beside ``s`` screened, the promising ones fitted and put into the store."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
@@ -138,7 +139,7 @@ class Store:
             mine = [p for p in s.placed if p.effect.name == name]
             if all(p.effect.stochastic or p.effect.claims is not None for p in mine):
                 seen = [self.seen[part_of(p)] for p in mine if part_of(p) in self.seen]
-                z = max((_z_of_p(c.p_value) for c in seen if c.tested), default=0.0)
+                z = max((_z_of_p(c.p_value * len(self.seen)) for c in seen if c.tested), default=0.0)
             else:
                 small = self.without(s, lambda p: p.effect.name == name)
                 z = compare(self.problem, small.fitted, s.fitted).z
@@ -157,7 +158,5 @@ def improper(fitted: Fit, placed: Placed) -> bool:
 
 
 def _z_of_p(p: float) -> float:
-    """Normal quantile of a p-value, of which half is given away: a test of its own is tried at many places."""
-    from scipy.stats import norm
-
-    return 0.5 * float(norm.isf(max(p, 1e-300)))
+    """Normal quantile of a p-value that was corrected for how many candidates were screened (Bonferroni)."""
+    return float(norm.isf(min(max(p, 1e-300), 1.0 - 1e-9)))

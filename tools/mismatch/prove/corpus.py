@@ -80,10 +80,11 @@ class Drawn:
 
 
 def digest_of(*sources: str) -> str:
-    """SHA-256 over Python files and folders of them (paths in the repository): what a kept result depends on."""
+    """SHA-256 over sources and folders of them (paths in the repository): what a kept result depends on."""
     digest = hashlib.sha256()
     paths = [_ROOT / s for s in sources]
-    for file in sorted(f for p in paths for f in ((p,) if p.suffix == ".py" else p.rglob("*.py"))):
+    files = (f for p in paths for f in ((p,) if p.is_file() else p.rglob("*")) if f.suffix in (".py", ".json"))
+    for file in sorted(files):
         digest.update(str(file.relative_to(_ROOT)).encode())
         digest.update(file.read_bytes())
     return digest.hexdigest()

@@ -1,0 +1,127 @@
+"""Constants are learned from searches with known answers, without another fit."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.unit.mismatch_engine.cases import recording, wave
+from tools.mismatch.calibration import calibrate, write_constants
+from tools.mismatch.infer.constants import START, Constants
+from tools.mismatch.infer.decide import decide
+from tools.mismatch.infer.learn import (
+    CLIP,
+    Case,
+    SetTraits,
+    best_of,
+    cross_validated,
+    learn,
+    learn_sure,
+    raw_surenesses,
+    traits_of,
+)
+from tools.mismatch.infer.run import infer
+
+
+def _set(names: str, density: float, parameters: int = 2, z: float | None = 9.0, rest: float = 0.0) -> SetTraits:
+    return SetTraits(frozenset(names), density, parameters, z if names else None, rest, 1.0)
+
+
+def _cases(rng: np.random.Generator, count: int, form_error: float) -> list[Case]:
+    """One true name each; a false second name gains by chance up to ``form_error`` nats per sample."""
+    out: list[Case] = []
+    for i in range(count):
+        gain = rng.uniform(0.3, 2.0)
+        more = rng.uniform(0.0, form_error)
+        sets = (_set("", 0.0, 0), _set("a", gain), _set("b", 0.6 * gain), _set("ab", gain + more, 5))
+        out.append(Case(f"c{i}", "single", frozenset("a"), 900, sets, None))
+    return out
+
+
+def test_the_price_of_a_name_follows_the_error_of_forms() -> None:
+    rng = np.random.default_rng(1)
+    for form_error in (0.02, 0.08):
+        cases = _cases(rng, 40, form_error)
+        c = learn(cases)
+        assert sum(case.right(c) for case in cases) >= 39
+        assert np.mean([k.log_probability(c) for k in cases]) >= np.mean([k.log_probability(START) for k in cases])
+    # per sample, a name costs about what a form may leave
+    assert c.per_name / c.samples > 0.03
+
+
+def test_a_case_that_the_search_missed_costs_no_more_than_the_clip() -> None:
+    missed = Case("c", "pair", frozenset("xy"), 900, (_set("", 0.0, 0), _set("a", 3.0)), None)
+    assert missed.log_probability(START) == CLIP
+    wrong = Case("c", "single", frozenset("b"), 900, (_set("", 0.0, 0), _set("a", 3.0), _set("b", 0.1)), None)
+    assert wrong.log_probability(START) == CLIP
+
+
+def test_a_name_must_pass_its_test_and_a_leftover_makes_it_no_account() -> None:
+    sets = (_set("", 0.0, 0), _set("a", 1.0, z=2.0), _set("b", 0.9, z=8.0))
+    case = Case("c", "single", frozenset("b"), 900, sets, None)
+    assert case.right(replace(START, least_z=3.0))
+    assert not case.right(replace(START, least_z=1.0))
+    left = Case("c", "unknown", frozenset(), 900, (_set("", 0.0, 0), _set("a", 1.0, rest=4.0)), None)
+    assert left.right(START)
+    assert not left.right(replace(START, cut=5.0))
+    followed = Case("c", "unknown", frozenset(), 900, (_set("", 0.0, 0), _set("a", 0.2)), (0.8, 1.0))
+    assert followed.says(START)[0] == "unexplained"
+    assert Case("c", "unknown", frozenset(), 900, followed.sets, None).says(START)[0] == "named"
+
+
+def test_of_equal_options_the_middle_is_taken() -> None:
+    cases = [Case("c", "single", frozenset("a"), 900, (_set("", 0.0, 0), _set("a", 1.0, z=6.0)), None)]
+    c = best_of(START, ({"least_z": z} for z in (1.0, 2.0, 4.0, 8.0, 16.0)), cases)
+    assert c.least_z == 2.0
+
+
+def test_boastful_probabilities_are_lowered_on_cases_of_their_own() -> None:
+    rng = np.random.default_rng(3)
+    cases: list[Case] = []
+    for i in range(300):
+        true = "a" if rng.random() < 0.75 else "b"
+        sets = (_set("", -1.0, 0), _set("a", 0.0), _set("b", -0.015))
+        cases.append(Case(f"c{i}", "single", frozenset(true), 900, sets, None))
+    before = np.mean([p for p, _ in raw_surenesses(START, cases)])
+    c = learn_sure(START, cases[:150])
+    after = np.mean([p for p, _ in raw_surenesses(c, cases[150:])])
+    assert before > 0.97
+    assert after == pytest.approx(0.75, abs=0.06)
+
+
+def test_cross_validation_counts_every_case_once() -> None:
+    cases = _cases(np.random.default_rng(5), 20, 0.02)
+    figures = cross_validated(cases, lambda some: START)
+    assert figures["cases"] == 20
+    assert figures["exactly_right"] == sum(c.right(START) for c in cases)
+
+
+def test_what_is_learned_from_decides_as_the_engine_does() -> None:
+    rng = np.random.default_rng(4)
+    u = 40.0 * wave(rng, 2500)
+    y = 0.12 * np.clip(u, -22.0, 25.0) + 0.01 * rng.standard_normal(u.size)
+    stack = recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
+    inferred = infer(stack, START)
+    traits = json.loads(json.dumps(traits_of(inferred), default=float))
+    case = Case.of("c", "single", ["saturation"], traits)
+    answer = decide(inferred.found.store, inferred.found.first)
+    said, chosen = case.says(START)
+    assert chosen.names == answer.chosen.names == {"saturation"}
+    assert said == ("named" if answer.whole else "unexplained")
+
+
+def test_a_calibration_goes_on_where_it_was(tmp_path: Path) -> None:
+    body, left = calibrate(tmp_path, 9, 1000, minutes=0.0)
+    assert body is None
+    assert left == 9
+    assert not list(tmp_path.rglob("constants.json"))
+
+
+def test_constants_are_written_whole(tmp_path: Path) -> None:
+    body = {"format": 1, "constants": START.to_json(), "provenance": {"learned": True}}
+    file = write_constants(body, tmp_path / "constants.json")
+    assert Constants.of(json.loads(file.read_text())["constants"]) == START

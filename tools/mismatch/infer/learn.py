@@ -1,0 +1,253 @@
+"""Learns the constants of the decision from searches whose answer is known.
+
+Fits are not repeated: what a decision reads of a search is a few numbers per set (``traits_of``), and all of the
+learning works on these.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.optimize import minimize
+
+from tools.mismatch.engine.unexplained import leftover
+from tools.mismatch.infer.constants import START, Constants
+from tools.mismatch.infer.decide import (
+    CURVE,
+    TESTED,
+    candidate_signals,
+    free_curve,
+    is_whole,
+    log_odds,
+    surenesses,
+    worst_left,
+)
+from tools.mismatch.infer.run import Inferred
+from tools.mismatch.infer.store import Scored, Store
+
+Traits = Mapping[str, Any]
+
+CLIP = -4.0
+"""Least log probability of the right set that counts: a few deep misses of the search shall not own the constants."""
+LOOKED_AT = 3
+"""Sets of names, best first, whose leftovers are looked at."""
+FOLDS = 5
+SETS = 60
+"""Sets kept of a search, best first."""
+
+
+@dataclass(frozen=True)
+class SetTraits:
+    """What a decision reads of one set of names.
+
+    ``density`` is summed over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken`` are
+    those of ``worst_left`` (None: not looked at).
+    """
+
+    names: frozenset[str]
+    density: float
+    parameters: int
+    z: float | None
+    rest: float | None
+    taken: float | None
+
+    def score(self, c: Constants, held: int) -> float:
+        """As ``Scored.score``."""
+        return min(c.samples, held) * self.density - c.per_name * len(self.names) - c.per_parameter * self.parameters
+
+
+def traits_of(inferred: Inferred) -> dict[str, Any]:
+    """What a decision reads of a search, as plain JSON."""
+    store = inferred.found.store
+    ranked = store.ranked()[:TESTED]
+    tested = {s.key: store.least_z(s) if s.names else None for s in ranked}
+    ranked = store.ranked()  # tests may have fitted sets anew
+    leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
+    for s in [*ranked[:LOOKED_AT], store.base]:
+        left = {o: leftover(store.problem, s.fitted, o) for o in store.problem.twin.outputs}
+        leaves[s.key] = worst_left(store.problem, store.base.fitted, left)
+    strange = free_curve(store.problem, store.base.fitted, candidate_signals(inferred.found.first))
+    kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
+    return {
+        "held": store.held,
+        "sets": [
+            {"names": sorted(s.names), "density": sum(s.density.values()), "parameters": s.parameters,
+             "z": tested.get(s.key), "left": leaves.get(s.key)}
+            for s in [*kept, *([] if store.base in kept else [store.base])]
+        ],
+        "strange": None if strange is None else {
+            "share": strange.share, "room": _density_room(store, store.base, strange.output)
+        },
+    }  # fmt: skip
+
+
+def _density_room(store: Store, s: Scored, output: str) -> float:
+    """Nats per sample by which an output can be predicted better at most."""
+    return store.room(s)[output] / min(store.constants.samples, store.held)
+
+
+def sets_of(traits: Traits) -> list[SetTraits]:
+    """The sets of a search. What was tested of one set of names stands for its other places and forms, too."""
+    z: dict[frozenset[str], float] = {}
+    left: dict[frozenset[str], tuple[float, float]] = {}
+    for s in traits["sets"]:
+        names = frozenset(s["names"])
+        if s["z"] is not None:
+            z.setdefault(names, float(s["z"]))
+        if s["left"] is not None:
+            left.setdefault(names, (float(s["left"][0]), float(s["left"][1])))
+    out: list[SetTraits] = []
+    for s in traits["sets"]:
+        names = frozenset(s["names"])
+        rest, taken = left.get(names, (None, None))
+        out.append(SetTraits(names, float(s["density"]), int(s["parameters"]), z.get(names), rest, taken))
+    return out
+
+
+@dataclass(frozen=True)
+class Case:
+    """One search with its answer: the true ``names`` and the true ``verdict`` up to recalibration."""
+
+    case: str
+    kind: str
+    names: frozenset[str]
+    held: int
+    sets: tuple[SetTraits, ...]
+    curve: tuple[float, float] | None
+    """(share, room in nats per sample) of the best free curve of a signal that no effect is about."""
+
+    @staticmethod
+    def of(case: str, kind: str, names: Sequence[str], traits: Traits) -> Case:
+        strange = traits["strange"]
+        curve = None if strange is None else (float(strange["share"]), float(strange["room"]))
+        return Case(case, kind, frozenset(names), int(traits["held"]), tuple(sets_of(traits)), curve)
+
+    def ranked(self, c: Constants) -> list[SetTraits]:
+        """The best set of each set of names, best first."""
+        best: dict[frozenset[str], SetTraits] = {}
+        for s in self.sets:
+            if s.names not in best or s.score(c, self.held) > best[s.names].score(c, self.held):
+                best[s.names] = s
+        return sorted(best.values(), key=lambda s: (-s.score(c, self.held), sorted(s.names)))
+
+    def accepted(self, c: Constants) -> list[SetTraits]:
+        """Sets whose every name passes its test, best first, down to the empty one; as ``decide.accepted``."""
+        out: list[SetTraits] = []
+        for s in self.ranked(c):
+            if not s.names:
+                return [*out, s]
+            if s.z is not None and s.z > c.least_z:
+                out.append(s)
+        return out
+
+    def says(self, c: Constants) -> tuple[str, SetTraits]:
+        """(unexplained, named or nothing; the chosen set)."""
+        chosen = self.accepted(c)[0]
+        empty = next(s for s in self.ranked(c) if not s.names)
+        if self.curve is not None:
+            share, room = self.curve
+            n = min(c.samples, self.held)
+            gain = min(-0.5 * np.log(max(1.0 - share, 1e-12)), room) * n
+            if empty.score(c, self.held) + gain - c.per_name - c.per_parameter * CURVE > chosen.score(c, self.held):
+                return "unexplained", empty
+        rest = chosen.rest if chosen.rest is not None else 0.0
+        if not is_whole(rest, chosen.taken or 0.0, c):
+            return "unexplained", chosen
+        return ("named" if chosen.names else "nothing"), chosen
+
+    def right(self, c: Constants) -> bool:
+        """Whether verdict (up to recalibration) and set are exact."""
+        said, chosen = self.says(c)
+        if self.kind == "unknown":
+            return said == "unexplained"
+        return said == ("named" if self.names else "nothing") and chosen.names == self.names
+
+    def log_probability(self, c: Constants) -> float:
+        """Log probability of the true set among those of the search, clipped."""
+        ranked = self.ranked(c)
+        values = np.array([s.score(c, self.held) for s in ranked])
+        mine = [v for s, v in zip(ranked, values, strict=True) if s.names == self.names]
+        if not mine:
+            return CLIP
+        top = float(values.max())
+        return max(float(mine[0] - top - np.log(np.sum(np.exp(values - top)))), CLIP)
+
+
+def learn(cases: Sequence[Case]) -> Constants:
+    """Constants from cases: weights by the clipped log loss of the true set, then the test, then the cuts."""
+    known = [c for c in cases if c.kind != "unknown"]
+
+    def loss(x: np.ndarray) -> float:
+        c = _weights(x)
+        # weakly towards the start, by what one case in ten may say
+        pull = 0.05 * float(np.sum((x - _start()) ** 2))
+        return -float(np.mean([k.log_probability(c) for k in known])) + pull
+
+    found = minimize(loss, _start(), method="Nelder-Mead", options={"xatol": 0.02, "fatol": 1e-4, "maxiter": 400})
+    c = _weights(found.x)
+    c = best_of(c, ({"least_z": z} for z in np.arange(2.0, 6.1, 0.25)), cases)
+    cuts = ({"cut": a, "cut_share": b} for a in np.geomspace(0.1, 3.0, 10) for b in np.geomspace(0.01, 0.3, 9))
+    return best_of(c, cuts, cases)
+
+
+def _start() -> np.ndarray:
+    return np.log([START.samples, START.per_name, START.per_parameter])
+
+
+def _weights(x: np.ndarray) -> Constants:
+    n, name, parameter = (float(v) for v in np.exp(np.clip(x, -7.0, 9.0)))
+    return replace(START, samples=n, per_name=name, per_parameter=parameter)
+
+
+def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequence[Case]) -> Constants:
+    """``c`` with the option that gets most cases exactly right; of equals the one in their middle (by logarithms)."""
+    tried = [replace(c, **{k: float(v) for k, v in o.items()}) for o in options]
+    counts = [sum(case.right(t) for case in cases) for t in tried]
+    top = [t for t, n in zip(tried, counts, strict=True) if n == max(counts)]
+    at = np.log([[t.least_z, t.cut, t.cut_share] for t in top])
+    middle = np.median(at, axis=0)
+    return top[int(np.argmin(np.sum((at - middle) ** 2, axis=1)))]
+
+
+def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
+    """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases of their own, held
+    weakly at the identity."""
+    pairs = raw_surenesses(replace(c, sure_offset=0.0, sure_slope=1.0), cases)
+    if not pairs:
+        return c
+    x = np.array([log_odds(p) for p, _ in pairs])
+    right = np.array([r for _, r in pairs])
+
+    def loss(v: np.ndarray) -> float:
+        z = v[0] + np.exp(v[1]) * x
+        return float(np.sum(np.logaddexp(0.0, z) - right * z) + 0.5 * (v[0] ** 2 + v[1] ** 2))
+
+    found = minimize(loss, np.zeros(2), method="Nelder-Mead")
+    return replace(c, sure_offset=float(found.x[0]), sure_slope=float(np.exp(found.x[1])))
+
+
+def raw_surenesses(c: Constants, cases: Sequence[Case]) -> list[tuple[float, float]]:
+    """(stated probability, 1 if right) of every name that would be reported."""
+    out: list[tuple[float, float]] = []
+    for case in cases:
+        _, chosen = case.says(c)
+        sets = [(s.names, s.score(c, case.held)) for s in case.accepted(c)]
+        for name, sure in surenesses(chosen.names, sets, c).items():
+            out.append((sure, float(name in case.names)))
+    return out
+
+
+def cross_validated(cases: Sequence[Case], learner: Callable[[Sequence[Case]], Constants] = learn) -> dict[str, float]:
+    """What the constants do on cases that they were not learned on: every fold by constants of the others."""
+    right = probability = count = 0.0
+    for fold in range(FOLDS):
+        held = [c for i, c in enumerate(cases) if i % FOLDS == fold]
+        constants = learner([c for i, c in enumerate(cases) if i % FOLDS != fold])
+        right += sum(c.right(constants) for c in held)
+        known = [c for c in held if c.kind != "unknown"]
+        probability += sum(c.log_probability(constants) for c in known)
+        count += len(known)
+    return {"cases": len(cases), "exactly_right": right, "mean_log_probability": probability / max(count, 1.0)}
