@@ -30,7 +30,7 @@ def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     span = settings["span"][0]
     k = thin(ctx.keep, 8000)
-    straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    straight = ctx.line(x, k)
     grid = span * np.geomspace(5e-4, 0.4, 16)
     every = stops(x, grid, float(x[0]), np.array(ctx.starts, np.int64))
     tried: list[tuple[float, float]] = []

@@ -94,6 +94,7 @@ CREEP = Effect(
     " Relaxation of Nonlinear Viscoelastic Materials, ch. 5 (Kelvin chain)",
     excitation="steps or changes of the mean, with minutes to settle; several of both signs tell it from warm-up",
     confusable_with=("thermal_drift", "first_order_lag", "hysteresis", "ac_coupling"),
+    proportional=True,
     prepare=_prepare,
     guess=_guess,
     basis=_basis,

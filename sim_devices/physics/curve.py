@@ -41,7 +41,7 @@ def _curve_choose(x: Array, target: Array, ctx: Context) -> tuple[float, int, fl
     """(score, shape, lo, hi): the curve over x that meets the target best for its size."""
     lo, hi = value_range(x)
     k = thin(ctx.keep, 8000)
-    straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    straight = ctx.line(x, k)
     # effective samples: residuals are coloured, so one in ten counts
     n = max(k.size / 10.0, 20.0)
     best = (np.inf, 2)

@@ -35,7 +35,7 @@ def _dead_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     span = hi - lo
     k = thin(ctx.keep, 4000)
     r = residual[k]
-    straight = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    straight = ctx.line(x, k)
     tried: list[tuple[float, float, float]] = []
     centres = [*np.linspace(lo + 0.1 * span, hi - 0.1 * span, 9), *([0.0] if lo < 0 < hi else [])]
     for h in span * np.geomspace(0.01, 0.3, 8):

@@ -41,9 +41,7 @@ def _delay_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
     slope = np.gradient(model, ctx.dt)
     power = float(slope[k] @ slope[k])
     small = -float(slope[k] @ residual[k]) / power if power > 0 else ctx.dt
-    found = [small]
-    if ctx.measured is not None:
-        found.append(delay_by_correlation(model, ctx.measured, longest) * ctx.dt)
+    found = [small, delay_by_correlation(model, model + residual, longest) * ctx.dt]
     return tuple((float(np.clip(d, bounds.lo, bounds.hi)),) for d in dict.fromkeys(found))
 
 

@@ -96,6 +96,8 @@ class Context:
     everywhere: Array | None = None
     believed: Array | None = None
     through: Callable[[Array], Array] | None = None
+    bends: Array | None = None
+    """(n, k) for guesses: what the output moves with each searched parameter of the simulation, per unit."""
 
     @property
     def keep(self) -> NDArray[np.bool_]:
@@ -105,6 +107,24 @@ class Context:
     def to_output(self, change: Array) -> Array:
         """Return the change (n,) of the output that a change (n,) of the signal causes, to first order."""
         return change if self.through is None else self.through(change)
+
+    def line(self, x: Array, k: NDArray[np.int64]) -> Array:
+        """Return what needs no effect, at the samples ``k`` (k.size, columns): an offset, the signal ``x`` on its way
+        to the output, and parameters of the simulation that are a little off.
+
+        A base that was fitted without the effect has bent itself around it; a guess that leaves the base where it is
+        finds what the bent base lacks.
+        """
+        bends = np.empty((self.t.size, 0)) if self.bends is None else self.bends
+        return np.column_stack([np.ones(k.size), self.to_output(x)[k], bends[k]])
+
+    def wanted(self, x: Array, residual: Array) -> Array:
+        """Return what a course of the signal ``x`` with the effect in it would have to become at the output (n,).
+
+        Like ``to_output``, and unlike the recording, it has no start state: a plant that integrates and is started
+        afresh begins somewhere else each time.
+        """
+        return self.to_output(x) + residual
 
 
 @dataclass(frozen=True)
@@ -227,6 +247,15 @@ class Effect:
     """Searched parameters without which the effect says nothing: it is not named when one ends at its bound."""
     plain: str = ""
     """Vocabulary name of the simpler effect that it generalises, tried in its place when it is not borne out."""
+
+    proportional: bool = False
+    """For kind add: twice the signal makes twice of it. Behind columns of simulated output nobody can tell it from
+    parameters of the simulation that are off."""
+
+    @property
+    def is_linear(self) -> bool:
+        """Whether what it makes of a signal is linear in it."""
+        return self.kind == "linear" or self.proportional
 
     @property
     def form(self) -> tuple[str, str, str]:

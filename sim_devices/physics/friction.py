@@ -240,7 +240,7 @@ _BRISTLES = Effect(
     basis=_lugre_basis,
     fill=_lugre_fill,
     report=_lugre_report,
-    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
+    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
 
@@ -295,7 +295,7 @@ _GENTLE = Effect(
     basis=_gentle_basis,
     fill=_gentle_fill,
     report=_gentle_report,
-    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
+    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
 COULOMB_FRICTION = Effect(
@@ -313,7 +313,7 @@ COULOMB_FRICTION = Effect(
     fill=_coulomb_fill,
     report=_coulomb_report,
     variants=(_BRISTLES, _GENTLE),
-    vanishes_with=(("coulomb_forward", "coulomb_backward"),),
+    vanishes_with=(("coulomb_forward",), ("coulomb_backward",)),
 )
 
 
@@ -419,7 +419,7 @@ _STRIBECK_BRISTLES = Effect(
     basis=_stribeck_bristle_basis,
     fill=_stribeck_bristle_fill,
     report=_stribeck_bristle_report,
-    vanishes_with=(("coulomb_forward", "coulomb_backward", "static_friction"),),
+    vanishes_with=(("coulomb_forward", "static_friction"), ("coulomb_backward", "static_friction")),
 )
 
 STRIBECK_FRICTION = Effect(
@@ -438,5 +438,5 @@ STRIBECK_FRICTION = Effect(
     fill=_stribeck_fill,
     report=_stribeck_report,
     variants=(_STRIBECK_BRISTLES,),
-    vanishes_with=(("coulomb_forward", "coulomb_backward", "static_friction"),),
+    vanishes_with=(("coulomb_forward", "static_friction"), ("coulomb_backward", "static_friction")),
 )

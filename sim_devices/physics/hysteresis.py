@@ -238,7 +238,7 @@ def left_out(
     """Sum of squares on left-out blocks of what a form predicts."""
     index = thin(ctx.keep, 6000)
     fold = (np.arange(index.size) * 8 // max(index.size, 1)) % 2
-    straight = np.stack([np.ones(index.size), ctx.to_output(x)[index]], axis=1)
+    straight = ctx.line(x, index)
     first = float(x[0])
     wide = slips_once(lo, hi, first if before is None else before)
     e = columns(x, form, lo, hi, first, ctx.starts, wide, before).T

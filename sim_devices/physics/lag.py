@@ -48,16 +48,11 @@ def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     return low_pass(x, ctx.dt, q[0], np.array(ctx.starts))
 
 
-def _target(residual: Array, ctx: Context, x: Array) -> Array:
-    """Return the output to be reached: its recording, or else the model plus its residual."""
-    return ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
-
-
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     dt, span = settings["time"]
     model, at = ctx.to_output(x), np.zeros(1, np.int64)
     grid: list[tuple[float, ...]] = [(float(t),) for t in np.geomspace(0.1 * dt, 0.1 * span, 20)]
-    ranked = rank_starts(grid, lambda q: low_pass(model, dt, q[0], at), _target(residual, ctx, x), thin(ctx.keep, 8000))
+    ranked = rank_starts(grid, lambda q: low_pass(model, dt, q[0], at), ctx.wanted(x, residual), thin(ctx.keep, 8000))
     return ranked[:3]
 
 
@@ -111,7 +106,7 @@ def _ac_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Se
     return rank_starts(
         grid,
         lambda q: ctx.to_output(_ac_apply(x, ctx, np.array(q), settings)),
-        _target(residual, ctx, x),
+        ctx.wanted(x, residual),
         thin(ctx.keep, 8000),
     )[:3]
 
@@ -155,7 +150,7 @@ def _twice_guess(x: Array, residual: Array, ctx: Context, settings: Settings) ->
     return rank_starts(
         grid,
         lambda q: ctx.to_output(_twice_apply(x, ctx, np.array(q), settings)),
-        _target(residual, ctx, x),
+        ctx.wanted(x, residual),
         thin(ctx.keep, 8000),
     )[:3]
 

@@ -79,7 +79,7 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     bounds = _parts(settings).nonlinear
     model = ctx.to_output(x)
     k = thin(ctx.keep, 6000)
-    measured = (ctx.measured if ctx.measured is not None else model + residual)[k]
+    wanted = ctx.wanted(x, residual)[k]
     one = np.ones(k.size)
 
     def tried(frequencies: Array, dampings: Sequence[float]) -> list[tuple[float, tuple[float, ...]]]:
@@ -88,7 +88,7 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
             f = float(np.clip(f, 1.01 * bounds[0].lo, 0.99 * bounds[0].hi))
             for d in dampings:
                 z = _mode_of(model, ctx, f, d)[:, k]
-                w, left = least_squares(np.stack([one, model[k], z[0] - model[k], z[1]], axis=1), measured)
+                w, left = least_squares(np.stack([one, model[k], z[0] - model[k], z[1]], axis=1), wanted)
                 g = w[1] or 1.0
                 shares = np.clip([w[2] / g, w[3] / g], -19.0, 19.0)
                 out.append((left, (f, d, float(shares[0]), float(shares[1]))))

@@ -53,7 +53,7 @@ def _apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     lo, hi = settings["range"]
     span = hi - lo
-    measured = ctx.measured if ctx.measured is not None else ctx.to_output(x) + residual
+    wanted = ctx.wanted(x, residual)
     cut = (-0.4, 0.03, 0.12, 0.3)
     # a limit that was not reached is taken to mirror the other one
     centres = (0.0, 0.5 * (lo + hi)) if lo < 0.0 < hi else (0.5 * (lo + hi),)
@@ -68,7 +68,8 @@ def _guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Seque
     grid += [
         (lo + a * span, hi - b * span, w * span) for a, b in ((-0.1, -0.1), (-0.4, 0.0), (0.0, -0.4)) for w in (0.3,)
     ]
-    return rank_starts(grid, lambda q: ctx.to_output(limit(x, q[0], q[1], q[2])), measured, thin(ctx.keep, 4000))[:4]
+    k = thin(ctx.keep, 4000)
+    return rank_starts(grid, lambda q: ctx.to_output(limit(x, q[0], q[1], q[2])), wanted, k, ctx.bends)[:4]
 
 
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

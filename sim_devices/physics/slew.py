@@ -67,7 +67,7 @@ def _slew_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _slew_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     usual, top = settings["rates"]
     k = thin(ctx.keep, 8000)
-    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    line = ctx.line(x, k)
     tried: list[tuple[float, tuple[float, float, float]]] = []
     for rate in np.geomspace(0.03 * usual, top, 24).tolist():
         for lag in (0.1 * ctx.dt, 0.6 * ctx.dt, 3.0 * ctx.dt, 12.0 * ctx.dt):

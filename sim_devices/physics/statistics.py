@@ -122,9 +122,10 @@ def smooth(x: Array, width: int) -> Array:
     return (c[hi] - c[lo]) / (hi - lo)
 
 
-def affine_misfit(candidate: Array, measured: Array) -> float:
-    """Sum of squares left when ``a + b candidate`` is fitted to the measured samples."""
-    return least_squares(np.stack([np.ones(candidate.size), candidate]).T, measured)[1]
+def affine_misfit(candidate: Array, measured: Array, beside: Array | None = None) -> float:
+    """Sum of squares left when ``a + b candidate`` is fitted to the measured samples, with the columns ``beside``."""
+    columns = np.column_stack([np.ones(candidate.size), candidate])
+    return least_squares(columns if beside is None else np.column_stack([columns, beside]), measured)[1]
 
 
 def rank_starts(
@@ -132,12 +133,15 @@ def rank_starts(
     output_of: Callable[[tuple[float, ...]], Array],
     measured: Array,
     k: NDArray[np.int64],
+    bends: Array | None = None,
 ) -> list[tuple[float, ...]]:
     """Candidates by how well their output, scaled and offset, meets the measured samples at ``k``; best first.
+    ``bends`` (n, j): columns that may be added to each.
 
     Of candidates within half a percent, the one that is listed first.
     """
-    found = [(affine_misfit(output_of(q)[k], measured[k]), i) for i, q in enumerate(candidates)]
+    beside = None if bends is None else bends[k]
+    found = [(affine_misfit(output_of(q)[k], measured[k], beside), i) for i, q in enumerate(candidates)]
     steps = [(round(float(np.log(max(f, 1e-300))) / 0.005), i) for f, i in found if np.isfinite(f)]
     return [candidates[i] for _, i in sorted(steps)] or candidates[:1]
 

@@ -34,7 +34,7 @@ def _warm_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _warm_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     p = _warm_parts(settings).nonlinear[0]
     k = thin(ctx.keep, 4000)
-    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    line = ctx.line(x, k)
     tried: list[tuple[float, float, float]] = []
     for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
         for ratio in (0.05, 0.2):
@@ -78,7 +78,7 @@ def _late_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _late_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     span = settings["time"][1]
     k = thin(ctx.keep, 4000)
-    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    line = ctx.line(x, k)
     tried: list[tuple[float, float, float]] = []
     for middle in np.linspace(0.0, 1.0, 11) * span:
         for width in (0.04 * span, 0.12 * span):
@@ -109,7 +109,7 @@ def _one_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
 def _one_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
     p = _warm_parts(settings).nonlinear[0]
     k = thin(ctx.keep, 4000)
-    line = np.stack([np.ones(k.size), ctx.to_output(x)[k]], axis=1)
+    line = ctx.line(x, k)
     tried: list[tuple[float, float]] = []
     for tau in np.geomspace(1.05 * p.lo, 0.95 * p.hi, 14):
         column = _one_basis(x, ctx, np.array([tau]), settings)[k]

@@ -126,6 +126,15 @@ def test_start_states_are_sought_behind_the_play_of_the_gear(tmp_path: Path) -> 
     np.testing.assert_allclose(module(dict(rec.signals), dt=rec.dt)["angle"], engine, atol=1e-4)
 
 
+def test_play_is_met_though_a_lag_that_was_fitted_without_it_stood_in_for_it(tmp_path: Path) -> None:
+    """Re-fitted alone the time constant is a fifth too long, and from there no gap of any size helps."""
+    command = [sys.executable, "make.py", str(tmp_path), "backlash", "--seed", "101318077"]
+    subprocess.run(command, cwd=EXAMPLE, check=True, timeout=300)
+    found = best_of(tmp_path / "backlash" / "ode.toml", "backlash")
+    assert found.left < 20.0
+    assert found.human[0].value == pytest.approx(0.378, rel=0.1)
+
+
 class Best(NamedTuple):
     left: float
     place: Placed

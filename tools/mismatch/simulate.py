@@ -292,7 +292,8 @@ class Model:
         states of equations start afresh from what was measured behind them.
         """
         found, change = dict(outputs), dict[str, Array]()
-        afresh = self.twin.restart and inside_of(self.twin) is not None
+        inside = inside_of(self.twin)
+        afresh = inside is not None and inside.integrates
         for k in self.order:
             pl = self.placed[k]
             if pl.site != "output":

@@ -60,6 +60,7 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
             out.append(th.copy())
             th[b] *= 0.3
         out.append(th)
+    out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x, residual, ctx), *out]
     if not twin.static:
         # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
         given = twin.start(view.recording)
@@ -86,6 +87,48 @@ def _from_believed(model: Model, rest: Model, k: int, view: View, found: Sequenc
     return out
 
 
+MOST_BACK = 0.7
+"""Of its value, that a parameter of the base moves at most before a search begins."""
+
+
+def bent_back(
+    model: Model, k: int, theta: Array, guesses: Sequence[Array], x: Array, residual: Array, ctx: Context
+) -> list[Array]:
+    """Starts at the guesses of effect ``k`` with the base where it would be beside it, to first order.
+
+    Along the way from a base that was bent around the effect to both as they are, each alone makes things worse.
+    """
+    pl = model.placed[k]
+    searched = [i for i in model.nonlinear if i < model.n_base]
+    a, b = model.slices(k)
+    out: list[Array] = []
+    if ctx.bends is None or ctx.bends.shape[1] != len(searched):
+        return out
+    rows = thin(ctx.keep, 20_000)
+    for q in guesses:
+        if pl.effect.basis is not None:
+            columns = pl.effect.basis(x, ctx, q, pl.settings)
+        else:
+            assert pl.effect.apply is not None
+            columns = (pl.effect.apply(x, ctx, q, pl.settings) - x)[:, None]
+        if columns.shape[1] == 0 or not np.all(np.isfinite(columns)):
+            continue
+        columns = np.stack([ctx.to_output(np.ascontiguousarray(c)) for c in columns.T], axis=1)
+        w, _ = least_squares(
+            np.column_stack([columns[rows], np.ones(rows.size), ctx.bends[rows]]), residual[rows], 1e-9
+        )
+        other = theta.copy()
+        other[a] = q
+        if pl.effect.basis is not None:
+            other[b] = w[: b.stop - b.start]
+        for i, shift in zip(searched, w[columns.shape[1] + 1 :], strict=True):
+            p = model.parameters[i]
+            most = MOST_BACK * abs(theta[i]) if theta[i] else np.inf
+            other[i] = min(max(theta[i] + float(np.clip(shift, -most, most)), p.lo), p.hi)
+        out.append(other)
+    return out
+
+
 def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array) -> Array:
     """Weights that meet the residual best to first order, on the recorded course of ``x``."""
     basis = pl.effect.basis
@@ -97,7 +140,8 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
     line = np.ones((k.size, 1)) if pl.site == "output" else np.stack([np.ones(k.size), x[k]], axis=1)
     if pl.site == "feedback":
         line = np.column_stack([np.ones(k.size), *(c[k] for c in base_moves(x, ctx))])
-    w, _ = least_squares(np.column_stack([columns[k], line]), residual[k], 1e-5)
+    free = [line] if ctx.bends is None else [line, ctx.bends[k]]
+    w, _ = least_squares(np.column_stack([columns[k], *free]), residual[k], 1e-5)
     return w[: columns.shape[1]]
 
 
@@ -173,6 +217,29 @@ def moved(model: Model, view: View, theta: Array, output: str) -> Array:
     return measured - _bounded(added, measured)
 
 
+MOST_BENDS = 4_000_000
+"""Numbers (32 MB) that the movements of the outputs with the parameters may take; more are not computed."""
+
+
+def bends(model: Model, view: View, theta: Array, output: str) -> Array | None:
+    """What the output moves with each searched parameter of the base, per unit, (n, k) by forward differences.
+
+    None where none is searched, where they would not fit, or where one is not finite.
+    """
+    searched = [i for i in model.nonlinear if i < model.n_base]
+    if not searched or len(searched) * view.recording.n * len(model.twin.outputs) > MOST_BENDS:
+        return None
+    now = model.whole(view, theta)[output]
+    columns: list[Array] = []
+    for i in searched:
+        p = model.parameters[i]
+        h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
+        shifted = theta.copy()
+        shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
+        columns.append((model.whole(view, shifted)[output] - now) / (shifted[i] - theta[i]))
+    return np.column_stack(columns) if np.all(np.isfinite(columns)) else None
+
+
 def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: str) -> tuple[Array, Context]:
     """The signal (n,) that a placed effect would sit on in ``model`` (or be driven by), and its context with
     the view as mask, the declared noise, and the way to the output."""
@@ -191,6 +258,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
         measured=measured,
         everywhere=everywhere,
         signals=signals,
+        bends=bends(model, view, theta, output),
     )
     base = theta[: model.n_base]
     if pl.site == "output" and not (twin.static and pl.effect.kind == "add"):

@@ -82,3 +82,26 @@ def test_prepare_guess_and_forward_agree(effect: Effect) -> None:
         signature = effect.test(x, residual, ctx)
         assert 0.0 <= signature.p_value <= 1.0
         assert 0.0 <= signature.share <= 1.0
+
+
+ALONE = [(n, e) for n, e in ALL if e.driven and e.kind in ("add", "nonlinear") and not e.needs and e.test is None]
+
+
+@pytest.mark.parametrize("effect", [e for _, e in ALONE], ids=[n for n, _ in ALONE])
+def test_an_effect_says_whether_it_is_linear(effect: Effect) -> None:
+    """Equal steps of the signal's size make equal changes of what it makes, or they do not."""
+    rng = np.random.default_rng(2)
+    t = np.arange(1500) * 0.004
+    x = np.cumsum(rng.standard_normal(1500)) / 20
+    ctx = Context(t, 0.004, {}, "x", "x", measured=x)
+    settings = effect.prepare(x, 0.1 * x, ctx)
+    q = np.array(effect.guess(x, 0.1 * x, ctx, settings)[0], np.float64)
+
+    def made(v: np.ndarray) -> np.ndarray:
+        if effect.basis is not None:
+            return effect.basis(v, ctx, q, settings)
+        assert effect.apply is not None
+        return effect.apply(v, ctx, q, settings)
+
+    straight = np.allclose(made(3 * x) - made(2 * x), made(2 * x) - made(x), rtol=1e-6, atol=1e-9)
+    assert straight == effect.is_linear

@@ -46,12 +46,16 @@ def human_values(problem: Problem, fitted: Fit, cov: Array) -> dict[str, dict[st
     spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, cov, gradient), 0.0))
     read_off = {p.label: half_widths(problem, fitted, k) for k, p in enumerate(model.placed)}
     out: dict[str, dict[str, ParameterValue]] = {}
+    # beyond its bounds a parameter was not searched
+    bounds = {p.name: (p.lo, p.hi) for p in model.parameters[model.n_base :]}
     i = 0
     for label, group in values.items():
         out[label] = {}
         for h in group:
             half = max(1.96 * float(np.hypot(spread[i], h.spread)), read_off.get(label, {}).get(h.name, 0.0))
-            out[label][h.name] = ParameterValue(h.value, h.unit, (h.value - half, h.value + half))
+            lo, hi = bounds.get(f"{label}.{h.name}", (-np.inf, np.inf))
+            ends = (max(h.value - half, min(lo, h.value)), min(h.value + half, max(hi, h.value)))
+            out[label][h.name] = ParameterValue(h.value, h.unit, ends)
             i += 1
     return out
 
@@ -166,6 +170,10 @@ def share_among(step: Trial, alike: Sequence[Trial]) -> float:
     return 1.0 / (1.0 + float(sum(odds)))
 
 
+AS_WELL = 1.05
+"""Times what the named effect leaves: a rival that leaves more does not fit as well, however plain it is."""
+
+
 def alternatives(
     problem: Problem, selection: Selection, rule: Rule
 ) -> tuple[list[Alternative], list[Equivalent], dict[str, list[Trial]]]:
@@ -179,12 +187,14 @@ def alternatives(
     before = misfits(problem, selection.base)
     for step, rivals in zip(selection.steps, selection.rivals, strict=True):
         alike: list[Trial] = []
+        assert step.fitted is not None
+        theirs = step.fitted.residual
         for t in rivals[:6]:
             if t.fitted is None or t.name in named:
                 continue
             o = next(q for q in t.placed.outputs if q in step.placed.outputs)
             rms = _rms(t.fitted.residual[o][rows])
-            same = as_good(t, step, rule, o, before[o])
+            same = as_good(t, step, rule, o, before[o]) and rms <= AS_WELL * _rms(theirs[o][rows])
             if same:
                 why = f"fits as well; {step.name} is simpler" if t.parameters > step.parameters else "fits as well"
                 if t.name not in (a.name for a in alike):

@@ -63,8 +63,10 @@ def choose(good: Sequence[Trial], rule: Rule, now: Mapping[str, float], named: f
             t.misfits[output] > close, -t.improvement, t.label,
         ),
     )  # fmt: skip
-    # of its forms the one that leaves least, unless by a trifle: what a form leaves is mended with names
-    trifle = 0.02 + 0.25 * rule.shape * max(now[output] - chosen.misfits[output], 0.0)
+    # of its forms the one that leaves least, unless by a trifle: what a form leaves is mended with names; where one
+    # comes near the noise, a share of all that both explain is no trifle
+    left = max(chosen.misfits[output] - 1.0, 0.0)
+    trifle = 0.02 + min(0.25 * rule.shape * max(now[output] - chosen.misfits[output], 0.0), (rule.tie - 1.0) * left)
     forms = [t for t in here if t.label == chosen.label and t.placed.site == chosen.placed.site]
     least = min(forms, key=lambda t: t.misfits[output])
     return least if least.misfits[output] < chosen.misfits[output] - trifle else chosen
@@ -120,9 +122,11 @@ def as_good(rival: Trial, best: Trial, rule: Rule, output: str, before: float) -
     shapeless = best.placed.effect.stochastic
     # far above the noise a share of the excess is no trifle
     slack = form if shapeless else form + min((rule.tie - 1.0) * a, MOST_TIE + 3.0 * form)
+    if b > 2.0 * a + 0.1 + min(5.0 * form, NEAR):
+        return False  # who leaves twice as much lacks something, however much both explain
     if b <= a + slack:
         return True
-    if shapeless or a > FAR or b > 2.0 * a + 0.1 + 5.0 * form:
+    if shapeless or a > FAR:
         return False
     column = best.outputs.index(output)
     mine, his = best.energy[:, column], rival.energy[:, column]

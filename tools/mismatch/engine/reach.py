@@ -53,7 +53,7 @@ def imitable(physics: Sequence[PhysicsFound], twin: Twin) -> list[bool]:
     effect behind columns of simulated output, whose parameters nobody can re-fit here.
     """
     columns = getattr(twin, "core", twin).kind == "columns"
-    linear = {name for name, effect in EFFECTS.items() if effect.kind == "linear"}
+    linear = {name for name, effect in EFFECTS.items() if effect.is_linear}
     return [columns and p.name in linear for p in physics]
 
 

@@ -131,7 +131,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     new_weights = [j for j in model.nonlinear if model.parameters[j].name not in n_old and _is_weight(model, j)]
     # the design at these parameters holds the simulation, too
     moved = {o: design.constant[o] + design.columns[o] @ theta[list(design.linear[o])] for o in outputs}
-    # a start on another base: what that base does without the effect is not the effect's share
+    # a start on another base is measured from there: what that base does without the effect is not the effect's share
     base = current.theta.copy()
     base[: model.n_base] = theta[: model.n_base]
     elsewhere_based = not problem.twin.static and not np.array_equal(base, current.theta)
@@ -165,7 +165,7 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
         old.append(np.column_stack([columns(old_linear), ground.bends[o] / s]))
         extra = [columns(new_linear)]
         if model.nonlinear:
-            extra.append(((moved[o] - here) / s)[:, None])
+            extra.append(((moved[o] - (here if without is None else without[o][rows])) / s)[:, None])
             extra += [((p[o][rows] - moved[o]) / s)[:, None] for p in pushed]
         new.append(np.column_stack(extra))
     e, base, more = np.concatenate(target), np.concatenate(old), np.concatenate(new)
@@ -180,14 +180,12 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
     before_ = float(e0 @ e0) + idle
     if before_ <= 0 or more.shape[1] == 0:
         return 0.0, 1.0
-    null = before_
+    null, begin = before_, e0
     if without is not None:
-        moved_base = np.concatenate(shift)
-        moved_base = (moved_base - base_q @ (base_q.T @ moved_base))[:, None]
-        alone, _ = _without(e0, moved_base)
-        null = float(alone @ alone) + idle
-        more = np.column_stack([more, moved_base])
-    left, _ = _without(e0, more)
+        begin = np.concatenate(target) - np.concatenate(shift)
+        begin = begin - base_q @ (base_q.T @ begin)
+        null = min(before_, float(begin @ begin) + idle)
+    left, _ = _without(begin, more)
     after = float(left @ left) + idle
     dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - base.shape[1], 1)
     f = (null - after) / more.shape[1] / max(after / dof, 1e-300)

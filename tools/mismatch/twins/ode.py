@@ -49,6 +49,8 @@ class OdeTwin(Head):
     places: tuple[Place, ...]
     fastest_per_s: float
     restart: bool
+    integrates: bool
+    """Whether a start state is not forgotten within the recording."""
     feedback_on: str
     static: bool = False
     apart: bool = False

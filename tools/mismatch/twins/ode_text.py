@@ -88,6 +88,7 @@ def assembled(
     def text_of(found: Mapping[str, float]) -> dict[str, object]:
         return {k: found.get(k, v) for k, v in table.items()}
 
+    integrates = bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN)
     return OdeTwin(
         kind=recording.twin.kind,
         inputs=tuple(recording.inputs),
@@ -110,7 +111,8 @@ def assembled(
         middle=middle,
         places=places,
         fastest_per_s=float(np.max(np.abs(rates))),
-        restart=bool(np.min(-about.real) * recording.n * recording.dt < FORGOTTEN),
+        restart=integrates,
+        integrates=integrates,
         feedback_on=next(iter(recording.outputs)) if places else "",
     )
 
