@@ -117,7 +117,7 @@ heavier = simulate({"force": data["force_N"]}, parameters={"mass": 3.0})["positi
 ```
 
 `start` among its parameters is the state at the first sample of this recording; another recording begins elsewhere. An
-FMU holds its inputs over a communication step: it sees them one step later than the columns have them.
+FMU knows its inputs at the ends of a communication step: set before each step what they are at its end.
 
 ## 3. Does it hold on the next recording?
 

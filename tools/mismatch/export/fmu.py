@@ -26,7 +26,8 @@ SCALARS = [k for k, v in PARAMETERS.items() if isinstance(v, float)]
 class {name}(Fmi2Slave):
     """Inputs are held over a communication step, which is cut into whole internal steps of about {dt:g} s.
 
-    Outputs at the end of a step have seen the inputs that were set before it.
+    Outputs at the end of a step have seen the inputs that were set before it: set what they are at its end, and the
+    FMU gives what the module gives.
     """
 
     def __init__(self, **kwargs):

@@ -130,7 +130,7 @@ def _run_fmu(path: Path, recording: Recording) -> dict[str, Array]:
     lost = [s for s in (*recording.inputs, *recording.outputs) if s not in known]
     if lost:
         raise RecordingError(f"{path}: no variable {', '.join(lost)} in the FMU")
-    found = fmu({**signals, "t": recording.t}, {})
+    found = fmu({**signals, "t": recording.t}, {"hold": "end"})
     return {o: units.convert(np.asarray(y), recording.unit[o], recording.file_unit[o]) for o, y in found.items()}
 
 
