@@ -22,6 +22,7 @@ def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
+@pytest.mark.slow
 def test_a_bench_file_made_as_the_guide_says_is_whole(place: Path):
     guide = (ROOT / "docs" / "lab-machine.md").read_text(encoding="utf-8")
     (made,) = re.findall(r"^mkdir lab && .*$", guide, re.MULTILINE)

@@ -57,6 +57,7 @@ def test_a_status_of_the_command_itself_is_handed_on(tmp_path: Path) -> None:
     assert micron(tmp_path, "scope", "--bench", str(path), "--virtual", "--seconds", "1") == (7, "")
 
 
+@pytest.mark.slow
 def test_too_much_memory_does_not_take_the_machine(tmp_path: Path) -> None:
     path = bench(tmp_path, "x = [bytearray(1 << 30) for _ in range(64)]")
     micron(tmp_path, "trust", str(path))

@@ -214,13 +214,13 @@ def test_the_base_alone(kind: str) -> None:
     same(corrected(made(kind), []))
 
 
-@pytest.mark.parametrize("quarter", [0, *(pytest.param(q, marks=pytest.mark.slow) for q in (1, 2, 3))])
+@pytest.mark.parametrize("eighth", [0, *(pytest.param(q, marks=pytest.mark.slow) for q in range(1, 8))])
 @pytest.mark.parametrize(("name", "index", "form"), FORMS, ids=[f"{n} {i}" for n, i, _ in FORMS])
-def test_every_effect_at_every_place_of_every_twin(name: str, index: int, form: Effect, quarter: int) -> None:
-    """A quarter of the places by default, the others with the slow tests."""
+def test_every_effect_at_every_place_of_every_twin(name: str, index: int, form: Effect, eighth: int) -> None:
+    """An eighth of the places by default, the others with the slow tests."""
     places = [(kind, place) for kind in TWINS for place in placements(made(kind), form)]
     assert places
-    for kind, place in places[(quarter + index) % 4 :: 4]:
+    for kind, place in places[(eighth + index) % 8 :: 8]:
         try:
             same(corrected(made(kind), [place]), 1e-4 if "friction" in name else 1e-6)
         except AssertionError as error:

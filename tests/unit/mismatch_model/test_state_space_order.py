@@ -40,7 +40,7 @@ def as_given(rec: Recording) -> Array:
     return np.stack([found[o] for o in rec.outputs], axis=1)
 
 
-@pytest.mark.parametrize(("order", "inputs", "outputs"), [(16, 1, 3), (64, 2, 2)])
+@pytest.mark.parametrize(("order", "inputs", "outputs"), [(16, 1, 3), pytest.param(64, 2, 2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("discrete", [False, True])
 def test_a_high_order_runs_as_its_matrices_do_and_is_written_and_read_again(
     order: int, inputs: int, outputs: int, discrete: bool

@@ -99,6 +99,7 @@ def dies_first(job: Job) -> Row:
     return with_threads(job)
 
 
+@pytest.mark.slow
 def test_a_dask_cluster_of_two_survives_a_killed_worker(tmp_path: Path):
     distributed = pytest.importorskip("distributed")
     jobs = [Job(f"r{i}", tmp_path, None, 0.3, 0) for i in range(6)]

@@ -30,6 +30,7 @@ def run(arguments: list[str], folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.slow
 def test_a_command_and_its_children_find_ours(hers: Path) -> None:
     script = "import sys, micron_start; sys.argv[0] = 'micron'; micron_start.main()"
     done = run(["-c", script, "data", "list"], hers)
