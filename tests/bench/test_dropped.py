@@ -220,6 +220,18 @@ def stack(path: Path) -> Path:
     return path
 
 
+def test_a_parameter_that_the_twin_does_not_take_is_said_in_the_form(page: Any, still: Still, tmp_path: Path):
+    page.set_input_files(FILE, stack(tmp_path / "own stack.csv"))
+    form = page.locator(".new-recording")
+    form.locator("[aria-label=gain_um_per_V]").fill("twelve")
+    form.locator("text=Make the recording").click()
+    alert = form.locator("p[role=alert]", has_text="gain_um_per_V")
+    alert.wait_for()
+    assert alert.inner_text() == "[twin.parameters] gain_um_per_V must be a finite number, got 'twelve'"
+    assert form.locator("[aria-label=gain_um_per_V]").input_value() == "twelve", "nothing is lost"
+    assert not (still.session.recorder.folder / "own stack").exists(), "nothing half written"
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_from_a_dropped_csv_to_the_corrected_twin_that_is_downloaded(page: Any, tmp_path: Path, artefacts: Path):

@@ -89,6 +89,46 @@ def test_the_trigger_holds_where_the_trace_rises_through_the_level(scope: Any):
     assert f"Triggered at {held_s:.3f} s" in scope.locator(".trigger").inner_text()
 
 
+def test_the_axis_says_the_division_that_is_drawn(scope: Any):
+    """A lane that is scaled while it is looked at: the range of uPlot's axis stays, its labels change."""
+    use(scope, channels=["command_1"], trigger=NO_TRIGGER)
+    scope.evaluate(
+        """() => {
+            const g = micron.scope.strips[0].strip.plot.ctx, real = g.fillText;
+            window.written = [];
+            g.fillText = function (text, ...where) { window.written.push(text); return real.call(g, text, ...where); };
+            micron.scope.traces[0].set = { ...micron.scope.traces[0].set, div: 200 };
+            micron.scope.setCursor(-0.5, false);
+        }"""
+    )
+    scope.evaluate(FRAMES)
+    written = scope.evaluate("window.written.filter((text) => text.endsWith(' V'))")
+    assert written[-2:] == ["-200 V", "200 V"]
+
+
+def test_no_label_of_an_axis_is_cut(scope: Any):
+    """A label that is too wide loses its sign first."""
+    maths = [{"op": "derivative", "a": name, "b": ""} for name in ("tip_displacement_x", "specific_force_x")]
+    channels = ["rate_x", "specific_force_x", "magnetometer_x", "tip_displacement_x", "volts_0", "quaternion_x"]
+    use(scope, channels=channels, maths=maths, trigger=NO_TRIGGER)
+    seen = scope.evaluate(
+        """micron.scope.strips.map(({ strip, divs }) => {
+            const { plot } = strip;
+            const widest = () => {
+                plot.ctx.font = "10px " + getComputedStyle(document.documentElement).getPropertyValue("--mono");
+                return Math.max(...strip.ticks(plot).map((t) => plot.ctx.measureText(t.text).width));
+            };
+            const drawn = widest();
+            const all = [1e-4, 5e-3, 0.05, 0.2, 50].map((div) => { divs.fill(div); return widest(); });
+            return [Math.max(drawn, ...all), plot.bbox.left / devicePixelRatio];
+        })"""
+    )
+    assert len(seen) >= 6
+    assert len({left for _, left in seen}) == 1, "times lie under one another"
+    for width, left in seen:
+        assert width <= left - 8
+
+
 def test_eight_inputs_have_eight_lanes_and_each_is_seen(scope: Any):
     use(scope, channels=[f"volts_{i}" for i in range(8)], trigger=NO_TRIGGER)
     lanes = scope.evaluate(
@@ -131,6 +171,28 @@ def test_filters_are_those_of_the_book(scope: Any, kind: str, hz: float, q: floa
     assert a == pytest.approx(expected_a, rel=1e-6)
     state = signal.lfilter_zi(b, a) * values[0]
     assert out == pytest.approx(signal.lfilter(b, a, values, zi=state)[0], abs=1e-9)
+
+
+def test_where_a_recording_has_no_samples_nothing_is_computed(scope: Any):
+    """Gaps, and what is not read yet, stay gaps; samples far from them are those of a recording without gaps."""
+    a = column("volts_0")[:3000]
+    found = scope.evaluate(
+        """async (a) => {
+            const { calculate, run, section } = await import("/static/signals.js");
+            const whole = Float64Array.from(a), torn = whole.slice();
+            torn.fill(NaN, 600, 700);
+            const none = new Float64Array(50).fill(NaN);
+            const ways = [(v) => run(v, section("high", 2, 0.7, 1000)), (v) => calculate("rms", v, null, 1000)];
+            const text = (v) => [...v].map((y) => (y === y ? y : null));
+            return ways.map((way) => [way(whole), way(torn), way(none)].map(text));
+        }""",
+        a.tolist(),
+    )
+    for whole, torn, none in found:
+        assert [k for k, y in enumerate(torn) if y is None] == list(range(600, 700))
+        assert none == [None] * 50
+        assert torn[:600] == pytest.approx(whole[:600], abs=1e-12)
+        assert torn[2500:] == pytest.approx(whole[2500:], abs=1e-6)
 
 
 def test_maths_beside_numpy(scope: Any):

@@ -166,6 +166,28 @@ def test_a_bench_is_described_and_written_from_the_page(still_page: Any, still: 
     assert still.session.choice.sense_only
 
 
+def test_a_part_that_is_left_out_while_a_scan_runs_stays_out(still_page: Any):
+    tab = still_page
+    asked: list[Any] = []
+    tab.route("**/api/setup/scan", lambda route: asked.append(route))  # a builtin cannot be inspected
+
+    def answer(number: int) -> None:
+        while len(asked) <= number:
+            tab.wait_for_timeout(20)
+        asked[number].fulfill(json={"kind": "i2c", "addresses": [0x48], "frames": []})
+
+    go(tab, "setup")
+    tab.wait_for_function("document.querySelector('[aria-label=\"Address of i2c1\"]').value === 'sim://i2c1'")
+    tab.uncheck("[aria-label='The bench has: telemetry on CAN']")
+    tab.click("text=Scan I2C and CAN")
+    tab.uncheck("[aria-label='The bench has: converter of the magnetometer']")
+    answer(0)
+    answer(1)
+    tab.wait_for_selector("text=sim://i2c1: 0x48")
+    assert not tab.is_checked("[aria-label='The bench has: converter of the magnetometer']"), "chosen by hand"
+    assert not tab.is_checked("[aria-label='The bench has: converter of the monitor']"), "nobody answers there"
+
+
 @pytest.mark.slow
 def test_the_emulated_buses_are_scanned_and_parts_that_nobody_answers_for_are_left_out(still: Still):
     import json

@@ -2,8 +2,8 @@
 
 A guess is a proposal that a person corrects; it lists what it could not know. Units are read from the names of columns
 (``force_N``, ``x [mm]``) or a row of units, roles from names and units. The bench page and ``micron mismatch new``
-share it. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a descriptor as
-``micron mismatch diagnose`` would and prints nothing where it is good.
+share it. ``python -m tools.mismatch.guess FILE`` prints the guess as JSON; ``--check RECORDING`` loads a descriptor and
+builds its twin as ``micron mismatch diagnose`` would, and prints nothing where both are good.
 """
 
 from __future__ import annotations
@@ -334,6 +334,10 @@ def as_json(found: Guess) -> dict[str, Any]:
     return asdict(found)
 
 
+_COSTLY = ("fmu", "instrument")
+"""Kinds of twin that a check does not build: the one is a program, the other a whole bench."""
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print a guess, or check a descriptor; exit status 2 with one message where that cannot be."""
     parser = argparse.ArgumentParser(prog="python -m tools.mismatch.guess")
@@ -344,7 +348,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if options.check:
             from tools.mismatch.recording_load import load
 
-            load(options.file)
+            recording = load(options.file)
+            if recording.twin.kind not in _COSTLY:
+                from tools.mismatch.twins.make import make
+
+                make(recording)
         else:
             print(json.dumps(as_json(guess(options.file))))
     except InputError as error:

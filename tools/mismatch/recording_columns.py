@@ -115,6 +115,8 @@ def _npz_names(path: Path) -> list[str]:
         with open_npz(path) as data:
             sizes = {k: a.size for k in data.files if (a := data[k]).ndim == 1 and a.dtype.kind in "fiub"}
             return [k for k, size in sizes.items() if size == max(sizes.values())]
+    except RecordingError:
+        raise
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: not a readable npz file ({error})") from None
 
@@ -145,6 +147,8 @@ def read_scalars(path: Path) -> dict[str, float]:
             return {
                 k: float(a.reshape(-1)[0]) for k in data.files if (a := data[k]).size == 1 and a.dtype.kind in "fiu"
             }
+    except RecordingError:
+        raise
     except (OSError, ValueError) as error:
         raise RecordingError(f"{path}: not a readable npz file ({error})") from None
 

@@ -52,7 +52,7 @@ export function times(buckets, t0) {
 export class Strip {
   /**
    * `traces`: [{label, unit, colour?}]; options: sync, onSelect(x0, x1), onClick(x, shift), onWheel(direction, x),
-   * least (smallest span), xTitle, yTitle, ticks(heightPx): [{at, text}] of the vertical axis, more: series after the
+   * least (smallest span), axisPx (width of the vertical axis), xTitle, yTitle, ticks(heightPx): [{at, text}] of the vertical axis, more: series after the
    * traces, in the colour of a fault; over: series after those, in the colours of the traces, dashed.
    */
   constructor(traces, options = {}) {
@@ -75,6 +75,7 @@ export class Strip {
 
   build() {
     this.plot?.destroy();
+    this.words = "";
     const palette = colours();
     const title = (text) => (text ? { label: text, labelSize: 15, labelGap: 0, labelFont: "10px " + css("--sans") } : {});
     const axis = { stroke: css("--faint"), grid: { stroke: css("--grid"), width: 1 }, ticks: { stroke: css("--line"), size: 4 }, font: "10px " + css("--mono") };
@@ -96,7 +97,7 @@ export class Strip {
         scales: { x: { time: false, range: () => this.x }, y: { range: (u, low, high) => this.fixed || this.range.follow(low, high) } },
         axes: [
           { ...axis, size: this.options.noTimeAxis ? 6 : this.options.xTitle ? 22 : 30, values: this.options.noTimeAxis ? () => [] : undefined, gap: 2, ...title(this.options.noTimeAxis ? "" : this.options.xTitle) },
-          { ...axis, size: 56, gap: 4, ...title(this.options.yTitle),
+          { ...axis, size: this.options.axisPx || 56, gap: 4, ...title(this.options.yTitle),
             ...(this.options.ticks ? { splits: (u) => this.ticks(u).map((t) => t.at), values: (u) => this.ticks(u).map((t) => t.text) }
               : { values: (u, splits) => splits.map((v) => digits(v, 3)) }) },
         ],
@@ -180,8 +181,18 @@ export class Strip {
     if (this.spanWords.textContent !== words) this.spanWords.textContent = words;
     this.data = [x, ...ys];
     this.plot.setData(this.data);
+    this.label();
     if (texts) texts.forEach((text, i) => { this.values[i].textContent = text; });
     else ys.slice(0, this.traces.length).forEach((y, i) => this.value(i, y.length ? y[y.length - 1] : NaN));
+  }
+
+  /** uPlot writes the labels of an axis anew when its scale changes; those of lanes also change when a lane's division does. */
+  label() {
+    if (!this.options.ticks) return;
+    const words = this.ticks(this.plot).map((t) => `${t.at} ${t.text}`).join();
+    if (words === this.words) return;
+    this.words = words;
+    this.plot.redraw(false, true);
   }
 
   value(i, number) { this.values[i].textContent = digits(number) + (this.traces[i].unit ? ` ${unitText(this.traces[i].unit)}` : ""); }

@@ -1,6 +1,6 @@
 // The bar of a replay: which recording the views show, where in it, what is marked, and a second run over it.
 import { download, get, post } from "./api.js";
-import { canvas, css, digits, duration, exportOptions, h } from "./dom.js";
+import { canvas, css, duration, exportOptions, h } from "./dom.js";
 
 const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10, 50];
 const STEPS = 10000;
@@ -113,7 +113,7 @@ export function replayBar(link, context) {
     play.setAttribute("aria-label", play.textContent);
     if (document.activeElement !== speed) speed.value = r.speed;
     if (performance.now() - held > 300) scrub.value = Math.round((r.position_s / Math.max(r.length_s, 1e-9)) * STEPS);
-    time.textContent = `${digits(r.position_s, 5)} of ${duration(r.length_s)}`;
+    time.textContent = `${duration(Math.floor(r.position_s))}.${String(Math.floor((r.position_s % 1) * 1000)).padStart(3, "0")} of ${duration(r.length_s)}`;
     scrub.setAttribute("aria-valuetext", `${r.position_s.toFixed(1)} s`);
     shiftBox.hidden = !r.second;
     if (document.activeElement !== shift) shift.value = r.shift_s;

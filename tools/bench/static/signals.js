@@ -21,19 +21,22 @@ export function section(kind, hz, q, rateHz) {
   return [...b, -2 * c, 1 - alpha].map((v) => v / (1 + alpha));
 }
 
-/** Filter `values`, as if the first one had been there for ever. */
+/** Filter `values`, as if the first one had been there for ever. Where there is no number the result has none; the
+ * filter goes on from the number before. */
 export function run(values, [b0, b1, b2, a1, a2]) {
   const out = new Float64Array(values.length);
   const x0 = values.find((v) => v === v) ?? 0;
   const y0 = (x0 * (b0 + b1 + b2)) / (1 + a1 + a2);
   let s2 = b2 * x0 - a2 * y0;
   let s1 = b1 * x0 - a1 * y0 + s2;
+  let x = x0;
   for (let i = 0; i < values.length; i++) {
-    const x = values[i] === values[i] ? values[i] : x0;
+    const known = values[i] === values[i];
+    if (known) x = values[i];
     const y = b0 * x + s1;
     s1 = b1 * x - a1 * y + s2;
     s2 = b2 * x - a2 * y;
-    out[i] = y;
+    out[i] = known ? y : NaN;
   }
   return out;
 }
@@ -66,18 +69,15 @@ export function rms(values, seconds, rateHz) {
   const n = Math.max(1, Math.round(seconds * rateHz));
   const out = new Float64Array(values.length);
   const zero = mean(values);
-  let [sum, squares] = [0, 0];
+  let [sum, squares, m] = [0, 0, 0];
+  const add = (value, sign) => {
+    if (value !== value) return; // a recording has gaps: no number is no sample
+    [sum, squares, m] = [sum + sign * (value - zero), squares + sign * (value - zero) ** 2, m + sign];
+  };
   for (let i = 0; i < values.length; i++) {
-    const v = values[i] === values[i] ? values[i] - zero : 0;
-    sum += v;
-    squares += v * v;
-    if (i >= n) {
-      const old = values[i - n] - zero;
-      sum -= old;
-      squares -= old * old;
-    }
-    const m = Math.min(n, i + 1);
-    out[i] = Math.sqrt(Math.max(0, squares / m - (sum / m) ** 2));
+    add(values[i], 1);
+    if (i >= n) add(values[i - n], -1);
+    out[i] = values[i] === values[i] ? Math.sqrt(Math.max(0, squares / m - (sum / m) ** 2)) : NaN;
   }
   return out;
 }
@@ -86,7 +86,7 @@ export function rms(values, seconds, rateHz) {
 export const MATHS = {
   sum: [(a, b) => `${a} + ${b}`, true, (u) => u],
   difference: [(a, b) => `${a} − ${b}`, true, (u) => u],
-  derivative: [(a) => `d/dt ${a}`, false, (u) => (u === "1" ? "1/s" : u.endsWith("/s") ? `${u}²` : `${u}/s`)],
+  derivative: [(a) => `d/dt ${a}`, false, (u) => (u === "1" ? "1/s" : u.endsWith("/s") ? `${u}²` : u.endsWith("/s²") ? u.replace("²", "³") : `${u}/s`)],
   rms: [(a) => `rms ${a}`, false, (u) => u],
 };
 const RMS_S = 0.5;
@@ -104,7 +104,7 @@ export function step125(value) {
   return [1, 2, 5, 10].find((s) => s * power >= value * (1 - 1e-9)) * power;
 }
 
-const SCALED = new Set(["V", "A", "m", "s", "µm", "W"]);
+const SCALED = new Set(["V", "A", "m", "s", "µm", "W", "V/s", "m/s", "rad/s"]);
 const PREFIXES = [[1e-9, "n"], [1e-6, "µ"], [1e-3, "m"], [1, ""], [1e3, "k"]];
 
 /** A value with its unit and a prefix where the unit takes one: 0.02 V is "20 mV". */

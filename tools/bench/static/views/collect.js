@@ -46,7 +46,7 @@ export function mount(root, context) {
       h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
       h("td.num.soft.when", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
       h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r, list))))));
-    if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));
+    if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft.whole", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));
   }
 
   function actions(r, list) {

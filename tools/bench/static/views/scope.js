@@ -14,6 +14,7 @@ const MODES = [["time", "Time"], ["xy", "XY"], ["fft", "FFT"], ["spectrogram", "
 const HZ = 1000;
 const MOST_PIXELS = 8192; // the server gives no more
 const ANALYSIS_MS = 200;
+const [AXIS_PX, CHARACTER_PX] = [8, 6.1]; // of the vertical axis: its marks and gap, and a letter of 10 px
 const SLACK = 0.3; // further part of the window in which a trigger may be found
 
 export function mount(root, { link, catalogue, bar }) {
@@ -105,13 +106,15 @@ export function mount(root, { link, catalogue, bar }) {
     displays.hidden = settings.mode !== "time";
     if (settings.mode !== "time") analysed.mode();
     plots.replaceChildren();
+    // the same for all strips, so that their times lie under one another
+    const axisPx = Math.min(100, Math.max(56, ...traces.map(({ unit: { length } }) => (length > 2 ? AXIS_PX + CHARACTER_PX * (length + 8) : 0))));
     strips = parts.map((members, i) => {
       const inLanes = settings.display === "lanes";
       const made = { members, inLanes, divs: members.map(() => 1) };
       const unit = members[0].unit === "m" ? "µm" : members[0].unit;
       made.strip = new Strip(members.map((t) => ({ label: t.name, unit: t.unit })), {
         sync: "scope", noTimeAxis: i < parts.length - 1, onSelect: zoomTo, onClick: setCursor, onDouble: zoomOut, onWheel: wheel,
-        xTitle: "time, s", yTitle: inLanes ? "" : unit || "no unit", more: members.length, over: link.replay?.second ? members.length : 0,
+        axisPx: inLanes ? axisPx : 56, xTitle: "time, s", yTitle: inLanes ? "" : unit || "no unit", more: members.length, over: link.replay?.second ? members.length : 0,
         ticks: inLanes ? (height) => laneTicks(members.length, made.divs, members.map((t) => t.unit), members.map((t) => t.set.offset), height / members.length, withUnit) : undefined,
       });
       if (inLanes) made.strip.fixed = [0, members.length];

@@ -36,9 +36,10 @@ export function mount(root, { link, navigate }) {
   const card = (what, value) => h("input.unit-field", { type: "text", maxLength: 60, value, "aria-label": `NI card of the ${what}` });
   const cards = { daq: card("converter", "Dev1"), output: card("outputs", "Dev2") };
   const has = {};
+  const byHand = new Set(); // parts that a person ticked or left out while a scan was running: the scan does not
   const addresses = {};
   const partRows = Object.fromEntries(PARTS.map(([part, bus, address, what]) => {
-    has[part] = h("input", { type: "checkbox", checked: true, disabled: part === "piezo", "aria-label": `The bench has: ${what}`, onchange: () => showNeeded() });
+    has[part] = h("input", { type: "checkbox", checked: true, disabled: part === "piezo", "aria-label": `The bench has: ${what}`, onchange: () => { byHand.add(part); showNeeded(); } });
     addresses[part] = h("input.unit-field", { type: "text", value: hex(address), "aria-label": `Address of the ${what}` });
     return [part, h("div.part", {}, h("label", {}, has[part], what), h("label.faint", {}, `${bus} at`, addresses[part]))];
   }));
@@ -98,6 +99,7 @@ export function mount(root, { link, navigate }) {
 
   async function scan() {
     const said = [];
+    byHand.clear();
     scanButton.disabled = true;
     try {
       // a bus may have parts that the bench was not told of: i2c1 is asked also when nothing is ticked there
@@ -108,7 +110,7 @@ export function mount(root, { link, navigate }) {
         const found = await post("/api/setup/scan", { uri });
         const names = found.kind === "can" ? found.frames.map(([id, name, hz]) => `${hex(id)} ${name === "?" ? "" : `${name} `}${digits(hz, 3)}/s`) : found.addresses.map(hex);
         said.push(h("div", {}, `${uri}: ${names.join(", ") || (found.kind === "can" ? "no frame within two seconds" : "nobody answers")}`));
-        for (const [part, on] of PARTS) if (on === bus && part !== "piezo") has[part].checked = found.addresses.includes(Number(addresses[part].value));
+        for (const [part, on] of PARTS) if (on === bus && part !== "piezo" && !byHand.has(part)) has[part].checked = found.addresses.includes(Number(addresses[part].value));
       }
     } finally {
       scanButton.disabled = !link.mayOrder;
