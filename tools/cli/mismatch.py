@@ -293,6 +293,7 @@ def prove(
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="With --corpus: begin no case after these; run again to go on.")
     ] = None,
+    first: Annotated[int, typer.Option(min=0, help="With --corpus: the number of the first case.")] = 0,
 ) -> None:
     """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
 
@@ -307,7 +308,7 @@ def prove(
         if corpus is not None:
             if seed is not None:
                 raise InputError("--corpus has seeds of its own; leave --seed out")
-            _prove_corpus(corpus, engine, cases, samples, minutes, jobs, keep, json_file)
+            _prove_corpus(corpus, engine, cases, first, samples, minutes, jobs, keep, json_file)
             return
         from functools import partial
 
@@ -338,6 +339,7 @@ def _prove_corpus(
     corpus: str,
     engine: str,
     cases: int,
+    first: int,
     samples: int,
     minutes: float | None,
     jobs: int | None,
@@ -354,7 +356,7 @@ def _prove_corpus(
     if corpus not in NAMES:
         raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
     limit = float("inf") if minutes is None else minutes
-    run = Run(cast(Name, corpus), cast(Engine, engine), cases, samples, limit, jobs or os.cpu_count() or 1)
+    run = Run(cast(Name, corpus), cast(Engine, engine), cases, samples, limit, jobs or os.cpu_count() or 1, first)
     err = console()
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))
@@ -369,6 +371,7 @@ def calibrate(
     cases: Annotated[int, typer.Option(min=8, help="Cases of the calibrate corpus.")] = 120,
     samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording.")] = 8000,
     minutes: Annotated[float | None, typer.Option(min=0.0, help="Begin no case after these; run again.")] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Learn from the cases that are done so far.")] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Learn the constants of the new engine from the calibrate corpus and write them with their provenance.
@@ -385,7 +388,12 @@ def calibrate(
         err = console()
         limit = float("inf") if minutes is None else minutes
         body, left = run_calibration(
-            keep, cases, samples, limit, progress=lambda text: err.print(text, markup=False, soft_wrap=True)
+            keep,
+            cases,
+            samples,
+            limit,
+            partial=partial,
+            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
         )
         if body is None:
             err.print(f"{left} of {cases} cases are still to be done; run the same command again", soft_wrap=True)

@@ -22,6 +22,8 @@ from tools.output import write_text_atomic
 
 SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("density", "search", "store")))
 """What the traits of a search depend on."""
+LEAST_CASES = 15
+"""Cases with fewer of which no constants are learned."""
 EVERY = 3
 """One case in so many is kept for the map of "sure" alone."""
 
@@ -39,7 +41,7 @@ def gather(
 
     Twins whose every run is a program (an FMU, the bench) are left out: one costs as much as ten others.
     """
-    file = traits_file(folder, samples)
+    file, digest = traits_file(folder, samples), digest_of(*SEARCHING)
     done: dict[int, dict[str, Any]] = {}
     for line in file.read_text().splitlines() if file.exists() else ():
         try:
@@ -53,7 +55,7 @@ def gather(
         for number in numbers:
             if number in done or time.monotonic() > until:
                 continue
-            row: dict[str, Any] = {"number": number}
+            row: dict[str, Any] = {"number": number, "search": digest}
             began = time.process_time()
             drawn = draw_case(corpus, number, folder, samples)
             if drawn is not None and drawn.answer["twin"] not in SELDOM:
@@ -69,13 +71,23 @@ def gather(
 
 
 def calibrate(
-    folder: Path, cases: int, samples: int, minutes: float = float("inf"), *, progress: Callable[[str], None] = print
+    folder: Path,
+    cases: int,
+    samples: int,
+    minutes: float = float("inf"),
+    *,
+    partial: bool = False,
+    progress: Callable[[str], None] = print,
 ) -> tuple[dict[str, Any] | None, int]:
-    """(what belongs into ``constants.json``, 0); or (None, how many cases are still to be done)."""
+    """(what belongs into ``constants.json``, cases that are still to be done).
+
+    None instead of constants while cases are open, unless ``partial`` asks to learn from those that are done, and of
+    fewer than ``LEAST_CASES``.
+    """
     rows, left = gather(folder, range(cases), samples, minutes, progress)
-    if left:
-        return None, left
     kept = {n: r for n, r in rows.items() if "traits" in r}
+    if (left and not partial) or len(kept) < LEAST_CASES:
+        return None, left
     known = {n: case_of(n, r) for n, r in kept.items()}
     main = [c for n, c in known.items() if n % EVERY]
     apart = [c for n, c in known.items() if n % EVERY == 0]
@@ -89,8 +101,9 @@ def calibrate(
             "learned": True,
             "revision": git_revision(),
             "generator": generator_digest(),
-            "search": digest_of(*SEARCHING),
+            "search": sorted({str(r["search"]) for r in kept.values()}),
             "seeds": [corpus.first, corpus.seed_of(cases - 1)],
+            "numbers": list(kept),
             "cases": len(kept),
             "without": sorted(SELDOM),
             "max_samples": samples,
@@ -104,7 +117,7 @@ def calibrate(
             "true_set_was_searched": float(sum(any(s.names == c.names for s in c.sets) for c in main)),
             "sure": {"cases": len(apart), **reliability(stated)},
         },
-    }, 0  # fmt: skip
+    }, left  # fmt: skip
 
 
 def _left_out(constants: Any, cases: list[Case], k: int) -> list[tuple[float, float]]:

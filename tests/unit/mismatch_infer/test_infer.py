@@ -38,10 +38,11 @@ def test_what_normal_noise_scores_at_most() -> None:
 class _Set:
     """The part of a scored set that its score reads."""
 
-    score = Scored.score
+    score, mean_density = Scored.score, Scored.mean_density
 
-    def __init__(self, density: float, names: set[str], parameters: int) -> None:
-        self.density, self.names, self.parameters = {"y": density}, frozenset(names), parameters
+    def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0) -> None:
+        self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
+        self.names, self.parameters = frozenset(names), parameters
 
 
 def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_number() -> None:
@@ -49,6 +50,7 @@ def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_numbe
     assert _Set(0.1, {"a"}, 3).score(c, 10_000) == pytest.approx(200 * 0.1 - 5 - 1.5)
     assert _Set(0.1, {"a", "b"}, 3).score(c, 10_000) == pytest.approx(200 * 0.1 - 10 - 1.5)
     assert _Set(0.1, set(), 0).score(c, 50) == pytest.approx(5.0)
+    assert _Set(0.1, set(), 0, idle=3).score(c, 50) == pytest.approx(1.25)
 
 
 def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:

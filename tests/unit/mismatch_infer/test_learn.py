@@ -68,7 +68,7 @@ def test_a_name_must_pass_its_test_and_a_leftover_makes_it_no_account() -> None:
     left = Case("c", "unknown", frozenset(), 900, (_set("", 0.0, 0), _set("a", 1.0, rest=4.0)), None)
     assert left.right(START)
     assert not left.right(replace(START, cut=5.0))
-    followed = Case("c", "unknown", frozenset(), 900, (_set("", 0.0, 0), _set("a", 0.2)), (0.8, 1.0))
+    followed = Case("c", "unknown", frozenset(), 900, (_set("", 0.0, 0), _set("a", 0.2)), 0.8)
     assert followed.says(START)[0] == "unexplained"
     assert Case("c", "unknown", frozenset(), 900, followed.sets, None).says(START)[0] == "named"
 

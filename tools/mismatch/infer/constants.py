@@ -14,11 +14,12 @@ FILE = Path(__file__).with_name("constants.json")
 
 @dataclass(frozen=True)
 class Constants:
-    """``samples``: independent samples per output that a held-out residual counts for at most (form errors are
-    systematic); ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of
-    every name. ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left, and follow
-    signals, before the account is no account. ``sure_offset`` and ``sure_slope``: the map of the log odds of a name to
-    those that are stated.
+    """What a decision is weighed with.
+
+    ``samples``: independent samples that a held-out residual counts for at most (form errors are systematic);
+    ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
+    ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left and follow signals before the
+    account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones.
     """
 
     samples: float

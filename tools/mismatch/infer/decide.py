@@ -134,7 +134,7 @@ def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger
 def curve_score(store: Store, s: Scored, found: Stranger) -> float:
     """The score of ``s`` with a free curve beside it: its gain on blocks that it has not seen, less its price."""
     c = store.constants
-    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held)
+    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held) / len(s.density)
     room = store.room(s)[found.output]
     return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
 
@@ -183,8 +183,8 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
 def recalibrated(store: Store, raw: Fit) -> bool:
     """Whether re-fitted base parameters predict better than the given ones by more than their price."""
     p, c = store.problem, store.constants
-    before = sum(float(np.mean(d[p.held_rows])) for d in log_density(p, raw).values())
-    gain = min(c.samples, store.held) * (sum(store.base.density.values()) - before)
+    before = float(np.mean([np.mean(d[p.held_rows]) for d in log_density(p, raw).values()]))
+    gain = min(c.samples, store.held) * (store.base.mean_density - before)
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 
 

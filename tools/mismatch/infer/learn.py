@@ -6,6 +6,7 @@ learning works on these.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -43,8 +44,8 @@ SETS = 60
 class SetTraits:
     """What a decision reads of one set of names.
 
-    ``density`` is summed over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken`` are
-    those of ``worst_left`` (None: not looked at).
+    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken``
+    are those of ``worst_left`` (None: not looked at).
     """
 
     names: frozenset[str]
@@ -73,13 +74,15 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
     kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
     return {
         "held": store.held,
+        "outputs": len(store.problem.twin.outputs),
         "sets": [
-            {"names": sorted(s.names), "density": sum(s.density.values()), "parameters": s.parameters,
+            {"names": sorted(s.names), "density": s.mean_density, "parameters": s.parameters,
              "z": tested.get(s.key), "left": leaves.get(s.key)}
             for s in [*kept, *([] if store.base in kept else [store.base])]
         ],
         "strange": None if strange is None else {
-            "share": strange.share, "room": _density_room(store, store.base, strange.output)
+            "gain": -0.5 * math.log(max(1.0 - strange.share, 1e-12)) / len(store.base.density),
+            "room": _density_room(store, store.base, strange.output),
         },
     }  # fmt: skip
 
@@ -116,13 +119,13 @@ class Case:
     names: frozenset[str]
     held: int
     sets: tuple[SetTraits, ...]
-    curve: tuple[float, float] | None
-    """(share, room in nats per sample) of the best free curve of a signal that no effect is about."""
+    curve: float | None
+    """Nats per sample that the best free curve of a signal gains about which no effect is."""
 
     @staticmethod
     def of(case: str, kind: str, names: Sequence[str], traits: Traits) -> Case:
         strange = traits["strange"]
-        curve = None if strange is None else (float(strange["share"]), float(strange["room"]))
+        curve = None if strange is None else min(float(strange["gain"]), float(strange["room"]))
         return Case(case, kind, frozenset(names), int(traits["held"]), tuple(sets_of(traits)), curve)
 
     def ranked(self, c: Constants) -> list[SetTraits]:
@@ -148,9 +151,7 @@ class Case:
         chosen = self.accepted(c)[0]
         empty = next(s for s in self.ranked(c) if not s.names)
         if self.curve is not None:
-            share, room = self.curve
-            n = min(c.samples, self.held)
-            gain = min(-0.5 * np.log(max(1.0 - share, 1e-12)), room) * n
+            gain = min(c.samples, self.held) * self.curve
             if empty.score(c, self.held) + gain - c.per_name - c.per_parameter * CURVE > chosen.score(c, self.held):
                 return "unexplained", empty
         rest = chosen.rest if chosen.rest is not None else 0.0

@@ -20,8 +20,8 @@ Progress = Callable[[str, int, int], None]
 
 BEAM = 3
 """Sets that are extended at a time."""
-MOVES = 6
-"""Extensions at most between two rounds of swaps."""
+MOVES = 5
+"""Sets that are extended at most, besides the base: each costs a screen of the whole vocabulary."""
 SWAPS = 2
 """Rounds in which every effect of the best set is taken out and what fits beside the others is looked for."""
 RIVALS = 3
@@ -50,6 +50,7 @@ class Search:
         self.problem, self.effects, self.jobs, self.progress = problem, tuple(effects), jobs, progress
         self.store = Store(problem, base, constants)
         self.expanded: set[Key] = set()
+        self.moves = MOVES
         self.stride = max(1, problem.fit_rows.size // 12000)
         self.first: tuple[Trial, ...] = ()
 
@@ -63,7 +64,8 @@ class Search:
                 break
             rests = [self.store.without(best, lambda p, n=name: p.effect.name == n) for name in sorted(best.names)]
             for rest in rests:
-                if rest.key not in self.expanded:
+                if rest.key not in self.expanded and self.moves:
+                    self.moves -= 1
                     self.expand(rest)
             if self.store.ranked()[0].key == best.key:
                 break
@@ -97,7 +99,7 @@ class Search:
     def grow(self) -> None:
         """Extend the best of the beam that can gain, one at a time, until the best set can hardly be beaten."""
         base = self.store.score(self.store.base)
-        for _ in range(MOVES):
+        while self.moves:
             ranked = self.store.ranked()
             if not self.can_be_beaten(ranked[0]):
                 return
@@ -106,6 +108,7 @@ class Search:
             chosen = next((s for s in beam if self.store.score(s) - base >= HALF * (best - base)), None)
             if chosen is None:
                 return
+            self.moves -= 1
             self.expand(chosen)
 
     def can_be_beaten(self, best: Scored) -> bool:

@@ -53,14 +53,21 @@ class Scored:
         return frozenset(p.effect.name for p in self.fitted.model.placed)
 
     @property
+    def mean_density(self) -> float:
+        """Nats per held-out sample, averaged over outputs."""
+        return sum(self.density.values()) / len(self.density)
+
+    @property
     def placed(self) -> tuple[Placed, ...]:
         return self.fitted.model.placed
 
     def score(self, c: Constants, held: int) -> float:
         """Nats: the tempered log density (Miller and Dunson 2019: a likelihood raised to a power below one, because the
         form of a model is never quite right) less the prices of names and parameters. ``held``: samples held out.
+
+        The mean over outputs counts: what the form of an effect leaves on one output it leaves on all of them.
         """
-        gain = min(c.samples, float(held)) * sum(self.density.values())
+        gain = min(c.samples, float(held)) * self.mean_density
         return gain - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
@@ -104,7 +111,7 @@ class Store:
 
     def room(self, s: Scored) -> dict[str, float]:
         """Nats per output by which a larger set can be better at most: up to noise at its floor."""
-        n = min(self.constants.samples, self.held)
+        n = min(self.constants.samples, self.held) / len(s.density)
         return {o: max(n * (self._best[o] - d), 0.0) for o, d in s.density.items()}
 
     def without(self, s: Scored, drop: Callable[[Placed], bool]) -> Scored:

@@ -27,7 +27,10 @@ SOURCES = MappingProxyType({"old": SHARED, "new": (*SHARED, "tools/mismatch/infe
 
 @dataclass(frozen=True)
 class Run:
-    """What is run: ``cases`` of a corpus at ``max_samples`` by an engine. ``minutes``: no case is begun after these."""
+    """What is run: ``cases`` of a corpus from number ``first`` on, at ``max_samples``, by an engine.
+
+    ``minutes``: no case is begun after these.
+    """
 
     corpus: Name
     engine: Engine
@@ -35,6 +38,7 @@ class Run:
     max_samples: int
     minutes: float = float("inf")
     jobs: int = 1
+    first: int = 0
 
 
 @dataclass(frozen=True)
@@ -127,7 +131,8 @@ def run_corpus(
     if not corpus.open:
         _remember_draw(folder, run, revision)
     call = diagnose or partial(tool, engine=run.engine)
-    left = [n for n in range(run.cases) if f"c{n:05d}" not in done]
+    numbers = range(run.first, run.first + run.cases)
+    left = [n for n in numbers if f"c{n:05d}" not in done]
     until = time.monotonic() + 60.0 * run.minutes
     begun: Iterator[int] = (n for n in left if time.monotonic() < until)
     if run.jobs > 1:
@@ -143,8 +148,8 @@ def run_corpus(
                 rows.write(json.dumps({**row, "digest": digest}) + "\n")
                 rows.flush()
                 done[row["case"]] = row
-                progress(f"{len(done)}/{run.cases}  {row['case']}  {row.get('cpu_s', 0.0):.1f} s of CPU")
-    wanted = [done[c] for n in range(run.cases) if (c := f"c{n:05d}") in done]
+                progress(f"{len(done)} rows  {row['case']}  {row.get('cpu_s', 0.0):.1f} s of CPU")
+    wanted = [done[c] for n in numbers if (c := f"c{n:05d}") in done]
     scored = [{k: v for k, v in r.items() if k != "report"} for r in wanted if not r.get("left_out")]
     shown = tuple(scored) if corpus.open else ()
     return Result(run, shown, summarise(scored), len(wanted) - len(scored), run.cases - len(wanted), digest)
