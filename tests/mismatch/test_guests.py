@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from hal import plugins
+from hal.trust import require_package
 from tools.mismatch import units
 from tools.mismatch.prove import draw, guests
 from tools.mismatch.prove.disk import contract_unit
@@ -46,6 +47,15 @@ def test_a_users_package_is_there_while_it_is_installed_and_gone_afterwards(tmp_
     assert guests.USER not in plugins.offered(plugins.TWINS)
     with pytest.raises(RecordingError, match=f"kind '{guests.USER}' is unknown"):
         load(path)
+
+
+def test_a_users_package_beside_relative_paths_is_the_one_that_was_trusted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    guests.install_user_twin(Path("block"))
+    with guests.installed(Path("block") / "recordings" / "r000" / "recording.toml"):
+        require_package("lever_arm:LeverArm", Path("recording.toml"))
 
 
 def test_without_the_extra_a_case_of_an_fmu_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

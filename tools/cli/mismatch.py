@@ -396,6 +396,8 @@ def calibrate(
             progress=lambda text: err.print(text, markup=False, soft_wrap=True),
         )
         if body is None:
+            if not left:
+                raise InputError(f"--cases {cases}: too few of them can be searched to learn from; take more cases")
             err.print(f"{left} of {cases} cases are still to be done; run the same command again", soft_wrap=True)
             return
         file = write_constants(body)

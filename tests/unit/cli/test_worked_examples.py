@@ -31,6 +31,7 @@ ADDED = {
     "hands": "--seconds 8",
     "imu evaluate": "--seconds 5",
     "latency": "--seconds 0.2 --policy other --no-firmware",
+    "mismatch calibrate": "--samples 500 --minutes 0.001",
     "mismatch prove": "--cases 1 --jobs 1",
     "ramp": "--virtual",
     "read": "--virtual",

@@ -93,7 +93,7 @@ def write_bench(target: Path, unit: int) -> None:
 
 def install_user_twin(folder: Path) -> None:
     """The user's package below ``folder / PACKAGES``, with the entry point that offers its twin."""
-    packages = folder / PACKAGES
+    packages = folder.resolve() / PACKAGES
     about = packages / "lever_arm-1.0.dist-info"
     about.mkdir(parents=True, exist_ok=True)
     (packages / "lever_arm.py").write_text(_LEVER)
@@ -105,7 +105,7 @@ def install_user_twin(folder: Path) -> None:
 @contextmanager
 def installed(recording: Path) -> Iterator[None]:
     """With the packages beside the recordings on the path, as after ``pip install``; without them nothing happens."""
-    packages = str(recording.parent.parent.parent / PACKAGES)
+    packages = str(recording.resolve().parent.parent.parent / PACKAGES)
     if not Path(packages).is_dir():
         yield
         return
