@@ -99,7 +99,7 @@ class CanAmplifier:
         self._fresh_status(STATUS_LIMIT_NS * 1e-9)
         self.guard.require(self.state != FAULT, "the node reports a fault: switch it off and on")
         self.guard.start_from([float(v) for v in self.measured_V])
-        self.guard.next_V = list(self.guard.last_V)
+        self.guard.offer_last()
         # the node may compare with what it accepted last, and refuse a repeated counter
         self._counter = (self._acknowledged + 1) & 0xFF
         self._send_command(1)
