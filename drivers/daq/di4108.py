@@ -74,7 +74,7 @@ class Di4108:
         self.serial_number = ""
         self.scans = 0
         self.lost = 0
-        self._port = port
+        self.port = port
         self._clock = clock
         self._answer_timeout_s = answer_timeout_s
         self._info: ScanInfo | None = None
@@ -84,7 +84,7 @@ class Di4108:
         self._view = memoryview(self._buf)
         self._bytes = np.frombuffer(self._buf, dtype=np.uint8)
         self._width = 0
-        self._dt_ns = 0
+        self.dt_ns = 0
         # made by configure: kernels pull in numba, which a command that never scans does not pay
         self._kernels: Any = None
         self._stream: Any = None
@@ -137,7 +137,7 @@ class Di4108:
         self._command("endo 3")
         self._command(f"dout {self._digital_bits}")
         self._width = width
-        self._dt_ns = round(1e9 / rate_hz)
+        self.dt_ns = round(1e9 / rate_hz)
         self._load_kernels(width, 16 << code, rate_hz)
         self._info = ScanInfo(
             rate_hz=rate_hz,
@@ -171,10 +171,10 @@ class Di4108:
     def start(self) -> None:
         """Begin to scan; scan 0 is the first one after this."""
         self._require_info()
-        self._port.drain_input()
+        self.port.drain_input()
         self._kernels.restart(self._stream)
         self._timeline.restart()
-        self._port.write(b"start 0\r", self._answer_timeout_s)
+        self.port.write(b"start 0\r", self._answer_timeout_s)
         self._scanning = True
 
     def read_scans(self, out: Int16Array, timeout_s: float) -> ScanBlock:
@@ -187,7 +187,11 @@ class Di4108:
             raise BenchError(f"room for {out.shape[1]} channels, {self._width} are scanned", device=self.name)
         kernels, stream = self._kernels, self._stream
         self._receive(0.0 if kernels.scans_ready(stream) else timeout_s)
-        n, t0_ns, seq0, lost, shifted = kernels.decode(stream, self._bytes, out)
+        return self.block_of(*kernels.decode(stream, self._bytes, out))
+
+    def block_of(self, n: int, t0_ns: int, seq0: int, lost: int, shifted: bool) -> ScanBlock:
+        """Return what ``decode`` has just found as ``read_scans`` does; a compiled loop hands over scans with it."""
+        stream = self._stream
         if n == 0:
             if stream["overflowed"][0]:
                 self._raise_overrun()
@@ -197,7 +201,7 @@ class Di4108:
         status = Status.GAP if lost else Status.OK
         if shifted:
             status |= Status.SHIFTED
-        return ScanBlock(n, t0_ns, self._dt_ns, seq0, TimeSource.DEVICE_CLOCK, status, lost)
+        return ScanBlock(n, t0_ns, self.dt_ns, seq0, TimeSource.DEVICE_CLOCK, status, lost)
 
     def _receive(self, timeout_s: float) -> None:
         """Read until at least one whole scan can be trusted, the time is up or the device has stopped."""
@@ -209,12 +213,17 @@ class Di4108:
             end = int(stream["end"][0])
             if end == BUFFER_BYTES:
                 self._raise_backlog()
-            n = self._port.read_into(self._view[end:], timeout_s)
+            n = self.port.read_into(self._view[end:], timeout_s)
             if n == 0:
                 return
             now_ns = self._clock.now_ns()
             verdict = kernels.accept(stream, self._bytes, n, now_ns)
             timeout_s = max(0.0, (limit_ns - now_ns) * 1e-9)
+        self.obey(verdict)
+
+    def obey(self, verdict: int) -> None:
+        """Do what the ``verdict`` of ``accept`` asks for. Raises ``ProtocolError`` when bytes are missing."""
+        kernels, stream = self._kernels, self._stream
         if verdict == kernels.OVERFLOWED:
             self._scanning = False
         elif verdict == kernels.MISALIGNED:
@@ -224,6 +233,11 @@ class Di4108:
                 kind=ErrorKind.FRAMING,
                 device=self.name,
             )
+
+    @property
+    def memory(self) -> tuple[Any, Any]:
+        """Return the stream's record and the buffer of bytes that its kernels work on; a compiled loop uses both."""
+        return self._stream, self._bytes
 
     def _raise_backlog(self) -> None:
         lost = self._timeline.due_by(self._clock.now_ns())
@@ -245,13 +259,13 @@ class Di4108:
 
     def stop(self) -> None:
         """End the scan and throw away what is still on its way. Bounded; also right when nothing runs."""
-        self._port.write(b"stop\r", self._answer_timeout_s)
+        self.port.write(b"stop\r", self._answer_timeout_s)
         limit_ns = self._clock.now_ns() + round(self._answer_timeout_s * 1e9)
         tail = b""
         chunk = self._view[-4096:]
         while not tail.endswith(b"stop\r"):
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9
-            n = self._port.read_into(chunk, left_s) if left_s > 0 else 0
+            n = self.port.read_into(chunk, left_s) if left_s > 0 else 0
             if n == 0:
                 raise HalTimeout(
                     f"no echo of 'stop' within {self._answer_timeout_s} s: is this a DI-{MODEL} in CDC mode, "
@@ -260,7 +274,7 @@ class Di4108:
                 )
             tail = (tail + bytes(chunk[:n]))[-64:].rstrip(b"\x00\n")
         self._scanning = False
-        self._port.drain_input()
+        self.port.drain_input()
 
     def close(self) -> None:
         """Stop if scanning, then close the port. Idempotent."""
@@ -269,7 +283,7 @@ class Di4108:
                 self.stop()
         finally:
             self._scanning = False
-            self._port.close()
+            self.port.close()
 
     # switch outputs
 
@@ -279,7 +293,7 @@ class Di4108:
             raise BenchError(f"digital outputs {bits:#x}: only bits 0 and 1 are outputs", device=self.name)
         self._digital_bits = bits
         if self._scanning:
-            self._port.write(f"dout {bits}\r".encode(), self._answer_timeout_s)
+            self.port.write(f"dout {bits}\r".encode(), self._answer_timeout_s)
         else:
             self._command(f"dout {bits}")
 
@@ -302,12 +316,12 @@ class Di4108:
         return answer[len(text) + 1 :].strip()
 
     def _exchange(self, text: str) -> str:
-        self._port.write(text.encode() + b"\r", self._answer_timeout_s)
+        self.port.write(text.encode() + b"\r", self._answer_timeout_s)
         limit_ns = self._clock.now_ns() + round(self._answer_timeout_s * 1e9)
         line = b""
         while not line.endswith(b"\r"):
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9
-            n = self._port.read_into(self._view[:256], left_s) if left_s > 0 else 0
+            n = self.port.read_into(self._view[:256], left_s) if left_s > 0 else 0
             if n == 0:
                 raise HalTimeout(
                     f"no answer to {text!r} within {self._answer_timeout_s} s, got {line!r}",

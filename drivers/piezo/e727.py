@@ -8,6 +8,7 @@ values go out at ``rate_hz`` at most, and errors are asked for now and then with
 
 from __future__ import annotations
 
+from array import array
 from collections.abc import Sequence
 from typing import Any, Literal
 
@@ -29,6 +30,8 @@ COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
 """Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
 ERROR_BYTES = len("ERR?\n")
 """Bytes that ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
+DUE_NS, PERIOD_NS, COMMANDS, SUPERSEDED, LATE, WORDS = range(6)
+"""Places in ``E727.words``: when the next command may go out, the time between two, and three counters."""
 
 
 class E727:
@@ -59,16 +62,14 @@ class E727:
         self.name = name
         self.limits = (OutputLimit(lo_V, hi_V, slew_V_per_s, neutral_V),) * CHANNELS
         self.guard = OutputGuard(name, self.limits, clock, longest_gap_s=1.5 / rate_hz)
-        self.commands = 0
-        self.superseded = 0
-        self.late = 0
+        self.words = array("q", bytes(8 * WORDS))
+        self.words[PERIOD_NS] = round(1e9 / rate_hz)
+        self.port = port
+        self.link = GcsLink(port, clock, name)
+        self.servo = mode == "servo"
+        self.per_V = um_per_V if self.servo else 1.0
         self._clock = clock
-        self._link = GcsLink(port, clock, name)
-        self._servo = mode == "servo"
-        self._verb = "MOV" if self._servo else "SVA"
-        self._per_V = um_per_V if self._servo else 1.0
-        self._period_ns = round(1e9 / rate_hz)
-        self._due_ns = 0
+        self._verb = "MOV" if self.servo else "SVA"
         self._position_known = False
         self._kernels: Any = None
         self._text = np.zeros(0, np.uint8)
@@ -76,19 +77,19 @@ class E727:
     def probe(self) -> str:
         """Identity, axes and limits; the servo is switched as ``mode`` says. Raises ``WrongDevice``."""
         self._load_kernels()  # from here on a ramp to neutral may be needed at once
-        identity = self._link.query("*IDN?")[0]
+        identity = self.link.query("*IDN?")[0]
         if "E-727" not in identity:
             raise WrongDevice(f"expected a PI E-727, found {identity!r}", device=self.name)
-        axes = self._link.query("SAI?")
+        axes = self.link.query("SAI?")
         if axes[:CHANNELS] != ["1", "2", "3"]:
             raise WrongDevice(f"axes 1, 2, 3 are needed, the controller has {axes}", device=self.name)
-        self._link.clear_error()
-        on = int(self._servo)
-        self._link.command(f"SVO 1 {on} 2 {on} 3 {on}")
-        if self._servo:
-            low, high = self._link.values("TMN?", CHANNELS), self._link.values("TMX?", CHANNELS)
+        self.link.clear_error()
+        on = int(self.servo)
+        self.link.command(f"SVO 1 {on} 2 {on} 3 {on}")
+        if self.servo:
+            low, high = self.link.values("TMN?", CHANNELS), self.link.values("TMX?", CHANNELS)
             limit = self.limits[0]
-            if max(low) > limit.lo_V * self._per_V or min(high) < limit.hi_V * self._per_V:
+            if max(low) > limit.lo_V * self.per_V or min(high) < limit.hi_V * self.per_V:
                 raise BenchError(f"the stage travels {low} .. {high} um, less than commanded", device=self.name)
         return identity
 
@@ -100,13 +101,28 @@ class E727:
         self._position_known = False
         while not self.safe_step():
             wait_s(self._clock, TICK_S)
-        self._link.settle()
-        self._link.command(self._command().decode().rstrip())
-        told = [v / self._per_V for v in self._link.values(f"{self._verb}?", CHANNELS)]
+        self.link.settle()
+        self.link.command(self._command().decode().rstrip())
+        told = [v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)]
         neutral = [limit.safe_V for limit in self.limits]
         good = all(abs(a - b) < 0.01 for a, b in zip(told, neutral, strict=True))
         self.guard.require(good, f"neutral is {neutral} V, the controller answers {told}")
         self.guard.armed = True
+
+    @property
+    def commands(self) -> int:
+        """Return the number of commands that the port has taken, in whole or in part."""
+        return self.words[COMMANDS]
+
+    @property
+    def superseded(self) -> int:
+        """Return the number of values that a newer one replaced before their command was due."""
+        return self.words[SUPERSEDED]
+
+    @property
+    def late(self) -> int:
+        """Return the number of values that were given up, because the line was slower than asked for."""
+        return self.words[LATE]
 
     @property
     def commands_sent(self) -> int:
@@ -119,15 +135,15 @@ class E727:
     def write(self, values_V: Float64Array) -> int:
         """See ``AnalogOutput.write``: between two commands only the newest values count, the others are
         ``superseded``. Raises what the controller reports, some commands later."""
-        self._link.take_error()
+        self.link.take_error()
         now_ns = self._clock.now_ns()
-        if now_ns < self._due_ns:
+        if now_ns < self.words[DUE_NS]:
             # still checked, so that a bad value trips in its own tick
             mask = self.guard.admit(values_V)
-            self.superseded += 1
+            self.words[SUPERSEDED] += 1
             return mask
         mask = self.guard.admit(values_V)
-        self._due_ns = next_due_ns(self._due_ns, now_ns, self._period_ns)
+        self._begin_period(now_ns)
         if self._send():
             self.guard.sent()
         return mask
@@ -135,12 +151,12 @@ class E727:
     def safe_step(self) -> bool:
         """One tick of the ramp; steps between two command times are not sent, the last one always is."""
         if not self._position_known:
-            self.guard.start_from([v / self._per_V for v in self._link.values(f"{self._verb}?", CHANNELS)])
+            self.guard.start_from([v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)])
             self._position_known = True
         done = self.guard.ramp()
         now_ns = self._clock.now_ns()
-        if done or now_ns >= self._due_ns:
-            self._due_ns = next_due_ns(self._due_ns, now_ns, self._period_ns)
+        if done or now_ns >= self.words[DUE_NS]:
+            self._begin_period(now_ns)
             if not self._send():
                 return False
         self.guard.sent()
@@ -148,8 +164,8 @@ class E727:
 
     def readback_V(self) -> Float64Array:
         """Piezo voltages of output channels 1 to 3, measured by the controller (``VOL?``)."""
-        self._link.settle()
-        return np.array(self._link.values("VOL? 1 2 3", CHANNELS))
+        self.link.settle()
+        return np.array(self.link.values("VOL? 1 2 3", CHANNELS))
 
     def close(self) -> None:
         """Ramp to neutral unless there, then close the port."""
@@ -163,7 +179,7 @@ class E727:
             ) from error
         finally:
             self._position_known = False
-            self._link.close()
+            self.link.close()
 
     def channels(self) -> Sequence[ChannelInfo]:
         limit = self.limits[0]
@@ -176,16 +192,19 @@ class E727:
             self._kernels, self._text = e727_kernels, np.zeros(e727_kernels.TEXT_BYTES, np.uint8)
             e727_kernels.encode(self._text, False, np.zeros(CHANNELS), 1.0)
 
+    def _begin_period(self, now_ns: int) -> None:
+        self.words[DUE_NS] = next_due_ns(self.words[DUE_NS], now_ns, self.words[PERIOD_NS])
+
     def _command(self) -> bytes:
         self._load_kernels()
-        n = self._kernels.encode(self._text, self._servo, np.array(self.guard.next_V), self._per_V)
+        n = self._kernels.encode(self._text, self.servo, np.array(self.guard.next_V), self.per_V)
         return self._text[:n].tobytes()
 
     def _send(self) -> bool:
-        if not self._link.send(self._command()):
-            self.late += 1  # the line is slower than asked for: this value is given up
+        if not self.link.send(self._command()):
+            self.words[LATE] += 1  # the line is slower than asked for: this value is given up
             return False
-        self.commands += 1
+        self.words[COMMANDS] += 1
         if self.commands % ASK_ERROR_EVERY == 0:
-            self._link.ask_error()
+            self.link.ask_error()
         return True

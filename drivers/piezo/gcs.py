@@ -7,6 +7,10 @@ ends with SP LF, the last with LF.
 from __future__ import annotations
 
 import math
+from array import array
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from hal.contracts import Clock, SerialPort
 from hal.errors import HalTimeout, ProtocolError
@@ -27,21 +31,83 @@ ERRORS = {
     307: "receive timeout",
     333: "hardware error",
 }
+ERROR_QUERY = b"ERR?\n"
 LONGEST_REPLY = 4096  # a controller that never ends a line is not one
+NOTHING, ACCEPTED, COMPLAINT = range(3)
+"""Verdicts of ``take_answer``: no whole answer yet; "0", no error; an answer that the caller has to read."""
+LINE_FEED, ZERO = 10, 48
+NEVER = -1
+
+
+class LinkMemory(NamedTuple):
+    """Holds what a link knows, for Python and for a compiled loop.
+
+    ``asked_ns`` (1,): when ``ERR?`` was sent, NEVER when no answer is awaited; ``sizes``: bytes used of ``line``, the
+    answer so far, and of ``unsent``, which the port did not take at once."""
+
+    asked_ns: Any
+    sizes: Any
+    line: Any
+    unsent: Any
+
+    def view(self) -> LinkMemory:
+        """Return numpy arrays over the same memory, for compiled code."""
+        asked_ns, sizes, line, unsent = self
+        return LinkMemory(
+            np.frombuffer(asked_ns, np.int64), np.frombuffer(sizes, np.int64), np.frombuffer(line, np.uint8),
+            np.frombuffer(unsent, np.uint8),
+        )  # fmt: skip
+
+
+LINE, UNSENT = 0, 1
+"""Places in ``LinkMemory.sizes``."""
+UNSENT_BYTES = 256
+
+
+def new_memory() -> LinkMemory:
+    return LinkMemory(array("q", [NEVER]), array("q", [0, 0]), bytearray(LONGEST_REPLY), bytearray(UNSENT_BYTES))
+
+
+def take_answer(memory: LinkMemory, data: Any, n: int) -> int:
+    """Append ``data[:n]`` to the answer to ``ERR?``. Return the verdict; the answer "0" is done with then, any other
+    stays in ``line``. An answer longer than ``line`` is a complaint."""
+    sizes, line = memory.sizes, memory.line
+    for i in range(n):
+        if sizes[LINE] == len(line):
+            return COMPLAINT
+        line[sizes[LINE]] = data[i]
+        sizes[LINE] += 1
+    end = 0
+    while end < sizes[LINE] and line[end] != LINE_FEED:
+        end += 1
+    if end == sizes[LINE]:
+        return NOTHING
+    if end != 1 or line[0] != ZERO:
+        return COMPLAINT
+    for i in range(end + 1, sizes[LINE]):
+        line[i - end - 1] = line[i]
+    sizes[LINE] -= end + 1
+    memory.asked_ns[0] = NEVER
+    return ACCEPTED
+
+
+def keep_unsent(memory: LinkMemory, data: Any, begin: int, end: int) -> None:
+    """Keep ``data[begin:end]``, which the port did not take."""
+    for i in range(begin, end):
+        memory.unsent[i - begin] = data[i]
+    memory.sizes[UNSENT] = end - begin
 
 
 class GcsLink:
-    """One controller on one port. ``unsent`` holds what the port did not take at once, in order."""
+    """One controller on one port. ``memory`` holds what the port did not take at once, and the answer so far."""
 
     def __init__(self, port: SerialPort, clock: Clock, name: str, timeout_s: float = 0.5) -> None:
         self.name = name
         self._port = port
         self._clock = clock
         self._timeout_s = timeout_s
-        self._unsent = b""
-        self._line = bytearray()
+        self.memory = new_memory()
         self._buf = memoryview(bytearray(256))
-        self._asked_ns: int | None = None
 
     # set-up: may wait, bounded
 
@@ -91,40 +157,54 @@ class GcsLink:
     def send(self, data: bytes) -> bool:
         """Hand ``data`` to the port without waiting. False when an earlier command is still stuck: then nothing
         of ``data`` was taken."""
-        if self._unsent and not self._push():
+        if self._is_stuck and not self._push():
             return False
-        self._unsent = data
+        keep_unsent(self.memory, data, 0, len(data))
         self._push()
         return True
 
     def ask_error(self) -> None:
         """Send ``ERR?`` unless one is under way; ``take_error`` finds the answer later."""
-        if self._asked_ns is None and self.send(b"ERR?\n"):
-            self._asked_ns = self._clock.now_ns()
+        if not self._awaits and self.send(ERROR_QUERY):
+            self.memory.asked_ns[0] = self._clock.now_ns()
 
     def take_error(self) -> None:
         """Read what has come. Raises ``ProtocolError`` for a latched error, ``HalTimeout`` for a late answer."""
-        if self._unsent:
+        if self._is_stuck:
             self._push()
-        if self._asked_ns is None:
+        if not self._awaits:
             return
         n = self._port.read_into(self._buf, 0.0)
-        if n:
-            self._line += self._buf[:n]
-            end = self._line.find(b"\n")
-            if end >= 0:
-                answer = self._line[:end].decode("latin-1")
-                del self._line[: end + 1]
-                self._asked_ns = None
-                self._check(answer, "an earlier command")
+        if n or self.memory.sizes[LINE]:
+            verdict = take_answer(self.memory, self._buf, n)
+            if verdict == COMPLAINT:
+                self._read_complaint()
+            if verdict != NOTHING:
                 return
-        if self._clock.now_ns() - self._asked_ns > self._timeout_s * 1e9:
+        if self._clock.now_ns() - self.memory.asked_ns[0] > self._timeout_s * 1e9:
             raise HalTimeout(f"no answer to 'ERR?' within {self._timeout_s} s: link lost?", device=self.name)
+
+    def _read_complaint(self) -> None:
+        memory = self.memory
+        text = bytes(memory.line[: memory.sizes[LINE]])
+        answer, _, rest = text.partition(b"\n")
+        memory.line[: len(rest)] = rest
+        memory.sizes[LINE] = len(rest)
+        memory.asked_ns[0] = NEVER
+        self._check(answer.decode("latin-1"), "an earlier command")
+
+    @property
+    def _is_stuck(self) -> bool:
+        return self.memory.sizes[UNSENT] > 0
+
+    @property
+    def _awaits(self) -> bool:
+        return self.memory.asked_ns[0] != NEVER
 
     def settle(self) -> None:
         """Wait, bounded, for an answer under way, so that queries may be used again."""
         limit_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
-        while (self._unsent or self._asked_ns is not None) and self._clock.now_ns() < limit_ns:
+        while (self._is_stuck or self._awaits) and self._clock.now_ns() < limit_ns:
             self.take_error()
             self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)
 
@@ -132,12 +212,14 @@ class GcsLink:
         self._port.close()
 
     def _push(self) -> bool:
+        memory = self.memory
+        data = bytes(memory.unsent[: memory.sizes[UNSENT]])
         try:
-            self._port.write(self._unsent, 0.0)
+            self._port.write(data, 0.0)
         except HalTimeout as stuck:
-            self._unsent = self._unsent[stuck.partial :]
+            keep_unsent(memory, data, stuck.partial, len(data))
             return False
-        self._unsent = b""
+        memory.sizes[UNSENT] = 0
         return True
 
     def _check(self, answer: str, text: str) -> None:

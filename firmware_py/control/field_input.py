@@ -16,6 +16,16 @@ USUAL_NS = 11_000_000
 """Time between readings for which ``outlier_V`` is meant, with some reserve."""
 
 
+def fill_field(frame: NDArray[np.float64], volts: NDArray[np.float64], fresh: NDArray[np.int64]) -> None:
+    """Write ``volts`` (3,) into the frame's columns if they are ``fresh`` (1,), and mark whether they were. A compiled
+    loop runs the same function."""
+    frame[MAGNETOMETER_FRESH] = float(fresh[0])
+    if fresh[0] != 0:
+        for i in range(3):
+            frame[MAGNETOMETER_RAW + i] = volts[i]
+        fresh[0] = 0
+
+
 class FieldInput:
     """Polls the magnetometer and checks its readings.
 
@@ -31,18 +41,15 @@ class FieldInput:
         self._counts = counts
         self._limit_ms = limit_ms
         self._outlier_V = outlier_V
-        self._volts = np.zeros(3)
+        self.volts, self.fresh = np.zeros(3), np.zeros(1, np.int64)
+        """Hold the newest reading, and 1 in ``fresh`` until it has been taken."""
         self._before, self._slope = np.full(3, np.nan), np.full(3, np.nan)
         self._before_ns = 0
-        self._fresh = False
         self._hangs = False
 
     def fill(self, frame: NDArray[np.float64]) -> None:
         """Write a fresh reading into the frame's columns, once per reading, and mark whether there was one."""
-        frame[MAGNETOMETER_FRESH] = float(self._fresh)
-        if self._fresh:
-            frame[MAGNETOMETER_RAW : MAGNETOMETER_RAW + 3] = self._volts
-            self._fresh = False
+        fill_field(frame, self.volts, self.fresh)
 
     def poll(self, info: TickInfo) -> None:
         """Run the magnetometer's task: one transfer on the bus, and the checks of a completed reading."""
@@ -56,8 +63,8 @@ class FieldInput:
                     incidents.notice("magnetometer's converter hangs")
                 self._hangs = hangs
                 self._look_for_outliers(volts, magnetometer.t_ns)
-                self._volts[:] = volts
-                self._fresh = not hangs
+                self.volts[:] = volts
+                self.fresh[0] = not hangs
             incidents.bad_for(Finding.MAGNETOMETER_SILENT, False, info.due_ns, self._limit_ms, error="")
             incidents.bad_for(
                 Finding.MAGNETOMETER_HANGS, self._hangs, info.due_ns, self._limit_ms, device=magnetometer.name

@@ -219,6 +219,63 @@ class PairState(NamedTuple):
     spread: NDArray[np.float64]
 
 
+TICK, LOOKS = range(2)
+"""Places in ``CheckMemory.words``: last tick that was checked, -1 before the first; how often pairs were checked."""
+
+
+class CheckMemory(NamedTuple):
+    """Holds all that ``check_scan`` and ``check_frame`` need. ``order``: places in a scan of the inputs; ``counts``:
+    their last counts; ``limits``: the last six arguments of ``check_counts``; ``pair_limits``: those of
+    ``check_pairs``."""
+
+    words: NDArray[np.int64]
+    order: NDArray[np.int64]
+    counts: NDArray[np.int16]
+    last: NDArray[np.int64]
+    same: NDArray[np.int64]
+    slope: NDArray[np.int64]
+    odd: NDArray[np.int64]
+    together: NDArray[np.int64]
+    limits: NDArray[np.int64]
+    noisy: NDArray[np.int64]
+    pairs: PairState
+    places: NDArray[np.int64]
+    mix: NDArray[np.float64]
+    pair_step: NDArray[np.float64]
+    pair_limits: NDArray[np.float64]
+
+
+@kernel
+def steps_since(words: NDArray[np.int64], tick: int) -> int:
+    """Note that scan ``tick`` is checked. Return the ticks since the one before, 1 for the first."""
+    steps = tick - words[TICK] if words[TICK] >= 0 else 1
+    words[TICK] = tick
+    return steps
+
+
+@kernel
+def check_scan(memory: CheckMemory, row: NDArray[np.int16], tick: int) -> int:
+    """Run ``check_counts`` on scan ``tick``, whose counts are ``row``, as ``ScanCheck.scan`` does."""
+    m, limits = memory, memory.limits
+    for i in range(len(m.order)):
+        m.counts[i] = row[m.order[i]]
+    return check_counts(
+        m.counts, m.noisy[0], m.last, m.same, m.slope, m.odd, m.together, steps_since(m.words, tick), limits[0],
+        limits[1], limits[2], limits[3], limits[4], limits[5],
+    )  # fmt: skip
+
+
+@kernel
+def check_frame(memory: CheckMemory, frame: NDArray[np.float64]) -> int:
+    """Run ``check_pairs`` on ``frame``, as ``ScanCheck.pairs`` does."""
+    m, p = memory, memory.pairs
+    m.words[LOOKS] += 1
+    return check_pairs(
+        frame, m.places, m.mix, m.words[LOOKS] - 1, p.window, p.sums, p.usual, p.spread, m.pair_step, m.pair_limits[0],
+        m.pair_limits[1], m.pair_limits[2],
+    )  # fmt: skip
+
+
 class ScanCheck:
     """Checks every scan before it is used.
 
@@ -242,75 +299,77 @@ class ScanCheck:
         self._sensors = sensors
         self._supply = sensors if len(columns) > sensors else None
         self.limits = limits
-        self._order = np.array(columns, dtype=np.intp)
         self._labels = tuple(labels)
         n = len(columns)
-        self._counts, self._last = np.zeros(n, dtype=np.int16), np.zeros(n, dtype=np.int64)
-        self._same = np.full(n, -1, dtype=np.int64)
-        self._slope, self._odd = np.full(n, NO_SLOPE), np.zeros(n, dtype=np.int64)
-        self._together = np.array([NO_SLOPE, round(TOGETHER_V / lsb_V)])
         self._told = 0
-        self._outlier, self._supply_step = round(limits.outlier_V / lsb_V), round(limits.supply_step_V / lsb_V)
-        self._jump, self._lo, self._hi = round(limits.jump_V / lsb_V), *(round(v / lsb_V) for v in limits.rail_V)
-        self._pairs = PairState(
-            np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3))
-        )
-        self._looks = 0
-        self._mix = np.eye(len(PAIRS)) if mix is None else mix
-        self._pair_step = np.array(limits.pair_step_m_s2)
+        volts = (limits.jump_V, limits.outlier_V, limits.supply_step_V, *limits.rail_V)
+        self.memory = CheckMemory(
+            np.array([-1, 0]), np.array(columns, dtype=np.int64), np.zeros(n, dtype=np.int16),
+            np.zeros(n, dtype=np.int64), np.full(n, -1, dtype=np.int64), np.full(n, NO_SLOPE),
+            np.zeros(n, dtype=np.int64), np.array([NO_SLOPE, round(TOGETHER_V / lsb_V)]),
+            np.array([*(round(v / lsb_V) for v in volts), limits.stuck_ticks]), np.array([sensors]),
+            PairState(
+                np.zeros((max(2, round(limits.pair_s / TICK_S)), len(PAIRS))), *(np.zeros(len(PAIRS)) for _ in range(3))
+            ),
+            PAIR_PLACES, np.eye(len(PAIRS)) if mix is None else mix, np.array(limits.pair_step_m_s2),
+            np.array([limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S]),
+        )  # fmt: skip
+        # handed over one by one, because a tuple of arrays costs each call 10 us
+        self._limits, self._pair_limits = self.memory.limits.tolist(), self.memory.pair_limits.tolist()
         self._pair_told = 0
-        self._tick = -1
         self._load_kernels()
 
     def _load_kernels(self) -> None:
         """Compile or load the kernels before the first scan arrives. The state does not change."""
-        last, same, slope, odd = (state.copy() for state in (self._last, self._same, self._slope, self._odd))
-        check_counts(
-            self._counts, self._sensors, last, same, slope, odd, self._together.copy(), 1, self._jump, self._outlier,
-            self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
-        )  # fmt: skip
-        window, sums, usual, spread = (state.copy() for state in self._pairs)
-        limits = self.limits
-        check_pairs(
-            np.zeros(LAYOUT.size), PAIR_PLACES, self._mix, 0, window, sums, usual, spread, self._pair_step,
-            limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
-        )  # fmt: skip
+        m = self.memory
+        last, same, slope, odd = (state.copy() for state in (m.last, m.same, m.slope, m.odd))
+        steps_since(m.words.copy(), 0)
+        check_counts(m.counts, self._sensors, last, same, slope, odd, m.together.copy(), 1, *self._limits)
+        window, sums, usual, spread = (state.copy() for state in m.pairs)
+        frame = np.zeros(LAYOUT.size)
+        check_pairs(frame, m.places, m.mix, 0, window, sums, usual, spread, m.pair_step, *self._pair_limits)
 
     def scan(self, row: NDArray[np.int16], tick: int) -> str:
         """Check the counts of scan ``tick``. Return an empty string, or a message that says what is wrong."""
-        steps = tick - self._tick if self._tick >= 0 else 1
-        self._tick = tick
-        np.take(row, self._order, out=self._counts)
+        memory = self.memory
+        np.take(row, memory.order, out=memory.counts)
         for channel in self._ignored:
-            self._counts[channel] = self._quiet(tick)
+            memory.counts[channel] = self._quiet(tick)
         supply = self._supply
-        supply_before = 0 if supply is None else int(self._last[supply])
+        supply_before = 0 if supply is None else int(memory.last[supply])
         found = check_counts(
-            self._counts, self._sensors, self._last, self._same, self._slope, self._odd, self._together, steps,
-            self._jump, self._outlier, self._supply_step, self._lo, self._hi, self.limits.stuck_ticks,
+            memory.counts, self._sensors, memory.last, memory.same, memory.slope, memory.odd, memory.together,
+            steps_since(memory.words, tick), *self._limits,
         )  # fmt: skip
         if not found:
             return ""
         channel, finding = divmod(found, 16)
         self.channel = channel
-        if supply is not None and supply_before and abs(int(self._counts[supply]) - supply_before) > self._jump // 2:
+        jump = self._limits[0]
+        if supply is not None and supply_before and abs(int(memory.counts[supply]) - supply_before) > jump // 2:
             # the sensors are ratiometric: all of them follow their supply
             return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
         return f"{self._labels[channel]} {WORDS[Implausible(finding)].format(n=self.limits.stuck_ticks)}"
 
+    @property
+    def ignores(self) -> bool:
+        """True if a channel is treated as healthy whatever it reads."""
+        return bool(self._ignored)
+
     def ignore(self, channel: int) -> None:
         """Treat ``channel`` as healthy from now on, whatever it reads."""
         self._ignored.append(channel)
-        self._last[channel], self._slope[channel] = self._quiet(self._tick), NO_SLOPE
+        memory = self.memory
+        memory.last[channel], memory.slope[channel] = self._quiet(int(memory.words[TICK])), NO_SLOPE
 
     def _quiet(self, tick: int) -> int:
-        return (self._lo + self._hi) // 2 + tick % 2
+        return (self._limits[3] + self._limits[4]) // 2 + tick % 2
 
     @property
     def stepped_together(self) -> bool:
         """True if, within the last ``TOGETHER_TICKS``, nearly all axes bent the same way at once, as they do when their
         supply steps."""
-        return bool(self._together[0] <= TOGETHER_TICKS)
+        return bool(self.memory.together[0] <= TOGETHER_TICKS)
 
     def odd(self) -> str:
         """Return a message about an input that was out of line since the last call, or an empty string. Such a reading
@@ -319,11 +378,11 @@ class ScanCheck:
             i, j, axis = PAIRS[self._pair_told - 1]
             self._pair_told = 0
             return f"{self._labels[i]} and {self._labels[j]} came apart along {axis}"
-        total = int(self._odd.sum())
+        total = int(self.memory.odd.sum())
         if total == self._told:
             return ""
         self._told = total
-        worst = int(self._odd.argmax())
+        worst = int(self.memory.odd.argmax())
         if worst == self._supply:
             return f"{self._labels[worst]} stepped"
         return f"{self._labels[worst]} read a value out of line with its neighbours"
@@ -335,19 +394,25 @@ class ScanCheck:
         The mean over 0.1 s leaves out most of a tremor. A difference that has lasted for seconds comes from
         calibration, or was there before; a new difference is a drift or a blow.
         """
-        state, limits = self._pairs, self.limits
-        found = check_pairs(
-            frame, PAIR_PLACES, self._mix, self._looks, state.window, state.sums, state.usual, state.spread,
-            self._pair_step, limits.pair_m_s2, TICK_S / limits.pair_memory_s, TICK_S / SPREAD_S,
-        )  # fmt: skip
-        self._looks += 1
+        m, p = self.memory, self.memory.pairs
+        looks = int(m.words[LOOKS])
+        m.words[LOOKS] = looks + 1
+        return self.judge_pairs(
+            check_pairs(
+                frame, m.places, m.mix, looks, p.window, p.sums, p.usual, p.spread, m.pair_step, *self._pair_limits
+            )
+        )
+
+    def judge_pairs(self, found: int) -> str:
+        """Return the message of what ``check_pairs`` found, as ``pairs`` does."""
         if found == 0:
             return ""
         if found < 0:
             self._pair_told = -found
             return ""
         i, j, axis = PAIRS[found - 1]
-        apart = state.sums[found - 1] / len(state.window)
+        pairs = self.memory.pairs
+        apart = pairs.sums[found - 1] / len(pairs.window)
         return (
             f"{self._labels[i]} and {self._labels[j]} disagree by {apart:.2f} m/s^2 along {axis}: "
             "one of them has drifted or is calibrated wrongly"

@@ -11,7 +11,7 @@ from __future__ import annotations
 import mmap
 import os
 import struct
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,6 +36,17 @@ class LiveRows(NamedTuple):
     missed: int
 
 
+def put_over(words: Any, rows: NDArray[np.float64], row: NDArray[np.float64]) -> None:
+    """Copy ``row`` over the oldest of ``rows``; ``announce`` follows. A compiled loop runs the same two functions, with
+    a fence for the compiler between them."""
+    rows[words[_HEAD] % len(rows)] = row
+
+
+def announce(words: Any) -> None:
+    """Let readers see the row that was put last."""
+    words[_HEAD] += 1
+
+
 class LiveMemory:
     """Both ends: one process uses ``push`` and ``put_histogram``, any number of others ``read`` and ``histogram``."""
 
@@ -52,7 +63,6 @@ class LiveMemory:
         self._histograms = np.frombuffer(
             self._map, dtype=np.int64, offset=_HEADER_BYTES + flat.nbytes, count=HISTOGRAMS * HISTOGRAM_WORDS
         ).reshape(HISTOGRAMS, HISTOGRAM_WORDS)
-        self._head = self._words[_HEAD]
 
     @classmethod
     def create(cls, n_columns: int, capacity: int = 8192) -> LiveMemory:
@@ -69,8 +79,12 @@ class LiveMemory:
 
     def push(self, row: NDArray[np.float64]) -> None:
         """Copy ``row[n_columns]`` in, over the oldest."""
-        self._rows[self._head % self.capacity] = row
-        self._head = self._words[_HEAD] = self._head + 1
+        put_over(self._words, self._rows, row)
+        announce(self._words)
+
+    def view(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Return header and rows for compiled code, which may push in place of ``push``, never beside it."""
+        return np.frombuffer(self._words, np.int64), self._rows
 
     def put_histogram(self, index: int, histogram: DurationHistogram) -> None:
         """Copy the counts of a histogram to place ``index``."""

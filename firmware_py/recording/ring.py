@@ -17,6 +17,7 @@ import os
 import platform
 import struct
 import tempfile
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,6 +77,36 @@ class _Shared:
         os.close(self.fd)
 
 
+class RowsView(NamedTuple):
+    """Holds a ring's memory for ``put_row``: ``words`` [header], ``numbers`` [capacity], ``rows`` [capacity, n]."""
+
+    words: Any
+    numbers: Int64Array
+    rows: Float64Array
+
+
+def put_row(view: RowsView, row: Float64Array) -> bool:
+    """Copy ``row`` to the next free slot; ``announce_row`` follows. Return False, and count it, when the ring is full.
+
+    A compiled loop runs the same two functions, with a fence for the compiler between them: a row must be there before
+    the head says so.
+    """
+    words = view.words
+    head, capacity = words[_HEAD], len(view.numbers)
+    if head - words[_TAIL] >= capacity:
+        words[_DROPPED] += 1
+        return False
+    slot = head % capacity
+    view.rows[slot] = row
+    view.numbers[slot] = head + words[_DROPPED]
+    return True
+
+
+def announce_row(words: Any) -> None:
+    """Let the consumer see the row that was put last."""
+    words[_HEAD] += 1
+
+
 class RowRing:
     """Rows of float64 from one producer to one consumer.
 
@@ -91,8 +122,7 @@ class RowRing:
         slots = np.frombuffer(self._shared.data(), dtype=np.float64).reshape(self.capacity, 1 + self.n_columns)
         self._numbers: Int64Array = slots.view(np.int64)[:, 0]
         self._rows: Float64Array = slots[:, 1:]
-        self._head = self._words[_HEAD]
-        self._seen_tail = self._words[_TAIL]
+        self._own = RowsView(self._words, self._numbers, self._rows)
 
     @classmethod
     def create(cls, n_columns: int, capacity: int) -> RowRing:
@@ -107,21 +137,18 @@ class RowRing:
 
     def push(self, row: Float64Array) -> bool:
         """Copy ``row[n_columns]`` in; False (and counted) when the ring is full. Never waits."""
-        head = self._head
-        if head - self._seen_tail >= self.capacity:
-            self._seen_tail = self._words[_TAIL]
-            if head - self._seen_tail >= self.capacity:
-                self._words[_DROPPED] += 1
-                return False
-        slot = head % self.capacity
-        self._rows[slot] = row
-        self._numbers[slot] = head + self._words[_DROPPED]
-        self._head = self._words[_HEAD] = head + 1
+        if not put_row(self._own, row):
+            return False
+        announce_row(self._words)
         return True
+
+    def view(self) -> RowsView:
+        """Return the same memory for compiled code, which may push in place of ``push``, never beside it."""
+        return RowsView(np.frombuffer(self._words, np.int64), self._numbers, self._rows)
 
     def full(self) -> bool:
         """Return True if the next ``push`` would be refused."""
-        return self._head - self._words[_TAIL] >= self.capacity
+        return self._words[_HEAD] - self._words[_TAIL] >= self.capacity
 
     def pop(self, max_rows: int) -> tuple[Int64Array, Float64Array]:
         """Take up to ``max_rows`` of the oldest rows: their numbers ``[n]`` and values ``[n, n_columns]``."""
@@ -164,7 +191,7 @@ class RowRing:
 
     def close(self) -> None:
         """Unmap; the object is of no use afterwards."""
-        del self._numbers, self._rows
+        del self._numbers, self._rows, self._own
         self._words = memoryview(b"").cast("q")
         self._shared.close()
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -56,69 +58,85 @@ class Distribution:
         }
 
 
-class DurationHistogram:
-    """Counts durations in ns. A negative one (a due time in the future) counts as zero."""
+_MIN, _MAX, _TOTAL, _MAX_TICK, _FIRST = range(5)
+"""Places in a histogram's words: ns, ns, ns, a tick, and the first bucket."""
+_NO_MIN = (1 << 63) - 1
 
-    __slots__ = ("_counts", "_max_ns", "_min_ns", "_total_ns", "max_tick")
-    STATE_WORDS = _N_BUCKETS + 4
+
+def add_duration(words: Any, value_ns: int, tick: int) -> None:
+    """Count ``value_ns``, seen at ``tick``, in the ``words`` of a ``DurationHistogram``. A compiled loop runs the same
+    function."""
+    if value_ns < 16:  # below one octave a bucket is one nanosecond
+        value_ns = max(value_ns, 0)
+        index = value_ns
+    elif value_ns <= _LAST_NS:
+        octave = math.frexp(value_ns)[1] - 5
+        index = (octave << 4) + (value_ns >> octave)
+    else:
+        index = _N_BUCKETS - 1
+    words[_FIRST + index] += 1
+    words[_TOTAL] += value_ns
+    if value_ns > words[_MAX]:
+        words[_MAX] = value_ns
+        words[_MAX_TICK] = tick
+    if value_ns < words[_MIN]:
+        words[_MIN] = value_ns
+
+
+class DurationHistogram:
+    """Counts durations in ns. A negative one (a due time in the future) counts as zero.
+
+    ``words``: its whole state, on which ``add_duration`` works.
+    """
+
+    __slots__ = ("words",)
+    STATE_WORDS = _N_BUCKETS + _FIRST
 
     def __init__(self) -> None:
-        self._counts = array("q", bytes(8 * _N_BUCKETS))
+        self.words = array("q", bytes(8 * self.STATE_WORDS))
         self.clear()
 
     def clear(self) -> None:
         """Forget everything."""
-        for i in range(_N_BUCKETS):
-            self._counts[i] = 0
-        self._total_ns = 0
-        self._min_ns = 1 << 63
-        self._max_ns = -1
-        self.max_tick = -1
+        words = self.words
+        for i in range(self.STATE_WORDS):
+            words[i] = 0
+        words[_MIN], words[_MAX], words[_MAX_TICK] = _NO_MIN, -1, -1
 
     @property
     def n(self) -> int:
         """Return the number of counted values."""
-        return sum(self._counts)
+        return sum(self.words[_FIRST:])
 
     @property
     def max_ns(self) -> int:
         """Return the largest value, 0 when nothing was counted."""
-        return max(0, self._max_ns)
+        return max(0, self.words[_MAX])
+
+    @property
+    def max_tick(self) -> int:
+        """Return the tick of the largest value, -1 when nothing was counted."""
+        return self.words[_MAX_TICK]
 
     def add(self, value_ns: int, tick: int) -> None:
         """Count one value, seen at ``tick``."""
-        if value_ns < 16:  # below one octave a bucket is one nanosecond
-            value_ns = max(value_ns, 0)
-            index = value_ns
-        elif value_ns <= _LAST_NS:
-            octave = value_ns.bit_length() - 5
-            index = (octave << 4) + (value_ns >> octave)
-        else:
-            index = _N_BUCKETS - 1
-        self._counts[index] += 1
-        self._total_ns += value_ns
-        if value_ns > self._max_ns:
-            self._max_ns = value_ns
-            self.max_tick = tick
-        if value_ns < self._min_ns:
-            self._min_ns = value_ns
+        add_duration(self.words, value_ns, tick)
 
     def counts(self) -> np.ndarray:
         """Return a copy of the bucket counts, int64."""
-        return np.frombuffer(self._counts, dtype=np.int64).copy()
+        return np.frombuffer(self.words, dtype=np.int64)[_FIRST:].copy()
 
     def copy_state_to(self, words: np.ndarray) -> None:
         """Copy the whole state into int64 ``words[STATE_WORDS]``, for another process to read."""
-        words[:4] = self._min_ns % (1 << 63), self._max_ns, self._total_ns, self.max_tick
-        words[4:] = self._counts
+        words[:] = self.words
 
     @classmethod
     def from_state(cls, words: np.ndarray) -> DurationHistogram:
-        """Return the histogram that ``copy_state_to`` wrote."""
+        """Return the histogram that ``copy_state_to`` wrote. Memory of zeros, which nobody has written yet, is an empty
+        one."""
         histogram = cls()
-        histogram._counts = array("q", words[4:].tobytes())
-        lowest, histogram._max_ns, histogram._total_ns, histogram.max_tick = (int(w) for w in words[:4])
-        histogram._min_ns = lowest if histogram._max_ns >= 0 else 1 << 63
+        if words[_FIRST:].any():
+            histogram.words[:] = array("q", words.tobytes())
         return histogram
 
     def quantile_ns(self, q: float) -> float:
@@ -133,7 +151,7 @@ class DurationHistogram:
         lo_ns, width_ns = bucket_bounds_ns(index)
         share = (rank - below - 0.5) / (int(cumulated[index]) - below)
         value_ns = lo_ns + share * (width_ns - 1)
-        return min(max(value_ns, float(self._min_ns)), float(self._max_ns))
+        return min(max(value_ns, float(self.words[_MIN])), float(self.words[_MAX]))
 
     def distribution(self) -> Distribution:
         """Return percentiles and extremes; the histogram does not change."""
@@ -144,11 +162,11 @@ class DurationHistogram:
         p50, p99, p99_9 = (self._quantile_ns(q, cumulated) * 1e-3 for q in (0.5, 0.99, 0.999))
         return Distribution(
             n=n,
-            min_us=self._min_ns * 1e-3,
-            mean_us=self._total_ns / n * 1e-3,
+            min_us=self.words[_MIN] * 1e-3,
+            mean_us=self.words[_TOTAL] / n * 1e-3,
             p50_us=p50,
             p99_us=p99,
             p99_9_us=p99_9,
-            max_us=self._max_ns * 1e-3,
-            max_tick=self.max_tick,
+            max_us=self.words[_MAX] * 1e-3,
+            max_tick=self.words[_MAX_TICK],
         )
