@@ -17,7 +17,7 @@ from hal.compiled import kernel
 
 @pytest.fixture(scope="module")
 def compiled() -> dict[str, Any]:
-    made = {f.__name__: kernel(f) for f in (put_row, announce_row, put_over, announce, add_duration)}
+    made: dict[str, Any] = {f.__name__: kernel(f) for f in (put_row, announce_row, put_over, announce, add_duration)}
     # the compiler keeps what it has compiled for; a ring that is closed has to be free
     view = RowRing.create(3, 4).view()
     copy = view._replace(words=view.words.copy(), numbers=view.numbers.copy(), rows=view.rows.copy())
