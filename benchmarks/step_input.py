@@ -7,7 +7,7 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import Stages
 from firmware_py.frame import COUNTS, LAYOUT, MAGNETOMETER_FRESH, MAGNETOMETER_RAW, STATUS, TICK, TIME, FrameStatus
 from hal.bench import load_bench
@@ -19,7 +19,7 @@ SETTLED = 3000
 
 @cache
 def _configs():
-    return load_firmware_config(load_bench(bench_path(None)), {})[1]
+    return load_plan(load_bench(bench_path(None))).stages
 
 
 def stages() -> Stages:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, model_validator
+
+from hal.types import OutputLimit
 
 Channel = Annotated[int, Field(ge=0, le=7)]
 
@@ -24,7 +26,15 @@ class DaqOptions(Options):
 
 
 class OutputOptions(Options):
-    """Checks the keys of every analog output's entry: the neutral voltage at the stack lies between its limits."""
+    """Checks the keys of every analog output's entry: the neutral voltage at the stack lies between its limits.
+
+    A subclass has ``lo_V``, ``hi_V``, ``neutral_V`` and ``slew_V_per_s``."""
+
+    @property
+    def limit(self) -> OutputLimit:
+        """Return the limits of each output, which the actuation stage follows."""
+        low, high, slew, neutral = (getattr(self, name) for name in ("lo_V", "hi_V", "slew_V_per_s", "neutral_V"))
+        return OutputLimit(low, high, slew, neutral)
 
     @model_validator(mode="after")
     def _neutral_is_between(self) -> OutputOptions:
@@ -95,7 +105,8 @@ class Hmc2003Options(Options):
 class AmplifierMonitorOptions(Options):
     """Monitor voltages of the amplifier's three outputs on an ADC: output volts = ADC volts x ``ratio``.
 
-    ``rate_hz``: readings per second, of one output each; two in five ticks unless said otherwise.
+    ``rate_hz``: readings per second, of one output each; two in five ticks unless said otherwise, fewer
+    where conversions take longer than that.
     """
 
     channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
@@ -143,8 +154,11 @@ class NiOutputOptions(OutputOptions):
     slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)
 
 
-class CanAmplifierOptions(Options):
-    """The CAN piezo node of ``drivers/dbc/micron.dbc``."""
+class CanAmplifierOptions(OutputOptions):
+    """The CAN piezo node of ``drivers/dbc/micron.dbc``, whose set points reach from 0 to 100 V."""
+
+    lo_V: ClassVar[float] = 0.0
+    hi_V: ClassVar[float] = 100.0
 
     neutral_V: float = Field(default=50.0, ge=0, le=100)
     slew_V_per_s: float = Field(default=20_000.0, ge=100.0, le=1e6)

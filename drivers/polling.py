@@ -53,6 +53,8 @@ VERIFY = Polls(10, 3)
 VERIFY_BESIDE_MONITOR = Polls(10)
 MONITOR = Polls(5, 2)
 """Default of an amplifier monitor: a fault must be seen soon, whatever rate other converters have."""
+SLOWER_MONITORS = (Polls(4), Polls(5), Polls(10), Polls(20))
+"""Defaults where a conversion takes longer than two ticks; they repeat with the other tasks."""
 
 
 @dataclass(frozen=True)
@@ -89,9 +91,12 @@ def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tup
                     f"[device.{adc}.rate_hz] this converter is read by '{name}': remove this key and write "
                     f"rate_hz = ... (readings per second, of one output each) under [device.{name}]"
                 )
-            monitor = MONITOR if option.rate_hz is None else _polls(option.rate_hz, 1, tick_hz, gap)
-            if monitor is None or monitor.shortest_gap < gap:
-                asked = tick_hz * MONITOR.count / MONITOR.divider if option.rate_hz is None else option.rate_hz
+            if option.rate_hz is None:
+                monitor = next((p for p in (MONITOR, *SLOWER_MONITORS) if p.shortest_gap >= gap), None)
+            else:
+                monitor = _polls(option.rate_hz, 1, tick_hz, gap)
+            if monitor is None:
+                asked = MONITOR.per_s(tick_hz) if option.rate_hz is None else option.rate_hz
                 problems.append(_refusal(name, asked, 1, tick_hz, gap, "one output is read each time"))
     for name, option in options.items():
         if isinstance(option, E727Options) and _polls(option.rate_hz, 1, tick_hz, 1, most=1) is None:

@@ -71,6 +71,10 @@ NEEDS = {
 }
 
 
+ADDRESSES = {"dac_amplifier": range(0x0C, 0x10), "ads1115": range(0x48, 0x4C)}
+"""I2C addresses that the pins of a part can select."""
+
+
 def device_options(description: BenchDescription, name: str, where: str) -> Any:
     """The checked options of device ``name``. Raises ``BenchError`` naming file and key."""
     spec = description.device[name]
@@ -81,6 +85,12 @@ def device_options(description: BenchDescription, name: str, where: str) -> Any:
     needed = NEEDS.get(spec.driver) if added is None else added.needs
     if needed and getattr(spec, needed) is None:
         raise BenchError(f"{where}: [device.{name}] driver '{spec.driver}' needs '{needed} = ...'")
+    addresses = ADDRESSES.get(spec.driver)
+    if addresses is not None and spec.address is not None and spec.address not in addresses:
+        raise BenchError(
+            f"{where}: [device.{name}.address] 0x{spec.address:02X} is not one of 0x{addresses[0]:02X}.."
+            f"0x{addresses[-1]:02X}, which the pins of '{spec.driver}' can select"
+        )
     return validate_table(
         OPTIONS[spec.driver] if added is None else added.options, spec.options(), f"{where}: device.{name}"
     )

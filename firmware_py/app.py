@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.control.config import load_firmware_config
 from firmware_py.control.loop import InstrumentLoop
+from firmware_py.control.plan import load_plan
 from firmware_py.control.safety import RAMP_TICKS
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
@@ -74,14 +74,15 @@ def run_in_process(
 
         return run_request(request, bench, on_status, runtime_dir, on_open, wrap, own_process=own_process)
     # everything that can be wrong with the file, and the compiler's seconds, before a device is touched
-    _, configs = load_firmware_config(bench, {}, request.method)
-    Stages(configs).warm_up()
+    plan = load_plan(bench, request.method)
+    Stages(plan.stages).warm_up()
     with contextlib.ExitStack() as stack:
         opened = stack.enter_context(open_requested(request, bench, runtime_dir, wrap))
         if on_open is not None:
             on_open(opened)
-        devices = open_devices(opened)
-        config, configs = load_firmware_config(bench, devices.sensing_table, request.method)
+        devices = open_devices(opened, plan.options)
+        plan = plan.with_wiring(devices.sensing_table)
+        config, configs = plan.firmware, plan.stages
         if request.stale_ms is not None:
             stalled_ms = max(request.stale_ms, config.safety.stalled_ms)
             safety = config.safety.model_copy(update={"stale_ms": request.stale_ms, "stalled_ms": stalled_ms})
@@ -99,7 +100,7 @@ def run_in_process(
             stages,
             config,
             opened.clock,
-            tick_hz=bench.description.clock.tick_hz,
+            tick_hz=plan.tick_hz,
             recorder=recorder,
             on_status=with_fallbacks(on_status, stages),
             live=live,

@@ -179,6 +179,10 @@ class StackConfig(_Table):
 
 
 class AmplifierConfig(_Table):
+    """The piezo amplifier. ``gain``, limits and ``neutral_V`` follow the output's entry under [device]."""
+
+    gain: Positive = 20.0
+    """Output volts per volt of the DAC in front of it."""
     bandwidth_hz: Positive = 2000.0
     slew_V_per_ms: Positive = 40.0
     low_V: float = 0.0
@@ -334,8 +338,32 @@ class EmulationConfig(_Table):
 
 
 def emulation_config(description: Mapping[str, Any]) -> EmulationConfig:
-    """The checked ``[emulation]`` table; ``BenchError`` names each wrong key."""
+    """Return the checked ``[emulation]`` table; its amplifier follows the bench's output. ``BenchError`` names each
+    wrong key."""
+    table = dict(description["emulation"])
+    amplifier = table.get("amplifier", {})
+    if isinstance(amplifier, Mapping):
+        table["amplifier"] = _follow_output(amplifier, description.get("device", {}))
     try:
-        return EmulationConfig.model_validate(description["emulation"])
+        return EmulationConfig.model_validate(table)
     except ValidationError as error:
         raise BenchError(describe_validation_error(error, "[emulation]")) from error
+
+
+def _follow_output(amplifier: Mapping[str, Any], devices: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the amplifier's table with the gain and the neutral voltage of the bench's output, and rails that reach
+    as far as its limits. ``BenchError`` where both tables name a neutral voltage and they differ."""
+    table, nominal = dict(amplifier), AmplifierConfig()
+    for name, device in devices.items():
+        if "neutral_V" not in device:
+            continue
+        neutral_V = device["neutral_V"]
+        if table.setdefault("neutral_V", neutral_V) != neutral_V:
+            raise BenchError(
+                f"[emulation.amplifier] neutral_V = {table['neutral_V']}, but [device.{name}] says {neutral_V}: leave "
+                "it out, the emulated stacks rest where the output does"
+            )
+        table.setdefault("low_V", min(nominal.low_V, device.get("lo_V", nominal.low_V)))
+        table.setdefault("high_V", max(nominal.high_V, device.get("hi_V", nominal.high_V)))
+        table.setdefault("gain", device.get("gain", nominal.gain))
+    return table

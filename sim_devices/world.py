@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hal.errors import BenchError
 from sim_devices.added import Surroundings, added_device
-from sim_devices.config import DaqConfig, ImuConfig
+from sim_devices.config import DaqConfig, ImuConfig, emulation_config
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.devices.ads1115 import Ads1115
 from sim_devices.devices.bmx055 import Bmx055Accelerometer, Bmx055Gyroscope
@@ -38,8 +38,8 @@ from sim_devices.transports.i2c_line import I2cLine
 from sim_devices.wiring_faults import WiringFaults
 
 SIM_SCHEME = "sim://"
-MONITOR_RATIO = 20.0  # the divider between a stack and the input of an amplifier monitor
-AMPLIFIER_GAIN = 20.0  # the emulated amplifier's own; what the firmware believes is in its device table
+MONITOR_RATIO = 20.0
+"""Divider between a stack and the input of an amplifier monitor whose entry names no ``ratio``."""
 SPIKE_V, SPIKE_NS = 0.5, 2_000_000
 STRAP_SET, STRAP_RESET = 1, 2  # digital outputs 0 and 1 of the DAQ
 Truth = dict[str, NDArray[np.float64] | NDArray[np.int64]]
@@ -170,21 +170,22 @@ class World:
         self._adc_volts[self._adc_wiring[:3]] = self.plant.magnetometer_V
         return self._adc_volts
 
-    def _stack_monitor(self, channels: Sequence[int]) -> VoltageSource:
-        """Inputs of an ADC whose ``channels`` hang behind dividers on the terminals of the three stacks."""
+    def _stack_monitor(self, channels: Sequence[int], ratio: float) -> VoltageSource:
+        """Inputs of an ADC whose ``channels`` hang behind dividers by ``ratio`` on the terminals of the three
+        stacks."""
         volts = np.zeros(4)
 
         def at(t_ns: int) -> Volts:
             self.plant.advance_to(t_ns - self.epoch_ns)
             for channel, stack_V in zip(channels, self.plant.stack_V, strict=True):
-                volts[channel] = stack_V / MONITOR_RATIO
+                volts[channel] = stack_V / ratio
             return volts
 
         return at
 
     def _amplifier_input(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
-            self._piezo_demand(channel, volts * AMPLIFIER_GAIN, t_ns)
+            self._piezo_demand(channel, volts * self._gain, t_ns)
 
     def _piezo_demand(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
@@ -222,8 +223,9 @@ class World:
             "motion_card": self._add_motion_card,
         }
         emulation = description.get("emulation", {})
+        self._gain = emulation_config({"emulation": {}, **description}).amplifier.gain
         self._monitors = {
-            device.get("adc"): device.get("channels", (0, 1, 2))
+            device.get("adc"): (device.get("channels", (0, 1, 2)), float(device.get("ratio", MONITOR_RATIO)))
             for device in description["device"].values()
             if device["driver"] == "amplifier_monitor"
         }
@@ -305,7 +307,7 @@ class World:
 
     def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
         monitored = self._monitors.get(name)
-        source = self._magnetometer_V if monitored is None else self._stack_monitor(monitored)
+        source = self._magnetometer_V if monitored is None else self._stack_monitor(*monitored)
         # outputs step within a conversion; the field does not
         adc = Ads1115(self.stimuli.volts(name, source, 4), looks=1 if monitored is None else 8)
         self._add_i2c(name, device, adc)
@@ -315,7 +317,7 @@ class World:
         dac = Ad5696r(on_output=self._amplifier_input)
         self.stimuli.outputs(name, lambda: dac.output_V, 4)
         self._add_i2c(name, device, dac)
-        self._rest_at([volts * AMPLIFIER_GAIN for volts in dac.output_V])
+        self._rest_at([volts * self._gain for volts in dac.output_V])
 
     def _add_can(self, name: str, device: Mapping[str, Any], node: Any) -> None:
         self.buses.can[device["bus"]].attach(node)

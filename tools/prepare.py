@@ -92,10 +92,10 @@ def _lines(streams: list[IO[str]]) -> Iterator[str]:
 
 def compile_part(part: str, bench: BenchFile, method: str | None) -> None:
     """Compile the kernels of one part of ``WAVES`` into the cache on disk."""
-    from firmware_py.control.config import load_firmware_config
+    from firmware_py.control.plan import load_plan
     from firmware_py.control.stages import Stages
 
-    _, configs = load_firmware_config(bench, {}, method)
+    configs = load_plan(bench, method).stages
     stages = Stages(configs)
     if part == "sensing":
         stages.warm_up_sensing()

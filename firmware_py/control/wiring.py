@@ -84,15 +84,15 @@ class Devices:
     bus_us: Mapping[str, float] = field(default_factory=dict[str, float])
 
 
-def open_devices(bench: OpenBench) -> Devices:
-    """Make and probe every device of the bench.
+def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> Devices:
+    """Make and probe every device of the bench. ``options``: the checked keys of a plan, which are not parsed again.
 
     Raises ``BenchError`` when the description cannot be this instrument, ``OpenFailed`` with every probe that
     did not answer.
     """
     where = str(bench.file.path)
     description = bench.file.description
-    options = check_devices(description, where)
+    options = check_devices(description, where) if options is None else options
     daqs = {name: spec for name, spec in description.device.items() if isinstance(options[name], DaqOptions)}
     daq_name = _only(daqs, "DAQ (driver di4108 or nidaqmx)", where)
     piezo_name = _only(

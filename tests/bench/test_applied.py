@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH
@@ -111,5 +111,5 @@ def test_another_attitude_filter_for_the_firmware(bench: tuple[Applied, Stub]):
     applied, _ = bench
     toml = calibration_toml("attitude filter", "micron bench", {"sensing": {"attitude_method": "observer"}})
     out = asyncio.run(applied.calibration("attitude filter", toml))
-    _, stages = load_firmware_config(load_bench(out), {})
+    stages = load_plan(load_bench(out)).stages
     assert stages.sensing.attitude_method == "observer"

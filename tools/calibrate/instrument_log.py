@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.frame import COUNTS, LAYOUT, MAGNETOMETER_RAW, XYZ
 from firmware_py.sensing.calibration import calibrate, calibrate_magnetometer, calibration_params, reading_names
 from firmware_py.sensing.config import SensingConfig
@@ -49,7 +49,7 @@ def bench_sensing(path: Path) -> SensingConfig:
     scan = next(iter(bench.description.devices_with("di4108", "nidaqmx")), None)
     if scan is None:
         raise InputError(f"{path}: this bench has no DAQ, so no instrument whose sensors could be calibrated")
-    return load_firmware_config(bench, {})[1].sensing
+    return load_plan(bench).stages.sensing
 
 
 def calibrated_log(log: SensorLog, bench: Path) -> SensorLog:

@@ -34,14 +34,14 @@ def workspace(
     """
     from dataclasses import asdict
 
-    from firmware_py.control.config import load_firmware_config
+    from firmware_py.control.plan import load_plan
     from hal.bench import load_bench
     from tools.manipulator.picture import save_workspace_picture
     from tools.manipulator.workspace import analyse
 
     with clear_errors():
         check_writable(json_file)
-        config = load_firmware_config(load_bench(bench_path(bench)), {})[1].actuation
+        config = load_plan(load_bench(bench_path(bench))).stages.actuation
         found = analyse(config)
         table = Table(title="Workspace of the tip (000, Table 6.1, sec. 6.1.1)", title_justify="left")
         for heading in ("quantity", "required", "ours"):

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.specs import DacAmplifierOptions, Di4108Options, Hmc2003Options, check_devices
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import sensing_table
 from firmware_py.frame import LAYOUT
@@ -125,8 +125,9 @@ def simulate(
     emulation = emulation_config(table)
     if emulation.endoscope is not None:
         raise InputError(f"{bench.path}: an endoscope bench has no closed loop")
-    config, configs = load_firmware_config(bench, {}, method)
-    watch = round(config.self_test.watch_ms)
+    plan = load_plan(bench, method)
+    configs = plan.stages
+    watch = round(plan.firmware.self_test.watch_ms)
     wire = wires_of(bench, watch, delay_s)
     ticks = watch + round(1000.0 * seconds)
     hand = make_hand(emulation.hand, emulation.seed, hand_file, hand_scale)

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 
 from drivers.specs import check_devices
 from firmware_py.app import run_in_process
-from firmware_py.control.config import FirmwareConfig, load_firmware_config
+from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.plan import load_plan
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
@@ -75,7 +76,7 @@ def with_number(folder: Path, place: tuple[str | int, ...], number: float) -> Pa
 
 def test_the_bench_with_everything_said_is_a_bench(tmp_path: Path):
     path = with_number(tmp_path, ("device", "acc1", "channels", "x"), 0)
-    load_firmware_config(load_bench(path), {})
+    load_plan(load_bench(path))
     assert len(PLACES) > 80
 
 
@@ -88,7 +89,7 @@ def test_a_bench_is_checked_without_a_traceback(
     try:
         bench = load_bench(path)
         check_devices(bench.description, str(path))
-        load_firmware_config(bench, {})
+        load_plan(bench)
         emulation_config(bench.description.model_dump())
     except BenchError:
         return
@@ -107,13 +108,13 @@ def test_no_safety_limit_is_absurd(tmp_path: Path, name: str, number: float):
     for place in [("firmware", "safety", name, k) for k in (0, 1)] if pair else [("firmware", "safety", name)]:
         path = with_number(tmp_path, place, number)
         with pytest.raises(BenchError, match=name):
-            load_firmware_config(load_bench(path), {})
+            load_plan(load_bench(path))
 
 
 def test_the_ends_of_a_safety_limit_are_in_order(tmp_path: Path):
     path = with_number(tmp_path, ("firmware", "safety", "supply_V", 0), 5.6)
     with pytest.raises(BenchError, match=r"supply_V\] the lower limit"):
-        load_firmware_config(load_bench(path), {})
+        load_plan(load_bench(path))
 
 
 @pytest.mark.slow

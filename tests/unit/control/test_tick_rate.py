@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import Stages
 from hal.bench import load_bench
 from hal.errors import BenchError
@@ -25,7 +25,7 @@ def bench_at(tmp_path: Path, tick_hz: int, more: str = "") -> Path:
 
 @pytest.mark.parametrize("tick_hz", [500, 1000])
 def test_every_stage_is_designed_for_the_clock(tmp_path: Path, tick_hz: int) -> None:
-    _, configs = load_firmware_config(load_bench(bench_at(tmp_path, tick_hz)), {})
+    configs = load_plan(load_bench(bench_at(tmp_path, tick_hz))).stages
     stages = Stages(configs)
     assert stages.sensing.params["attitude"]["dt_s"][0] == pytest.approx(1.0 / tick_hz)
     assert stages.actuation.params["tick_hz"][0] == tick_hz
@@ -35,12 +35,12 @@ def test_every_stage_is_designed_for_the_clock(tmp_path: Path, tick_hz: int) -> 
 def test_a_stage_that_names_another_rate_is_refused(tmp_path: Path) -> None:
     path = bench_at(tmp_path, 500, "[firmware.actuation]\ntick_hz = 1000.0\n")
     with pytest.raises(BenchError, match=r"firmware\.actuation: tick_hz = 1000\.0, but \[clock\] tick_hz is 500"):
-        load_firmware_config(load_bench(path), {})
+        load_plan(load_bench(path))
 
 
 def test_taps_of_another_rate_are_refused(tmp_path: Path) -> None:
     path = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\n")
     with pytest.raises(BenchError, match=r"the taps of feedforward are for ticks of 1000 Hz, this bench has 500 Hz"):
-        load_firmware_config(load_bench(path), {})
+        load_plan(load_bench(path))
     same = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\ntick_hz = 500.0\n")
-    assert load_firmware_config(load_bench(same), {})[1].actuation.feedforward[0] == (1.2, -0.2)
+    assert load_plan(load_bench(same)).stages.actuation.feedforward[0] == (1.2, -0.2)

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
@@ -49,7 +49,7 @@ def bench_with(tmp_path: Path, calibration: str) -> Path:
 
 def test_a_calibration_of_version_1_arrives_in_the_stages(tmp_path: Path):
     path = bench_with(tmp_path, (GOLDEN / "calibration.toml").read_text())
-    _, configs = load_firmware_config(load_bench(path), {})
+    configs = load_plan(load_bench(path)).stages
     assert configs.tremor.loop_delay_s == 0.0017
     assert configs.actuation.low_V == 5.0
 
@@ -57,13 +57,13 @@ def test_a_calibration_of_version_1_arrives_in_the_stages(tmp_path: Path):
 def test_a_calibration_of_a_later_version_is_named(tmp_path: Path):
     text = (GOLDEN / "calibration.toml").read_text().replace("format = 1", "format = 3")
     with pytest.raises(BenchError, match=r"calibration\.toml: a calibration of format 3, written by a later version"):
-        load_firmware_config(load_bench(bench_with(tmp_path, text)), {})
+        load_plan(load_bench(bench_with(tmp_path, text)))
 
 
 def test_a_calibration_without_a_version_is_refused(tmp_path: Path):
     text = (GOLDEN / "calibration.toml").read_text().replace("format = 1", "")
     with pytest.raises(BenchError, match="format = 1 is missing"):
-        load_firmware_config(load_bench(bench_with(tmp_path, text)), {})
+        load_plan(load_bench(bench_with(tmp_path, text)))
 
 
 def test_noise_of_version_1_arrives_and_a_later_one_is_named(tmp_path: Path):

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from hal.errors import BenchError
 from hal.toml_file import LARGEST_BYTES, parse_toml, read_text
@@ -52,4 +52,4 @@ def test_a_calibration_that_is_none_is_refused(tmp_path: Path, name: str):
     path = tmp_path / "bench.toml"
     path.write_text(DEFAULT_BENCH.read_text().replace("calibration/sensors.toml", name))
     with pytest.raises(BenchError):
-        load_firmware_config(load_bench(path), {})
+        load_plan(load_bench(path))

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.sensors import AXES, DIRECTION, LOCATION
@@ -18,7 +18,7 @@ BENCHES = Path(__file__).parents[3] / "benches"
 @pytest.mark.parametrize("name", ["micron", "micron-can", "micron-e727"])
 def test_positions_tip_and_channels_agree(name: str) -> None:
     bench = load_bench(BENCHES / f"{name}.toml")
-    sensing = load_firmware_config(bench, {})[1].sensing
+    sensing = load_plan(bench).stages.sensing
     emulation = bench.description.emulation
     drawn = EmulationConfig.model_validate({k: v for k, v in emulation.items() if k != "provider"}).instrument
     np.testing.assert_allclose(np.array(sensing.positions_m), np.array(drawn.positions_mm) * 1e-3, atol=1e-12)

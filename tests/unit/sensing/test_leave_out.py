@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.control.config import load_firmware_config
 from firmware_py.control.parity import LIMIT, Parity, Verdict
+from firmware_py.control.plan import load_plan
 from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
 from firmware_py.sensing.kinematics import observation_matrix
 from firmware_py.sensing.leave_out import tip_noise
@@ -21,7 +21,7 @@ MOTION = np.array([0.3, -0.2, 9.7, 1.0, -2.0, 0.5])  # f m/s^2, alpha rad/s^2
 
 @pytest.fixture(scope="module")
 def config() -> SensingConfig:
-    return load_firmware_config(load_bench(BENCH), {})[1].sensing
+    return load_plan(load_bench(BENCH)).stages.sensing
 
 
 def observe(config: SensingConfig) -> np.ndarray:

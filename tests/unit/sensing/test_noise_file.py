@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.frame import AXES
 from firmware_py.sensing.attitude_params import alpha_drift_densities, error_state_params, motion_densities
 from firmware_py.sensing.config import SensingConfig
@@ -76,11 +76,11 @@ def test_from_a_recording_at_rest_to_the_firmware(tmp_path: Path) -> None:
     arguments += ["--json", str(tmp_path / "noise.json"), "--picture", str(tmp_path / "noise.png")]
     result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
-    sensing = load_firmware_config(load_bench(bench_with(tmp_path, tmp_path / "noise.json")), {})[1].sensing
+    sensing = load_plan(load_bench(bench_with(tmp_path, tmp_path / "noise.json"))).stages.sensing
     np.testing.assert_allclose(sensing.noise_ug_per_rtHz, n * np.sqrt(2.0) * 1e6 / 9.80665, rtol=0.05)
     assert sensing.magnetometer_noise_uT == pytest.approx(7e-4, rel=0.05)
     # what came from the bench and its calibration stays
-    assert sensing.bias_V == load_firmware_config(load_bench(BENCH), {})[1].sensing.bias_V
+    assert sensing.bias_V == load_plan(load_bench(BENCH)).stages.sensing.bias_V
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from firmware_py.frame import ANGULAR_ACCELERATION, LAYOUT, TICK, TIP_ACCELERATION, TREMOR_AHEAD
 from firmware_py.sensing.attitude_params import tip_lever
 from firmware_py.sensing.config import SensingConfig
@@ -106,7 +106,7 @@ def test_noise_of_the_tip_is_that_of_the_point_and_of_the_turn() -> None:
 
 
 def test_a_bench_gives_the_lever_unless_the_hand_shall_not_be_split(tmp_path: Path) -> None:
-    _, configs = load_firmware_config(load_bench(DEFAULT_BENCH), {}, None)
+    configs = load_plan(load_bench(DEFAULT_BENCH)).stages
     assert configs.tremor.lever is not None
     assert configs.tremor.lever.arm_m[2] == pytest.approx(0.097, abs=0.02)
     design = design_adaptive(configs.tremor)
@@ -118,7 +118,7 @@ def test_a_bench_gives_the_lever_unless_the_hand_shall_not_be_split(tmp_path: Pa
     text = DEFAULT_BENCH.read_text().replace("adaptive = { ", "adaptive = { lever_share = 0.0, ")
     other = tmp_path / "bench.toml"
     other.write_text(text.replace('"calibration/', f'"{DEFAULT_BENCH.parent}/calibration/'))
-    assert load_firmware_config(load_bench(other), {}, None)[1].tremor.lever is None
+    assert load_plan(load_bench(other)).stages.tremor.lever is None
 
 
 def test_a_solved_filter_is_eased_in() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from tools.cli.main import app
@@ -33,7 +33,7 @@ def test_a_part_that_is_made_perfect_loses_its_calibration(tmp_path: Path, sourc
     )
     config = EmulationConfig.model_validate(table["emulation"])
     assert config.sensors.noise_ug_per_rtHz > 0.0  # noise is another row's
-    load_firmware_config(load_bench(file), {})
+    load_plan(load_bench(file))
 
 
 def test_an_endoscope_has_no_budget_of_tremor() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from firmware_py.control.config import load_firmware_config
+from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.unit import build_unit
@@ -41,7 +41,7 @@ def test_the_firmware_is_told_the_ideal_instrument_as_it_is(tmp_path: Path, nois
     file = write_variant(BENCH, ideal_changes(noise), tmp_path, "ideal")
     table = tomllib.loads(file.read_text(encoding="utf-8"))["emulation"]
     config = EmulationConfig.model_validate(table)
-    _, stages = load_firmware_config(load_bench(file), {})
+    stages = load_plan(load_bench(file)).stages
     places = np.array(config.instrument.positions_mm) * 1e-3
     np.testing.assert_allclose(np.array(POSITIONS_M), places, atol=1e-12)
     assert stages.sensing.tip_m == tuple(1e-3 * v for v in config.instrument.tip_mm)
