@@ -16,6 +16,7 @@ from tools.mismatch.simulate import Model, make_context
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, remember, travelled
 from tools.mismatch.twins.cascade import CascadeTwin
+from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.ode import inside_of
 
 
@@ -34,7 +35,10 @@ def prepare(model: Model, view: View, theta: Array, pl: Placed) -> Placed:
         if best is None or share > best[0]:
             best = (share, settings)
     assert best is not None
-    return replace(pl, settings=best[1])
+    settings, rate = best[1], getattr(model.twin, "fastest_per_s", 0.0)
+    if pl.site == "feedback" and rate:
+        settings = {**settings, FASTEST: (rate,)}
+    return replace(pl, settings=settings)
 
 
 def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:

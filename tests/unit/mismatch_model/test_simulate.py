@@ -17,6 +17,7 @@ from tools.mismatch.simulate_sites import sites, why_not
 from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.make import make
 
 Array = NDArray[np.float64]
@@ -115,6 +116,12 @@ def test_text_round_trip(make_one: object, names: tuple[str, ...]) -> None:
     view = View.whole(rec, 20)
     for o, y in model.simulate(view, theta).items():
         np.testing.assert_allclose(again.simulate(view, other)[o], y, rtol=1e-6, atol=1e-9)
+
+
+def test_a_force_remembers_the_fastest_mode_of_the_twin_that_it_is_fitted_in() -> None:
+    """Its steps follow that rate wherever it is read again (``test_apply.py``)."""
+    assert place(oscillator(), "cubic_stiffness").settings[FASTEST] == pytest.approx((30.0,))
+    assert FASTEST not in place(piezo(), "backlash").settings
 
 
 def test_what_is_linear() -> None:

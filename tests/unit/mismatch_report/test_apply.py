@@ -19,6 +19,7 @@ from tools.mismatch.recording import RecordingError, TwinText
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
+from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.make import make
 
 FEW = [EFFECTS[n] for n in ("dead_zone", "hysteresis", "vibration")]
@@ -112,15 +113,16 @@ def test_a_corrected_twin_can_be_corrected_again(tmp_path: Path, dead: tuple[Pat
 
 
 AXIS = TwinText("mechanical_axis", {"mass": 2.0, "damping": 5.0, "stiffness": 300.0, "offset_force": 0.0})
+FAST = 100.0
 STATE_SPACE = TwinText(
     "state_space", {"A": [[0.0, 1.0], [-300.0, -5.0]], "B": [[0.0], [1.0]], "C": [[1.0, 0.0]], "D": [[0.0]]}
 )
 
 
 @pytest.mark.parametrize("kind", ["mechanical_axis", "state_space"])
-@pytest.mark.parametrize("stretch", [1.0, 1.7])
+@pytest.mark.parametrize("stretch", [0.3, 1.0, 1.7])
 def test_a_force_stays_the_same_when_the_twin_is_written_and_read(tmp_path: Path, kind: str, stretch: float):
-    """The coordinates of a state-space twin change with its poles; the friction inside it must not."""
+    """The coordinates of a state-space twin change with its poles; the spring inside it and its steps must not."""
     axis = kind == "mechanical_axis"
     rec = load(_dynamic(tmp_path, "position" if axis else "y", "force" if axis else "u", kind))
     twin = make(rec)
@@ -129,9 +131,9 @@ def test_a_force_stays_the_same_when_the_twin_is_written_and_read(tmp_path: Path
     theta[stiff] *= stretch
     output, signal = next(iter(rec.outputs)), next(iter(rec.inputs))
     names = [p.name for p in EFFECTS["cubic_stiffness"].parts({}).weights]
-    raw = dict(zip(names, (40.0 * twin.input_gain(signal, theta), 0.0), strict=True))
+    raw = dict(zip(names, (4000.0 * twin.input_gain(signal, theta), 0.0), strict=True))
     found = {"name": "cubic_stiffness", "site": "feedback", "target": output, "stage": "mechanics"}
-    found |= {"outputs": [output], "settings": {}, "raw": raw}
+    found |= {"outputs": [output], "settings": {FASTEST: [FAST]}, "raw": raw}
     from tools.mismatch.simulate_text import restore
 
     as_fitted = replace(rec, twin=replace(rec.twin, effects=({**found, "parameters": raw},)))

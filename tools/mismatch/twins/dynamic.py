@@ -282,7 +282,7 @@ class DynamicTwin(Head):
         that they seldom change while a fit moves; ``push``: acceleration per unit of force), eight to a period of
         cogging.
         """
-        sub = int(np.ceil(run.dt * self.fastest_per_s / 0.25))
+        sub = int(np.ceil(run.dt * (packed.fastest_per_s or self.fastest_per_s) / 0.25))
         springs = float(np.sum(np.abs(packed.memory))) + max(float(packed.friction[5]), 0.0)
         stiff = run.dt * np.sqrt(abs(push) * springs) / 0.5
         if stiff > sub:

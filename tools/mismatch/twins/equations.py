@@ -45,6 +45,7 @@ class Inside:
     rows: tuple[Rows, ...]
     flows: Array
     sway: Array
+    fastest_per_s: float = 0.0
 
     @cached_property
     def arrays(self) -> tuple[Array, Array, Array, NDArray[np.int64], Array, Array]:

@@ -12,16 +12,28 @@ from sim_devices.physics.effect import Array
 from sim_devices.physics.forces import COGGING, FRICTION, SPRING, bristle_after, friction_limit, smooth_force
 from tools.mismatch.twins.base import Force
 
+FASTEST = "fastest_per_s"
+"""Setting of a placed force: rate of the fastest mode of the twin that it was fitted in. Steps follow that rate, so
+that a corrected twin, whose own modes are others, is integrated like the fit that it comes from."""
+
 
 @dataclass(frozen=True)
 class Rows:
-    """Packed parameters of all feedback effects of a model."""
+    """Packed parameters of all feedback effects of a model; ``fastest_per_s``: see ``FASTEST``, 0 where it is not
+    known.
+    """
 
     friction: Array
     spring: Array
     cogging: Array
     thresholds: Array
     memory: Array
+    fastest_per_s: float = 0.0
+
+
+def fastest_of(forces: Sequence[Force]) -> float:
+    """The largest of the rates that forces were fitted with (1/s), 0 where none says."""
+    return max((f.settings[FASTEST][0] for f in forces if FASTEST in f.settings), default=0.0)
 
 
 def pack(forces: Sequence[Force]) -> Rows:
@@ -56,6 +68,7 @@ def pack(forces: Sequence[Force]) -> Rows:
         cogging,
         np.concatenate(thresholds) if thresholds else empty,
         np.concatenate(memory) if memory else empty,
+        fastest_of(forces),
     )
 
 

@@ -17,7 +17,7 @@ from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.equations import NOTHING, Equations, Inside, Linearised, Place, State, linearise, meet_start
-from tools.mismatch.twins.feedback import Rows, pack
+from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
 from tools.mismatch.twins.ode_run import SWAY
@@ -217,6 +217,7 @@ class OdeTwin(Head):
             tuple(rows),
             np.concatenate(flows) if flows else np.zeros((0, FLOW)),
             np.array(sway, np.float64).reshape(-1, SWAY),
+            fastest_of(forces),
         )
 
     def substeps(self, dt: float, inside: Inside) -> int:
@@ -226,14 +227,15 @@ class OdeTwin(Head):
         Where dry friction may stick: two at least, and up to eight for 32 to a radian, because a step in which the
         velocity crosses zero is of second order only.
         """
-        sub = int(np.ceil(dt * self.fastest_per_s / 0.25))
+        fastest_per_s = inside.fastest_per_s or self.fastest_per_s
+        sub = int(np.ceil(dt * fastest_per_s / 0.25))
         for (position, velocity, *_), rows in zip(inside.place, inside.rows, strict=True):
             springs = float(np.sum(np.abs(rows.memory))) + max(float(rows.friction[5]), 0.0)
             stiff = dt * np.sqrt(springs) / 0.5
             if stiff > sub:
                 sub = 1 << int(np.ceil(np.log2(min(stiff, MOST_SUBSTEPS))))
             if np.any(rows.friction[:3] != 0.0):
-                sub = max(sub, 2, min(8, int(np.ceil(32 * dt * self.fastest_per_s))))
+                sub = max(sub, 2, min(8, int(np.ceil(32 * dt * fastest_per_s))))
             if rows.cogging[0] > 0.0 and position != velocity:
                 sub = max(sub, int(np.ceil(6 * self.typical[velocity] * dt / rows.cogging[0])))
         return int(np.clip(sub, 1, MOST_SUBSTEPS))
