@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+from drivers.options import Adxl203Options, AnalogOptions
+from drivers.registry import Driver
 from hal.errors import BenchError
 from hal.types import ChannelInfo
 
@@ -52,3 +54,8 @@ class Adxl203:
     def channels(self) -> Sequence[ChannelInfo]:
         limit = RANGE_G * STANDARD_GRAVITY
         return [ChannelInfo(f"{self.name}.{axis}", "m/s^2", -limit, limit, 0.01) for axis in self.axes]
+
+
+DRIVER = Driver(Adxl203Options, role="part", needs="daq", inputs=lambda options: tuple(options.channels.values()))
+ANALOG = Driver(AnalogOptions, role="part", needs="daq", inputs=lambda options: (options.channel,))
+"""A plain analog quantity, such as half the sensors' supply."""

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from drivers.adc.ads1115 import EXCHANGE_NS, ORDER_NS, RATE_TOLERANCE, WAKE_UP_NS, Ads1115
+from drivers.options import AmplifierMonitorOptions
+from drivers.registry import Driver
 from hal.contracts import Clock, Float64Array
 from hal.output_guard import OutputGuard
 
@@ -207,3 +209,6 @@ def _mean(commands: Sequence[tuple[float, float, float]]) -> float:
         left -= extra
         mean_V += volts * (least + extra)
     return mean_V
+
+
+DRIVER = Driver(AmplifierMonitorOptions, role="part", needs="adc", inputs=lambda options: options.channels)

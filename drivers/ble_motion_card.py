@@ -14,6 +14,8 @@ from drivers.motion_card_protocol import (
     decode_battery,
     decode_packet,
 )
+from drivers.options import BleMotionCardOptions
+from drivers.registry import Driver
 from hal.contracts import Clock, GattClient
 from hal.errors import HalTimeout, ProtocolError
 from hal.types import Status
@@ -81,3 +83,6 @@ class BleMotionCard(QueuedCard):
         except ValueError:
             self.bad_frames += 1
         return True
+
+
+DRIVER = Driver(BleMotionCardOptions, role="inertial", needs="")

@@ -13,24 +13,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from drivers import can_frames, can_telemetry
-from drivers.adc import ads1115
-from drivers.added import added_driver
-from drivers.imu.bench import MAX_BUS_HZ as IMU_BUS_HZ
-from drivers.imu.bench import ImuOptions, transactions
-from drivers.motion_card_protocol import line_bytes
-from drivers.options import (
-    Ads1115Options,
-    CanAmplifierOptions,
-    CanTelemetryOptions,
-    DacAmplifierOptions,
-    E727Options,
-    MotionCardOptions,
-)
-from drivers.piezo import can_amplifier, dac_amplifier, e727
-from drivers.polling import Polling, poll_divider
+from drivers.polling import Polling
+from drivers.registry import Load, find_driver
 from hal.bench import BenchDescription, CanSpec, I2cSpec, SerialSpec
-from hal.wire_bits import can_bits, serial_bits
 
 MOST = 0.8
 """Largest part of its time that a bus may be asked for."""
@@ -70,7 +55,9 @@ def bus_uses(description: BenchDescription, options: Mapping[str, Any], polling:
         if bus is None or spec.bus is None:
             continue
         speed = bits_per_s(bus)
-        for what, bits, per_s, task in _repeated(description, name, options[name], polling):
+        readers = frozenset(other.driver for other in description.device.values() if other.adc == name)
+        load = Load(name, options[name], description.clock.tick_hz, polling, readers)
+        for what, bits, per_s, task in find_driver(spec.driver).repeated(load):
             if per_s <= 0.0 or bits <= 0:
                 continue
             if what == "HOST_HEARTBEAT":  # one per bus, whoever sends it
@@ -152,57 +139,6 @@ def _remedies(description: BenchDescription, name: str, here: list[BusUse]) -> I
 
 def _slowest(description: BenchDescription, bus: str) -> tuple[int, str] | None:
     """Fastest clock that all devices of an I2C bus allow, and the device that allows no more."""
-    limits = {"dac_amplifier": dac_amplifier.MAX_BUS_HZ, "ads1115": ads1115.MAX_BUS_HZ}
-    limits |= dict.fromkeys(("mpu6050", "lsm6ds3", "bmx055"), IMU_BUS_HZ)
-    there = [(limits[d.driver], n) for n, d in description.device.items() if d.bus == bus and d.driver in limits]
-    return min(there, default=None)
-
-
-def _repeated(
-    description: BenchDescription, name: str, option: Any, polling: Polling
-) -> Iterator[tuple[str, float, float, str]]:
-    """Name, bits, times per second and the task that waits, of what one device's driver repeats."""
-    tick_hz = description.clock.tick_hz
-    match option:
-        case DacAmplifierOptions(read_back=read_back):
-            command = "command with read-back" if read_back else "command"
-            yield command, dac_amplifier.WIRE_BITS[command], tick_hz, "actuate"
-            if polling.verify is not None:
-                yield "verify", dac_amplifier.WIRE_BITS["verify"], polling.verify.per_s(tick_hz), "verify"
-        case Ads1115Options():
-            readers = [spec.driver for spec in description.device.values() if spec.adc == name]
-            for driver, polls in (("hmc2003", polling.magnetometer), ("amplifier_monitor", polling.monitor)):
-                if driver in readers and polls is not None:
-                    task = "magnetometer" if driver == "hmc2003" else "monitor"
-                    yield "reading", ads1115.WIRE_BITS["reading"], polls.per_s(tick_hz), task
-        case E727Options(rate_hz=rate_hz):
-            yield "command", serial_bits(e727.COMMAND_BYTES), rate_hz, ""
-            yield "ERR?", serial_bits(e727.ERROR_BYTES), rate_hz / e727.ASK_ERROR_EVERY, ""
-        case CanAmplifierOptions():
-            frames_hz = {
-                "command": float(tick_hz),
-                "STATUS": can_amplifier.STATUS_HZ,
-                "AMPLIFIER_HEARTBEAT": can_amplifier.NODE_HEARTBEAT_HZ,
-            }
-            for frame, n in can_amplifier.FRAMES.items():
-                yield frame, can_bits(n), frames_hz[frame], ""
-            yield _heartbeat()
-        case CanTelemetryOptions():
-            sent_hz = polling.telemetry.per_s(tick_hz) if polling.telemetry is not None else 0.0
-            for frame, n in can_telemetry.FRAMES.items():
-                yield frame, can_bits(n), can_telemetry.BUTTON_HZ if frame == "STOP_BUTTON" else sent_hz, ""
-            yield _heartbeat()
-        case MotionCardOptions(rate_hz=rate_hz, fields=fields):
-            yield "line", serial_bits(line_bytes(fields)), rate_hz, ""
-        case ImuOptions():
-            for what, bits, per_s in transactions(option, name):
-                looks_hz = tick_hz / poll_divider(option.rate_hz, tick_hz) if what == "sample" else 0.0
-                yield what, bits, max(per_s, looks_hz), ""
-        case _:
-            added = added_driver(description.device[name].driver)
-            if added is not None:
-                yield "in all", added.bits_per_s(option), 1.0, ""
-
-
-def _heartbeat() -> tuple[str, float, float, str]:
-    return "HOST_HEARTBEAT", can_bits(can_frames.HEARTBEAT_BYTES), 1e9 / can_frames.HEARTBEAT_PERIOD_NS, ""
+    there = [(d.driver, name) for name, d in description.device.items() if d.bus == bus]
+    limits = [(find_driver(driver).max_bus_hz, name) for driver, name in there]
+    return min(((hz, name) for hz, name in limits if hz is not None), default=None)

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from drivers.base import next_due_ns
 from drivers.dbc import DbcDatabase
+from drivers.registry import Traffic
 from hal.contracts import CanBus, Clock
 from hal.types import CanFrame
+from hal.wire_bits import can_bits
 
 HEARTBEAT_PERIOD_NS = 20_000_000
 HEARTBEAT_BYTES = 1
@@ -52,3 +54,8 @@ class HostHeartbeat:
         self._due_ns = next_due_ns(self._due_ns, now_ns, HEARTBEAT_PERIOD_NS)
         self._bus.send(CanFrame(self._id, bytes((self.state & 0xFF,))), 0.0)
         self.sent += 1
+
+
+def host_heartbeat() -> Traffic:
+    """Return the traffic of the host's heartbeat, which is sent once per bus for all devices."""
+    return Traffic("HOST_HEARTBEAT", can_bits(HEARTBEAT_BYTES), 1e9 / HEARTBEAT_PERIOD_NS)

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
-from drivers.can_frames import HostHeartbeat
+from drivers.can_frames import HostHeartbeat, host_heartbeat
 from drivers.dbc import load_database
+from drivers.options import CanTelemetryOptions
+from drivers.registry import Driver, Load, Traffic
 from hal.contracts import CanBus, Clock
 from hal.types import CanFrame, ChannelInfo
+from hal.wire_bits import can_bits
 
 BUTTON_LIMIT_NS = 1_500_000_000  # three heartbeats of the button
 RECEIVE_LIMIT = 32
@@ -99,3 +102,14 @@ class CanTelemetry:
 
 def _within(value: float, top: float) -> float:
     return min(max(value, 0.0), top) if math.isfinite(value) else top
+
+
+def _traffic(load: Load) -> Iterator[Traffic]:
+    polls = load.polling.telemetry
+    sent_hz = polls.per_s(load.tick_hz) if polls is not None else 0.0
+    for frame, n in FRAMES.items():
+        yield Traffic(frame, can_bits(n), BUTTON_HZ if frame == "STOP_BUTTON" else sent_hz)
+    yield host_heartbeat()
+
+
+DRIVER = Driver(CanTelemetryOptions, role="node", traffic=_traffic)

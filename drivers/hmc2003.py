@@ -13,6 +13,8 @@ import numpy as np
 
 from drivers.adc.ads1115 import Ads1115
 from drivers.base import DigitalOutput
+from drivers.options import Hmc2003Options
+from drivers.registry import Driver
 from hal.contracts import Clock, Float64Array
 from hal.errors import HalTimeout
 from hal.types import ChannelInfo
@@ -111,3 +113,6 @@ class Hmc2003:
     def channels(self) -> Sequence[ChannelInfo]:
         epsilon = self._adc.lsb_V / SCALE_V_PER_T
         return [ChannelInfo(f"{self.name}.{axis}", "T", -RANGE_T, RANGE_T, epsilon) for axis in "xyz"]
+
+
+DRIVER = Driver(Hmc2003Options, role="part", needs="adc", inputs=lambda options: options.channels)

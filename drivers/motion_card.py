@@ -12,10 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from drivers.imu.base import RAD_PER_DEG, STANDARD_GRAVITY, ImuSample
-from drivers.motion_card_protocol import CardReading, Fields, LineParser, SpikeFilter, to_si
+from drivers.motion_card_protocol import CardReading, Fields, LineParser, SpikeFilter, line_bytes, to_si
+from drivers.options import MotionCardOptions
+from drivers.registry import Driver, Load, Traffic
 from hal.contracts import Clock, SerialPort
 from hal.errors import HalTimeout, WrongDevice
 from hal.types import ChannelInfo, Status, TimeSource
+from hal.wire_bits import serial_bits
 
 ACCEL_RANGE_G = 2.0
 GYRO_RANGE_DPS = 2000.0
@@ -203,3 +206,10 @@ def card_channels(name: str) -> Sequence[ChannelInfo]:
     channels.append(ChannelInfo(f"{name}.temperature", "degC", -40.0, 85.0, TEMPERATURE_STEP_C))
     channels.append(ChannelInfo(f"{name}.status", "1", 0.0, 2.0, 1.0))
     return channels
+
+
+def _traffic(load: Load) -> list[Traffic]:
+    return [Traffic("line", serial_bits(line_bytes(load.options.fields)), load.options.rate_hz)]
+
+
+DRIVER = Driver(MotionCardOptions, role="inertial", traffic=_traffic)

@@ -16,10 +16,10 @@ from drivers.options import (
     Ads1115Options,
     AmplifierMonitorOptions,
     CanTelemetryOptions,
-    DacAmplifierOptions,
     E727Options,
     Hmc2003Options,
 )
+from drivers.registry import find_driver
 from hal.bench import BenchDescription, I2cSpec
 
 LONGEST_FRAME = 1000
@@ -102,7 +102,7 @@ def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tup
         if isinstance(option, E727Options) and _polls(option.rate_hz, 1, tick_hz, 1, most=1) is None:
             problems.append(_refusal(name, option.rate_hz, 1, tick_hz, 1, "a command goes out so often", most=1))
     verify = None
-    if any(isinstance(option, DacAmplifierOptions) for option in options.values()):
+    if any(find_driver(spec.driver).verifies for spec in description.device.values()):
         verify = VERIFY if monitor is None else VERIFY_BESIDE_MONITOR
     telemetry = TELEMETRY if any(isinstance(option, CanTelemetryOptions) for option in options.values()) else None
     return Polling(magnetometer, monitor, verify, telemetry), problems

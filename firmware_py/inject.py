@@ -11,26 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any, cast
 
+from drivers.registry import BUILT_IN, find_driver
 from hal.bench import SIM_SCHEME, BenchDescription, BenchFile, Port
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import BenchError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
 
-SENSING_DRIVERS = frozenset(
-    {
-        "di4108",
-        "nidaqmx",
-        "adxl203",
-        "analog",
-        "ads1115",
-        "hmc2003",
-        "amplifier_monitor",
-        "can_telemetry",
-        "motion_card",
-    }
-    | {"mpu6050", "bmx055", "lsm6ds3"}
-)
-"""Drivers known to sense only. A device with any other driver may move something."""
 SENSING, MOTION = 1, 4
 PROBABILITIES = (
     "loss", "corruption", "write_corruption", "duplication", "reorder", "truncation", "delay", "nack",
@@ -97,10 +83,15 @@ def _number(text: str, key: str, value: str) -> float:
         raise BenchError(f"--inject {text!r}: {key} = {value!r} is not a number") from None
 
 
+def _only_senses(driver: str) -> bool:
+    """Return True for a driver of ours that moves nothing; any other driver may move something."""
+    return driver in BUILT_IN and find_driver(driver).role != "output"
+
+
 def effect_of(description: BenchDescription, injection: Injection) -> int:
     """Return how much the fault may disturb: motion where outputs may be commanded over the bus, else sensing only."""
     moves = any(
-        device.driver not in SENSING_DRIVERS
+        not _only_senses(device.driver)
         and device.bus == injection.bus
         and injection.only in (None, device.address if device.address is not None else injection.only)
         for device in description.device.values()

@@ -1,4 +1,4 @@
-"""Find the plugins of other installed packages: entry points by group, loaded when they are used.
+"""Registries of lazily loaded objects by name: ours, those of folders beside ours, and those of other packages.
 
 A package declares ``[project.entry-points."micron.GROUP"]`` with ``name = "module:object"``; nothing here is edited.
 Our own names come first: a package cannot replace what is built in.
@@ -6,9 +6,13 @@ Our own names come first: a package cannot replace what is built in.
 
 from __future__ import annotations
 
+import importlib
+import pkgutil
 from collections.abc import Mapping
+from dataclasses import dataclass
 from importlib.metadata import EntryPoint, entry_points
-from typing import TypeVar
+from pathlib import Path
+from typing import Generic, TypeVar
 
 from hal.errors import BenchError
 
@@ -39,8 +43,10 @@ def load(group: str, name: str, kind: type[_Kind]) -> _Kind | None:
     ``BenchError`` says what is wrong with the package.
     """
     entry = offered(group).get(name)
-    if entry is None:
-        return None
+    return None if entry is None else _load(group, name, entry, kind)
+
+
+def _load(group: str, name: str, entry: EntryPoint, kind: type[_Kind]) -> _Kind:
     try:
         thing = entry.load()
     except Exception as error:
@@ -48,3 +54,39 @@ def load(group: str, name: str, kind: type[_Kind]) -> _Kind | None:
     if not isinstance(thing, kind):
         raise BenchError(f"'{name}' of {group}: {entry.value} is a {type(thing).__name__}, not a {kind.__name__}")
     return thing
+
+
+@dataclass(frozen=True)
+class Registry(Generic[_Kind]):
+    """Finds objects of ``kind`` by name; each is imported when it is asked for.
+
+    ``built_in`` maps names to ``module:object``. ``folder`` is ``package:module:object``: a folder NAME in the package
+    that has this module is found as NAME. Entry points of ``group`` come last.
+    """
+
+    group: str
+    kind: type[_Kind]
+    built_in: Mapping[str, str]
+    folder: str
+
+    def targets(self) -> dict[str, str]:
+        """Return ``module:object`` of every name, ours first."""
+        ours = {**self.built_in, **self._folders()}
+        others = {name: entry.value for name, entry in sorted(offered(self.group).items()) if name not in ours}
+        return {**ours, **others}
+
+    def find(self, name: str) -> _Kind | None:
+        """Return the object ``name``, or ``None`` if there is none. ``BenchError`` says what is wrong with it."""
+        target = self.built_in.get(name) or self._folders().get(name)
+        if target is not None:
+            return _load(self.group, name, EntryPoint(name, target, self.group), self.kind)
+        return load(self.group, name, self.kind)
+
+    def _folders(self) -> dict[str, str]:
+        package, module, attribute = self.folder.split(":")
+        found: dict[str, str] = {}
+        for info in pkgutil.iter_modules(importlib.import_module(package).__path__):
+            path = getattr(info.module_finder, "path", None)
+            if info.ispkg and path is not None and (Path(path) / info.name / f"{module}.py").is_file():
+                found[info.name] = f"{package}.{info.name}.{module}:{attribute}"
+        return found

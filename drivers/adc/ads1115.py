@@ -9,8 +9,10 @@ one transfer: one request to the adapter instead of two. Nothing here waits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
+from drivers.options import Ads1115Options
+from drivers.registry import Driver, Load, Traffic
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError, WrongDevice
 from hal.types import ChannelInfo, I2cOp, I2cRead, I2cWrite
@@ -115,3 +117,18 @@ class Ads1115:
 
     def channels(self) -> Sequence[ChannelInfo]:
         return [ChannelInfo(f"ain{i}", "V", 0.0, self.full_scale_V, self.lsb_V) for i in range(4)]
+
+
+def _traffic(load: Load) -> Iterator[Traffic]:
+    readers = (
+        ("hmc2003", "magnetometer", load.polling.magnetometer),
+        ("amplifier_monitor", "monitor", load.polling.monitor),
+    )
+    for driver, task, polls in readers:
+        if driver in load.readers and polls is not None:
+            yield Traffic("reading", WIRE_BITS["reading"], polls.per_s(load.tick_hz), task)
+
+
+DRIVER = Driver(
+    Ads1115Options, role="converter", traffic=_traffic, addresses=(0x48, 0x49, 0x4A, 0x4B), max_bus_hz=MAX_BUS_HZ
+)

@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+from drivers.options import Di4108Options
+from drivers.registry import Driver, Site
 from hal.contracts import Clock, Int16Array, SerialPort
 from hal.errors import (
     BenchError,
@@ -335,3 +337,11 @@ class Di4108:
 def _clean(line: bytes) -> str:
     """The manual allows LF and stray NULs between echoes."""
     return line.replace(b"\x00", b"").replace(b"\n", b"").decode("latin-1").strip("\r")
+
+
+def _open(site: Site) -> Di4108:
+    return Di4108(site.bench.serial(site.spec.bus or ""), site.bench.clock, name=site.name)
+
+
+DRIVER = Driver(Di4108Options, _open, "daq", bits_per_s=lambda options: 0.0)
+"""It streams over USB, whose capacity is far beyond its scans."""

@@ -17,6 +17,8 @@ from drivers.imu.bmx055_addresses import check_addresses
 from drivers.imu.lsm6ds3 import Lsm6ds3
 from drivers.imu.mpu6050 import Mpu6050
 from drivers.options import Options, one_of
+from drivers.polling import poll_divider
+from drivers.registry import Driver, Load, Traffic
 from hal.bench import BenchDescription, DeviceSpec
 from hal.contracts import Clock, I2cBus
 from hal.errors import BenchError
@@ -188,3 +190,17 @@ def transactions(option: ImuOptions, name: str) -> list[tuple[str, int, float]]:
 def _bits(n: int) -> int:
     """Bits of reading ``n`` bytes from a register on."""
     return i2c_bits((I2cWrite(bytes(1)), I2cRead(n)))
+
+
+def _traffic(load: Load) -> list[Traffic]:
+    option, tick_hz = load.options, load.tick_hz
+    looks_hz = {"sample": tick_hz / poll_divider(option.rate_hz, tick_hz)}
+    return [
+        Traffic(what, bits, max(per_s, looks_hz.get(what, 0.0)))
+        for what, bits, per_s in transactions(option, load.name)
+    ]
+
+
+MPU6050, LSM6DS3, BMX055 = (
+    Driver(options, role="inertial", traffic=_traffic, max_bus_hz=MAX_BUS_HZ) for options in IMU_OPTIONS.values()
+)

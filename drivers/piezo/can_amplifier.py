@@ -7,17 +7,20 @@ for it and waits, tick by tick, until a status frame confirms.
 from __future__ import annotations
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from drivers.base import wait_s
-from drivers.can_frames import HostHeartbeat, crc8_j1850
+from drivers.can_frames import HostHeartbeat, crc8_j1850, host_heartbeat
 from drivers.dbc import load_database
+from drivers.options import CanAmplifierOptions
+from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import CanBus, Clock, Float64Array
 from hal.errors import BenchError, HalError, HalTimeout, ProtocolError, SafetyTrip
 from hal.output_guard import OutputGuard
 from hal.types import CanFrame, ChannelInfo, OutputLimit
+from hal.wire_bits import can_bits
 
 CHANNELS = 3
 FULL_V = 100.0
@@ -246,3 +249,22 @@ class CanAmplifier:
         self._bus.send(CanFrame(self._setpoint_id, data + bytes((crc8_j1850(data),))), 0.0)
         self._counter = (self._counter + 1) & 0xFF
         self.guard.sent()
+
+
+def _open(site: Site) -> CanAmplifier:
+    if site.can is None:
+        raise BenchError("the CAN amplifier is opened by an instrument alone", device=site.name)
+    bus = site.spec.bus or ""
+    view = site.can.view(bus, CanAmplifier.receives())
+    options = site.options.model_dump()
+    return CanAmplifier(view, site.bench.clock, heartbeat=site.can.heartbeat(bus), name=site.name, **options)
+
+
+def _traffic(load: Load) -> Iterator[Traffic]:
+    frames_hz = {"command": load.tick_hz, "STATUS": STATUS_HZ, "AMPLIFIER_HEARTBEAT": NODE_HEARTBEAT_HZ}
+    for frame, n in FRAMES.items():
+        yield Traffic(frame, can_bits(n), frames_hz[frame])
+    yield host_heartbeat()
+
+
+DRIVER = Driver(CanAmplifierOptions, _open, "output", traffic=_traffic)

@@ -9,17 +9,20 @@ values go out at ``rate_hz`` at most, and errors are asked for now and then with
 from __future__ import annotations
 
 from array import array
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal
 
 import numpy as np
 
 from drivers.base import next_due_ns, wait_s
+from drivers.options import E727Options
 from drivers.piezo.gcs import GcsLink
+from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, SerialPort
 from hal.errors import BenchError, HalError, WrongDevice
 from hal.output_guard import OutputGuard
 from hal.types import ChannelInfo, OutputLimit
+from hal.wire_bits import serial_bits
 
 CHANNELS = 3
 RATE_MAX_HZ = 200.0
@@ -208,3 +211,16 @@ class E727:
         if self.commands % ASK_ERROR_EVERY == 0:
             self.link.ask_error()
         return True
+
+
+def _open(site: Site) -> E727:
+    return E727(site.bench.serial(site.spec.bus or ""), site.bench.clock, name=site.name, **site.options.model_dump())
+
+
+def _traffic(load: Load) -> Iterator[Traffic]:
+    rate_hz = load.options.rate_hz
+    yield Traffic("command", serial_bits(COMMAND_BYTES), rate_hz)
+    yield Traffic("ERR?", serial_bits(ERROR_BYTES), rate_hz / ASK_ERROR_EVERY)
+
+
+DRIVER = Driver(E727Options, _open, "output", traffic=_traffic)

@@ -7,34 +7,18 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 from drivers.adc.ads1115 import Ads1115
-from drivers.added import open_added
 from drivers.amplifier_monitor import AmplifierMonitor
 from drivers.base import wait_s
 from drivers.bus_use import bus_uses
 from drivers.can_frames import HostHeartbeat
 from drivers.can_telemetry import CanTelemetry
-from drivers.daq.di4108 import Di4108
 from drivers.dbc import load_database
 from drivers.hmc2003 import Hmc2003
-from drivers.options import DaqOptions
-from drivers.piezo.can_amplifier import CanAmplifier
-from drivers.piezo.dac_amplifier import DacAmplifier
-from drivers.piezo.e727 import E727
+from drivers.options import Ads1115Options, Adxl203Options, AmplifierMonitorOptions, DaqOptions, Hmc2003Options
+from drivers.piezo.dac_output import DacOutput
 from drivers.polling import Polling, polling_of
-from drivers.specs import (
-    OPTIONS,
-    Ads1115Options,
-    Adxl203Options,
-    AmplifierMonitorOptions,
-    CanAmplifierOptions,
-    DacAmplifierOptions,
-    Di4108Options,
-    E727Options,
-    Hmc2003Options,
-    NiDaqOptions,
-    NiOutputOptions,
-    check_devices,
-)
+from drivers.registry import Role, find_driver, open_device
+from drivers.specs import check_devices
 from firmware_py.guardian.care import GuardianCare
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
@@ -93,11 +77,8 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     where = str(bench.file.path)
     description = bench.file.description
     options = check_devices(description, where) if options is None else options
-    daqs = {name: spec for name, spec in description.device.items() if isinstance(options[name], DaqOptions)}
-    daq_name = _only(daqs, "DAQ (driver di4108 or nidaqmx)", where)
-    piezo_name = _only(
-        description.devices_with("dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"), "piezo output", where
-    )
+    daq_name = _only(description, "daq", "DAQ", where)
+    piezo_name = _only(description, "output", "piezo output", where)
     identities: dict[str, str] = {}
     failures: list[HalError] = []
 
@@ -110,8 +91,8 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     daq, identify = open_daq(bench, daq_name, options[daq_name])
     probe(daq_name, identify)
     can = _CanBuses(bench)
-    amplifier, identify = _amplifier(bench, can, piezo_name, options[piezo_name])
-    probe(piezo_name, identify)
+    amplifier: AnalogOutput = open_device(bench, piezo_name, options[piezo_name], can=can)
+    probe(piezo_name, _identify(amplifier, options[piezo_name]))
     magnetometer = None
     for name, spec in description.devices_with("hmc2003").items():
         magnetometer_options: Hmc2003Options = options[name]
@@ -135,8 +116,8 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
             can.view(bus, CanTelemetry.receives()), bench.clock, heartbeat=can.heartbeat(bus), name=name
         )
     for name, spec in description.device.items():
-        if spec.bus is not None and spec.driver not in OPTIONS and name != daq_name:
-            probe(name, lambda name=name: open_added(bench, name, options[name], _no_inputs).probe())
+        if spec.bus is not None and find_driver(spec.driver).role == "sensor":
+            probe(name, lambda name=name: open_device(bench, name, options[name]).probe())
     if failures:
         raise failures[0] if len(failures) == 1 else OpenFailed(failures)
     daq_options: DaqOptions = options[daq_name]
@@ -156,7 +137,7 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     labels += tuple(
         f"{name} (DAQ input {options[name].channel})" for name in ("supply", "temperature") if name in options
     )
-    verify = amplifier.verify if isinstance(amplifier, DacAmplifier) else None
+    verify = amplifier.verify if isinstance(amplifier, DacOutput) else None
     polling, bus_us = bus_plan(description, options)
     return Devices(
         daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities,
@@ -171,10 +152,11 @@ def bus_plan(description: BenchDescription, options: Mapping[str, Any]) -> tuple
     return polling, {use.task: use.bus_us for use in uses if use.task}
 
 
-def _only(found: Mapping[str, DeviceSpec], what: str, where: str) -> str:
+def _only(description: BenchDescription, role: Role, what: str, where: str) -> str:
+    found = [name for name, spec in description.device.items() if find_driver(spec.driver).role == role]
     if len(found) != 1:
         raise BenchError(f"{where}: [device] the instrument needs exactly one {what}, this bench has {len(found)}")
-    return next(iter(found))
+    return found[0]
 
 
 def _adc(bench: OpenBench, name: str, options: Mapping[str, Any]) -> Ads1115:
@@ -185,9 +167,9 @@ def _adc(bench: OpenBench, name: str, options: Mapping[str, Any]) -> Ads1115:
 
 
 def _guard_of(amplifier: AnalogOutput, where: str, name: str) -> OutputGuard:
-    if not isinstance(amplifier, DacAmplifier):
+    if not isinstance(amplifier, DacOutput):
         raise BenchError(
-            f"{where}: [device.{name}] compares commands of a dac_amplifier; '{amplifier.name}' measures its outputs "
+            f"{where}: [device.{name}] compares commands of a DAC; '{amplifier.name}' measures its outputs "
             "itself or cannot be compared; remove the monitor"
         )
     return amplifier.guard
@@ -222,43 +204,13 @@ Identify = Callable[[], str]
 
 def open_daq(bench: OpenBench, name: str, options: DaqOptions) -> tuple[Daq, Identify]:
     """Return the DAQ ``name``, to which nothing has been sent yet, and the function that identifies it."""
-    if isinstance(options, NiDaqOptions):
-        from hal.backends.nidaqmx_ai import NidaqmxScan  # the package and its driver are optional
-
-        return NidaqmxScan(options.device, bench.clock, name=name), lambda: f"NI {options.device}"
-    if isinstance(options, Di4108Options):
-        daq = Di4108(bench.serial(_bus(bench.file.description.device[name])), bench.clock, name=name)
-        return daq, daq.probe
-    added = open_added(bench, name, options, _no_inputs)
-    return added, added.probe
+    daq = open_device(bench, name, options)
+    return daq, _identify(daq, options)
 
 
-def _no_inputs(channel: int) -> float:
-    raise BenchError(f"input {channel} belongs to no DAQ")
-
-
-def _amplifier(bench: OpenBench, can: _CanBuses, name: str, options: Any) -> tuple[AnalogOutput, Identify]:
-    spec = bench.file.description.device[name]
-    clock = bench.clock
-    common = {"neutral_V": options.neutral_V, "slew_V_per_s": options.slew_V_per_s, "name": name}
-    match options:
-        case DacAmplifierOptions(gain=gain, lo_V=lo_V, hi_V=hi_V, read_back=read_back):
-            bus, address = bench.i2c(_bus(spec)), spec.address or 0x0C
-            limits = {"gain": gain, "lo_V": lo_V, "hi_V": hi_V}
-            amplifier = DacAmplifier(bus, clock, address, read_back=read_back, **limits, **common)
-        case E727Options(lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz):
-            amplifier = E727(bench.serial(_bus(spec)), clock, lo_V=lo_V, hi_V=hi_V, rate_hz=rate_hz, **common)
-        case CanAmplifierOptions():
-            bus = can.view(_bus(spec), CanAmplifier.receives())
-            amplifier = CanAmplifier(bus, clock, heartbeat=can.heartbeat(_bus(spec)), **common)
-        case NiOutputOptions(device=device, channels=channels, gain=gain, lo_V=lo_V, hi_V=hi_V):
-            from hal.backends.nidaqmx_ao import NidaqmxOutput  # the package and its driver are optional
-
-            output = NidaqmxOutput(device, clock, channels, gain=gain, lo_V=lo_V, hi_V=hi_V, **common)
-            return output, lambda: f"NI {device} analog outputs"
-        case _:
-            raise BenchError(f"{bench.file.path}: [device.{name}] no piezo driver for these options")
-    return amplifier, amplifier.probe
+def _identify(device: Any, options: Any) -> Identify:
+    """Return ``probe`` of the device; NI cards have none, and are called by the name that the bench file gives them."""
+    return getattr(device, "probe", lambda: f"NI {options.device}")
 
 
 def _axes(options: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

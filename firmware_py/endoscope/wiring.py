@@ -8,21 +8,20 @@ from typing import Protocol
 
 from drivers.ble_motion_card import BleMotionCard
 from drivers.imu.base import Imu, ImuSample
-from drivers.imu.bench import IMU_OPTIONS, ImuOptions, open_imu
+from drivers.imu.bench import ImuOptions, open_imu
 from drivers.motion_card import MotionCard
-from drivers.specs import BleMotionCardOptions, MotionCardOptions, check_devices
+from drivers.options import BleMotionCardOptions, MotionCardOptions
+from drivers.registry import find_driver
+from drivers.specs import check_devices
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.errors import BenchError, HalError, OpenFailed
 from hal.types import Status
 
-CARDS = ("motion_card", "ble_motion_card")
-
 
 def is_endoscope(description: BenchDescription) -> bool:
     """Return True if a bench declares inertial sensors or a motion card, and neither a DAQ nor a piezo output."""
-    return bool(description.devices_with(*IMU_OPTIONS, *CARDS)) and not description.devices_with(
-        "di4108", "nidaqmx", "dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao"
-    )
+    roles = {find_driver(spec.driver).role for spec in description.device.values()}
+    return "inertial" in roles and not roles & {"daq", "output"}
 
 
 class Card(Protocol):
@@ -98,7 +97,7 @@ def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
     """
     where, description = str(bench.file.path), bench.file.description
     options = check_devices(description, where)
-    found = description.devices_with(*IMU_OPTIONS, *CARDS)
+    found = {name: spec for name, spec in description.device.items() if find_driver(spec.driver).role == "inertial"}
     if only is not None and only not in found:
         raise BenchError(
             f"{where}: [device] there is no inertial sensor '{only}'; there are {', '.join(found) or 'none'}"

@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from drivers.base import wait_s
-from drivers.piezo.dac_amplifier import DacAmplifier
+from drivers.piezo.dac_output import DacOutput
 from firmware_py.guardian.care import Keeper
 from firmware_py.guardian.gate import LeaseGate
 from firmware_py.guardian.heart import Phase
@@ -33,7 +33,7 @@ PATIENCE_NS = 22_000_000
 class GuardedAmplifier:
     """AnalogOutput around ``inner``, armed only while the guardian of ``keeper`` lives."""
 
-    def __init__(self, inner: DacAmplifier, keeper: Keeper, clock: Clock, *, lease_ms: float) -> None:
+    def __init__(self, inner: DacOutput, keeper: Keeper, clock: Clock, *, lease_ms: float) -> None:
         heart = keeper.heart
         self.name = inner.name
         self.limits: tuple[OutputLimit, ...] = inner.limits

@@ -21,7 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from drivers.piezo.dac_amplifier import DacAmplifier
+from drivers.registry import find_driver
 from firmware_py.guardian.care import start_failed
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart, Why
@@ -46,7 +46,7 @@ _ROOT = Path(__file__).resolve().parents[2]
 class GuardianProcess:
     """``Keeper`` of a guardian in a process of its own. Start it before real-time settings are made.
 
-    ``order``: uri, speed_hz, options of the DacAmplifier, notice_ms, limit_ms, retry_s; see ``main``. The guardian
+    ``order``: uri, speed_hz, driver and options of the output, notice_ms, limit_ms, retry_s; see ``main``. The guardian
     starts at once; ``await_ready`` says whether it came up. ``may_end_us``: this process is the firmware and nothing
     else, and may be killed when it stands still within a command.
     """
@@ -165,7 +165,9 @@ def main(arguments: list[str]) -> int:
     clock = MonotonicClock()
     try:
         bus = open_i2c(order["uri"], speed_hz=order["speed_hz"], exclusive=False)
-        amplifier = DacAmplifier(bus, clock, **order["options"])
+        part = find_driver(order["driver"]).leased
+        assert part is not None  # the firmware asks for a guardian of such outputs alone
+        amplifier = part(bus, clock, **order["options"])
         amplifier.readback_V()
     except HalError as error:
         sys.stdout.write(f"{error}\n")

@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-from drivers.piezo.dac_amplifier import DacAmplifier
-from drivers.specs import DacAmplifierOptions, device_options
+from drivers.piezo.dac_output import DacOutput
+from drivers.specs import device_options
 from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.wiring import Devices
 from firmware_py.guardian.amplifier import GuardedAmplifier
@@ -34,7 +34,7 @@ def guarded(
     Raises ``OpenFailed`` when it has no way to the amplifier.
     """
     amplifier = devices.amplifier
-    if not limits.guardian or not isinstance(amplifier, DacAmplifier):
+    if not limits.guardian or not isinstance(amplifier, DacOutput):
         yield None
         return
     # without scans there are no commands: the loop's own limit for those comes first
@@ -44,14 +44,15 @@ def guarded(
         "limit_ms": lease_ms + LEASE_MARGIN_MS,
         "retry_s": limits.neutral_retry_s,
     }
-    options = _options(opened, amplifier.name)
+    options, part = _options(opened, amplifier.name), type(amplifier)
     if isinstance(opened.clock, VirtualClock):
         clock, bus = opened.clock, _bus_of(opened, amplifier.name)
         keeper = VirtualGuardian(
-            lambda heart: Guardian(heart, DacAmplifier(bus, clock, **options), clock, **times), clock, opened.processes
+            lambda heart: Guardian(heart, part(bus, clock, **options), clock, **times), clock, opened.processes
         )
     else:
-        order = {**_uri(opened, amplifier.name), "options": options, **times}
+        driver = opened.file.description.device[amplifier.name].driver
+        order = {**_uri(opened, amplifier.name), "driver": driver, "options": options, **times}
         keeper = GuardianProcess(order, runtime_dir, may_end_us=may_end_us)
     try:
         if isinstance(keeper, GuardianProcess):
@@ -130,5 +131,5 @@ def _uri(opened: OpenBench, name: str) -> dict[str, Any]:
 
 def _options(opened: OpenBench, name: str) -> dict[str, Any]:
     spec = opened.file.description.device[name]
-    options: DacAmplifierOptions = device_options(opened.file.description, name, str(opened.file.path))
-    return {"address": spec.address or 0x0C, "name": name, **options.model_dump()}
+    options = device_options(opened.file.description, name, str(opened.file.path))
+    return {"address": spec.address, "name": name, **options.model_dump()}

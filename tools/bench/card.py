@@ -15,7 +15,8 @@ from pathlib import Path
 
 from drivers.imu.base import ImuSample
 from drivers.motion_card import MotionCard
-from drivers.specs import MotionCardOptions, check_devices
+from drivers.options import MotionCardOptions
+from drivers.specs import check_devices
 from hal.bench import OpenBench, load_bench, open_bench
 from hal.errors import HalError
 from hal.types import Status

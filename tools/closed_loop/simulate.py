@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from drivers.specs import DacAmplifierOptions, Di4108Options, Hmc2003Options, check_devices
+from drivers.options import DacAmplifierOptions, Di4108Options, Hmc2003Options
+from drivers.specs import check_devices
 from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import sensing_table

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from drivers.added import Sensor, added_driver, open_added
+from drivers.registry import Sensor, find_driver, open_device
 from drivers.specs import check_devices
 from firmware_py.control.wiring import open_daq
 from hal.bench import OpenBench
@@ -38,10 +38,9 @@ def read_sensors(bench: OpenBench) -> list[Value]:
     inputs = _Inputs(bench, options)
     values: list[Value] = []
     for name, spec in description.device.items():
-        driver = added_driver(spec.driver)
-        if driver is None or driver.scans:
+        if find_driver(spec.driver).role != "sensor":
             continue
-        sensor: Sensor = open_added(bench, name, options[name], inputs.of(spec.daq or ""))
+        sensor: Sensor = open_device(bench, name, options[name], inputs.of(spec.daq or ""))
         identity = sensor.probe()
         pairs = zip(sensor.channels(), sensor.read(), strict=True)
         values += [Value(name, identity, c.name, float(v), c.unit) for c, v in pairs]

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from pydantic import Field
 
-from drivers.added import AddedDriver, Site
 from drivers.options import Options
+from drivers.registry import Driver, Site
 from hal.types import ChannelInfo
 from sim_devices.added import AddedDevice, Surroundings
 
@@ -44,5 +44,5 @@ def emulated(around: Surroundings) -> dict[int, Callable[[int], float]]:
     return {around.entry["channel"]: volts}
 
 
-DRIVER = AddedDriver(Lm35Options, Lm35, needs="daq", inputs=lambda options: (options.channel,))
+DRIVER = Driver(Lm35Options, Lm35, needs="daq", inputs=lambda options: (options.channel,))
 EMULATED = AddedDevice(emulated)

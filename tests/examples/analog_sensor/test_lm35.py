@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from drivers.added import Site, added_driver
+from drivers.registry import Site, find_driver
 from drivers.specs import check_devices
 from hal.bench import DeviceSpec, load_bench
 from hal.errors import BenchError
@@ -15,7 +15,7 @@ HERE = Path(__file__).parent
 
 
 def test_ten_millivolts_are_a_degree():
-    driver = added_driver("lm35")
+    driver = find_driver("lm35")
     site = Site("t", DeviceSpec(driver="lm35"), driver.options(channel=3), None, {3: 0.250}.__getitem__)
     assert driver.open(site).read() == pytest.approx([25.0])
 

@@ -3,9 +3,9 @@
 Commands, each with a line feed: "who" is answered by "linedaq 1", "go RATE CHANNEL...", "halt", "out BITS".
 """
 
-from drivers.added import AddedDriver, Site
 from drivers.daq.scan_by_scan import ScanByScan
 from drivers.options import DaqOptions
+from drivers.registry import Driver, Site
 from hal.errors import ProtocolError, WrongDevice
 from hal.types import ScanConfig
 
@@ -40,4 +40,4 @@ class LineDaq(ScanByScan):
         self.forget_input()
 
 
-DRIVER = AddedDriver(DaqOptions, LineDaq, bits_per_s=lambda o: o.rate_hz * 10 * 7 * (1 + len(o.channels)))
+DRIVER = Driver(DaqOptions, LineDaq, "daq", bits_per_s=lambda o: o.rate_hz * 10 * 7 * (1 + len(o.channels)))

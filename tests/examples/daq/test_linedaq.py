@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import benches
-from drivers.added import Site, added_driver
+from drivers.registry import Site, find_driver
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from hal.bench import DeviceSpec
@@ -30,7 +30,7 @@ class Port:
 def test_lines_are_scans():
     port, rows = Port(), np.zeros((2, 2), np.int16)
     bench = SimpleNamespace(serial=lambda bus: port, clock=VirtualClock())
-    daq = added_driver("linedaq").open(Site("daq", DeviceSpec(driver="linedaq"), None, bench, None))
+    daq = find_driver("linedaq").open(Site("daq", DeviceSpec(driver="linedaq"), None, bench, None))
     daq.configure(ScanConfig(1000.0, (0, 3), (5.0, 5.0)))
     daq.start()
     assert daq.read_scans(rows, 0.0).n == 2

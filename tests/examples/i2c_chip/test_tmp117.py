@@ -5,7 +5,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from drivers.added import Site, added_driver
+from drivers.registry import Site, find_driver
 from hal.bench import DeviceSpec
 from hal.errors import WrongDevice
 from hal.types import I2cRead
@@ -20,7 +20,7 @@ def driver(words: dict[str, str]):
         return bytes.fromhex(words[ops[0].data.hex()])
 
     bench = SimpleNamespace(i2c=lambda bus: SimpleNamespace(transfer=transfer), clock=None)
-    return added_driver("tmp117").open(Site("t", DeviceSpec(driver="tmp117", address=0x49), None, bench, None))
+    return find_driver("tmp117").open(Site("t", DeviceSpec(driver="tmp117", address=0x49), None, bench, None))
 
 
 @pytest.mark.parametrize(("word", "degC"), [("8000", -256), ("F380", -25), ("FFFF", -1 / 128), ("0C80", 25)])

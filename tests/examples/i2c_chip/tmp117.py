@@ -1,8 +1,8 @@
 """TMP117 thermometer on I2C. Source: Texas Instruments TMP117 data sheet SNOSD82D, section 7.6 (register map)."""
 
-from drivers.added import AddedDriver, Site
 from drivers.base import wait_s
 from drivers.options import Options
+from drivers.registry import Driver, Site
 from hal.errors import HalTimeout, WrongDevice
 from hal.types import ChannelInfo, I2cRead, I2cWrite
 
@@ -39,4 +39,4 @@ class Tmp117:
 
 
 # at most 21 words a second: 5 bytes of 9 bits, START twice, STOP
-DRIVER = AddedDriver(Options, Tmp117, bits_per_s=lambda options: 21 * (9 * 5 + 3))
+DRIVER = Driver(Options, Tmp117, bits_per_s=lambda options: 21 * (9 * 5 + 3))

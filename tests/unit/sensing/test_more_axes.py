@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from drivers.specs import Adxl203Options
+from drivers.options import Adxl203Options
 from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
 from firmware_py.control.stages import StageConfigs
 from firmware_py.control.wiring import _axes  # pyright: ignore[reportPrivateUsage]

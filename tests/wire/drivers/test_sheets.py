@@ -17,8 +17,8 @@ from drivers.motion_card import MotionCard
 from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
+from drivers.registry import BUILT_IN
 from drivers.sheets import load_sheet, names
-from drivers.specs import OPTIONS
 from hal.clock import VirtualClock
 from hal.types import ScanConfig
 from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, ScriptedSerial
@@ -57,7 +57,7 @@ def drivers() -> dict[str, HasChannels]:
 
 
 def test_every_driver_of_the_bench_file_has_a_sheet():
-    assert set(names()) == set(OPTIONS) - NOT_PARTS
+    assert set(names()) == set(BUILT_IN) - NOT_PARTS
 
 
 @pytest.mark.parametrize("name", names())

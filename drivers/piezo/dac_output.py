@@ -1,0 +1,243 @@
+"""Analog outputs behind an I2C DAC with an amplifier: what all such parts have in common.
+
+A part is a subclass that says which bytes go over the bus. The DAC has no watchdog: the safe state is the firmware's
+duty, and a guardian may hold the same part through an object of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import ClassVar, Protocol
+
+import numpy as np
+
+from drivers.base import wait_s
+from drivers.options import OutputOptions
+from drivers.registry import Driver, Load, Site, Traffic
+from hal.contracts import Clock, Float64Array, I2cBus
+from hal.errors import BenchError, HalError, ProtocolError
+from hal.output_guard import OutputGuard
+from hal.types import ChannelInfo, I2cOp, OutputLimit
+
+CHANNELS = 3
+RAMP_TICK_S = 0.001
+
+
+class OutputGate(Protocol):
+    """Asked immediately before every transfer that moves outputs, told when it is over."""
+
+    def enter(self, codes: tuple[int, int, int]) -> None:
+        """May raise: then nothing is sent."""
+        ...
+
+    def leave(self) -> None: ...
+
+
+class DacOutput:
+    """AnalogOutput of three stacks, in V at the stack. ``arm`` -> ``write`` ... -> ``safe_step``.
+
+    A subclass sets the constants of its part and defines ``identify``, ``segments``, ``codes_of`` and ``verify``.
+    """
+
+    PART: ClassVar[str]
+    ADDRESSES: ClassVar[tuple[int, ...]]
+    """Addresses that the pins of the part can select; the first one is taken where a bench names none."""
+    MAX_BUS_HZ: ClassVar[int]
+    SPAN_V: ClassVar[float]
+    """Full scale of the DAC, V; the highest code is one step below."""
+    CODES: ClassVar[int]
+    TRANSFER_NS: ClassVar[int]
+    """Shortest time of a command's transfer on the fastest bus, less a bit for each segment."""
+    READ_BACK_NS: ClassVar[int]
+    """Shortest time for which a command that is read back has been in force at the end of its transfer."""
+    READ_CODES: ClassVar[tuple[I2cOp, ...]]
+    """Segments that read the three codes."""
+    WIRE_BITS: ClassVar[Mapping[str, int]]
+    """Bits of what the loop repeats: "command", "command with read-back" and "verify". Retries are left out."""
+
+    def __init__(
+        self,
+        bus: I2cBus,
+        clock: Clock,
+        address: int | None = None,
+        *,
+        gain: float = 20.0,
+        lo_V: float = 0.0,
+        hi_V: float = 100.0,
+        neutral_V: float = 50.0,
+        slew_V_per_s: float = 20_000.0,
+        read_back: bool = False,
+        name: str = "piezo",
+    ) -> None:
+        full_V = self.SPAN_V * gain
+        address = self.ADDRESSES[0] if address is None else address
+        if address not in self.ADDRESSES:
+            first, last = self.ADDRESSES[0], self.ADDRESSES[-1]
+            raise BenchError(f"address 0x{address:02X} is not one of 0x{first:02X}..0x{last:02X}", device=name)
+        if not (0.0 <= lo_V <= neutral_V <= hi_V <= full_V and neutral_V < full_V):
+            raise BenchError(
+                f"0 <= lo_V = {lo_V} <= neutral_V = {neutral_V} <= hi_V = {hi_V} <= {full_V} V does not hold",
+                device=name,
+            )
+        self.name = name
+        self.lsb_V = full_V / self.CODES
+        top_V = min(hi_V, full_V - self.lsb_V)  # the highest code is one step below full scale
+        self.limits = (OutputLimit(lo_V, top_V, slew_V_per_s, neutral_V),) * CHANNELS
+        self.guard = OutputGuard(name, self.limits, clock)
+        self.gate: OutputGate | None = None
+        self._bus = bus
+        self._clock = clock
+        self._address = address
+        self._codes_per_V = self.CODES / full_V
+        self._read_back = read_back
+        self._probed = False
+        self._position_known = False
+
+    def probe(self) -> str:
+        """Identify the part and prepare it for commands; nothing moves. Raises ``WrongDevice`` or ``I2cNack``."""
+        self.identify()
+        self._probed = True
+        return f"{self.PART} at 0x{self._address:02X}, {self.limits[0].lo_V:.0f} .. {self.limits[0].hi_V:.0f} V"
+
+    def identify(self) -> None:
+        """Exchange what shows that this is the part. Raises ``WrongDevice``."""
+        raise NotImplementedError
+
+    def segments(self, a: int, b: int, c: int) -> tuple[I2cOp, ...]:
+        """Return the transfer that moves all three outputs to these codes."""
+        raise NotImplementedError
+
+    def codes_of(self, answer: bytes) -> list[int]:
+        """Return the three codes in the answer to ``READ_CODES``."""
+        raise NotImplementedError
+
+    def verify(self) -> str:
+        """Read the part back: empty, or what is not as it was told."""
+        raise NotImplementedError
+
+    def transfer(self, ops: Sequence[I2cOp]) -> bytes:
+        """Make one transfer to the part."""
+        return self._bus.transfer(self._address, ops)
+
+    def arm(self) -> None:
+        """Self-test, ramp to neutral, verify it by readback; then ``write`` is allowed.
+
+        Takes about 20 ms of bench time. Raises ``SafetyTrip`` when the readback differs.
+        """
+        if not self._probed:
+            self.probe()
+        self._position_known = False
+        while not self.safe_step():
+            wait_s(self._clock, RAMP_TICK_S)
+        self.guard.armed = True
+
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
+    @property
+    def told_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
+    def write(self, values_V: Float64Array) -> int:
+        """``ProtocolError`` with ``read_back``: the DAC holds something else than it was told just now."""
+        mask = self.guard.admit(values_V)
+        self._send(self.READ_CODES if self._read_back else ())
+        return mask
+
+    def safe_step(self) -> bool:
+        if not self._position_known:
+            self.guard.start_from([float(v) for v in self.readback_V()])
+            self._position_known = True
+        done = self.guard.ramp()
+        self._send()
+        if done:
+            found = self.read_codes()
+            wanted = [self._code(limit.safe_V) for limit in self.limits]
+            self.guard.require(found == wanted, f"neutral codes {wanted} read back as {found}")
+        return done
+
+    def lose_position(self) -> None:
+        """Somebody else has moved the outputs: the next ramp begins where they are found."""
+        self._position_known = False
+
+    def differences(self, codes: Sequence[int]) -> str:
+        """Return what differs between ``codes`` and the last command; empty if nothing does."""
+        for i, (code, told_V) in enumerate(zip(codes, self.guard.last_V, strict=True)):
+            if code != self._code(told_V):
+                return f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {told_V:.3f} V"
+        return ""
+
+    def readback_V(self) -> Float64Array:
+        """Contents of the input registers, which equal the outputs after each update command."""
+        return np.array(self.read_codes(), dtype=np.float64) * self.lsb_V
+
+    def close(self) -> None:
+        """Ramp to neutral unless there; the bus belongs to the bench and stays open."""
+        if not self._position_known:
+            return  # nothing was ever moved
+        try:
+            while not self.guard.at_safe_state() and not self.safe_step():
+                wait_s(self._clock, RAMP_TICK_S)
+        except HalError as error:
+            raise type(error)(
+                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
+            ) from error
+
+    def channels(self) -> Sequence[ChannelInfo]:
+        limit = self.limits[0]
+        return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, self.lsb_V) for i in range(CHANNELS)]
+
+    def _code(self, value_V: float) -> int:
+        return int(value_V * self._codes_per_V + 0.5)
+
+    def _send(self, read_back: tuple[I2cOp, ...] = ()) -> None:
+        k = self._codes_per_V
+        a, b, c = self.guard.next_V
+        a, b, c = int(a * k + 0.5), int(b * k + 0.5), int(c * k + 0.5)
+        segments = (*self.segments(a, b, c), *read_back)
+        self.guard.not_before(self._clock.now_ns() + self.TRANSFER_NS)
+        if self.gate is None:
+            answer = self._bus.transfer(self._address, segments)
+        else:
+            self.gate.enter((a, b, c))
+            try:
+                answer = self._bus.transfer(self._address, segments)
+            finally:
+                self.gate.leave()
+        self.guard.sent(self.READ_BACK_NS if read_back else 0)
+        if read_back:
+            self._compare(answer, (a, b, c))
+
+    def _compare(self, answer: bytes, told: tuple[int, int, int]) -> None:
+        for i, (code, wanted) in enumerate(zip(self.codes_of(answer), told, strict=True)):
+            if code != wanted:
+                self._position_known = False  # the ramp begins where the outputs are
+                raise ProtocolError(
+                    f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {wanted * self.lsb_V:.3f} V: check "
+                    "the wires of the bus",
+                    device=self.name,
+                )
+
+    def read_codes(self) -> list[int]:
+        """Return the codes of the three outputs as the part holds them."""
+        return self.codes_of(self.transfer(self.READ_CODES))
+
+
+def output_driver(part: type[DacOutput], options: type[OutputOptions]) -> Driver:
+    """Return the record of a driver whose device is ``part`` and whose keys are the keywords of its constructor."""
+
+    def open_part(site: Site) -> DacOutput:
+        bus = site.bench.i2c(site.spec.bus or "")
+        return part(bus, site.bench.clock, site.spec.address, name=site.name, **site.options.model_dump())
+
+    def traffic(load: Load) -> Iterator[Traffic]:
+        command = "command with read-back" if getattr(load.options, "read_back", False) else "command"
+        yield Traffic(command, part.WIRE_BITS[command], load.tick_hz, "actuate")
+        if load.polling.verify is not None:
+            yield Traffic("verify", part.WIRE_BITS["verify"], load.polling.verify.per_s(load.tick_hz), "verify")
+
+    return Driver(
+        options, open_part, "output", traffic=traffic, addresses=part.ADDRESSES, max_bus_hz=part.MAX_BUS_HZ,
+        leased=part, verifies=True,
+    )  # fmt: skip
