@@ -117,10 +117,11 @@ class Driver:
     """Describes a driver; its module holds it as ``DRIVER``.
 
     ``open(site)`` returns the device by ``role``: a ``Sensor``; a "daq", an ``AnalogInputScan`` with ``name``,
-    ``probe`` and ``write_digital``; an "output", an ``AnalogOutput`` with ``probe``. Other roles are parts of the instruments'
-    own loops. ``needs`` is the key that connects the device and is required. ``inputs(options)`` returns the inputs of
-    its DAQ or ADC that it uses. ``traffic(load)`` returns what it repeats on its bus; a device whose traffic no task
-    waits for may give ``bits_per_s(options)`` instead, with 9 bits for an I2C byte and 10 for a serial one.
+    ``probe`` and ``write_digital``; an "output", an ``AnalogOutput`` with ``probe``. Other roles are parts of the
+    instruments' own loops. ``needs`` is the key that connects the device and is required. ``inputs(options)`` returns
+    the inputs of its DAQ or ADC that it uses. ``traffic(load)`` returns what it repeats on its bus; a device whose
+    traffic no task waits for may give ``bits_per_s(options)`` instead, with 9 bits for an I2C byte and 10 for a serial
+    one.
     ``addresses``: those that the pins of the part can select. ``max_bus_hz``: fastest I2C clock of the part.
     ``leased``: class of an output that a guardian can hold as well. ``verifies``: the output can be read back.
     """
