@@ -98,6 +98,8 @@ ONE_SIDED_CONDUCTION = Effect(
     guess=_guess,
     apply=_apply,
     report=_report,
+    # at either end it would stand in for saturation in anything that is no circuit, and neither would be named
+    sites=("between",),
     vanishes_with=(("exponential_width",),),
     essential=("knee",),
 )

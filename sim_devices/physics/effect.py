@@ -46,7 +46,8 @@ nonlinear  any other map of x
 feedback   a force phi(position, velocity) @ weights inside the equation of motion; ``x`` is position
 """
 
-Site = Literal["input", "output"]
+Site = Literal["input", "output", "between"]
+"""``between`` two filters of a circuit; effects at an input may sit there, too."""
 
 
 @dataclass(frozen=True)

@@ -319,7 +319,7 @@ class Model:
     ) -> tuple[dict[str, Signal], list[Force]]:
         """Return what the base physics is driven by: inputs behind their effects, and forces."""
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
-        inside = str(getattr(self.twin, "inside", ""))
+        inside = str(getattr(self.twin, "middle", ""))
         for k in sorted(self.order, key=lambda k: self.placed[k].target == inside):
             pl = self.placed[k]
             if pl.site == "input":

@@ -44,6 +44,8 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return "the twin has no equation of motion"
     if effect.kind == "feedback" and not {p.kind for p in places_of(twin)} & set(effect.acts_on):
         return "no state that it could act on"
+    if effect.sites == ("between",) and not hasattr(twin, "middle"):
+        return "no place between two filters"
     missing = [s for s in effect.needs if s not in recording.signals]
     if missing:
         return f"{', '.join(missing)} not recorded"
@@ -122,8 +124,9 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present and _commutes(twin):
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
         found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]
-    if inputs and effect.driven and effect.kind != "linear" and hasattr(twin, "inside"):
-        found.append(Placed(effect, "input", str(twin.inside), "mechanics", twin.outputs))  # type: ignore[attr-defined]
+    between = inputs or "between" in effect.sites
+    if between and effect.driven and effect.kind != "linear" and hasattr(twin, "middle"):
+        found.append(Placed(effect, "input", str(twin.middle), "mechanics", twin.outputs))  # type: ignore[attr-defined]
     return found
 
 

@@ -278,7 +278,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
         ctx = replace(ctx, through=through)
-        if isinstance(twin, CascadeTwin) and pl.target == twin.inside:
+        if isinstance(twin, CascadeTwin) and pl.target == twin.middle:
             drive = Signal(run.signals[twin.inputs[0]], {}, twin.inputs)
             return twin.between(run, drive, base).value, ctx
         return (run.signals[pl.target] if pl.site == "input" else course(model, view, theta, output)), ctx

@@ -14,7 +14,7 @@ from tests.unit.mismatch_engine.cases import recording
 from tools.mismatch.engine.diagnose import opened
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_sites import sites, why_not
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
@@ -77,6 +77,37 @@ def test_a_diode_between_the_filters_is_simulated_and_written_down() -> None:
     again = replace(rec, twin=replace(rec.twin, parameters=table["parameters"], effects=tuple(table["effects"])))
     other, values = restore(again)
     assert other.simulate(whole, values)["y"] == pytest.approx(y, abs=1e-6)
+
+
+def test_a_diode_is_offered_between_filters_and_nowhere_else() -> None:
+    u, y = circuit(400, 0.4)
+    rec, diode = in_two(u, y), EFFECTS["one_sided_conduction"]
+    assert [(p.site, p.target) for p in sites(make(rec), rec, diode)] == [("input", BETWEEN)]
+    one = recording("state_space", {"u": u}, {"y": y}, {**matrices(*SECOND, 1.0), "discrete": True})
+    assert sites(make(one), one, diode) == []
+    assert "between two filters" in why_not(make(one), one, diode)
+
+
+def test_a_corrected_twin_has_no_places_that_its_core_lacks() -> None:
+    """What only two filters have, and what helps a corrected twin with its parameters, once had one name."""
+    u, y = circuit(400, 0.4)
+    rec = recording("state_space", {"u": u}, {"y": y}, {**matrices(*SECOND, 1.0), "discrete": True})
+    place = next(p for p in sites(make(rec), rec, EFFECTS["saturation"]) if p.site == "output")
+    model = Model(make(rec), [replace(place, settings={"range": (-1.0, 1.0)})])
+    table = describe(model, model.start(rec))
+    again = replace(rec, twin=replace(rec.twin, parameters=table["parameters"], effects=tuple(table["effects"])))
+    assert {p.target for p in sites(make(again), again, EFFECTS["dead_zone"])} == {"u", "y"}
+
+
+def test_parameters_of_two_filters_are_reported_whatever_comes_behind_them() -> None:
+    """Those of the second filter come first; the first filter's and the effects' are no business of its names."""
+    rec = in_two(*circuit(400, 0.4))
+    twin = make(rec)
+    theta = twin.start(rec)
+    names = [h.name for h in twin.human(theta)]
+    assert "y0" in names
+    assert len([n for n in names if n.startswith("first_")]) == 3
+    assert [h.name for h in twin.human(np.concatenate([theta, [1.0, 2.0]]))] == names
 
 
 def test_every_parameter_of_two_filters_moves_the_output() -> None:

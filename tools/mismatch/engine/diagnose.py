@@ -193,9 +193,6 @@ def pose(
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
-    if effects is None and not isinstance(make(recording), CascadeTwin):
-        # it would stand in for saturation in anything that is no circuit, and neither would be named
-        catalogue = tuple(effect for effect in catalogue if effect.name != "one_sided_conduction")
     if is_long(recording, make(recording)):
         catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)

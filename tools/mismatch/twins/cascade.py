@@ -40,7 +40,7 @@ class CascadeTwin(Head):
     static: bool = False
     apart: bool = False
     counted: Counted = ""
-    inside: str = BETWEEN
+    middle: str = BETWEEN
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -52,6 +52,10 @@ class CascadeTwin(Head):
         n = len(self.second.parameters)
         out[list(self.free)] = theta[n : n + len(self.free)]
         return out
+
+    def second_theta(self, theta: Array) -> Array:
+        """Parameters of the second filter: those of the first and of effects come behind them."""
+        return theta[: len(self.second.parameters)]
 
     def drive(self, output: str) -> str:
         """See Twin."""
@@ -67,7 +71,7 @@ class CascadeTwin(Head):
 
     def input_gain(self, signal: str, theta: Array) -> float:
         """See Twin."""
-        return self.second.input_gain(BETWEEN, theta) if signal == BETWEEN else 1.0
+        return self.second.input_gain(BETWEEN, self.second_theta(theta)) if signal == BETWEEN else 1.0
 
     def between(self, run: Run, drive: Signal, theta: Array) -> Signal:
         """The signal between the filters for the input ``drive``; the first filter is at rest before the record."""
@@ -114,12 +118,12 @@ class CascadeTwin(Head):
             for i in self.free
             if i < len(names) - len(self.first.links)
         ]
-        return [*self.second.human(theta), *before]
+        return [*self.second.human(self.second_theta(theta)), *before]
 
     def to_text(self, theta: Array) -> dict[str, object]:
         """See Twin."""
         first = self.first.to_text(self.first_theta(theta))
-        return {**self.second.to_text(theta), "first": {k: first[k] for k in FILTER}}
+        return {**self.second.to_text(self.second_theta(theta)), "first": {k: first[k] for k in FILTER}}
 
 
 def cascade_twin(recording: Recording, build: Callable[[Recording], DynamicTwin]) -> CascadeTwin:
