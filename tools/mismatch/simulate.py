@@ -25,6 +25,7 @@ from tools.mismatch.placed import Free, Placed, free_entry, middle
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Force, Run, Signal, Twin, fold, remember
+from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.ode import inside_of, weight_scale
 
 START_PASSES = 2
@@ -319,12 +320,11 @@ class Model:
     ) -> tuple[dict[str, Signal], list[Force]]:
         """Return what the base physics is driven by: inputs behind their effects, and forces."""
         inputs = dict(given) if given is not None else {s: Signal(run.signals[s], {}, (s,)) for s in self.twin.inputs}
-        inside = str(getattr(self.twin, "middle", ""))
-        for k in sorted(self.order, key=lambda k: self.placed[k].target == inside):
+        for k in sorted(self.order, key=lambda k: self.placed[k].target == BETWEEN):
             pl = self.placed[k]
             if pl.site == "input":
-                if pl.target == inside and inside not in inputs:
-                    inputs[inside] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)  # type: ignore[attr-defined]
+                if pl.target == BETWEEN and BETWEEN not in inputs and isinstance(self.twin, CascadeTwin):
+                    inputs[BETWEEN] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)
                 inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
         return inputs, [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
 

@@ -9,6 +9,7 @@ from sim_devices.physics.effect import STAGES, Effect, Stage
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.cascade import between_of
 from tools.mismatch.twins.equations import Place
 
 SAME = "input or output"
@@ -44,7 +45,7 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return "the twin has no equation of motion"
     if effect.kind == "feedback" and not {p.kind for p in places_of(twin)} & set(effect.acts_on):
         return "no state that it could act on"
-    if effect.sites == ("between",) and not hasattr(twin, "middle"):
+    if effect.sites == ("between",) and not between_of(twin):
         return "no place between two filters"
     missing = [s for s in effect.needs if s not in recording.signals]
     if missing:
@@ -124,9 +125,8 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present and _commutes(twin):
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
         found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]
-    between = inputs or "between" in effect.sites
-    if between and effect.driven and effect.kind != "linear" and hasattr(twin, "middle"):
-        found.append(Placed(effect, "input", str(twin.middle), "mechanics", twin.outputs))  # type: ignore[attr-defined]
+    if between_of(twin) and (inputs or "between" in effect.sites) and effect.driven and effect.kind != "linear":
+        found.append(Placed(effect, "input", between_of(twin), "mechanics", twin.outputs))
     return found
 
 

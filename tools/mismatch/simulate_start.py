@@ -15,7 +15,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, remember, travelled
-from tools.mismatch.twins.cascade import CascadeTwin
+from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
 from tools.mismatch.twins.feedback import FASTEST
 from tools.mismatch.twins.ode import inside_of
 
@@ -278,7 +278,7 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)
         ctx = replace(ctx, through=through)
-        if isinstance(twin, CascadeTwin) and pl.target == twin.middle:
+        if isinstance(twin, CascadeTwin) and pl.target == BETWEEN:
             drive = Signal(run.signals[twin.inputs[0]], {}, twin.inputs)
             return twin.between(run, drive, base).value, ctx
         return (run.signals[pl.target] if pl.site == "input" else course(model, view, theta, output)), ctx

@@ -13,6 +13,7 @@ from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.base import Twin
+from tools.mismatch.twins.cascade import between_of
 from tools.mismatch.twins.core import core
 
 
@@ -75,7 +76,7 @@ def _one(where: str, entry: Mapping[str, Any], twin: Twin) -> tuple[Placed, Arra
     outputs = entry.get("outputs", [target])
     if not isinstance(outputs, Sequence) or not outputs or any(o not in twin.outputs for o in outputs):
         raise RecordingError(f"{where}: outputs {outputs!r} are not among {', '.join(twin.outputs)}")
-    if site == "input" and target not in (*twin.inputs, getattr(twin, "middle", "")):
+    if site == "input" and target not in (*twin.inputs, between_of(twin)):
         raise RecordingError(f"{where}: target '{target}' is not an input of the twin")
     try:
         settings = {k: tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}

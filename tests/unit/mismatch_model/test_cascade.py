@@ -99,6 +99,13 @@ def test_a_corrected_twin_has_no_places_that_its_core_lacks() -> None:
     assert {p.target for p in sites(make(again), again, EFFECTS["dead_zone"])} == {"u", "y"}
 
 
+def test_equations_have_no_place_between_filters() -> None:
+    u, y = circuit(400, 0.4)
+    table: dict[str, object] = {"states": {"level": "V"}, "equations": {"level": "(inflow - level) / lag"}, "lag": 0.1}
+    rec = recording("ode", {"inflow": u}, {"level": y}, table)
+    assert {p.target for p in sites(make(rec), rec, EFFECTS["saturation"])} == {"inflow", "level"}
+
+
 def test_parameters_of_two_filters_are_reported_whatever_comes_behind_them() -> None:
     """Those of the second filter come first; the first filter's and the effects' are no business of its names."""
     rec = in_two(*circuit(400, 0.4))

@@ -40,7 +40,6 @@ class CascadeTwin(Head):
     static: bool = False
     apart: bool = False
     counted: Counted = ""
-    middle: str = BETWEEN
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -124,6 +123,11 @@ class CascadeTwin(Head):
         """See Twin."""
         first = self.first.to_text(self.first_theta(theta))
         return {**self.second.to_text(self.second_theta(theta)), "first": {k: first[k] for k in FILTER}}
+
+
+def between_of(twin: object) -> str:
+    """Return the name of the signal between two filters, "" for a twin that has none."""
+    return BETWEEN if isinstance(twin, CascadeTwin) else ""
 
 
 def cascade_twin(recording: Recording, build: Callable[[Recording], DynamicTwin]) -> CascadeTwin:
