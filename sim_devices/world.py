@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.errors import BenchError
-from sim_devices.added import Surroundings, added_device
 from sim_devices.config import DaqConfig, ImuConfig, emulation_config
 from sim_devices.devices.ad5696r import Ad5696r
 from sim_devices.devices.ads1115 import Ads1115
@@ -32,6 +31,7 @@ from sim_devices.devices.motion_card import MotionCard
 from sim_devices.devices.mpu6050 import Mpu6050
 from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
 from sim_devices.plant.imu import BMX055_SPEC, LSM6DS3_SPEC, MPU6050_SPEC, Imu, ImuSpec
+from sim_devices.registry import HasOutputs, Surroundings, find_device
 from sim_devices.stimuli import Stimuli
 from sim_devices.transports.can_hub import CanHub
 from sim_devices.transports.i2c_line import I2cLine
@@ -261,17 +261,21 @@ class World:
                 raise BenchError(f"[bus.{name}] is emulated but no device is on it; remove it or add a device")
 
     def _add_added(self, name: str, device: Mapping[str, Any], kind: str) -> bool:
-        """A device of another package; False if none has it. A driver on a DAQ without one shows the plant's volts."""
-        added = added_device(device["driver"])
+        """Add a device of a folder or another package; False if there is none. A driver on a DAQ then shows the plant's
+        volts."""
+        added = find_device(device["driver"])
         if added is None:
             return False
         motion = self._motion if kind == "daq" else self.stimuli.motion(name, self._motion, Mount())
-        senses = motion, self._analog_V, self._strap_switch
+        senses = motion, self._analog_V, self._strap_switch, self._amplifier_input
         made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, *senses))
         if kind == "daq":
             self._added_V.update(made)
         else:
             {"serial": self._put_serial, "i2c": self._add_chip, "can": self._add_can}[kind](name, device, made)
+            if isinstance(made, HasOutputs):
+                self.stimuli.outputs(name, lambda: made.output_V, len(made.output_V))
+                self._rest_at([volts * self._gain for volts in made.output_V])
         return True
 
     def _put_serial(self, name: str, device: Mapping[str, Any], face: Any) -> None:

@@ -8,8 +8,8 @@ Model limits
 
 from __future__ import annotations
 
-from sim_devices.added import Surroundings
 from sim_devices.devices.acting import ActingFace
+from sim_devices.registry import Surroundings
 
 
 class LineFace(ActingFace):

@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
-from sim_devices.added import Surroundings
 from sim_devices.devices.acting import ActingFace
+from sim_devices.registry import Surroundings
 
 RESET = 0x06  # general call
 

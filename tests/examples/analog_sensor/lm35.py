@@ -10,7 +10,7 @@ from pydantic import Field
 from drivers.options import Options
 from drivers.registry import Driver, Site
 from hal.types import ChannelInfo
-from sim_devices.added import AddedDevice, Surroundings
+from sim_devices.registry import Device, Surroundings
 
 V_PER_C = 0.010
 
@@ -45,4 +45,4 @@ def emulated(around: Surroundings) -> dict[int, Callable[[int], float]]:
 
 
 DRIVER = Driver(Lm35Options, Lm35, needs="daq", inputs=lambda options: (options.channel,))
-EMULATED = AddedDevice(emulated)
+EMULATED = Device(emulated)

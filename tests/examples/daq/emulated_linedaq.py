@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from sim_devices.added import AddedDevice
 from sim_devices.devices.line_face import LineFace
+from sim_devices.registry import Device
 
 
 class EmulatedLineDaq(LineFace):
@@ -25,4 +25,4 @@ class EmulatedLineDaq(LineFace):
         self._sequence, self.due_ns = self._sequence + 1, t_ns + self._period_ns
 
 
-EMULATED = AddedDevice(EmulatedLineDaq)
+EMULATED = Device(EmulatedLineDaq)

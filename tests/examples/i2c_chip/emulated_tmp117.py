@@ -4,8 +4,8 @@ Model limits: as powered up (8 averages, a cycle a second); other configurations
 error, no EEPROM, no alert pin.
 """
 
-from sim_devices.added import AddedDevice
 from sim_devices.devices.word_map import WordFace
+from sim_devices.registry import Device
 
 RESULT, CONFIGURATION, DATA_READY = 0x00, 0x01, 0x2000
 POWER_UP = {RESULT: 0x8000, CONFIGURATION: 0x0220, 0x02: 0x6000, 0x03: 0x8000, 0x0F: 0x0117}
@@ -27,4 +27,4 @@ class EmulatedTmp117(WordFace):
         self.due_ns = t_ns + 1_000_000_000
 
 
-EMULATED = AddedDevice(EmulatedTmp117)
+EMULATED = Device(EmulatedTmp117)

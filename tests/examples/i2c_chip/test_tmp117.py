@@ -9,7 +9,7 @@ from drivers.registry import Site, find_driver
 from hal.bench import DeviceSpec
 from hal.errors import WrongDevice
 from hal.types import I2cRead
-from sim_devices.added import Surroundings, added_device
+from sim_devices.registry import Surroundings, find_device
 from tools.diagnose.opened import opened_bench
 from tools.diagnose.read import read_sensors
 
@@ -33,7 +33,7 @@ def test_the_driver_reads_table_7_1_of_the_data_sheet(word, degC):
 
 def test_the_emulator_answers_as_the_data_sheet_says():
     cold = SimpleNamespace(temperature_C=-25.0)
-    chip = added_device("tmp117").make(Surroundings("t", {}, 1, 0, lambda t_ns: cold, None))
+    chip = find_device("tmp117").make(Surroundings("t", {}, 1, 0, lambda t_ns: cold, None))
     asked = ((0, 0), (1, 0), (15, 0), (0, 125_499_999), (1, 125_500_000), (1, 125_500_000), (0, 125_500_000))
     words = [(chip.write(bytes((register,)), t_ns), chip.read(2, t_ns).hex())[1] for register, t_ns in asked]
     assert words == ["8000", "0220", "0117", "8000", "2220", "0220", "f380"]
