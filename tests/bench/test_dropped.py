@@ -5,11 +5,13 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import threading
 import tomllib
 import urllib.error
 import urllib.request
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,8 @@ from tools.bench.dropped import NEEDS_FILE, OFFERED, description, parameter_valu
 from tools.bench.dropped_files import MOST_KEPT, Dropped
 from tools.bench.guard import MAX_UPLOAD_BYTES
 from tools.errors import InputError
+from tools.mismatch.key_tables import of_kind
+from tools.mismatch.keys import Key
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.make import make
 
@@ -120,6 +124,24 @@ def put(still: Still, name: str, body: bytes, token: str | None, length: int | N
     found = answer.status, answer.read().decode()
     connection.close()
     return found
+
+
+def test_orders_are_answered_while_the_kinds_are_looked_up(still: Still, monkeypatch: pytest.MonkeyPatch):
+    """The first look imports modules, which takes seconds on a busy machine."""
+    looking, answered = threading.Event(), threading.Event()
+
+    def slow(kind: str) -> Sequence[Key]:
+        looking.set()
+        assert answered.wait(60), "the server answers nobody else meanwhile"
+        return of_kind(kind)
+
+    monkeypatch.setattr("tools.bench.dropped.of_kind", slow)
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(get, still, "/api/mismatch/kinds")
+        assert looking.wait(60)
+        post(still, "/api/safe", {}, 200)
+        answered.set()
+        assert len(json.loads(asked.result(60))["kinds"]) == len(OFFERED)
 
 
 def test_who_may_send_what(still: Still, tmp_path: Path):

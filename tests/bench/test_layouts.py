@@ -60,6 +60,10 @@ def test_a_layout_is_saved_with_the_bench_and_loaded_again(browser: Any, still: 
         tab.click("#nav button")
         tab.click("#nav button")
         assert "In use: inputs, wiring, changed since." in tab.locator("#layouts").inner_text()
+        tab.click("#nav a[data-view=setup]")
+        tab.wait_for_function("document.getElementById('view').dataset.view === 'setup'")
+        assert not tab.locator("#layouts").is_visible(), "it does not lie over the view that was gone to"
+        tab.click("#nav a[data-view=scope]")
         tab.reload()
         tab.wait_for_function(READY)
         assert names(tab) == ["volts_3"], "the last one comes back as it was left"

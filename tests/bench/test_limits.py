@@ -11,10 +11,11 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 
-from tests.bench.still import TOKEN, Still, still_server
+from tests.bench.still import TOKEN, Still, made_up_rows, still_server
 from tools.bench import guard, limits
 from tools.bench.app import MAX_VIEWERS, RESERVED_VIEWERS
 from tools.bench.guard import MAX_BODY_BYTES
+from tools.bench.wire import HEADER
 
 PATIENCE_S = 60.0
 
@@ -139,3 +140,28 @@ def test_behind_listen_recordings_need_the_token(tmp_path: Path, path: str):
             assert status(sock) == 403
         with opened(still, head(still, f"GET {path}", f"X-Micron-Token: {TOKEN}")) as sock:
             assert status(sock) in (200, 400)  # 400: there is none of that name
+
+
+def test_what_a_viewer_has_is_not_sent_again(still: Still):
+    """Also a bucket that is not full yet, as the last one of a run that has ended: only with further rows."""
+    ask = {"type": "subscribe", "id": 1, "channels": ["volts_0"], "rows": 60_000, "pixels": 900}
+    with connect(still.base.replace("http", "ws") + "/live", open_timeout=PATIENCE_S) as viewer:
+        viewer.send(json.dumps(ask))
+
+        def frames(states: int) -> list[bytes]:
+            """What comes until so many status messages have come, ten a second."""
+            found: list[bytes] = []
+            while states:
+                message = viewer.recv(PATIENCE_S)
+                if isinstance(message, bytes):
+                    found.append(message)
+                else:
+                    states -= json.loads(message)["type"] == "state"
+            return found
+
+        (whole,) = frames(5)
+        still.session.history.append(made_up_rows()[:5])
+        (further,) = frames(5)
+    (_, _, _, n, per_bucket, _, first), (_, _, _, n_more, _, _, first_more) = map(HEADER.unpack_from, (whole, further))
+    assert (n, per_bucket, first) == (188, 64, 0.0)
+    assert (n_more, first_more) == (1, 187.0)

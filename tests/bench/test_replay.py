@@ -295,6 +295,7 @@ def test_a_marked_span_is_exported_and_sent_to_mismatch(page: Any, still: Still,
     page.click("text=To Mismatch")
     page.wait_for_function("document.getElementById('view').dataset.view === 'mismatch'", timeout=120_000)
     page.wait_for_function("document.querySelector('[aria-label=Recording]').value.startsWith('run one 3')")
+    assert "cutting" not in page.locator("#replay").inner_text(), "what is done is not said to go on"
     assert len(list(still.session.recorder.folder.glob("run one 3*.mcap"))) == 1
 
 

@@ -147,7 +147,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     async def recordings(_: Request) -> Any:
         now = recorder.name if recorder.active else ""
         formats = [[ending, known.readers] for ending, known in FORMATS.items()]
-        return {"folder": str(recorder.folder), "recordings": listing(recorder.folder, now), "formats": formats}
+        found = await asyncio.to_thread(listing, recorder.folder, now)  # reads the notes of up to 500 files
+        return {"folder": str(recorder.folder), "recordings": found, "formats": formats}
 
     async def start(request: Request) -> Any:
         table = await body(request)

@@ -179,7 +179,8 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
 
     async def kinds(_: Request) -> Any:
         files = {kind: list(files_of(session, kind)) for kind in NEEDS_FILE}
-        kinds = [_kind(kind, files.get(kind)) for kind in OFFERED]
+        # the first look imports the twins' modules: meanwhile the loop has frames to send and orders to obey
+        kinds = await asyncio.to_thread(lambda: [_kind(kind, files.get(kind)) for kind in OFFERED])
         return {"kinds": kinds, "most_bytes": MAX_UPLOAD_BYTES, "suffixes": SUFFIXES}
 
     return [

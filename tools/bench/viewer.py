@@ -46,7 +46,8 @@ class Nonsense(ValueError):
 
 @dataclass
 class Subscription:
-    """``next_bucket``: the first that the viewer does not have for good; None: it has nothing yet."""
+    """``next_bucket``: the first that the viewer does not have for good; None: it has nothing yet. ``sent_rows``: rows
+    of the history when it was sent something last."""
 
     id: int
     channels: NDArray[np.intp]
@@ -54,6 +55,7 @@ class Subscription:
     per_bucket: int
     source: int = SHOWN
     next_bucket: int | None = None
+    sent_rows: int = 0
 
 
 def _number(message: dict[str, Any], key: str, low: float, high: float) -> float:
@@ -345,8 +347,9 @@ class Viewer:
         first = subscription.next_bucket
         if first is None or first < oldest:
             first = oldest
-        if first * k >= history.head:
-            return
+        rows = history.head
+        if first * k >= rows or (subscription.next_bucket is not None and rows == subscription.sent_rows):
+            return  # a bucket that is not full yet is sent again only with further rows
         generation = self._generation
         if history is self._session.history:
             buckets = self._session.live_buckets(subscription.channels, k, first)
@@ -356,6 +359,7 @@ class Viewer:
             return  # somebody has jumped meanwhile
         if buckets.t_s.size:
             subscription.next_bucket = min(newest, buckets.first + buckets.t_s.size)
+            subscription.sent_rows = rows
             await self._socket.send_bytes(encode(buckets, subscription.id))
 
     async def _send_state(self) -> None:

@@ -65,8 +65,10 @@ async function show(name) {
 }
 
 function buildNav() {
+  const layouts = layoutPanel(link, context);
+  byId("view").after(layouts.element);
   VIEWS.forEach(([key, title, path], i) => {
-    const a = h("a", { href: `#/${key}` });
+    const a = h("a", { href: `#/${key}`, onclick: () => layouts.show(false) });
     a.dataset.view = key;
     a.innerHTML = `<svg viewBox="0 0 24 24" aria-hidden="true"><path d="${path}"/></svg>`;
     a.append(title, h("kbd", {}, String((i + 1) % 10)));
@@ -74,8 +76,6 @@ function buildNav() {
   });
   context.bar = replayBar(link, context);
   byId("top").append(context.bar.element);
-  const layouts = layoutPanel(link, context);
-  byId("view").after(layouts.element);
   const button = h("button", { onclick: () => layouts.toggle() });
   button.innerHTML = '<svg viewBox="0 0 24 24" aria-hidden="true"><path d="M4 4h16v16H4zM4 10h16M10 10v10"/></svg>';
   button.append("Layouts");

@@ -39,6 +39,7 @@ export function replayBar(link, context) {
   async function act(work) {
     problem.textContent = "";
     try { await work(); } catch (error) { problem.textContent = error.message; }
+    show(); // a replay that stands still says nothing that would take the progress of the work away
   }
 
   /** Mark a span in the recording's own time; null takes the mark away. */
