@@ -95,7 +95,12 @@ def run_in_process(
             live = LiveLink(*request.live_fds)
             stack.callback(live.close)
             (opened.runtime_dir / "metadata.json").write_text(json.dumps(recording_metadata(bench, configs, opened)))
-        loop = InstrumentLoop(
+        make_loop = InstrumentLoop
+        if request.compiled:
+            from firmware_py.compiled.loop import CompiledLoop
+
+            make_loop = CompiledLoop
+        loop = make_loop(
             devices,
             stages,
             config,
@@ -238,6 +243,7 @@ def make_outcome(
             "method": loop.stages.configs.sensing.kinematics_method,
             "fallbacks": loop.stages.sensing.fallbacks,
         },
+        "loop": loop.describe(),
         "host": describe_host(opened, loop.scans.host_gaps),
         "realtime": describe_scheduling(report, opened.virtual),
         "recording": str(recording.path) if recording is not None else None,

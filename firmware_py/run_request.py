@@ -41,6 +41,8 @@ class RunRequest:
     policy: bool = True
     """Asks, in real time, for a real-time policy, locked memory and no garbage collector. False is for comparison
     only."""
+    compiled: bool = False
+    """Runs the ticks in one compiled thread (``firmware_py.compiled``). Raises ``BenchError`` where a device cannot."""
     sense_only: bool = False
     """Runs without arming the outputs. Readings that would end a run are only noticed."""
     method: str | None = None

@@ -13,10 +13,12 @@ from __future__ import annotations
 
 import errno
 import select
+from typing import Any
 
 import numba
 import numpy as np
 from numba import types
+from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from hal.compiled import kernel
@@ -91,6 +93,17 @@ def wait_fds(polls: NDArray[np.int64], until_ns: int) -> int:
         failed = _errno()
         if failed != EINTR:
             return -failed
+
+
+@intrinsic
+def release_fence(typing_context: Any) -> Any:
+    """Keep what was stored before in front of what is stored after, for the compiler and the processor."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence("release")
+        return context.get_dummy_value()
+
+    return types.none(), generate
 
 
 @kernel

@@ -105,7 +105,7 @@ class GcsLink:
         self.name = name
         self._port = port
         self._clock = clock
-        self._timeout_s = timeout_s
+        self.timeout_s = timeout_s
         self.memory = new_memory()
         self._buf = memoryview(bytearray(256))
 
@@ -113,15 +113,15 @@ class GcsLink:
 
     def query(self, text: str) -> list[str]:
         """Send a query and wait for all lines of its reply. Raises ``HalTimeout``."""
-        self._port.write(text.encode() + b"\n", self._timeout_s)
-        limit_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        self._port.write(text.encode() + b"\n", self.timeout_s)
+        limit_ns = self._clock.now_ns() + round(self.timeout_s * 1e9)
         reply = b""
         while not reply.endswith(b"\n") or reply.endswith(b" \n"):
             left_s = (limit_ns - self._clock.now_ns()) * 1e-9
             n = self._port.read_into(self._buf, left_s) if left_s > 0 else 0
             if n == 0 or len(reply) > LONGEST_REPLY:
                 raise HalTimeout(
-                    f"no answer to {text!r} within {self._timeout_s} s, got {reply!r}",
+                    f"no answer to {text!r} within {self.timeout_s} s, got {reply!r}",
                     device=self.name,
                     partial=len(reply),
                 )
@@ -144,7 +144,7 @@ class GcsLink:
 
     def command(self, text: str) -> None:
         """Send a set command and ask for its error at once. Raises ``ProtocolError`` with the error's meaning."""
-        self._port.write(text.encode() + b"\n", self._timeout_s)
+        self._port.write(text.encode() + b"\n", self.timeout_s)
         answer = self.query("ERR?")
         self._check(answer[-1], text)
 
@@ -181,8 +181,8 @@ class GcsLink:
                 self._read_complaint()
             if verdict != NOTHING:
                 return
-        if self._clock.now_ns() - self.memory.asked_ns[0] > self._timeout_s * 1e9:
-            raise HalTimeout(f"no answer to 'ERR?' within {self._timeout_s} s: link lost?", device=self.name)
+        if self._clock.now_ns() - self.memory.asked_ns[0] > self.timeout_s * 1e9:
+            raise HalTimeout(f"no answer to 'ERR?' within {self.timeout_s} s: link lost?", device=self.name)
 
     def _read_complaint(self) -> None:
         memory = self.memory
@@ -194,6 +194,11 @@ class GcsLink:
         self._check(answer.decode("latin-1"), "an earlier command")
 
     @property
+    def is_well(self) -> bool:
+        """True while the port has taken everything at once."""
+        return not self._is_stuck
+
+    @property
     def _is_stuck(self) -> bool:
         return self.memory.sizes[UNSENT] > 0
 
@@ -203,7 +208,7 @@ class GcsLink:
 
     def settle(self) -> None:
         """Wait, bounded, for an answer under way, so that queries may be used again."""
-        limit_ns = self._clock.now_ns() + round(self._timeout_s * 1e9)
+        limit_ns = self._clock.now_ns() + round(self.timeout_s * 1e9)
         while (self._is_stuck or self._awaits) and self._clock.now_ns() < limit_ns:
             self.take_error()
             self._clock.sleep_until_ns(self._clock.now_ns() + 1_000_000)

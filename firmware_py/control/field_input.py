@@ -7,23 +7,13 @@ from numpy.typing import NDArray
 
 from drivers.hmc2003 import Hmc2003
 from firmware_py.control.findings import Finding
+from firmware_py.control.fresh_field import fill_field
 from firmware_py.control.incidents import Incidents, LoopCounts
-from firmware_py.frame import MAGNETOMETER_FRESH, MAGNETOMETER_RAW
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
 USUAL_NS = 11_000_000
 """Time between readings for which ``outlier_V`` is meant, with some reserve."""
-
-
-def fill_field(frame: NDArray[np.float64], volts: NDArray[np.float64], fresh: NDArray[np.int64]) -> None:
-    """Write ``volts`` (3,) into the frame's columns if they are ``fresh`` (1,), and mark whether they were. A compiled
-    loop runs the same function."""
-    frame[MAGNETOMETER_FRESH] = float(fresh[0])
-    if fresh[0] != 0:
-        for i in range(3):
-            frame[MAGNETOMETER_RAW + i] = volts[i]
-        fresh[0] = 0
 
 
 class FieldInput:

@@ -85,6 +85,12 @@ class Finding(Enum):
         "the host stood still: {scans} scans of {device} came at once; see docs/lab-machine.md",
         "All scans are there and the filters see every one; only the outputs were left alone too long.",
     )
+    SUPERVISION_SILENT = _recoverable(
+        "the supervision was silent",
+        _HOST,
+        "Python beside the compiled loop was silent for {silent_ms:.0f} ms: the loop took the outputs to neutral",
+        "The loop ran, but nobody watched over it; what comes later can be watched again.",
+    )
     DAQ_OVERFLOW = _recoverable(
         "scans overflowed",
         _DEVICE,

@@ -80,6 +80,7 @@ class InstrumentLoop:
         self._recorder = recorder
         self._on_status = on_status
         self._ticks: Ticks | None = None
+        self._end_ns: int | None = None
         self._started_ns = 0
         self._disturbed_ns = 0
         self._warned = 0
@@ -150,6 +151,10 @@ class InstrumentLoop:
         """Return every hold of the run, as its JSON has them."""
         return self.holds.as_list(self._started_ns, self._clock.now_ns())
 
+    def describe(self) -> dict[str, Any]:
+        """Return, as JSON values, what ran the ticks."""
+        return {"kind": "python"}
+
     # -- running ------------------------------------------------------------------------------------------
 
     def run(self, seconds: float) -> None:
@@ -206,7 +211,6 @@ class InstrumentLoop:
             self._period_ns,
             silent_after_ns=round(limits.stale_ms * 1e6),
         )
-        end_ns: int | None = None
         while self.supervisor.state is not State.SAFE and not self.supervisor.must_not_wait:
             ticks = self._wait(ticker)
             awake_ns = self._clock.now_ns()
@@ -216,16 +220,16 @@ class InstrumentLoop:
             self.scans.look_at(ticks)
             if self._interrupted:
                 self.incidents.report(Finding.STOPPED, signal=self._interrupted)
-            elif end_ns is not None and newest_ns >= end_ns and self._may_finish():
+            elif self._end_ns is not None and newest_ns >= self._end_ns and self._may_finish():
                 self.incidents.report(Finding.FINISHED)
-            elif end_ns is None and self._sense_only:
-                end_ns = newest_ns + round(seconds * 1e9)
+            elif self._end_ns is None and self._sense_only:
+                self._end_ns = newest_ns + round(seconds * 1e9)
             self.scheduler.run(ticks)
             self.scans.host_gaps.look(awake_ns + self._period_ns, self._clock.now_ns())
             if self.supervisor.state is State.SELF_TEST and self._self_test_passed():
                 self._arm()
                 if self.armed_ns is not None:
-                    end_ns = self.armed_ns + round(seconds * 1e9)
+                    self._end_ns = self.armed_ns + round(seconds * 1e9)
             elif self.supervisor.is_holding:
                 self._look_after_hold()
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
@@ -364,20 +368,30 @@ class InstrumentLoop:
             else:
                 self.stages.command()
         self.stages.step()
+        self._judge_step()
+
+    def _judge_step(self, disagreement: str | None = None) -> None:
+        """Report what the step's frame reveals. ``disagreement``: what the check of pairs has said already."""
         bits = int(self._frame[STATUS])
         # check before the command goes out: a sensor that contradicts its twin must not move anything
         if self._redundancy.there:
             if unclear := self._redundancy.agree(self._frame):
                 self.incidents.doubt(Finding.AXES_CONTRADICT, what=unclear)
-        elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (apart := self._check.pairs(self._frame)):
+        elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (
+            apart := self._check.pairs(self._frame) if disagreement is None else disagreement
+        ):
             self.incidents.doubt(Finding.PAIRS_DISAGREE, what=apart)
         status = bits & (FrameStatus.JERK | FrameStatus.DRIFT)
         if status != self._warned:
-            for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):
-                if status & ~self._warned & bit:
-                    self.supervisor.warn(what)
-                    self.incidents.note({"event": what})
+            self._warn(status & ~self._warned)
             self._warned = status
+
+    def _warn(self, rising: int) -> None:
+        """Count and record the warnings whose bits in the frame's status have just risen."""
+        for bit, what in ((FrameStatus.JERK, "jerk"), (FrameStatus.DRIFT, "drift")):
+            if rising & bit:
+                self.supervisor.warn(what)
+                self.incidents.note({"event": what})
 
     def _actuate(self, info: TickInfo) -> None:
         if self.supervisor.may_move:

@@ -52,6 +52,7 @@ class ScanInput:
         self._supervisor = supervisor
         self._incidents = incidents
         self._others_stalled_ms = others_stalled_ms
+        self._handed_over: Callable[[], ScanBlock] | None = None
         self._was_silent = False
         self._newest_ns = 0  # of the scans that are counted; the start of the scan before the first
 
@@ -69,7 +70,11 @@ class ScanInput:
             self._clock.sleep_until_ns(due_ns)
             return self.take_none(due_ns)
         try:
-            block = self._daq.read_scans(self.rows, timeout_s)
+            if self._handed_over is not None:
+                take, self._handed_over = self._handed_over, None
+                block = take()
+            else:
+                block = self._daq.read_scans(self.rows, timeout_s)
         except HalError as error:
             self.host_gaps.look(due_ns, self._clock.now_ns())
             stall_ms = self.host_stalled_ms()
@@ -89,6 +94,22 @@ class ScanInput:
             self._counts.lost += block.lost
         self._counts.expected += block.n + block.lost
         return block
+
+    def hand_over(self, take: Callable[[], ScanBlock]) -> None:
+        """Let the next ``read`` return ``take()``, a block that a compiled loop has put into ``rows``, or fail with
+        it."""
+        self._handed_over = take
+
+    def note_run(self, n: int, newest_ns: int) -> None:
+        """Count ``n`` scans that a compiled loop has read and run, the newest taken at ``newest_ns``."""
+        self._newest_ns = newest_ns
+        self._counts.received += n
+        self._counts.expected += n
+
+    @property
+    def are_well(self) -> bool:
+        """True while scans come and none has failed."""
+        return not (self.failed or self._was_silent or self._handed_over is not None)
 
     def take_none(self, t_ns: int) -> ScanBlock:
         """Replace ``block`` by an empty one of the host's time ``t_ns``."""

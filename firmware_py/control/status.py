@@ -30,7 +30,7 @@ class LoopStatus:
         for_page: bool,
     ) -> None:
         self._stages = stages
-        self._frame = stages.frame
+        self.frame = stages.frame
         self._counts = counts
         self._supervisor = supervisor
         self._holds = holds
@@ -41,7 +41,7 @@ class LoopStatus:
 
     def amplitude_um(self) -> list[float]:
         """Return the tremor's amplitude along x, y, z."""
-        return [1e6 * float(v) for v in self._frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
+        return [1e6 * float(v) for v in self.frame[TREMOR_AMPLITUDE : TREMOR_AMPLITUDE + 3]]
 
     def histograms(self) -> dict[str, DurationHistogram]:
         """Return every live histogram, sample to command first."""
@@ -49,7 +49,7 @@ class LoopStatus:
 
     def numbers(self) -> dict[str, object]:
         """Return the status as JSON values, under the names of the bench page."""
-        frame = self._frame
+        frame = self.frame
         latency = self._counts.latency.distribution()
         return {
             **(self._page_numbers() if self._for_page else {}),

@@ -35,7 +35,7 @@ class Watch:
     ) -> None:
         self._devices = devices
         self._config = config
-        self._frame = frame
+        self.frame = frame
         self._check = check
         self._supervisor = supervisor
         self._incidents = incidents
@@ -43,7 +43,7 @@ class Watch:
     def supervise(self, info: TickInfo) -> None:
         """Run the supervising task: check for invalid or saturated readings, temperature, supply, guardian and stop
         button."""
-        frame, limits, incidents = self._frame, self._config.safety, self._incidents
+        frame, limits, incidents = self.frame, self._config.safety, self._incidents
         status = int(frame[STATUS])
         t_ns = info.due_ns
         if status & FrameStatus.INVALID:
@@ -141,7 +141,7 @@ class Watch:
 
     def waiting_for(self) -> list[str]:
         """Return the conditions that prevent arming, for the first time or after a hold."""
-        status = int(self._frame[STATUS])
+        status = int(self.frame[STATUS])
         telemetry = self._devices.telemetry
         return [
             name

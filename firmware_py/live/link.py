@@ -26,7 +26,7 @@ class LiveLink:
         self._control = socket.socket(fileno=control_fd)
         self._control.setblocking(False)
         self._hung_up = False
-        self.publish = self._memory.push
+        self.publish, self.view = self._memory.push, self._memory.view
 
     def orders(self) -> Iterator[dict[str, Any]]:
         """Yield the orders that have arrived: JSON objects with a text under ``order``. Anything else is dropped."""
@@ -56,6 +56,6 @@ class LiveLink:
                 yield False
 
     def close(self) -> None:
-        del self.publish
+        del self.publish, self.view
         self._memory.close()
         self._control.close()

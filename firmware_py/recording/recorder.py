@@ -21,7 +21,7 @@ from firmware_py.recording import drain
 from firmware_py.recording import format as fmt
 from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.errors import RecorderFailed, RecordingError
-from firmware_py.recording.ring import EventRing, RowRing
+from firmware_py.recording.ring import EventRing, RowRing, RowsView
 from hal.children import child_command, child_environment
 
 _PAUSE_S = 0.0005
@@ -137,6 +137,10 @@ class RecorderProcess:
             while self._rows.full() and self._process.poll() is None:
                 time.sleep(_PAUSE_S)
         return self._rows.push(row)
+
+    def view(self) -> RowsView:
+        """Return the ring's memory for a compiled loop, which drops rows when it is full, also if ``lossless``."""
+        return self._rows.view()
 
     def event(self, event: Mapping[str, Any]) -> bool:
         """Record something that happened once (give it ``t_ns``); False, and counted, when there is no room."""

@@ -9,7 +9,7 @@ maxima.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 from firmware_py.scheduler.background import Slack
 from firmware_py.scheduler.check import check_table, in_order
@@ -171,6 +171,59 @@ class Scheduler:
         """Run background steps that fit before ``until_ns`` (when the next tick is due); return how many ran."""
         return self._slack.run(until_ns, -1 if self._last_scan is None else self._last_scan)
 
+    def run_beside(self, due_ns: int, first: int, k: int, others: Collection[str], *, in_tick: bool) -> None:
+        """Run what is due in the ticks ``first`` .. ``k``, except the tasks ``others``, which a compiled loop runs and
+        ``adopt`` counts. ``in_tick``: this is the rest of tick ``k``, and tasks of earlier ones are skipped, as in
+        ``run``; else each task runs once, and none is deferred."""
+        info = TickInfo(k, due_ns, self._now_ns(), 0)
+        due: list[_LiveTask] = []
+        for task in self._tasks:
+            if task.spec.name in others or not (releases := task.releases(first, k + 1)):
+                continue
+            if in_tick and k % task.spec.divider != task.spec.phase:
+                task.skipped += releases
+            else:
+                task.skipped += releases - 1
+                due.append(task)
+        tasks = tuple(due)
+        if in_tick and self._waiting:
+            tasks = self._with_waiting(tasks)
+        self._run(tasks, info, info, beside=True, may_put_off=in_tick)
+
+    def next_beside(self, k: int, others: Collection[str]) -> int:
+        """Return the first tick after ``k`` in which ``run_beside`` has something to run."""
+        tasks = [task for task in self._tasks if task.spec.name not in others]
+        ticks = range(k + 1, k + 1 + self._hyperperiod)
+        return next((t for t in ticks if any(task.releases(t, t + 1) for task in tasks)), ticks.stop)
+
+    def adopt(self, k: int, ticks: int, caught_up: int, tasks: Mapping[str, tuple[int, int, int]]) -> None:
+        """Count what a compiled loop has run since the last call, up to tick ``k``: ticks, scans that came late, and of
+        each task its runs, overruns and slips. Durations it has counted in ``task_memory`` itself."""
+        self._last_scan = self._last_full = k
+        self._ticks += ticks
+        self._caught_up += caught_up
+        for task in self._tasks:
+            if task.spec.name in tasks:
+                runs, overruns, slips = tasks[task.spec.name]
+                task.runs += runs
+                task.overruns += overruns
+                task.slips += slips
+
+    def task_memory(self, name: str) -> tuple[DurationHistogram, DurationHistogram, int, int]:
+        """Return the histograms of duration and lateness of the task ``name``, its budget and its deadline (ns)."""
+        task = next(task for task in self._tasks if task.spec.name == name)
+        return task.duration, task.lateness, task.budget_ns, task.deadline_ns
+
+    @property
+    def tick_memory(self) -> tuple[DurationHistogram, DurationHistogram]:
+        """Return the histograms of the duration and the lateness of ticks."""
+        return self._tick_duration, self._tick_lateness
+
+    @property
+    def is_announced(self) -> bool:
+        """True if the next tick is an announced one-off (``ignore_next``)."""
+        return bool(self._ignoring)
+
     def _advance_scan(self, k: int) -> int:
         """Note that tick ``k`` is being run; return how many were never run since the last one."""
         if self._last_scan is None:
@@ -189,14 +242,22 @@ class Scheduler:
                 self._ignored[self._ignoring[-1]].skipped_ticks += lost
         return lost
 
-    def _run(self, due: tuple[_LiveTask, ...], info: TickInfo, scan_info: TickInfo) -> None:
+    def _run(
+        self,
+        due: tuple[_LiveTask, ...],
+        info: TickInfo,
+        scan_info: TickInfo,
+        *,
+        beside: bool = False,
+        may_put_off: bool = True,
+    ) -> None:
         now_ns = self._now_ns
-        ignored = self._ignored[self._ignoring.pop()] if self._ignoring else None
+        ignored = self._ignored[self._ignoring.pop()] if self._ignoring and not beside else None
         due_ns, k = info.due_ns, info.k
         done = 0
         try:
             for task in due:
-                if task.may_wait and self._put_off(task, due_ns):
+                if task.may_wait and may_put_off and self._put_off(task, due_ns):
                     done += 1
                     continue
                 task_info = scan_info if task.catch_up else info
@@ -237,7 +298,7 @@ class Scheduler:
                 ignored.ticks += 1
                 ignored.worst_tick_ns = max(ignored.worst_tick_ns, tick_ns)
                 ignored.worst_lateness_ns = max(ignored.worst_lateness_ns, lateness_ns)
-            else:
+            elif not beside:
                 self._tick_duration.add(tick_ns, k)
                 self._tick_lateness.add(lateness_ns, k)
 

@@ -12,7 +12,7 @@ from typing import NamedTuple, Protocol
 from hal.contracts import Clock
 from hal.types import ScanBlock, TimeSource
 
-_ROUNDING_NS = 1000  # a timeout in float seconds may come back a little early
+ROUNDING_NS = 1000  # a timeout in float seconds may come back a little early
 
 
 class Ticks(NamedTuple):
@@ -52,6 +52,12 @@ class HostTicker:
         return Ticks(newest, 1, self._t0_ns + newest * self._period_ns, self._period_ns, TimeSource.HOST)
 
 
+def silent_at_ns(last_due_ns: int, patience_ns: int, now_ns: int) -> int:
+    """Return when a device counts as silent whose last scan was due at ``last_due_ns``. A host that was away for longer
+    than ``patience_ns`` itself has not waited for the device yet. A compiled loop runs the same function."""
+    return (last_due_ns if last_due_ns + patience_ns > now_ns else now_ns) + patience_ns
+
+
 class ScanTicker:
     """Ticks are the scans of a device: tick number = its sequence number, counted from the first scan.
 
@@ -70,6 +76,8 @@ class ScanTicker:
         self._last_due_ns: int | None = None
         self._seq_of_tick0: int | None = None
         self._silent = False
+        self.silent_at_ns: int | None = None
+        """Replaces the limit of the next ``wait``: a compiled loop has waited for the device already."""
         self.host_ticks = 0
         self.rebased = 0
 
@@ -78,16 +86,27 @@ class ScanTicker:
         if self._last_due_ns is None:
             self._last_due_ns = self._clock.now_ns()
         patience_ns = self._period_ns if self._silent else self._silent_after_ns
-        # a host that was away for so long itself has not waited for the device yet
-        now_ns = self._clock.now_ns()
-        silent_at_ns = (self._last_due_ns if self._last_due_ns + patience_ns > now_ns else now_ns) + patience_ns
+        given_ns, self.silent_at_ns = self.silent_at_ns, None
+        limit_ns = given_ns or silent_at_ns(self._last_due_ns, patience_ns, self._clock.now_ns())
         while True:
-            left_ns = silent_at_ns - self._clock.now_ns()
+            left_ns = limit_ns - self._clock.now_ns()
             block = self._read(max(0, left_ns) * 1e-9)
             if block.n:
                 return self._scans(block)
-            if self._clock.now_ns() + _ROUNDING_NS >= silent_at_ns:
+            if self._clock.now_ns() + ROUNDING_NS >= limit_ns:
                 return self._host_tick(self._last_due_ns)
+
+    @property
+    def place(self) -> tuple[int, int, int] | None:
+        """Return the sequence number of tick 0, the last tick and its due time (ns), for a compiled loop to go on from;
+        None while no scans come."""
+        if self._seq_of_tick0 is None or self._last_due_ns is None or self._silent:
+            return None
+        return self._seq_of_tick0, self._last_k, self._last_due_ns
+
+    def go_on_from(self, last_k: int, last_due_ns: int) -> None:
+        """Note that a compiled loop has run the ticks up to ``last_k``."""
+        self._last_k, self._last_due_ns = last_k, last_due_ns
 
     def tick_without_scan(self) -> Ticks:
         """Return a host tick now, because reading failed and supervision goes on without waiting."""
@@ -108,7 +127,7 @@ class ScanTicker:
         return Ticks(k0, block.n, block.t0_ns, block.dt_ns, block.source)
 
     def _host_tick(self, last_due_ns: int) -> Ticks:
-        periods = max(1, (self._clock.now_ns() + _ROUNDING_NS - last_due_ns) // self._period_ns)
+        periods = max(1, (self._clock.now_ns() + ROUNDING_NS - last_due_ns) // self._period_ns)
         self._last_k += periods
         self._last_due_ns = last_due_ns + periods * self._period_ns
         self._silent = True

@@ -43,6 +43,10 @@ class PyserialPort:
         self._fd: int = self._port.fileno()
         self._wait = [self._fd]
 
+    def fileno(self) -> int:
+        """Return the non-blocking descriptor, for a compiled loop; -1 when the port is closed."""
+        return self._fd
+
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         try:
             if not select.select(self._wait, (), (), timeout_s)[0]:

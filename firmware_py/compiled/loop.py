@@ -1,0 +1,415 @@
+"""The instrument's loop with its ticks in the compiled thread, as long as the outputs may move and nothing is odd.
+
+``CompiledLoop`` is an ``InstrumentLoop``. Self-test, arming, holds and ramps run as there. In between it enters the
+thread and comes back when the thread hands over; meanwhile a Python thread beside it runs the slow devices, the
+supervision and the page. One of the two Python threads at a time touches the loop's objects (``_lock``). In virtual
+time there is no thread beside: its pass follows each entry, so that both loops run the same tasks in the same ticks.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import platform
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+
+from drivers.daq.di4108 import Di4108
+from drivers.piezo.e727 import E727
+from firmware_py.compiled import memory as at
+from firmware_py.compiled.memory import Memory, Sinks, Timing
+from firmware_py.control.findings import Finding
+from firmware_py.control.loop import LATE_PART, InstrumentLoop
+from firmware_py.control.safety import State
+from firmware_py.control.wiring import Devices
+from firmware_py.recording.recorder import RecorderProcess
+from firmware_py.recording.ring import RowsView
+from firmware_py.scheduler.task import TickInfo
+from firmware_py.scheduler.ticker import ScanTicker, Ticks
+from hal.clock import VirtualClock
+from hal.contracts import Clock, Float64Array
+from hal.errors import BenchError
+from hal.types import ScanBlock, TimeSource
+
+BEAT_LIMIT_MS = 100.0
+"""The thread takes the outputs to neutral when Python has been silent for so long."""
+AFTER_TICK_NS = 300_000
+"""The pass of the Python thread comes so long after its tick was due: the compiled thread is done with it then."""
+LONGEST_PAUSE_NS = 10_000_000
+SWITCH_S = 0.0005
+"""How long a Python thread may keep another one from running, instead of Python's 5 ms: a hand-over is not to wait."""
+
+
+@runtime_checkable
+class Descriptor(Protocol):
+    """A port with a non-blocking file descriptor."""
+
+    def fileno(self) -> int: ...
+
+
+@runtime_checkable
+class Fed(Descriptor, Protocol):
+    """A port of virtual time. ``feed`` lets time pass until bytes are there, at most ``timeout_s``, and puts them where
+    the descriptor reads them; ``flush`` takes to the device what was written to the descriptor."""
+
+    def feed(self, timeout_s: float) -> None: ...
+    def flush(self) -> None: ...
+
+
+def reasons_against(devices: Devices, clock: Clock, n_axes: int) -> list[str]:
+    """Return why the devices of a bench cannot run compiled, each with the device's name; an empty list if they can."""
+    needed = Fed if isinstance(clock, VirtualClock) else Descriptor
+    reasons: list[str] = []
+    if platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux":
+        reasons.append(f"this machine is {sys.platform} on {platform.machine()}; the thread needs Linux on x86-64")
+    for device, kind, words in ((devices.daq, Di4108, "DI-4108"), (devices.amplifier, E727, "E-727")):
+        name = device.name
+        if not isinstance(device, kind):
+            reasons.append(f"{name}: {type(device).__name__} has no kernels for it, only the {words} has")
+        elif not isinstance(device.port, needed):
+            if isinstance(clock, VirtualClock):
+                reasons.append(f"{name}: emulated time has no descriptors; add --realtime")
+            else:
+                reasons.append(f"{name}: its port ({type(device.port).__name__}) has no file descriptor")
+    if n_axes > 6:
+        reasons.append(f"{n_axes} accelerometer axes: what tells which of more than six is wrong is Python")
+    return reasons
+
+
+class CompiledLoop(InstrumentLoop):
+    """``InstrumentLoop``, with its arguments, over devices for which ``reasons_against`` is empty.
+
+    Raises ``BenchError`` for others. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks
+    that it ran."""
+
+    def __init__(self, devices: Devices, *arguments: Any, **options: Any) -> None:
+        super().__init__(devices, *arguments, **options)
+        reasons = reasons_against(devices, self._clock, len(devices.sensing_table["channels"]))
+        if reasons:
+            raise BenchError("; ".join(reasons))
+        assert isinstance(devices.daq, Di4108)
+        assert isinstance(devices.amplifier, E727)
+        from firmware_py.compiled import thread  # numba
+
+        self._thread = thread
+        self._daq, self._output = devices.daq, devices.amplifier
+        self._is_virtual = isinstance(self._clock, VirtualClock)
+        self.entries = self.ticks_compiled = 0
+        self._done: tuple[int, int, int] | None = None
+        self._lock = threading.Lock()
+        self._is_inside = threading.Event()
+        self._is_over = False
+        self._beside_error: BaseException | None = None
+        self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._words = np.zeros(at.N_WORDS, np.int64)
+        self._told = self._words.copy()
+        self._tasks_told = np.zeros((3, len(at.STAGES)), np.int64)
+        self._memory: Memory | None = self._gather()
+        thread.serve(self._memory)  # compiles or loads; CALLED_BACK: returns at once
+
+    def _gather(self) -> Memory:
+        words, period_ns, safety = self._words, self._period_ns, self._config.safety
+        words[at.FIXED_NS] = at.REAL_TIME
+        words[at.BEAT_LIMIT_NS] = round(BEAT_LIMIT_MS * 1e6)
+        words[at.PERIOD_NS], words[at.DT_NS] = period_ns, self._daq.dt_ns
+        words[at.STALE_NS], words[at.STALLED_NS] = round(safety.stale_ms * 1e6), math.floor(safety.stalled_ms * 1e6)
+        words[at.LATE_LIMIT_NS] = math.floor(LATE_PART * period_ns)
+        words[at.WAKE_FD] = self._wake_read
+        from drivers.piezo.e727_loop import memory_of
+
+        stream, buffer = self._daq.memory
+        field = self._field
+        volts, fresh = (field.volts, field.fresh) if field is not None else (np.zeros(3), np.zeros(1, np.int64))
+        check = self._check.memory
+        saved = np.zeros(4 * len(check.last) + len(check.together) + 1, np.int64)
+        return Memory(
+            words, self.stages.memory, stream, buffer, self.scans.rows, check, saved, volts, fresh,
+            memory_of(self._output), self._timing(), self._sinks(), np.zeros((at.NOTE_ROOM, 2), np.int64),
+        )  # fmt: skip
+
+    def _timing(self) -> Timing:
+        def words(histogram: Any) -> at.Words:
+            return np.frombuffer(histogram.words, np.int64)
+
+        parts = [self.scheduler.task_memory(name) for name in at.STAGES]
+        tasks = np.zeros((5, len(at.STAGES)), np.int64)
+        tasks[at.BUDGET_NS], tasks[at.DEADLINE_NS] = [p[2] for p in parts], [p[3] for p in parts]
+        duration, lateness = self.scheduler.tick_memory
+        return Timing(
+            tasks, tuple(words(p[0]) for p in parts), tuple(words(p[1]) for p in parts), words(duration),
+            words(lateness), words(self.counts.latency),
+        )  # fmt: skip
+
+    def _sinks(self) -> Sinks:
+        width = len(self._frame)
+        live_words, live_rows = np.zeros(0, np.int64), np.zeros((0, width))
+        if self._live is not None:
+            live_words, live_rows = self._live.view()
+        slots = np.zeros((2, 1 + width))
+        ring = RowsView(np.zeros(0, np.int64), slots.view(np.int64)[:, 0], slots[:, 1:])
+        if self._recorder is not None:
+            assert isinstance(self._recorder, RecorderProcess)
+            ring = self._recorder.view()
+        return Sinks(live_words, live_rows, ring, np.zeros(width))
+
+    def describe(self) -> dict[str, Any]:
+        """Return, as JSON values, what ran the ticks."""
+        return {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled}
+
+    # -- running -----------------------------------------------------------------------------------------
+
+    def run(self, seconds: float) -> None:
+        """See ``InstrumentLoop.run``."""
+        with contextlib.ExitStack() as stack:
+            stack.callback(self._close)
+            if not self._is_virtual:
+                stack.enter_context(self._python_beside())
+            super().run(seconds)
+
+    def _close(self) -> None:
+        self._memory = None  # lets go of the rings, which their owners close
+        os.close(self._wake_read)
+        os.close(self._wake_write)
+
+    @contextlib.contextmanager
+    def _python_beside(self) -> Iterator[None]:
+        """Run the thread of the passes, let signals wake the compiled thread, and let hand-overs be quick."""
+        beside = threading.Thread(target=self._run_beside, name="beside the compiled loop", daemon=True)
+        interval_s = sys.getswitchinterval()
+        before: int | None = None
+        with contextlib.suppress(ValueError):  # not the main thread: signals are somebody else's
+            before = signal.set_wakeup_fd(self._wake_write, warn_on_full_buffer=False)
+        sys.setswitchinterval(SWITCH_S)
+        beside.start()
+        try:
+            yield
+        finally:
+            self._is_over = True
+            self._is_inside.set()
+            beside.join()
+            sys.setswitchinterval(interval_s)
+            if before is not None:
+                signal.set_wakeup_fd(before)
+
+    def _wait(self, ticker: ScanTicker) -> Ticks:
+        while (place := self._place_to_enter(ticker)) is not None:
+            result = self._enter(ticker, *place)
+            if result != at.SPENT:
+                break
+        return super()._wait(ticker)
+
+    def _place_to_enter(self, ticker: ScanTicker) -> tuple[int, int, int] | None:
+        """Return where the thread goes on, None while Python has to run the ticks."""
+        self._done = None
+        is_free = (
+            self.supervisor.state is State.RUNNING
+            and not (self.manual.active or self._interrupted or self._rearm_signalled)
+            and self.scans.are_well
+            and not self.scheduler.is_announced
+            and self._output.link.is_well
+        )
+        return ticker.place if is_free else None
+
+    def _enter(self, ticker: ScanTicker, seq_of_tick0: int, last_k: int, last_due_ns: int) -> int:
+        words, memory = self._words, self._memory
+        assert memory is not None
+        words[at.DAQ_FD], words[at.OUTPUT_FD] = _fd_of(self._daq.port), _fd_of(self._output.port)
+        words[at.STARTED_NS] = self._started_ns
+        words[at.END_NS] = at.NO_END if self._end_ns is None else self._end_ns
+        words[at.SEQ_OF_TICK0], words[at.LAST_K], words[at.LAST_DUE_NS] = seq_of_tick0, last_k, last_due_ns
+        words[at.WARNED], words[at.READS_LEFT] = self._warned, -1
+        memory.sinks.shown[:] = self._frame
+        if self._is_virtual:
+            self._feed(last_due_ns)
+        words[at.BEAT_NS] = self._clock.now_ns()
+        words[at.ORDER] = at.GO
+        self.entries += 1
+        self._is_inside.set()
+        result = self._thread.serve(memory)
+        with self._lock:
+            self._is_inside.clear()
+            words[at.ORDER] = at.CALLED_BACK
+            if self._is_virtual:
+                self._flush()
+            self._take_over(ticker, result)
+        if self._beside_error is not None:
+            raise self._beside_error
+        if self._is_virtual and result in (at.SPENT, at.GAP):
+            self._pass_beside(last_k)
+        return result
+
+    def _take_over(self, ticker: ScanTicker, result: int) -> None:
+        """Bring the loop's objects to where the thread is, and prepare the next wait for why it has come back."""
+        words = self._words
+        self._sync()
+        self._warned = int(words[at.WARNED])
+        ticker.go_on_from(int(words[at.LAST_K]), int(words[at.LAST_DUE_NS]))
+        match result:
+            case at.CALLED:
+                with contextlib.suppress(BlockingIOError):
+                    os.read(self._wake_read, 4096)
+            case at.SILENT:
+                ticker.silent_at_ns = int(words[at.SILENT_AT_NS])
+            case at.SCANS | at.REST:
+                self.scans.hand_over(self._block)
+                if result == at.REST:
+                    k = int(words[at.LAST_K]) + 1 + int(words[at.DONE_ROW])
+                    self._done = k, int(words[at.DONE_STAGE]), int(words[at.FOUND])
+            case at.STREAM:
+                self.scans.hand_over(self._failed_block)
+            case at.GAP:
+                self.scans.host_gaps.look(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
+            case at.DEAF:
+                silent_ms = (self._clock.now_ns() - int(words[at.BEAT_NS])) * 1e-6
+                self.incidents.report(Finding.SUPERVISION_SILENT, silent_ms=silent_ms)
+            case _:
+                pass
+
+    def _block(self) -> ScanBlock:
+        n, t0_ns, seq, lost, shifted = (int(w) for w in self._words[at.BLOCK_N : at.BLOCK_SHIFTED + 1])
+        return self._daq.block_of(n, t0_ns, seq, lost, bool(shifted))
+
+    def _failed_block(self) -> ScanBlock:
+        self._daq.obey(int(self._words[at.VERDICT]))
+        return self._daq.read_scans(self.scans.rows, 0.0)
+
+    def _sync(self) -> None:
+        """Count what the thread has done since the last time."""
+        words, memory, counts = self._words.copy(), self._memory, self.counts
+        assert memory is not None
+        new = words - self._told
+        self._told = words
+        if new[at.RECEIVED]:
+            self.scans.note_run(int(new[at.RECEIVED]), int(words[at.LAST_DUE_NS]))
+            self._daq.scans += int(new[at.RECEIVED])
+        self.ticks_compiled += int(new[at.TICKS])
+        counts.commands += int(new[at.COMMANDS])
+        counts.superseded += int(new[at.SUPERSEDED])
+        counts.clipped += int(new[at.CLIPPED])
+        for place, what in ((at.LATE_NS, "commands were late"), (at.SCANS_LATE_NS, "scans came late")):
+            if words[place]:
+                counts.noticed.setdefault(what, int(words[place]))
+        tasks = memory.timing.tasks[:3].copy()
+        each = (tasks - self._tasks_told).T.tolist()
+        self._tasks_told = tasks
+        by_name = {name: (runs, overruns, slips) for name, (runs, overruns, slips) in zip(at.STAGES, each, strict=True)}
+        self.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), by_name)
+        if words[at.PAIR_TOLD]:
+            self._check.judge_pairs(-int(words[at.PAIR_TOLD]))
+            self._words[at.PAIR_TOLD] = 0
+        first = max(int(words[at.NOTES] - new[at.NOTES]), int(words[at.NOTES]) - at.NOTE_ROOM)
+        for number in range(first, int(words[at.NOTES])):
+            rising, self.incidents.tick = (int(w) for w in memory.notes[number % at.NOTE_ROOM])
+            self._warn(rising)
+
+    # -- beside ------------------------------------------------------------------------------------------
+
+    def _run_beside(self) -> None:
+        with contextlib.suppress(OSError, AttributeError):  # what waits for buses must not press the tick
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+        last_k = -1
+        while True:
+            self._is_inside.wait()
+            if self._is_over:
+                return
+            with self._lock:
+                if self._is_inside.is_set() and self._beside_error is None:
+                    try:
+                        last_k = self._pass_beside(last_k)
+                    except BaseException as error:
+                        self._beside_error = error
+                        self._call_back()
+            words = self._words
+            next_k = self.scheduler.next_beside(last_k, at.STAGES)
+            due_ns = int(words[at.LAST_DUE_NS]) + (next_k - int(words[at.LAST_K])) * self._period_ns + AFTER_TICK_NS
+            now_ns = self._clock.now_ns()
+            self._clock.sleep_until_ns(min(max(due_ns, now_ns + AFTER_TICK_NS), now_ns + LONGEST_PAUSE_NS))
+
+    def _pass_beside(self, last_k: int) -> int:
+        """Run what was due in the ticks after ``last_k``, and call the thread back if Python has to decide something.
+        Return the newest tick."""
+        words, memory = self._words, self._memory
+        assert memory is not None
+        words[at.BEAT_NS] = self._clock.now_ns()
+        if not self._is_virtual:
+            self._sync()
+        k, due_ns = int(words[at.LAST_K]), int(words[at.LAST_DUE_NS])
+        if k == last_k:
+            return k
+        first = k if last_k < 0 or k - last_k > at.LONG_AGO else last_k + 1
+        self.incidents.tick = k
+        self._ticks = Ticks(k, 1, due_ns, self._period_ns, TimeSource.DEVICE_CLOCK)
+        if not self._is_virtual:
+            self._show(memory.sinks.shown)
+        try:
+            self.scheduler.run_beside(due_ns, first, k, at.STAGES, in_tick=self._is_virtual)
+            self.scheduler.run_slack(due_ns + self._daq.dt_ns + self._period_ns)
+        finally:
+            self._show(self.stages.frame)
+        if not self.supervisor.may_move or self.manual.active:
+            self._call_back()
+        return k
+
+    def _show(self, frame: Float64Array) -> None:
+        """Let everything in Python that reads the frame read ``frame``: the thread is at work on its own."""
+        self._frame = self._watch.frame = self.shown.frame = frame
+
+    def _call_back(self) -> None:
+        self._words[at.ORDER] = at.CALLED_BACK
+        with contextlib.suppress(BlockingIOError):
+            os.write(self._wake_write, b"!")
+
+    # -- the rest of a block -----------------------------------------------------------------------------
+
+    def _is_done(self, k: int, stage: int) -> bool:
+        return self._done is not None and (k, stage) < self._done[:2]
+
+    def _sense(self, info: TickInfo) -> None:
+        if not self._is_done(info.k, at.SENSE):
+            super()._sense(info)
+
+    def _estimate(self, info: TickInfo) -> None:
+        if self._is_done(info.k, at.ESTIMATE):
+            return
+        if self._done is not None and self._done[:2] == (info.k, at.ESTIMATE):
+            self._judge_step(self._check.judge_pairs(self._done[2]))
+        else:
+            super()._estimate(info)
+
+    def _actuate(self, info: TickInfo) -> None:
+        if not self._is_done(info.k, at.ACTUATE):
+            super()._actuate(info)
+
+    def _publish(self, info: TickInfo) -> None:
+        if not self._is_done(info.k, at.PUBLISH):
+            super()._publish(info)
+
+    # -- virtual time ------------------------------------------------------------------------------------
+
+    def _feed(self, last_due_ns: int) -> None:
+        """Let virtual time pass until the next bytes are there, then fix the time for one read."""
+        daq, output = self._daq.port, self._output.port
+        assert isinstance(daq, Fed)
+        assert isinstance(output, Fed)
+        now_ns = self._clock.now_ns()
+        silent_ns = self._thread.silent_at(last_due_ns, int(self._words[at.STALE_NS]), now_ns)
+        daq.feed(max(0, silent_ns - now_ns) * 1e-9)
+        output.feed(0.0)
+        self._words[at.FIXED_NS] = self._clock.now_ns()
+        self._words[at.READS_LEFT] = 1
+
+    def _flush(self) -> None:
+        output = self._output.port
+        assert isinstance(output, Fed)
+        output.flush()
+
+
+def _fd_of(port: object) -> int:
+    assert isinstance(port, Descriptor)
+    return port.fileno()

@@ -1,0 +1,96 @@
+"""The memory that the compiled thread and Python share: names of its places, and the tuples of arrays."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+Words = NDArray[np.int64]
+
+(
+    # Python's words to the thread
+    ORDER, BEAT_NS, BEAT_LIMIT_NS, FIXED_NS, READS_LEFT, DAQ_FD, OUTPUT_FD, WAKE_FD, PERIOD_NS, DT_NS, STALE_NS,
+    STALLED_NS, LATE_LIMIT_NS, STARTED_NS, END_NS,
+    # where the thread is in the stream of scans
+    SEQ_OF_TICK0, LAST_K, LAST_DUE_NS, SILENT_AT_NS,
+    # the block under way, and how far it got
+    BLOCK_N, BLOCK_T0_NS, BLOCK_SEQ, BLOCK_LOST, BLOCK_SHIFTED, VERDICT, DONE_ROW, DONE_STAGE, FOUND,
+    # what the thread tells
+    GAP_DUE_NS, GAP_NOW_NS, WARNED, PAIR_TOLD, RECEIVED, TICKS, CAUGHT_UP, COMMANDS, SUPERSEDED, CLIPPED, LATE_NS,
+    SCANS_LATE_NS, NOTES,
+    N_WORDS,
+) = range(42)  # fmt: skip
+"""Places in ``Memory.words``.
+
+``ORDER``: GO or CALLED_BACK; ``BEAT_NS``: when Python was last alive; ``FIXED_NS``: the time in virtual time, else
+REAL_TIME; ``READS_LEFT``: reads until the thread comes back by itself, negative for no limit. ``BLOCK_...``: what
+``decode`` returned; ``DONE_ROW`` and ``DONE_STAGE``: the first row and stage of it that are not done. ``LATE_NS`` and
+``SCANS_LATE_NS``: when a command or scans were late for the first time, 0 for never; ``NOTES``: warnings so far.
+"""
+
+GO, CALLED_BACK = 1, 0
+REAL_TIME = -1
+NO_END = (1 << 63) - 1
+
+CALLED, SILENT, READ_FAILED, SCANS, STREAM, STUCK, GAP, DEAF, SPENT, REST = range(10)
+"""Why the thread has come back.
+
+CALLED: Python wants to decide something. SILENT: no scan for too long. READ_FAILED: the port failed or was closed, and
+a read tells more. SCANS: a block that Python must judge, untouched. STREAM: the verdict of ``accept`` is an error.
+STUCK: the output's port did not take a command at once. GAP: the host stood still. DEAF: Python has been silent; the
+outputs are at neutral. SPENT: as many reads as were asked for. REST: a block of which Python must do the rest, from
+``DONE_ROW`` and ``DONE_STAGE`` on."""
+
+SENSE, ESTIMATE, ACTUATE, PUBLISH = range(4)
+"""Stages of a tick, which are the tasks that the thread runs."""
+STAGES = ("sense", "estimate", "actuate", "publish")
+RUNS, OVERRUNS, SLIPS, BUDGET_NS, DEADLINE_NS = range(5)
+"""Rows of ``Timing.tasks``, one column per stage."""
+NOTE_ROOM = 64
+LONG_AGO = 1000
+"""Ticks after which what was due beside the thread is not made up for."""
+
+
+class Timing(NamedTuple):
+    """Holds the tasks' figures. ``tasks`` (5, 4); ``durations`` and ``lateness``: histograms (4, words) by stage;
+    ``ticks``: histograms (2, words) of the duration and lateness of a tick; ``latency`` (words,)."""
+
+    tasks: Words
+    durations: tuple[Words, ...]
+    lateness: tuple[Words, ...]
+    tick_duration: Words
+    tick_lateness: Words
+    latency: Words
+
+
+class Sinks(NamedTuple):
+    """Holds where frames go: the page's memory and the recorder's ring; (0,) and (0, 0) arrays where there is none.
+    ``shown`` is the last whole frame, for Python."""
+
+    live_words: Words
+    live_rows: NDArray[np.float64]
+    ring: Any
+    shown: NDArray[np.float64]
+
+
+class Memory(NamedTuple):
+    """Holds everything that the thread works on. ``step``: ``Stages.memory``; ``stream`` and ``buffer``: the DAQ's;
+    ``rows``: scans of the block under way; ``check``: of ``ScanCheck``; ``saved``: room for its state; ``field`` and
+    ``fresh``: of ``FieldInput``; ``output``: of the output's driver; ``notes`` (NOTE_ROOM, 2): warning bits that rose,
+    and their ticks."""
+
+    words: Words
+    step: Any
+    stream: Any
+    buffer: NDArray[np.uint8]
+    rows: NDArray[np.int16]
+    check: Any
+    saved: NDArray[np.int64]
+    field: NDArray[np.float64]
+    fresh: Words
+    output: Any
+    timing: Timing
+    sinks: Sinks
+    notes: Words

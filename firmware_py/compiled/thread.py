@@ -1,0 +1,377 @@
+"""The compiled thread: waits, reads, decodes, checks, steps, guards, encodes, writes and publishes without the GIL.
+
+It runs the functions and kernels of the Python loop over the same memory. A block of scans that is lost, late beyond
+the limit, shifted or implausible, a port that fails and an answer that is a complaint are handed over to Python as they
+are. What it does alone is the ramp to neutral when Python has been silent for ``BEAT_LIMIT_NS``.
+Importing this module imports numba. It imports little else, because a change of what it imports compiles it anew.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.daq.di4108_kernels import READY, WAIT, accept, decode
+from drivers.piezo.e727_loop import HANDED_OVER, SENT, step_ramp, write
+from drivers.piezo.gcs import UNSENT
+from firmware_py.chain import COMMANDED, step_kernel
+from firmware_py.compiled.memory import (
+    ACTUATE,
+    BEAT_LIMIT_NS,
+    BEAT_NS,
+    BLOCK_LOST,
+    BLOCK_N,
+    BLOCK_SEQ,
+    BLOCK_SHIFTED,
+    BLOCK_T0_NS,
+    BUDGET_NS,
+    CALLED,
+    CAUGHT_UP,
+    CLIPPED,
+    COMMANDS,
+    DAQ_FD,
+    DEADLINE_NS,
+    DEAF,
+    DONE_ROW,
+    DONE_STAGE,
+    DT_NS,
+    END_NS,
+    ESTIMATE,
+    FIXED_NS,
+    FOUND,
+    GAP,
+    GAP_DUE_NS,
+    GAP_NOW_NS,
+    GO,
+    LAST_DUE_NS,
+    LAST_K,
+    LATE_LIMIT_NS,
+    LATE_NS,
+    NOTE_ROOM,
+    NOTES,
+    ORDER,
+    OUTPUT_FD,
+    OVERRUNS,
+    PAIR_TOLD,
+    PERIOD_NS,
+    PUBLISH,
+    READ_FAILED,
+    READS_LEFT,
+    REAL_TIME,
+    RECEIVED,
+    REST,
+    RUNS,
+    SCANS,
+    SCANS_LATE_NS,
+    SENSE,
+    SEQ_OF_TICK0,
+    SILENT,
+    SILENT_AT_NS,
+    SLIPS,
+    SPENT,
+    STALE_NS,
+    STALLED_NS,
+    STARTED_NS,
+    STREAM,
+    STUCK,
+    SUPERSEDED,
+    TICKS,
+    VERDICT,
+    WAKE_FD,
+    WARNED,
+    Memory,
+    Timing,
+    Words,
+)
+from firmware_py.control.fresh_field import fill_field
+from firmware_py.control.plausibility import TICK as CHECK_TICK
+from firmware_py.control.plausibility import check_frame, check_scan
+from firmware_py.frame import CLIP, CLIP_YIELD, COMMAND, COUNTS, DRIFT, INVALID, JERK, STALE, STATUS, TICK, TIME
+from firmware_py.live.memory import announce, put_over
+from firmware_py.recording.ring import announce_row, put_row
+from firmware_py.scheduler.histogram import add_duration
+from firmware_py.scheduler.ticker import ROUNDING_NS, silent_at_ns
+from hal.compiled import kernel, thread_kernel
+from hal.fd_kernels import (
+    EAGAIN,
+    POLLIN,
+    is_ready,
+    now_ns,
+    poll_word,
+    read_fd,
+    release_fence,
+    sleep_until_ns,
+    wait_fds,
+)
+
+count_duration = kernel(add_duration)
+fill = kernel(fill_field)
+silent_at = kernel(silent_at_ns)
+ring_put, ring_announce = kernel(put_row), kernel(announce_row)
+live_put, live_announce = kernel(put_over), kernel(announce)
+
+RAMP_LIMIT = 64
+"""Largest number of steps of the thread's own ramp, ten times as many as it needs: a port that is stuck ends it."""
+
+
+@kernel
+def clock_ns(words: Words) -> int:
+    """Return the time, the one that virtual time has fixed where there is one."""
+    return now_ns() if words[FIXED_NS] == REAL_TIME else words[FIXED_NS]
+
+
+@kernel
+def save(check: Any, saved: Words, back: bool) -> None:
+    """Copy the state that ``check_scan`` changes to ``saved``, or back."""
+    at = 0
+    for part in (check.last, check.same, check.slope, check.odd, check.together):
+        for i in range(len(part)):
+            if back:
+                part[i] = saved[at]
+            else:
+                saved[at] = part[i]
+            at += 1
+    if back:
+        check.words[CHECK_TICK] = saved[at]
+    else:
+        saved[at] = check.words[CHECK_TICK]
+
+
+@kernel
+def sense(m: Memory, frame: NDArray[np.float64], row: int, k: int, due_ns: int) -> bool:
+    """Do what ``InstrumentLoop._sense`` does with a scan. Return False, and leave the checks as they were, if it is
+    implausible."""
+    scan = m.rows[row]
+    frame[TIME] = (due_ns - m.words[STARTED_NS]) * 1e-9
+    frame[TICK] = k
+    frame[STATUS] = 0
+    for i in range(len(scan)):
+        frame[COUNTS + i] = scan[i]
+    save(m.check, m.saved, False)
+    if check_scan(m.check, scan, k) != 0:
+        save(m.check, m.saved, True)
+        return False
+    fill(frame, m.field, m.fresh)
+    return True
+
+
+@kernel
+def estimate(m: Memory, frame: NDArray[np.float64], k: int, newest: bool) -> int:
+    """Do what ``InstrumentLoop._estimate`` does while the outputs may move. Return the number of a pair that disagrees
+    permanently, else 0."""
+    words = m.words
+    if newest:
+        frame[STATUS] = int(frame[STATUS]) | COMMANDED
+    step_kernel(m.step)
+    bits = int(frame[STATUS])
+    if bits & (INVALID | STALE) == 0:
+        found = check_frame(m.check, frame)
+        if found > 0:
+            return found
+        if found < 0:
+            words[PAIR_TOLD] = -found
+    bits &= JERK | DRIFT
+    rising = bits & ~words[WARNED]
+    if rising != 0:
+        note = m.notes[words[NOTES] % NOTE_ROOM]
+        note[0], note[1] = rising, k
+        words[NOTES] += 1
+    words[WARNED] = bits
+    return 0
+
+
+@kernel
+def actuate(m: Memory, frame: NDArray[np.float64], k: int, due_ns: int) -> bool:
+    """Do what ``InstrumentLoop._actuate`` does while the outputs may move. Return False if Python must do it."""
+    words = m.words
+    result, mask = write(m.output, words[OUTPUT_FD], frame[COMMAND : COMMAND + 3], clock_ns(words))
+    if result == HANDED_OVER:
+        return False
+    if mask != 0 or int(frame[CLIP]) & ~CLIP_YIELD != 0:
+        words[CLIPPED] += 1
+    if result != SENT:
+        words[SUPERSEDED] += 1
+        return True
+    now = clock_ns(words)
+    if now - due_ns > words[LATE_LIMIT_NS] and words[LATE_NS] == 0:
+        words[LATE_NS] = now
+    count_duration(m.timing.latency, now - due_ns, k)
+    words[COMMANDS] += 1
+    return True
+
+
+@kernel
+def publish(m: Memory, frame: NDArray[np.float64]) -> None:
+    """Do what ``InstrumentLoop._publish`` does with a frame."""
+    sinks = m.sinks
+    if len(sinks.live_words) > 0:
+        live_put(sinks.live_words, sinks.live_rows, frame)
+        release_fence()  # pyright: ignore[reportCallIssue]
+        live_announce(sinks.live_words)
+    if len(sinks.ring.words) > 0 and ring_put(sinks.ring, frame):
+        release_fence()  # pyright: ignore[reportCallIssue]
+        ring_announce(sinks.ring.words)
+    sinks.shown[:] = frame
+
+
+@kernel
+def count_task(timing: Timing, stage: int, started_ns: int, ended_ns: int, due_ns: int, k: int) -> None:
+    """Count one run of a task, as ``Scheduler`` does."""
+    tasks = timing.tasks
+    tasks[RUNS, stage] += 1
+    if ended_ns - started_ns > tasks[BUDGET_NS, stage]:
+        tasks[OVERRUNS, stage] += 1
+    if ended_ns - due_ns > tasks[DEADLINE_NS, stage]:
+        tasks[SLIPS, stage] += 1
+    count_duration(timing.durations[stage], ended_ns - started_ns, k)
+    count_duration(timing.lateness[stage], started_ns - due_ns, k)
+
+
+@kernel
+def hand_over(words: Words, row: int, stage: int, found: int) -> int:
+    words[DONE_ROW], words[DONE_STAGE], words[FOUND] = row, stage, found
+    return REST
+
+
+@kernel
+def run_block(m: Memory) -> int:
+    """Run the ticks of the block, the newest in full and the others as far as the filters need them. Return GO when all
+    is done, else REST."""
+    words, timing, frame = m.words, m.timing, m.step[0].frame
+    n, k0 = words[BLOCK_N], words[BLOCK_SEQ] - words[SEQ_OF_TICK0]
+    for row in range(n):
+        k, due_ns, newest = k0 + row, words[BLOCK_T0_NS] + row * words[DT_NS], row == n - 1
+        began_ns = clock_ns(words)
+        if not sense(m, frame, row, k, due_ns):
+            return hand_over(words, row, SENSE, 0)
+        sensed_ns = clock_ns(words)
+        found = estimate(m, frame, k, newest)
+        if found > 0:
+            return hand_over(words, row, ESTIMATE, found)
+        estimated_ns = clock_ns(words)
+        if newest and not actuate(m, frame, k, due_ns):
+            return hand_over(words, row, ACTUATE, 0)
+        actuated_ns = clock_ns(words)
+        publish(m, frame)
+        ended_ns = clock_ns(words)
+        count_task(timing, SENSE, began_ns, sensed_ns, due_ns, k)
+        count_task(timing, ESTIMATE, sensed_ns, estimated_ns, due_ns, k)
+        if newest:
+            count_task(timing, ACTUATE, estimated_ns, actuated_ns, due_ns, k)
+        count_task(timing, PUBLISH, actuated_ns, ended_ns, due_ns, k)
+        count_duration(timing.tick_duration, ended_ns - began_ns, k)
+        count_duration(timing.tick_lateness, began_ns - due_ns, k)
+    return GO
+
+
+@kernel
+def is_ordinary(words: Words) -> bool:
+    """Return True if Python need not judge the block: nothing is lost or shifted, it goes on from the last one, the run
+    does not end in it, and it is not so late that a finding follows."""
+    n = words[BLOCK_N]
+    k0 = words[BLOCK_SEQ] - words[SEQ_OF_TICK0]
+    newest_ns = words[BLOCK_T0_NS] + (n - 1) * words[DT_NS]
+    return (
+        words[BLOCK_LOST] == 0
+        and words[BLOCK_SHIFTED] == 0
+        and k0 == words[LAST_K] + 1
+        and newest_ns < words[END_NS]
+        and n * words[DT_NS] <= words[STALLED_NS]
+    )
+
+
+@kernel
+def take_block(m: Memory) -> int:
+    """Run the block that was decoded, and count it. Return GO, GAP, or why Python must go on."""
+    words = m.words
+    n, awake_ns = words[BLOCK_N], clock_ns(words)
+    if not is_ordinary(words) or words[ORDER] != GO:
+        return SCANS
+    if n > 1 and words[SCANS_LATE_NS] == 0:
+        words[SCANS_LATE_NS] = awake_ns
+    result = run_block(m)
+    if result != GO:
+        return result
+    words[RECEIVED] += n
+    words[TICKS] += 1
+    words[CAUGHT_UP] += n - 1
+    words[LAST_K] += n
+    words[LAST_DUE_NS] = words[BLOCK_T0_NS] + (n - 1) * words[DT_NS]
+    return note_gap(words, awake_ns + words[PERIOD_NS])
+
+
+@kernel
+def note_gap(words: Words, due_ns: int) -> int:
+    """Return GAP if this thread was to be awake at ``due_ns`` and was not for the time that ``HostGaps`` counts."""
+    now = clock_ns(words)
+    if now - due_ns < words[STALE_NS]:
+        return GO
+    words[GAP_DUE_NS], words[GAP_NOW_NS] = due_ns, now
+    return GAP
+
+
+@kernel
+def ramp_alone(m: Memory) -> None:
+    """Take the outputs to neutral, a step a millisecond, without Python."""
+    words = m.words
+    for _ in range(RAMP_LIMIT):
+        if step_ramp(m.output, words[OUTPUT_FD], clock_ns(words)):
+            break
+        if words[FIXED_NS] == REAL_TIME:
+            sleep_until_ns(now_ns() + 1_000_000)
+        else:
+            words[FIXED_NS] += 1_000_000
+
+
+@thread_kernel
+def serve(m: Memory) -> int:
+    """Run until Python is needed. Return why."""
+    words, stream = m.words, m.stream
+    polls = np.zeros(2, np.int64)
+    while True:
+        if words[ORDER] != GO:
+            return CALLED
+        if m.output.link.sizes[UNSENT] > 0:
+            return STUCK
+        if words[READS_LEFT] == 0:
+            return SPENT
+        words[READS_LEFT] -= 1
+        now = clock_ns(words)
+        if now - words[BEAT_NS] > words[BEAT_LIMIT_NS]:
+            ramp_alone(m)
+            return DEAF
+        words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
+        polls[0], polls[1] = poll_word(words[DAQ_FD], POLLIN), poll_word(words[WAKE_FD], POLLIN)
+        ready = wait_fds(polls, words[SILENT_AT_NS] if words[FIXED_NS] == REAL_TIME else 0)
+        now = clock_ns(words)
+        if ready < 0:
+            return READ_FAILED
+        if is_ready(polls[1]):
+            return CALLED
+        if note_gap(words, words[SILENT_AT_NS]) == GAP:
+            return GAP
+        if ready == 0:
+            if now + ROUNDING_NS >= words[SILENT_AT_NS]:
+                return SILENT
+            continue
+        end = stream[0].end
+        if end == len(m.buffer):
+            return READ_FAILED
+        n = read_fd(words[DAQ_FD], m.buffer, end, len(m.buffer))
+        if n == -EAGAIN:
+            continue
+        if n <= 0:
+            return READ_FAILED
+        words[VERDICT] = accept(stream, m.buffer, n, clock_ns(words))
+        if words[VERDICT] == WAIT:
+            continue
+        if words[VERDICT] != READY:
+            return STREAM
+        got, t0_ns, seq0, lost, shifted = decode(stream, m.buffer, m.rows)
+        words[BLOCK_N], words[BLOCK_T0_NS], words[BLOCK_SEQ] = got, t0_ns, seq0
+        words[BLOCK_LOST], words[BLOCK_SHIFTED] = lost, shifted
+        result = take_block(m)
+        if result != GO:
+            return result

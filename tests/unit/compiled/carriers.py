@@ -1,0 +1,61 @@
+"""Socket pairs between a compiled loop and the emulated devices of virtual time."""
+
+from __future__ import annotations
+
+import os
+import select
+import socket
+
+from hal.contracts import Clock, SerialPort
+from hal.types import PortInfo
+
+
+class SocketPort:
+    """``Fed`` over a port of virtual time: what the device sends passes a socket pair, and so does what is written to
+    its descriptor. A read or write of Python goes around it, after what waits there."""
+
+    def __init__(self, port: SerialPort) -> None:
+        self._port = port
+        self._near, self._far = socket.socketpair()
+        for end in (self._near, self._far):
+            end.setblocking(False)
+        self._room = memoryview(bytearray(1 << 16))
+
+    def fileno(self) -> int:
+        return self._near.fileno()
+
+    def feed(self, timeout_s: float) -> None:
+        if not select.select([self._near], [], [], 0.0)[0]:
+            n = self._port.read_into(self._room, timeout_s)
+            self._far.sendall(self._room[:n])
+
+    def flush(self) -> None:
+        while select.select([self._far], [], [], 0.0)[0]:
+            self._port.write(self._far.recv(4096), 0.0)
+
+    def read_into(self, buf: memoryview, timeout_s: float) -> int:
+        if select.select([self._near], [], [], 0.0)[0]:
+            return os.readv(self._near.fileno(), [buf])
+        return self._port.read_into(buf, timeout_s)
+
+    def write(self, data: bytes, timeout_s: float) -> None:
+        self._port.write(data, timeout_s)
+
+    def drain_input(self) -> int:
+        n = 0
+        while select.select([self._near], [], [], 0.0)[0]:
+            n += len(self._near.recv(4096))
+        return n + self._port.drain_input()
+
+    def info(self) -> PortInfo:
+        return self._port.info()
+
+    def close(self) -> None:
+        self._port.close()
+        self._near.close()
+        self._far.close()
+
+
+def wrap(bus: str, port: object, clock: Clock) -> object:
+    """Put socket pairs under the serial ports of a bench."""
+    return SocketPort(port) if hasattr(port, "drain_input") else port  # type: ignore[arg-type]
