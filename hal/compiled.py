@@ -115,6 +115,12 @@ def kernel(function: _Function) -> _Function:
     return _compiled(function, nogil=False)
 
 
+def inlined_kernel(function: _Function) -> _Function:
+    """Compile ``function`` into each kernel that calls it, not by itself: for what lies between a large kernel and its
+    only caller, because every level of calls optimizes all that is below it anew."""
+    return _compiled(function, nogil=False, inline="always")
+
+
 def thread_kernel(function: _Function) -> _Function:
     """Compile ``function`` as ``kernel`` does, and release the GIL while it runs: for loops that a thread enters once.
 
@@ -123,8 +129,8 @@ def thread_kernel(function: _Function) -> _Function:
     return _compiled(function, nogil=True)
 
 
-def _compiled(function: _Function, nogil: bool) -> _Function:
-    options: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": nogil}
+def _compiled(function: _Function, nogil: bool, inline: str = "never") -> _Function:
+    options: dict[str, Any] = {"cache": True, "error_model": "numpy", "nogil": nogil, "inline": inline}
     file = Path(function.__code__.co_filename).resolve()
     if "NUMBA_CACHE_DIR" in os.environ or not file.is_relative_to(ROOT):
         return cast(_Function, numba.njit(**options)(function))

@@ -93,7 +93,7 @@ from firmware_py.live.memory import announce, put_over
 from firmware_py.recording.ring import announce_row, put_row
 from firmware_py.scheduler.histogram import add_duration
 from firmware_py.scheduler.ticker import ROUNDING_NS, silent_at_ns
-from hal.compiled import kernel, thread_kernel
+from hal.compiled import inlined_kernel, kernel, thread_kernel
 from hal.fd_kernels import (
     EAGAIN,
     POLLIN,
@@ -157,7 +157,7 @@ def sense(m: Memory, frame: NDArray[np.float64], row: int, k: int, due_ns: int) 
     return True
 
 
-@kernel
+@inlined_kernel
 def estimate(m: Memory, frame: NDArray[np.float64], k: int, newest: bool) -> int:
     """Do what ``InstrumentLoop._estimate`` does while the outputs may move. Return the number of a pair that disagrees
     permanently, else 0."""
@@ -235,7 +235,7 @@ def hand_over(words: Words, row: int, stage: int, found: int) -> int:
     return REST
 
 
-@kernel
+@inlined_kernel
 def run_block(m: Memory) -> int:
     """Run the ticks of the block, the newest in full and the others as far as the filters need them. Return GO when all
     is done, else REST."""
@@ -282,7 +282,7 @@ def is_ordinary(words: Words) -> bool:
     )
 
 
-@kernel
+@inlined_kernel
 def take_block(m: Memory) -> int:
     """Run the block that was decoded, and count it. Return GO, GAP, or why Python must go on."""
     words = m.words
