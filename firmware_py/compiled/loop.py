@@ -31,7 +31,7 @@ from firmware_py.control.wiring import Devices
 from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.recording.ring import RowsView
 from firmware_py.scheduler.task import TickInfo
-from firmware_py.scheduler.ticker import ScanTicker, Ticks
+from firmware_py.scheduler.ticker import ScanTicker, Ticks, silent_at_ns
 from hal.clock import VirtualClock
 from hal.contracts import Clock, Float64Array
 from hal.errors import BenchError
@@ -398,11 +398,11 @@ class CompiledLoop(InstrumentLoop):
         assert isinstance(daq, Fed)
         assert isinstance(output, Fed)
         now_ns = self._clock.now_ns()
-        silent_ns = self._thread.silent_at(last_due_ns, int(self._words[at.STALE_NS]), now_ns)
+        silent_ns = silent_at_ns(last_due_ns, int(self._words[at.STALE_NS]), now_ns)
         daq.feed(max(0, silent_ns - now_ns) * 1e-9)
         output.feed(0.0)
         self._words[at.FIXED_NS] = self._clock.now_ns()
-        self._words[at.READS_LEFT] = 1
+        self._words[at.READS_LEFT], self._words[at.SILENT_AT_NS] = 1, silent_ns
 
     def _flush(self) -> None:
         output = self._output.port

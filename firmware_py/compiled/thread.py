@@ -342,7 +342,8 @@ def serve(m: Memory) -> int:
         if now - words[BEAT_NS] > words[BEAT_LIMIT_NS]:
             ramp_alone(m)
             return DEAF
-        words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
+        if words[FIXED_NS] == REAL_TIME:  # in virtual time the wait is over
+            words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
         polls[0], polls[1] = poll_word(words[DAQ_FD], POLLIN), poll_word(words[WAKE_FD], POLLIN)
         ready = wait_fds(polls, words[SILENT_AT_NS] if words[FIXED_NS] == REAL_TIME else 0)
         now = clock_ns(words)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import mmap
 import os
 import struct
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -119,6 +120,7 @@ class LiveMemory:
     def close(self) -> None:
         """Unmap; the object is of no use afterwards."""
         del self._rows, self._histograms
-        self._words.release()
-        self._map.close()
+        with suppress(BufferError):  # the traceback of what ended the run may still hold a compiled loop's view
+            self._words.release()
+            self._map.close()
         os.close(self.fd)

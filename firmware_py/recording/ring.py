@@ -17,6 +17,7 @@ import os
 import platform
 import struct
 import tempfile
+from contextlib import suppress
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -72,8 +73,9 @@ class _Shared:
         return memoryview(self._map)[_HEADER_BYTES:]
 
     def close(self) -> None:
-        self.words.release()
-        self._map.close()
+        with suppress(BufferError):  # the traceback of what ended the run may still hold a compiled loop's view
+            self.words.release()
+            self._map.close()
         os.close(self.fd)
 
 

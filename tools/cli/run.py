@@ -19,6 +19,7 @@ from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
 
+from firmware_py.compiled.eligible import check_compiled
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
@@ -48,6 +49,9 @@ def run(
     ] = False,
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
+    ] = False,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="The ticks run in one compiled thread, with Python beside it.")
     ] = False,
     hand: Annotated[
         str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
@@ -100,8 +104,13 @@ def run(
         decide_on([bench_path(bench)], trust, allow_outside)
         file = load_bench(bench_path(bench))
         pace = check_pace(file, "virtual" if virtual else "realtime" if realtime else None)
+        if compiled:
+            check_compiled(file, pace, injected=bool(inject))
+            if sense_only:
+                raise InputError("--compiled runs while outputs move, and --sense-only moves none; give one of them")
         request = RunRequest(
             bench=bench_path(bench),
+            compiled=compiled,
             seconds=seconds,
             pace=pace,
             hand_file=hand,
@@ -121,7 +130,7 @@ def run(
         if not is_endoscope(file.description):
             from tools.reports.run_live import opening_lines
 
-            for line in opening_lines(file, seconds, pace, hand, seed):
+            for line in opening_lines(file, seconds, pace, hand, seed, compiled):
                 console().print(line)
             prepare(file, request.method, console())
         outcome, truth = _run_real(request) if pace == "realtime" else _run_emulated(request)

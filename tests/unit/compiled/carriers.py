@@ -6,7 +6,8 @@ import os
 import select
 import socket
 
-from hal.contracts import Clock, SerialPort
+from hal.contracts import SerialPort
+from hal.errors import HalError
 from hal.types import PortInfo
 
 
@@ -26,16 +27,22 @@ class SocketPort:
 
     def feed(self, timeout_s: float) -> None:
         if not select.select([self._near], [], [], 0.0)[0]:
-            n = self._port.read_into(self._room, timeout_s)
+            try:
+                n = self._port.read_into(self._room, timeout_s)
+            except HalError:
+                self._far.close()  # so that the descriptor fails as well; the next call of Python says why
+                return
             self._far.sendall(self._room[:n])
 
     def flush(self) -> None:
-        while select.select([self._far], [], [], 0.0)[0]:
+        while self._far.fileno() >= 0 and select.select([self._far], [], [], 0.0)[0]:
             self._port.write(self._far.recv(4096), 0.0)
 
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         if select.select([self._near], [], [], 0.0)[0]:
-            return os.readv(self._near.fileno(), [buf])
+            n = os.readv(self._near.fileno(), [buf])
+            if n:
+                return n
         return self._port.read_into(buf, timeout_s)
 
     def write(self, data: bytes, timeout_s: float) -> None:
@@ -43,8 +50,8 @@ class SocketPort:
 
     def drain_input(self) -> int:
         n = 0
-        while select.select([self._near], [], [], 0.0)[0]:
-            n += len(self._near.recv(4096))
+        while select.select([self._near], [], [], 0.0)[0] and (data := self._near.recv(4096)):
+            n += len(data)
         return n + self._port.drain_input()
 
     def info(self) -> PortInfo:
@@ -54,8 +61,3 @@ class SocketPort:
         self._port.close()
         self._near.close()
         self._far.close()
-
-
-def wrap(bus: str, port: object, clock: Clock) -> object:
-    """Put socket pairs under the serial ports of a bench."""
-    return SocketPort(port) if hasattr(port, "drain_input") else port  # type: ignore[arg-type]

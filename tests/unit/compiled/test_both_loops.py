@@ -1,0 +1,94 @@
+"""Both loops give the same bits on the same bytes: whole runs in virtual time, over socket pairs, with damage.
+
+The thread takes a minute to compile.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from firmware_py.app import run_in_process
+from firmware_py.recording.reader import Recording
+from firmware_py.run_request import RunRequest
+from hal.contracts import Clock
+from hal.middleware.faults import FaultPlan, FaultSerial
+from tests.unit.compiled.carriers import SocketPort
+
+BENCH = Path(__file__).parents[3] / "benches" / "micron-e727.toml"
+SECONDS = 0.6
+pytestmark = pytest.mark.slow
+
+
+def run(folder: Path, plans: dict[str, FaultPlan], *, compiled: bool) -> tuple[dict[str, Any], bytes, list[Any]]:
+    """Return the outcome, the truth's bytes, and the recorded events and rows."""
+
+    def wrap(bus: str, port: Any, clock: Clock) -> Any:
+        if not hasattr(port, "drain_input"):
+            return port
+        return SocketPort(FaultSerial(port, clock, plans[bus]) if bus in plans else port)
+
+    file = folder / f"{compiled}.mcap"
+    file.unlink(missing_ok=True)
+    request = RunRequest(BENCH, SECONDS, pace="virtual", record=file, compiled=compiled)
+    outcome, truth = run_in_process(request, wrap=wrap)
+    assert truth is not None
+    recording = Recording(file)
+    recorded = [recording.array(recording.names).tobytes(), [event.content for event in recording.events]]
+    return outcome, b"".join(np.ascontiguousarray(truth[name]).tobytes() for name in sorted(truth)), recorded
+
+
+def compare(folder: Path, plans: dict[str, FaultPlan]) -> dict[str, Any]:
+    """Run both; return the compiled one's outcome."""
+    python, compiled = (run(folder, plans, compiled=c) for c in (False, True))
+    assert compiled[1] == python[1]
+    assert compiled[2] == python[2]
+    for key in ("armed_ns", "safe_ns", "samples", "noticed", "commands", "holds", "warnings", "safe_state", "latency"):
+        assert compiled[0][key] == python[0][key], key
+    for name, task in python[0]["tasks"].items():
+        for key in ("runs", "skipped", "errors"):
+            assert compiled[0]["tasks"][name][key] == task[key], (name, key)
+    for key in ("run", "caught_up", "skipped"):
+        assert compiled[0]["ticks"][key] == python[0]["ticks"][key], key
+    return compiled[0]
+
+
+def test_a_quiet_run(tmp_path: Path):
+    outcome = compare(tmp_path, {})
+    assert outcome["loop"]["kind"] == "compiled"
+    assert outcome["loop"]["ticks"] > 0.9 * 1000 * SECONDS
+    assert outcome["safe_state"]["normal"]
+
+
+def scan_faults() -> st.SearchStrategy[FaultPlan]:
+    rare = st.sampled_from([0.0, 0.0, 0.0001, 0.001])
+    return st.builds(
+        FaultPlan, seed=st.integers(0, 1000), loss=rare, corruption=rare, duplication=rare,
+        truncation=st.sampled_from([0.0, 0.01]), delay=st.sampled_from([0.0, 0.05]),
+        delay_s=st.sampled_from([0.0005, 0.003, 0.02]), from_s=st.sampled_from([0.7, 0.9]),
+    )  # fmt: skip
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(plan=scan_faults())
+def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
+    compare(tmp_path, {"daq0": plan})
+
+
+@pytest.mark.parametrize(
+    ("bus", "plan"),
+    [
+        ("daq0", FaultPlan(silent_after_s=0.9, silent_for_s=0.1)),
+        ("daq0", FaultPlan(disconnect_after_s=0.9)),
+        ("e7270", FaultPlan(seed=3, corruption=0.2, from_s=0.8)),
+        ("e7270", FaultPlan(silent_after_s=0.8)),
+        ("e7270", FaultPlan(disconnect_after_s=0.9)),
+    ],
+)
+def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
+    compare(tmp_path, {bus: plan})

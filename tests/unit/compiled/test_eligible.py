@@ -1,0 +1,50 @@
+"""Which benches can run compiled: the reason names the device; asked for, it is bad input."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from firmware_py.compiled.eligible import check_compiled, reasons_against_bench
+from hal.bench import load_bench
+from hal.errors import BenchError
+from tools.cli.main import app
+
+BENCHES = Path(__file__).parents[3] / "benches"
+
+
+def reasons(name: str) -> str:
+    return "; ".join(reasons_against_bench(load_bench(BENCHES / f"{name}.toml"), "realtime"))
+
+
+def test_the_serial_bench_can():
+    assert reasons("micron-e727") == ""
+    check_compiled(load_bench(BENCHES / "micron-e727.toml"), "realtime")
+
+
+@pytest.mark.parametrize(
+    ("bench", "what"),
+    [
+        ("micron", "device.piezo: its driver dac_amplifier has no kernels"),
+        ("micron-can", "device.piezo: its driver can_amplifier has no kernels"),
+        ("micron-eight", "8 accelerometer axes"),
+        ("endoscope", "an endoscope's loop is Python"),
+    ],
+)
+def test_others_say_which_device_and_why(bench: str, what: str):
+    assert what in reasons(bench)
+
+
+def test_emulated_time_and_injected_faults_are_python():
+    with pytest.raises(BenchError, match=r"--realtime.*--inject"):
+        check_compiled(load_bench(BENCHES / "micron-e727.toml"), "paced", injected=True)
+
+
+def test_asked_for_it_is_bad_input(tmp_path: Path):
+    record = tmp_path / "run.mcap"
+    bench = str(BENCHES / "micron.toml")
+    result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", "--compiled", "--record", str(record)])
+    assert result.exit_code == 2
+    assert not record.exists()
