@@ -16,6 +16,7 @@ import numpy as np
 
 from drivers.base import next_due_ns, wait_s
 from drivers.options import E727Options
+from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, LATE, PERIOD_NS, SUPERSEDED, WORDS
 from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, SerialPort
@@ -26,15 +27,12 @@ from hal.wire_bits import serial_bits
 
 CHANNELS = 3
 RATE_MAX_HZ = 200.0
-ASK_ERROR_EVERY = 20  # commands
 TICK_S = 0.001
 EPSILON_V = 1e-4  # four decimals are sent
 COMMAND_BYTES = len("SVA 1 100.0000 2 100.0000 3 100.0000\n")
 """Longest command of ``write``: three digits before each decimal point. ``MOV`` is as long."""
 ERROR_BYTES = len("ERR?\n")
 """Bytes that ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
-DUE_NS, PERIOD_NS, COMMANDS, SUPERSEDED, LATE, WORDS = range(6)
-"""Places in ``E727.words``: when the next command may go out, the time between two, and three counters."""
 
 
 class E727:

@@ -7,14 +7,14 @@ where this stopped. Importing this module imports numba.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import next_due_ns
-from drivers.piezo.e727 import ASK_ERROR_EVERY, COMMANDS, DUE_NS, E727, PERIOD_NS, SUPERSEDED
 from drivers.piezo.e727_kernels import TEXT_BYTES, encode
+from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, PERIOD_NS, SUPERSEDED
 from drivers.piezo.gcs import (
     COMPLAINT,
     ERROR_QUERY,
@@ -29,6 +29,9 @@ from drivers.piezo.gcs import (
 from hal.compiled import kernel
 from hal.fd_kernels import EAGAIN, read_fd, write_fd
 from hal.output_guard_steps import GuardState, admit, next_ramp_step, note_sent
+
+if TYPE_CHECKING:
+    from drivers.piezo.e727 import E727
 
 SENT, PASSED_OVER, HANDED_OVER = range(3)
 """Results of ``write``: the port has the command; a newer one will replace it; ``E727.write`` must be called."""

@@ -5,15 +5,16 @@ from __future__ import annotations
 import platform
 import sys
 
-from drivers.options import DaqOptions
-from drivers.specs import Adxl203Options, check_devices
+from drivers.options import Adxl203Options
+from drivers.registry import find_driver
+from drivers.specs import check_devices
 from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import BenchFile, Pace
 from hal.errors import BenchError
 
 WITH_KERNELS = ("di4108", "e727")
-OUTPUTS = ("dac_amplifier", "e727", "can_amplifier", "nidaqmx_ao")
-"""Drivers that every tick writes to. What is neither a DAQ nor an output is polled by Python beside the thread."""
+IN_TICK = ("daq", "output")
+"""Roles of the devices that every tick reads or writes. Others are polled by Python beside the thread."""
 AXES = 6
 
 
@@ -27,8 +28,7 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
     if platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux":
         reasons.append(f"the thread needs Linux on x86-64, this is {sys.platform} on {platform.machine()}")
     for name, spec in bench.description.device.items():
-        in_tick = isinstance(options[name], DaqOptions) or spec.driver in OUTPUTS
-        if in_tick and spec.driver not in WITH_KERNELS:
+        if find_driver(spec.driver).role in IN_TICK and spec.driver not in WITH_KERNELS:
             reasons.append(f"device.{name}: its driver {spec.driver} has no kernels on bytes")
     n_axes = sum(len(o.channels) for o in options.values() if isinstance(o, Adxl203Options))
     if n_axes > AXES:
