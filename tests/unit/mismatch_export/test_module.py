@@ -127,6 +127,17 @@ def tanks() -> Recording:
     return equations({**table, "inflow": 1.5, "drain": 0.8, "hold": "zero"}, ("pump",), ("level", "both"), "V")
 
 
+def in_two() -> Recording:
+    """Two filters in a row; effects may stand between them."""
+    first = {"A": [[-40.0]], "B": [[40.0]], "C": [[0.9]], "D": [[0.1]]}
+    return state_space(first=first, D=[[0.3]])
+
+
+def columns() -> Recording:
+    inputs, units = {"simulated_level": wave(1)}, {"simulated_level": "V", "level": "V", **CONTEXT_UNITS}
+    return recording("columns", DT, inputs, {"level": wave()}, units, {"offset": 0.1, "scale": 1.2}, CONTEXT)
+
+
 TWINS: dict[str, Callable[[], Recording]] = {
     "piezo_stack": piezo,
     "accelerometer": accelerometer,
@@ -144,6 +155,8 @@ TWINS: dict[str, Callable[[], Recording]] = {
     ),
     "state_space smooth": lambda: state_space(D=[[0.3]], hold="smooth"),
     "state_space several": several,
+    "state_space in two": in_two,
+    "columns": columns,
     "ode motor": motor,
     "ode tanks": tanks,
 }

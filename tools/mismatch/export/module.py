@@ -22,7 +22,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe
 from tools.mismatch.twins.base import Force
-from tools.mismatch.twins.cascade import CascadeTwin
+from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin, between_of
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.ode import OdeTwin
 from tools.mismatch.twins.opaque import OpaqueTwin
@@ -108,11 +108,13 @@ class _Module:
             self.writer.parameters[key] = (value, unit.replace("{in}", u_in).replace("{out}", u_out))
         return slot
 
-    def _through(self, site: str) -> None:
-        """Lines for the effects in front of the base physics (``input``) or behind it (``output``), in order."""
+    def _through(self, site: str, between: bool = False) -> None:
+        """Lines for the effects in front of the base physics (``input``) or behind it (``output``), in order; those
+        between two filters come on their own.
+        """
         for k in sorted(range(len(self.model.placed)), key=lambda k: STAGES.index(self.model.placed[k].stage)):
             pl = self.model.placed[k]
-            if pl.site != site:
+            if pl.site != site or between != (pl.site == "input" and pl.target == between_of(self.twin)):
                 continue
             for o in pl.outputs[:1] if site == "input" else pl.outputs:
                 x = _name(pl.target if site == "input" else o)
@@ -142,7 +144,9 @@ class _Module:
         elif isinstance(twin, StaticTwin):
             self._static()
         elif isinstance(twin, CascadeTwin):
-            raise InputError("two filters with an effect between them have no numpy form; use --out FILE.toml or .csv")
+            self._first(twin)
+            self._through("input", between=True)
+            self._dynamic(twin.second)
         elif isinstance(twin, OdeTwin):
             self._equations(twin)
         else:
@@ -245,6 +249,19 @@ class _Module:
         for o, code in rows.items():
             add(f"{_name(o)} = {code}")
 
+    def _first(self, twin: CascadeTwin) -> None:
+        """The filter in front of what stands between two, at rest before the record."""
+        table: Mapping[str, Any] = self.base["first"]
+        a, b, c, d = (f"np.array({self._put(f'first.{n}', table[n])})" for n in "ABCD")
+        hold = "discrete" if self.base.get("discrete") else str(twin.hold)
+        drive = _name(twin.inputs[0])
+        if hold == "smooth":
+            self.writer.used |= {"smoothed"}
+            hold, drive = "linear", f"smoothed({drive})"
+        self.writer.part("linear", f"{a}, {b}, dt, {hold!r}, np.zeros(len({a}))", "in_front")
+        through = f" + {d}[0, 0] * {drive}" if np.any(np.asarray(table["D"]) != 0.0) else ""
+        self.writer.run.append(f"{BETWEEN} = in_front(({drive})[:, None]) @ {c}[0]{through}")
+
     def _forced(
         self, twin: DynamicTwin, forces: list[int], a: str, b: str, place: str, speed: str, hold: str, start: str
     ) -> None:
@@ -307,7 +324,7 @@ class _Module:
             said = [f"{s} ({self.file_units[s]}, column {rec.column[s]})" for s in names]
             lines += textwrap.wrap(f"{role}  " + ", ".join(said), WIDTH, subsequent_indent=" " * 9)
         lines += [wrapped for line in self.report for wrapped in textwrap.wrap(line, WIDTH, subsequent_indent=" " * 9)]
-        if isinstance(self.twin, DynamicTwin | OdeTwin):
+        if isinstance(self.twin, DynamicTwin | OdeTwin | CascadeTwin):
             lines += ['"start" is the state at the first sample of that recording; another record begins elsewhere.']
         return [*(line.replace("\\", "/") for line in lines), '"""']
 

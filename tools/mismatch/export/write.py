@@ -21,6 +21,7 @@ from tools.mismatch.export.run import in_file_units, whole_run, whole_view
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
+from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.ode import OdeTwin
 from tools.output import write_text_atomic
@@ -104,6 +105,8 @@ def runnable(module: str) -> Any:
 def order_of(twin: Corrected) -> int:
     """Number of states of the text of a twin."""
     core = twin.model.twin
+    if isinstance(core, CascadeTwin):
+        return len(np.asarray(core.to_text(twin.theta)["A"]))
     if not isinstance(core, DynamicTwin):
         return 0
     a = core.to_text(twin.theta).get("A", np.eye(2))  # a mechanical axis has position and velocity
