@@ -132,6 +132,7 @@ def sealed(
 ) -> tuple[list[float], tuple[tuple[str, str, float], ...]]:
     """Residual rms on the sealed test, (as given, re-fitted, corrected), and what the last one follows."""
     from tools.mismatch.apply import corrected_twin
+    from tools.mismatch.engine.diagnose import opened
     from tools.mismatch.export.run import free_run
     from tools.mismatch.recording import TwinText
     from tools.mismatch.recording_load import load
@@ -145,7 +146,11 @@ def sealed(
     test = load(path)
     first = load(fit)
     twin = make(first)
-    alone = np.array([b["alone"] for b in report["fit"]["base_parameters"]])
+    shifts = report["fit"]["base_parameters"]
+    if [b["name"] for b in shifts] != [p.name for p in twin.parameters]:
+        # the engine wrote the twin in another way: as two filters
+        twin = make(opened(first))
+    alone = np.array([b["alone"] for b in shifts])
     base = dict(twin.to_text(alone))
     table = tomllib.loads(corrected_twin(fit, report).text)["twin"]
     texts = (

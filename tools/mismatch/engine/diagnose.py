@@ -287,7 +287,7 @@ def conclude(
     )  # fmt: skip
 
 
-def opened(recording: Recording, held_out: float, seed: int) -> Recording:
+def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Recording:
     """The recording with its twin as two filters, where an effect sits between them (``partition``).
 
     The busiest stretch decides; a twin that cannot be split costs nothing.
