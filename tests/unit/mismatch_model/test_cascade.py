@@ -22,6 +22,7 @@ from tools.mismatch.twins.make import make
 
 FIRST = ([-0.9, 0.1], [0.75 + 0.35j, 0.75 - 0.35j, 0.5])
 SECOND = ([0.3 + 0.9j, 0.3 - 0.9j], [0.8 + 0.2j, 0.8 - 0.2j, 0.6])
+PRODUCT = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
 
 
 def unit_gain(zeros: list[complex], poles: list[complex]) -> float:
@@ -54,8 +55,7 @@ def test_two_filters_are_the_same_twin_as_their_product() -> None:
     rec = in_two(u, y)
     twin = make(rec)
     assert isinstance(twin, CascadeTwin)
-    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
-    one = recording("state_space", {"u": u}, {"y": y}, {**matrices(*product, unit_gain(*product)), "discrete": True})
+    one = recording("state_space", {"u": u}, {"y": y}, {**matrices(*PRODUCT, unit_gain(*PRODUCT)), "discrete": True})
     a, b = (Model(make(r)) for r in (rec, one))
     view = View.whole(rec)
     assert a.simulate(view, a.start(rec))["y"] == pytest.approx(b.simulate(view, b.start(one))["y"], abs=1e-6)
@@ -134,8 +134,7 @@ def test_a_split_is_found_where_a_curve_sits_inside() -> None:
     u, y = circuit(12000, 0.4)
     noise = 1e-3 * np.random.default_rng(1).standard_normal(y.size)
     y = y + noise
-    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
-    believed = {**matrices(*product, unit_gain(*product)), "discrete": True}
+    believed = {**matrices(*PRODUCT, unit_gain(*PRODUCT)), "discrete": True}
     rec = recording("state_space", {"u": u}, {"y": y}, believed)
     split = opened(rec, 0.3, 0)
     assert "first" in split.twin.parameters
@@ -143,15 +142,14 @@ def test_a_split_is_found_where_a_curve_sits_inside() -> None:
     assert isinstance(first, dict)
     poles = np.linalg.eigvals(np.array(first["A"]))
     assert np.sort_complex(poles) == pytest.approx(np.sort_complex(np.array(FIRST[1])), abs=0.06)
-    straight = recording("state_space", {"u": u}, {"y": filtered(u, *product) + noise}, believed)
+    straight = recording("state_space", {"u": u}, {"y": filtered(u, *PRODUCT) + noise}, believed)
     assert opened(straight, 0.3, 0) is straight
 
 
 def test_a_curve_at_the_output_splits_nothing() -> None:
     u, _ = circuit(12000, 1e3)
-    product = (FIRST[0] + SECOND[0], FIRST[1] + SECOND[1])
-    y = conducted(filtered(u, *product), 0.3, 0.05, 1.0)
-    believed = {**matrices(*product, unit_gain(*product)), "discrete": True}
+    y = conducted(filtered(u, *PRODUCT), 0.3, 0.05, 1.0)
+    believed = {**matrices(*PRODUCT, unit_gain(*PRODUCT)), "discrete": True}
     rec = recording("state_space", {"u": u}, {"y": y}, believed)
     assert opened(rec, 0.3, 0) is rec
 

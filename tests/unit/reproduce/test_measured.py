@@ -11,10 +11,16 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from tests.unit.mismatch_model.test_cascade import PRODUCT, circuit, matrices, unit_gain
 from tools.cli.main import app
 from tools.errors import InputError
+from tools.mismatch.engine.diagnose import opened
+from tools.mismatch.prove.disk import toml_text
+from tools.mismatch.recording_load import load
+from tools.mismatch.twins.cascade import CascadeTwin
+from tools.mismatch.twins.make import make
 from tools.reproduce import measured, measured_rows
-from tools.reproduce.measured import chosen, score
+from tools.reproduce.measured import chosen, score, sealed, write_part
 from tools.reproduce.measured_page import document
 from tools.reproduce.measured_rows import Scored, rows_of
 from tools.reproduce.measured_sets import SETS, Goal, MeasuredSet, Published
@@ -141,3 +147,29 @@ def test_a_run_goes_on_where_it_was_stopped(made: Path, monkeypatch: pytest.Monk
     assert (made / "page.md").read_text().startswith("# The mismatch tool on measured recordings")
     assert CliRunner().invoke(app, ["reproduce", "sensing", "--set", "emps"]).exit_code == 2
     assert CliRunner().invoke(app, ["reproduce", "measured", "--set", "nosuch"]).exit_code == 2
+
+
+def test_the_refit_of_a_twin_that_the_engine_wrote_as_two_filters_is_scored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "data").mkdir()
+    monkeypatch.setenv("MICRON_DATA", str(tmp_path / "data"))
+    u, y = circuit(12000, 0.4)
+    np.savez(tmp_path / "data" / "train.npz", u=u, y=y)
+    believed = {**matrices(*PRODUCT, unit_gain(*PRODUCT)), "discrete": True}
+    channels = [{"column": c, "role": r, "signal": c, "unit": "V"} for c, r in (("u", "input"), ("y", "output"))]
+    table = {"format": 1, "data": "train.npz", "rate_hz": 100.0, "channels": channels}
+    (tmp_path / "data" / "train.toml").write_text(
+        toml_text(table | {"twin": {"kind": "state_space", "parameters": believed}})
+    )
+    s = MeasuredSet("c", "a circuit", ("train.toml", None), ("train.toml", (8000, 12000)), "y", "V", 1.0, 20, (), "")
+    fit = write_part(s, tmp_path / "fit", *s.fit)
+    twin = make(opened(load(fit)))
+    assert isinstance(twin, CascadeTwin)
+    theta = twin.start(load(fit))
+    shifts = [{"name": p.name, "alone": v, "with_effects": v} for p, v in zip(twin.parameters, theta, strict=True)]
+    report = {"format": 1, "verdict": "recalibrate", "twin": "state_space", "physics": []}
+    report |= {"fit": {"unit": {"y": "V"}, "base_parameters": shifts}, "corrected_base": twin.to_text(theta)}
+    figures, _ = sealed(s, fit, report, tmp_path)
+    assert figures[1] == pytest.approx(figures[2], rel=1e-6)
+    assert figures[1] < 1.5 * figures[0]
