@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from typing import Any
 
 from drivers.adc.ads1115 import RATE_TOLERANCE, SAMPLES_PER_S, WAKE_UP_NS, WIRE_BITS
@@ -19,6 +18,7 @@ from drivers.options import (
     E727Options,
     Hmc2003Options,
 )
+from drivers.polls import Polling, Polls
 from drivers.registry import find_driver
 from hal.bench import BenchDescription, I2cSpec
 
@@ -26,25 +26,6 @@ LONGEST_FRAME = 1000
 """Ticks: nothing is polled less often than once in so many."""
 MOST_IN_FRAME = 4
 AXES = 3
-
-
-@dataclass(frozen=True)
-class Polls:
-    """``count`` polls, evenly spread, in every frame of ``divider`` ticks."""
-
-    divider: int
-    count: int = 1
-
-    def per_s(self, tick_hz: float) -> float:
-        return tick_hz * self.count / self.divider
-
-    def ticks(self, first: int) -> tuple[int, ...]:
-        """Return the ticks of a frame in which a poll is due if the first poll is due in tick ``first``."""
-        return tuple((first + k * self.divider // self.count) % self.divider for k in range(self.count))
-
-    @property
-    def shortest_gap(self) -> int:
-        return self.divider // self.count
 
 
 SUPERVISE = Polls(10)
@@ -55,16 +36,6 @@ MONITOR = Polls(5, 2)
 """Default of an amplifier monitor: a fault must be seen soon, whatever rate other converters have."""
 SLOWER_MONITORS = (Polls(4), Polls(5), Polls(10), Polls(20))
 """Defaults where a conversion takes longer than two ticks; they repeat with the other tasks."""
-
-
-@dataclass(frozen=True)
-class Polling:
-    """Holds the polling rate of each task of the instrument; ``None`` if this bench has no device for the task."""
-
-    magnetometer: Polls | None = None
-    monitor: Polls | None = None
-    verify: Polls | None = None
-    telemetry: Polls | None = None
 
 
 def polling_of(description: BenchDescription, options: Mapping[str, Any]) -> tuple[Polling, list[str]]:

@@ -9,19 +9,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol
+from typing import Any, Literal, NamedTuple, Protocol
 
 from drivers.options import Options
+from drivers.polls import Polling
 from hal.bench import DeviceSpec, OpenBench
 from hal.contracts import CanBus
 from hal.errors import BenchError
 from hal.plugins import DRIVERS, Registry
 from hal.types import ChannelInfo
-
-if TYPE_CHECKING:
-    from drivers.can_frames import HostHeartbeat
-    from drivers.piezo.dac_output import DacOutput
-    from drivers.polling import Polling
 
 BUILT_IN: Mapping[str, str] = MappingProxyType(
     {
@@ -70,7 +66,7 @@ class CanViews(Protocol):
     """Lets several drivers share one CAN bus: each sees its own frames, and the host has one heartbeat."""
 
     def view(self, bus: str, can_ids: Iterable[int]) -> CanBus: ...
-    def heartbeat(self, bus: str) -> HostHeartbeat: ...
+    def heartbeat(self, bus: str) -> Any: ...
 
 
 def no_inputs(channel: int) -> float:
@@ -123,7 +119,8 @@ class Driver:
     traffic no task waits for may give ``bits_per_s(options)`` instead, with 9 bits for an I2C byte and 10 for a serial
     one.
     ``addresses``: those that the pins of the part can select. ``max_bus_hz``: fastest I2C clock of the part.
-    ``leased``: class of an output that a guardian can hold as well. ``verifies``: the output can be read back.
+    ``leased``: class of an output (``DacOutput``) that a guardian can hold as well. ``verifies``: the output can be
+    read back.
     """
 
     options: type[Options]
@@ -135,7 +132,7 @@ class Driver:
     traffic: Callable[[Load], Iterable[Traffic]] | None = None
     addresses: tuple[int, ...] = ()
     max_bus_hz: int | None = None
-    leased: type[DacOutput] | None = None
+    leased: Callable[..., Any] | None = None
     verifies: bool = False
 
     def repeated(self, load: Load) -> Iterable[Traffic]:

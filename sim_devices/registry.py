@@ -1,13 +1,14 @@
 """Emulated devices by the name of their driver.
 
-Beside those that ``sim_devices.world`` makes itself, a device is a folder ``sim_devices/parts/NAME`` whose module
-``device`` holds ``DEVICE``, or an entry point of group ``micron.devices`` of another package.
+A device is found in one of three places, in this order: ``BUILT_IN``; a folder ``sim_devices/parts/NAME`` whose module
+``device`` holds ``DEVICE``; an entry point of group ``micron.devices`` of another package.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 from hal.plugins import DEVICES, Registry
@@ -48,13 +49,29 @@ class Device:
 
     ``make(surroundings)`` returns the wire face that its bus requires (``devices.faces``); for a device on a DAQ it
     returns functions from bench time in ns to volts, by input. A face with ``output_V`` (``HasOutputs``) drives the
-    amplifier of the stacks.
+    amplifier of the stacks. A part of ours that is more than one face, or that the plant reaches in more ways, has
+    ``build(world, name, entry)`` instead, which puts its faces on the world's buses.
     """
 
-    make: Callable[[Surroundings], Any]
+    make: Callable[[Surroundings], Any] | None = None
+    build: Callable[[Any, str, Mapping[str, Any]], None] | None = None
 
 
-REGISTRY = Registry(DEVICES, Device, {}, "sim_devices.parts:device:DEVICE")
+BUILT_IN: Mapping[str, str] = MappingProxyType(
+    {
+        "di4108": "sim_devices.parts.instrument:DI4108",
+        "ads1115": "sim_devices.parts.instrument:ADS1115",
+        "dac_amplifier": "sim_devices.parts.instrument:DAC_AMPLIFIER",
+        "e727": "sim_devices.parts.instrument:E727_CONTROLLER",
+        "can_amplifier": "sim_devices.parts.instrument:CAN_AMPLIFIER",
+        "can_telemetry": "sim_devices.parts.instrument:CAN_TELEMETRY",
+        "mpu6050": "sim_devices.parts.inertial:MPU6050",
+        "lsm6ds3": "sim_devices.parts.inertial:LSM6DS3",
+        "bmx055": "sim_devices.parts.inertial:BMX055",
+        "motion_card": "sim_devices.parts.inertial:MOTION_CARD",
+    }
+)
+REGISTRY = Registry(DEVICES, Device, BUILT_IN, "sim_devices.parts:device:DEVICE")
 
 
 def find_device(driver: str) -> Device | None:

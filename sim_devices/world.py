@@ -16,22 +16,9 @@ from numpy.typing import NDArray
 
 from hal.errors import BenchError
 from sim_devices.config import DaqConfig, ImuConfig, emulation_config
-from sim_devices.devices.ad5696r import Ad5696r
-from sim_devices.devices.ads1115 import Ads1115
-from sim_devices.devices.bmx055 import Bmx055Accelerometer, Bmx055Gyroscope
-from sim_devices.devices.bmx055_magnetometer import Bmx055Magnetometer
-from sim_devices.devices.can_piezo_node import CanPiezoNode
-from sim_devices.devices.can_stop_button import CanStopButton
-from sim_devices.devices.can_telemetry_listener import CanTelemetryListener
-from sim_devices.devices.di4108 import Di4108
-from sim_devices.devices.e727 import E727
 from sim_devices.devices.faces import ByteFace, TimedFace, VoltageSource, Volts
-from sim_devices.devices.lsm6ds3 import Lsm6ds3
-from sim_devices.devices.motion_card import MotionCard
-from sim_devices.devices.mpu6050 import Mpu6050
 from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
-from sim_devices.plant.imu import BMX055_SPEC, LSM6DS3_SPEC, MPU6050_SPEC, Imu, ImuSpec
-from sim_devices.registry import HasOutputs, Surroundings, find_device
+from sim_devices.registry import REGISTRY, HasOutputs, Surroundings, find_device
 from sim_devices.stimuli import Stimuli
 from sim_devices.transports.can_hub import CanHub
 from sim_devices.transports.i2c_line import I2cLine
@@ -135,7 +122,7 @@ class World:
 
     # ------------------------------------------------------------------ wiring between devices and plant
 
-    def _analog_V(self, t_ns: int) -> Volts:
+    def analog_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
         volts = self.plant.analog_V
         if self._added_V:
@@ -161,16 +148,16 @@ class World:
         disturbed[self._spike_channel] += SPIKE_V
         return disturbed
 
-    def _motion(self, t_ns: int) -> BodyMotion:
+    def motion(self, t_ns: int) -> BodyMotion:
         self.plant.advance_to(t_ns - self.epoch_ns)
         return self.plant.motion()
 
-    def _magnetometer_V(self, t_ns: int) -> Volts:
+    def magnetometer_V(self, t_ns: int) -> Volts:
         self.plant.advance_to(t_ns - self.epoch_ns)
         self._adc_volts[self._adc_wiring[:3]] = self.plant.magnetometer_V
         return self._adc_volts
 
-    def _stack_monitor(self, channels: Sequence[int], ratio: float) -> VoltageSource:
+    def stack_monitor(self, channels: Sequence[int], ratio: float) -> VoltageSource:
         """Inputs of an ADC whose ``channels`` hang behind dividers by ``ratio`` on the terminals of the three
         stacks."""
         volts = np.zeros(4)
@@ -183,11 +170,11 @@ class World:
 
         return at
 
-    def _amplifier_input(self, channel: int, volts: float, t_ns: int) -> None:
+    def amplify(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
-            self._piezo_demand(channel, volts * self._gain, t_ns)
+            self.demand(channel, volts * self.gain, t_ns)
 
-    def _piezo_demand(self, channel: int, volts: float, t_ns: int) -> None:
+    def demand(self, channel: int, volts: float, t_ns: int) -> None:
         if channel < 3:
             self.plant.set_demand_V(channel, self.faults.demand(channel, volts), t_ns - self.epoch_ns)
 
@@ -196,11 +183,11 @@ class World:
         volts = self.faults.actuator(channel, kind, amount, t_ns)
         self.plant.set_demand_V(channel, volts, t_ns - self.epoch_ns)
 
-    def _stroke_um(self, axis: int, t_ns: int) -> float:
+    def stroke_um(self, axis: int, t_ns: int) -> float:
         self.plant.advance_to(t_ns - self.epoch_ns)
         return float(self.plant.truth_row()["stroke_m"][axis]) * 1e6
 
-    def _strap_switch(self, switches: int, t_ns: int) -> None:
+    def switch_strap(self, switches: int, t_ns: int) -> None:
         self.plant.advance_to(t_ns - self.epoch_ns)
         if switches & STRAP_SET:
             self.plant.strap("set")
@@ -210,29 +197,17 @@ class World:
     # ------------------------------------------------------------------ construction
 
     def _build(self, description: Mapping[str, Any]) -> None:
-        makers: dict[str, Callable[[str, Mapping[str, Any]], None]] = {
-            "di4108": self._add_di4108,
-            "ads1115": self._add_ads1115,
-            "dac_amplifier": self._add_dac,
-            "e727": self._add_e727,
-            "can_amplifier": self._add_can_amplifier,
-            "can_telemetry": self._add_can_telemetry,
-            "mpu6050": self._add_mpu6050,
-            "lsm6ds3": self._add_lsm6ds3,
-            "bmx055": self._add_bmx055,
-            "motion_card": self._add_motion_card,
-        }
         emulation = description.get("emulation", {})
-        self._gain = emulation_config({"emulation": {}, **description}).amplifier.gain
-        self._monitors = {
+        self.gain = emulation_config({"emulation": {}, **description}).amplifier.gain
+        self.monitors = {
             device.get("adc"): (device.get("channels", (0, 1, 2)), float(device.get("ratio", MONITOR_RATIO)))
             for device in description["device"].values()
             if device["driver"] == "amplifier_monitor"
         }
-        self._daq = DaqConfig.model_validate(emulation.get("daq", {}))
-        self._seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
-        self._presses = (emulation.get("endoscope") or {}).get("presses", ())
-        self._baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
+        self.daq = DaqConfig.model_validate(emulation.get("daq", {}))
+        self.seed, self._imus = int(emulation.get("seed", 1)), emulation.get("imu", {})
+        self.presses = (emulation.get("endoscope") or {}).get("presses", ())
+        self.baud = {name: bus.get("baud", 115_200) for name, bus in description["bus"].items()}
         for name, bus in description["bus"].items():
             if not str(bus["uri"]).startswith(SIM_SCHEME):
                 continue
@@ -243,16 +218,14 @@ class World:
                 self._timed.append(self.buses.can[name])
         for name, device in description["device"].items():
             if device.get("daq") is not None:
-                self._add_added(name, device, "daq")
+                self._add(name, device, "daq")
             bus = description["bus"].get(device.get("bus") or "", {})
             if not str(bus.get("uri", "")).startswith(SIM_SCHEME):
                 continue
-            if device["driver"] in makers:
-                makers[device["driver"]](name, device)
-            elif not self._add_added(name, device, bus["kind"]):
+            if not self._add(name, device, bus["kind"]):
                 raise BenchError(
                     f"[device.{name}.driver] there is no emulated '{device['driver']}'; "
-                    f"emulated are {', '.join(makers)}, or give its bus a real URI"
+                    f"emulated are {', '.join(REGISTRY.targets())}, or give its bus a real URI"
                 )
             if device["driver"] == "ads1115":
                 self._wire_magnetometer(name, description)
@@ -260,47 +233,39 @@ class World:
             if bus["kind"] == "serial" and str(bus["uri"]).startswith(SIM_SCHEME) and name not in self.buses.serial:
                 raise BenchError(f"[bus.{name}] is emulated but no device is on it; remove it or add a device")
 
-    def _add_added(self, name: str, device: Mapping[str, Any], kind: str) -> bool:
-        """Add a device of a folder or another package; False if there is none. A driver on a DAQ then shows the plant's
-        volts."""
-        added = find_device(device["driver"])
-        if added is None:
+    def _add(self, name: str, device: Mapping[str, Any], kind: str) -> bool:
+        """Add the emulated device ``name``; False if there is none for its driver. A driver on a DAQ then shows the
+        plant's volts."""
+        found = find_device(device["driver"])
+        if found is None:
             return False
-        motion = self._motion if kind == "daq" else self.stimuli.motion(name, self._motion, Mount())
-        senses = motion, self._analog_V, self._strap_switch, self._amplifier_input
-        made = added.make(Surroundings(name, device, self._seed, self.epoch_ns, *senses))
+        if found.build is not None:
+            found.build(self, name, device)
+            return True
+        assert found.make is not None
+        motion = self.motion if kind == "daq" else self.stimuli.motion(name, self.motion, Mount())
+        senses = motion, self.analog_V, self.switch_strap, self.amplify
+        made = found.make(Surroundings(name, device, self.seed, self.epoch_ns, *senses))
         if kind == "daq":
             self._added_V.update(made)
-        else:
-            {"serial": self._put_serial, "i2c": self._add_chip, "can": self._add_can}[kind](name, device, made)
-            if isinstance(made, HasOutputs):
-                self.stimuli.outputs(name, lambda: made.output_V, len(made.output_V))
-                self._rest_at([volts * self._gain for volts in made.output_V])
+            return True
+        {"serial": self.add_serial, "i2c": self.add_chip, "can": self.add_can}[kind](name, device, made)
+        if isinstance(made, HasOutputs):
+            self.stimuli.outputs(name, lambda: made.output_V, len(made.output_V))
+            self.rest_at([volts * self.gain for volts in made.output_V])
         return True
 
-    def _put_serial(self, name: str, device: Mapping[str, Any], face: Any) -> None:
-        self._add_serial(name, device["bus"], face)
-
-    def _add_serial(self, name: str, bus: str, face: Any) -> None:
+    def add_serial(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        """Put ``face`` at the far end of its serial line. ``BenchError`` where another device is."""
+        bus = device["bus"]
         if bus in self.buses.serial:
             raise BenchError(f"[device.{name}.bus] '{bus}' already has a device; a serial line carries one")
         self.buses.serial[bus] = face
         self.devices[name] = face
         self._timed.append(face)
 
-    def _add_di4108(self, name: str, device: Mapping[str, Any]) -> None:
-        volts = self.stimuli.volts(name, self._analog_V, 8)
-        daq = Di4108(volts, fifo_samples=self._daq.fifo_samples, on_switches=self._strap_switch)
-        self._add_serial(name, device["bus"], daq)
-
-    def _add_e727(self, name: str, device: Mapping[str, Any]) -> None:
-        measure_um = self.stimuli.axis(name, self._stroke_um)
-        controller = E727(on_output=self._piezo_demand, measure_um=measure_um)
-        self.stimuli.outputs(name, lambda: controller.output_V, 4)
-        self._add_serial(name, device["bus"], controller)
-        self._rest_at(controller.output_V)
-
-    def _add_i2c(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+    def add_chip(self, name: str, device: Mapping[str, Any], face: Any) -> None:
+        """Put ``face`` on its I2C bus. ``BenchError`` for a missing or taken address."""
         if device.get("address") is None:
             raise BenchError(f"[device.{name}] has no address; a part on an I2C bus needs one, such as address = 0x0C")
         try:
@@ -308,81 +273,23 @@ class World:
         except ValueError as error:
             raise BenchError(f"[device.{name}.address] {error}") from error
         self.devices[name] = face
+        self._timed.append(face)
 
-    def _add_ads1115(self, name: str, device: Mapping[str, Any]) -> None:
-        monitored = self._monitors.get(name)
-        source = self._magnetometer_V if monitored is None else self._stack_monitor(*monitored)
-        # outputs step within a conversion; the field does not
-        adc = Ads1115(self.stimuli.volts(name, source, 4), looks=1 if monitored is None else 8)
-        self._add_i2c(name, device, adc)
-        self._timed.append(adc)
-
-    def _add_dac(self, name: str, device: Mapping[str, Any]) -> None:
-        dac = Ad5696r(on_output=self._amplifier_input)
-        self.stimuli.outputs(name, lambda: dac.output_V, 4)
-        self._add_i2c(name, device, dac)
-        self._rest_at([volts * self._gain for volts in dac.output_V])
-
-    def _add_can(self, name: str, device: Mapping[str, Any], node: Any) -> None:
+    def add_can(self, name: str, device: Mapping[str, Any], node: Any) -> None:
+        """Put ``node`` on its CAN bus."""
         self.buses.can[device["bus"]].attach(node)
         self.devices[name] = node
 
-    def _add_can_amplifier(self, name: str, device: Mapping[str, Any]) -> None:
-        node = CanPiezoNode(on_output=self._piezo_demand, start_ns=self.epoch_ns)
-        self.stimuli.outputs(name, lambda: node.output_V, 3)
-        self._add_can(name, device, node)
-        self._rest_at(node.output_V)
-
-    def _rest_at(self, demand_V: Sequence[float]) -> None:
+    def rest_at(self, demand_V: Sequence[float]) -> None:
         """Start the amplifier from ``demand_V``, the output of the device at power-up."""
         for channel in range(3):
             self.plant.set_demand_V(channel, demand_V[channel], 0)
 
-    def _add_can_telemetry(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_can(name, device, CanTelemetryListener())
-        self._add_can(f"{name}.stop_button", device, CanStopButton(start_ns=self.epoch_ns))
-
-    def _specimen(self, name: str) -> dict[str, Any]:
+    def specimen(self, name: str) -> dict[str, Any]:
         """Keywords of the IMU that the bench file calls ``name``."""
         wish = ImuConfig.model_validate(self._imus.get(name, {}))
         mount = Mount(np.array(wish.position_mm) * 1e-3, rotation(wish.turn_deg))
-        return {"seed": self._seed, "name": name, "mount": mount, "errors": wish.errors, "noise": wish.noise}
-
-    def _imu(self, name: str, spec: ImuSpec) -> Imu:
-        specimen = self._specimen(name)
-        return Imu(spec, self.stimuli.motion(name, self._motion, specimen["mount"]), **specimen)
-
-    def _add_chip(self, name: str, device: Mapping[str, Any], face: Any) -> None:
-        self._add_i2c(name, device, face)
-        self._timed.append(face)
-
-    def _add_mpu6050(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_chip(name, device, Mpu6050(self._imu(name, MPU6050_SPEC)))
-
-    def _add_lsm6ds3(self, name: str, device: Mapping[str, Any]) -> None:
-        self._add_chip(name, device, Lsm6ds3(self._imu(name, LSM6DS3_SPEC)))
-
-    def _add_bmx055(self, name: str, device: Mapping[str, Any]) -> None:
-        """Three dies; ``NAME.gyro`` and ``NAME.magnetometer`` are the further two, for fault injection."""
-        imu = self._imu(name, BMX055_SPEC)
-        self._add_chip(name, device, Bmx055Accelerometer(imu, start_ns=self.epoch_ns))
-        gyro = {"bus": device["bus"], "address": device.get("gyro_address", 0x68)}
-        self._add_chip(f"{name}.gyro", gyro, Bmx055Gyroscope(imu, start_ns=self.epoch_ns))
-        magnetometer = {"bus": device["bus"], "address": device.get("mag_address", 0x10)}
-        self._add_chip(f"{name}.magnetometer", magnetometer, Bmx055Magnetometer(imu, seed=self._seed))
-
-    def _add_motion_card(self, name: str, device: Mapping[str, Any]) -> None:
-        specimen = self._specimen(name)
-        card = MotionCard(
-            self.stimuli.motion(name, self._motion, specimen["mount"]),
-            baud=self._baud[device["bus"]],
-            rate_hz=float(device.get("rate_hz", 100.0)),
-            scaled=device.get("fields") == "scaled",
-            start_ns=self.epoch_ns,
-            presses=self._presses,
-            **specimen,
-        )
-        self._add_serial(name, device["bus"], card)
+        return {"seed": self.seed, "name": name, "mount": mount, "errors": wish.errors, "noise": wish.noise}
 
     def _wire_magnetometer(self, adc: str, description: Mapping[str, Any]) -> None:
         """Bridge outputs x, y, z go to the inputs that the bench file names."""

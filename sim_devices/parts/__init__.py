@@ -1,4 +1,4 @@
-"""Emulated parts, a folder each: ``NAME/device.py`` holds ``DEVICE`` (``sim_devices.registry``).
+"""Emulated parts by name (``sim_devices.registry``): a folder each, ``NAME/device.py`` with ``DEVICE``, and our own.
 
-What lives here: parts written from their data sheets. What must not: any import of a driver.
+What lives here: how a part hangs on the world. What must not: any import of a driver.
 """
