@@ -195,6 +195,22 @@ def test_means_over_a_longer_step_keep_out_what_is_too_fast(tmp_path: Path):
     np.testing.assert_allclose(load(tmp_path).inputs["force"][1:-1], (8 * np.sin(4.4 * t))[1:-1], atol=0.02)
 
 
+def test_a_clock_that_follows_nothing_is_brought_to_a_rate_that_it_has_samples_for(tmp_path: Path):
+    """Even steps at the usual rate of such a clock hold more samples than were measured: said, with another."""
+    t = np.sort(np.random.default_rng(0).uniform(0, 30, T.size))
+    data = csv(tmp_path / "a.csv", "t_s,force_N,pos_mm", t, 8 * np.sin(0.9 * t), np.cos(0.9 * t))
+    result = call(data, "--cut")
+    assert result.exit_code == 0, result.output
+    said = " ".join(result.stderr.split())
+    assert "lie where nothing was measured" in said
+    offered = said.split("--resample ")[1].split()[0]
+    assert float(offered) == pytest.approx(0.5 * T.size / 30, rel=0.02)
+    result = call(data, "--resample", offered, "--force")
+    assert result.exit_code == 0, result.output
+    assert "lie where nothing was measured" not in " ".join(result.stderr.split())
+    assert 1 / load(tmp_path).dt == float(offered)
+
+
 ROWS = range(60)
 BAD = {
     "empty file": ("a.csv", b"", "no columns"),

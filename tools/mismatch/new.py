@@ -58,6 +58,10 @@ class NewRecording:
         }
 
 
+MOST_FILLED = 0.1
+"""Share of samples on straight lines between measured ones above which the reader is told."""
+
+
 def new_recording(
     data: Path,
     out: Path | None = None,
@@ -151,6 +155,12 @@ def _rewritten(data: Path, found: Guess, resample_hz: float | None) -> tuple[Str
     every = not found.kind or found.kind in APART
     columns, stretch = cut_columns(data, t, {k: read[k] for k in used}, every=every, rate_hz=resample_hz)
     notes = [*found.notes, *found.broken]
+    if resample_hz is None and stretch.filled > MOST_FILLED * stretch.samples:
+        mean_hz = t.size * stretch.rate_hz / stretch.samples
+        notes.append(
+            f"{stretch.filled} of {stretch.samples} samples lie where nothing was measured, on straight lines: noise"
+            f" and fast motion are misread there; --resample {0.5 * mean_hz:.3g} takes means instead"
+        )
     if stretch.kept < stretch.parts:
         why = "shorter ones are dropped" if every else f"a {found.kind} runs through: the longest is kept"
         notes.append(f"{stretch.parts} stretches without gaps, {stretch.kept} kept: {why}")

@@ -338,7 +338,8 @@ def _step(path: Path, name: str, stamps: Array, rate: float | None, notes: list[
         i = int(np.argmax(back)) + 1
         what = "stands still" if d[i - 1] == 0 else "runs backwards"
         raise RecordingError(
-            f"{path}: time column '{name}' {what} at sample {i} ({stamps[i - 1]:g} then {stamps[i]:g} s); sort it"
+            f"{path}: time column '{name}' {what} at sample {i} ({stamps[i - 1]:g} then {stamps[i]:g} s);"
+            " 'micron mismatch cut RECORDING --out FOLDER' sorts it"
         )
     dt, median = float(stamps[-1] - stamps[0]) / d.size, float(np.median(d))
     gap = d > 1.5 * median

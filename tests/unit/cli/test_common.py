@@ -1,6 +1,8 @@
 """JSON output and errors of all commands."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -56,6 +58,37 @@ def test_exit_codes(error: Exception, code: Exit, capsys: pytest.CaptureFixture[
         raise error
     assert caught.value.exit_code == code
     assert capsys.readouterr().err.startswith("micron: ")
+
+
+REFUSED = """
+import resource
+from pathlib import Path
+
+import numpy as np
+import typer
+
+from tools.cli.common import clear_errors
+
+
+def run() -> None:
+    with clear_errors():
+        np.ones(100_000_000)
+
+
+mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+resource.setrlimit(resource.RLIMIT_AS, (mapped + 32_000_000, resource.getrlimit(resource.RLIMIT_AS)[1]))
+typer.run(run)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="the limit is read off /proc")
+def test_a_computer_without_memory_to_start_with_gets_one_message():
+    """Below a limit of the operating system that leaves 32 MB: refused, with what to do, and no stack trace."""
+    done = subprocess.run([sys.executable, "-c", REFUSED], capture_output=True, text=True)
+    assert done.returncode == Exit.FAILED, done.stderr
+    assert done.stderr.startswith("micron: not enough memory: Unable to allocate")
+    assert done.stderr.endswith("end other programs, or ask for less\n")
+    assert done.stderr.count("\n") == 1
 
 
 def test_keys_in_brackets_reach_the_reader(capsys: pytest.CaptureFixture[str]):

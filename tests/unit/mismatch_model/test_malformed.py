@@ -43,6 +43,15 @@ def axis(parameters: str) -> str:
     return PLANT.format(kind="mechanical_axis", parameters=parameters, input="force", unit="N")
 
 
+def equation(text: str) -> str:
+    parameters = f'states = {{ z = "m" }}\nequations = {{ z = "{text}" }}\nlag = 0.1'
+    return (
+        PLANT.format(kind="ode", parameters="", input="u", unit="V")
+        .replace("[twin.parameters]", parameters.replace("lag = 0.1", "[twin.parameters]\nlag = 0.1"), 1)
+        .replace('signal = "position"', 'signal = "z"')
+    )
+
+
 def effect(lines: str) -> str:
     return GOOD.replace("[[channels]]", f"[[twin.effects]]\n{lines}\n[[channels]]", 1)
 
@@ -103,6 +112,11 @@ BAD: dict[str, tuple[str, str | bytes | None, str]] = {
     "A not square": (space("A = [[1.0, 2.0]]\nB = [[1.0]]\nC = [[1.0]]"), None, "it must be square"),
     "A ragged": (space("A = [[1.0, 2.0], [3.0]]"), None, "rows of equal length"),
     "B of wrong shape": (space("A = [[-1.0]]\nB = [[1.0, 2.0]]\nC = [[1.0]]"), None, "expected 1 x 1"),
+    "A with a hole": (space("A = [[-1.0, nan], [0.0, -2.0]]"), None, "A: row 1, column 2 is nan"),
+    "x0 of wrong size": (space("A = [[-1.0]]\nB = [[1.0]]\nC = [[1.0]]\nx0 = [1.0, 2.0]"), None, "expected 1 x 1"),
+    "unknown symbol": (equation("(u - kk * z) / lag"), None, "'kk' is no state, .*; known: t, z, u, lag$"),
+    "open bracket": (equation("(u - z / lag"), None, r"'\(u - z / lag' cannot be read \('\(' was never closed\)$"),
+    "infinite at once": (equation("u / (lag - lag)"), None, "state 'z' is .* with your own parameters"),
     "unknown hold": (space('A = [[-1.0]]\nB = [[1.0]]\nC = [[1.0]]\nhold = "first"'), None, "hold must be"),
     "mass zero": (axis("mass = 0.0"), None, "mass must be positive"),
     "stiffness as text": (axis('mass = 1.0\nstiffness = "soft"'), None, "stiffness must be a finite"),

@@ -104,7 +104,7 @@ def parse(builder: Builder, texts: Mapping[str, str], wanted: Sequence[str]) -> 
         if name == "pi":
             return builder.constant(math.pi)
         if name not in texts:
-            known = ", ".join((*builder.names, *texts))
+            known = ", ".join((*builder.names, *(t for t in texts if t.isidentifier())))
             raise EquationError(f"equation of '{where}': '{name}' is no state, input or parameter; known: {known}")
         if name in under_way:
             raise EquationError(f"equation of '{where}': '{name}' is defined by itself ({' -> '.join(under_way)})")
@@ -116,7 +116,8 @@ def parse(builder: Builder, texts: Mapping[str, str], wanted: Sequence[str]) -> 
             try:
                 tree = ast.parse(texts[name].strip(), mode="eval")
             except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
-                raise EquationError(f"equation of '{name}': '{texts[name]}' cannot be read ({error})") from None
+                why = error.msg if isinstance(error, SyntaxError) else error
+                raise EquationError(f"equation of '{name}': '{texts[name]}' cannot be read ({why})") from None
             try:
                 done[name] = value(tree.body, name)
             except RecursionError:

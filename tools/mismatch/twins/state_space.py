@@ -194,9 +194,12 @@ def _matrix(recording: Recording, key: str, shape: tuple[int | None, int | None]
     if a.ndim < 2:
         a = a.reshape(1, -1) if shape[0] == 1 else a.reshape(-1, 1)
     bad = any(want is not None and want != have for want, have in zip(shape, a.shape, strict=True))
-    if a.ndim != 2 or bad or not np.all(np.isfinite(a)):
+    if a.ndim == 2 and not bad and not np.all(np.isfinite(a)):
+        i, k = np.argwhere(~np.isfinite(a))[0]
+        raise RecordingError(f"{where}: row {i + 1}, column {k + 1} is {a[i, k]}; every entry must be a finite number")
+    if a.ndim != 2 or bad:
         want = " x ".join("?" if w is None else str(w) for w in shape)
-        raise RecordingError(f"{where} has shape {a.shape}, expected {want} finite numbers")
+        raise RecordingError(f"{where} has shape {a.shape}, expected {want} numbers")
     return a
 
 
