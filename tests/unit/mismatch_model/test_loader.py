@@ -148,7 +148,7 @@ BAD: list[tuple[str, Callable[[Path], None], str]] = [
     ("NaN", _line(11, "0.01,1,nan,3"), r"column 'z' sample 10 \(line 12\): nan"),
     ("not a number", _line(5, "0.004,1,oops,3"), "line 6: column 'z': 'oops' is not a number"),
     ("short line", _line(5, "0.004,1"), "line 6: 2 values, the header names 4"),
-    ("time backwards", _timed(20, "0.001"), r"time column 't_s' runs backwards at sample 19 .*mismatch cut .* sorts it"),
+    ("time backwards", _timed(20, "0.001"), r"'t_s' runs backwards at sample 19 .*mismatch cut .* sorts it"),
     ("time gap", _timed(80, "9.000"), r"time column 't_s' jumps by .* at sample 79"),
     ("too short", lambda f: write(f, data=rows(20)) and None, "20 samples; at least 50 .* 3 times the rate"),
     ("dead output", lambda f: write(f, data=[r.replace(r.split(",")[2], "7") if i else r for i, r in enumerate(rows())])
