@@ -55,7 +55,9 @@ class Row:
             return {"name": self.name, "error": self.error}
         fit = self.report["fit"]
         worst = max(fit["unit"], key=lambda o: fit["recalibrated_rms"][o] / max(fit["noise_floor_rms"][o], 1e-300))
-        factor, unit = scaled(fit["recalibrated_rms"][worst], fit["unit"][worst])
+        factor, unit = scaled(
+            fit["recalibrated_rms"][worst], fit["unit"][worst], fit.get("file_unit", {}).get(worst, "")
+        )
         return {
             "name": self.name,
             "error": "",

@@ -71,7 +71,18 @@ def test_poorly_known_is_more_than_thirty_percent():
 
 def test_before_and_after_share_a_unit():
     p = replace(creep(), residual_rms_before=8.27e-5, residual_rms_after=4.34e-6)
-    assert wording.before_after(p, "m") == "82.7 without it, 4.34 with it (um rms, held out)"
+    fit = replace(missing_physics().fit, unit={p.output: "m"})
+    assert wording.before_after(p, fit) == "82.7 without it, 4.34 with it (um rms, held out)"
+
+
+def test_figures_of_an_output_are_in_the_unit_of_its_file():
+    p = replace(creep(), residual_rms_before=8.27e-5, residual_rms_after=4.34e-6)
+    fit = replace(missing_physics().fit, unit={p.output: "m"}, file_unit={p.output: "mm"})
+    assert wording.before_after(p, fit) == "0.0827 without it, 0.00434 with it (mm rms, held out)"
+    assert wording.shown_in(fit, p.output, 3e-9) == (pytest.approx(1e3), "mm")
+    # a difference knows nothing of where a scale begins
+    assert wording.scaled(1.0, "degC", "K") == (1.0, "K")
+    assert wording.scaled(1.0, "rad", "deg") == (pytest.approx(57.29578), "deg")
 
 
 @pytest.mark.parametrize(
@@ -106,10 +117,11 @@ def test_two_figures_side_by_side_need_no_power_of_ten() -> None:
 def test_why_an_effect_is_not_named_is_said_with_the_figures_that_show_it():
     gap = ParameterValue(7e-5, "um", (-2.9e-4, 4.3e-4))
     held = Withheld("backlash", "displacement", "holds_zero", {"gap": gap}, ("gap",), 0.41, 0.4)
-    assert wording.why_withheld(held, "um") == (
+    fit = missing_physics().fit
+    assert wording.why_withheld(held, fit) == (
         "its size may be zero: gap 0.00007 (-0.00029 .. 0.00043) um; 0.41 without it, 0.4 with it (um rms, held out)"
     )
     stuck = replace(held, reason="at_limit", shown_by=("half_gap",), replaced_by="hysteresis")
-    said = wording.why_withheld(stuck, "um")
+    said = wording.why_withheld(stuck, fit)
     assert said.startswith("half gap ended at a limit of the search")
     assert said.endswith("hysteresis is named instead")

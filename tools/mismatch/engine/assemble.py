@@ -172,6 +172,7 @@ def assemble(
             tuple(shifts),
             decision.floors,
             dict(rec.tolerance),
+            {o: rec.file_unit[o] for o in twin.outputs if rec.file_unit[o] != twin.units[o]},
         ),
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),
@@ -276,7 +277,7 @@ def summary(
     if verdict == "missing_physics":
         names = " and ".join(dict.fromkeys(p.name.replace("_", " ") for p in physics))
         o = physics[0].output
-        factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o])
+        factor, unit = scaled(max(a[o], b[o]), problem.twin.units[o], problem.recording.file_unit[o])
         said = (
             f"The simulation lacks {names} at the {physics[0].stage} ({outputs}): with it the held-out residual falls"
             f" from {number(factor * a[o])} to {number(factor * b[o])} {unit}."

@@ -155,6 +155,8 @@ class FitSummary:
     base_parameters: tuple[BaseShift, ...]
     noise_floor_interval: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, "tuple[float, float]"])
     tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
+    file_unit: Mapping[str, str] = field(default_factory=dict[str, str])
+    """Unit of an output in the data file, where it is not ``unit``: people are shown that one."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from tools.mismatch.export.module import python_module
 from tools.mismatch.export.run import in_file_units, whole_run, whole_view
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
+from tools.mismatch.report.wording import scaled
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
@@ -176,7 +177,9 @@ def _said(report: Mapping[str, Any]) -> list[str]:
     fit = report.get("fit", {})
     for o, v in fit.get("fitted_rms", {}).items():
         base = fit.get("base_rms", {}).get(o)
-        lines.append(f"residual on held-out data, {o}: {_figure(v)} {fit['unit'][o]} (twin as given: {_figure(base)})")
+        factor, unit = scaled(v, fit["unit"][o], fit.get("file_unit", {}).get(o, ""))
+        given = _figure(None if base is None else factor * base)
+        lines.append(f"residual on held-out data, {o}: {_figure(factor * v)} {unit} (twin as given: {given})")
     return lines
 
 

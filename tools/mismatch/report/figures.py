@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tools.mismatch.engine.report import Pictures, Report
 from tools.mismatch.report import series
 from tools.mismatch.report.svg import AFTER, BEFORE, GIVEN, HELD, INK, MEASURED, NOISE, figure
-from tools.mismatch.report.wording import scaled
+from tools.mismatch.report.wording import scaled, shown_in
 
 Array = NDArray[np.float64]
 WIDTH_IN = 11.6
@@ -131,7 +131,7 @@ def follows(report: Report, p: Pictures, output: str, name: str) -> str:
 
 
 def _residual_unit(report: Report, output: str) -> tuple[float, str]:
-    return scaled(report.fit.recalibrated_rms[output], report.fit.unit[output])
+    return shown_in(report.fit, output, report.fit.recalibrated_rms[output])
 
 
 def _dots(ax: Any, x: Array, y: Array, colour: str) -> None:

@@ -85,8 +85,7 @@ def _base_equation(report: Report) -> str:
 
 
 def _effect(report: Report, p: PhysicsFound) -> dict[str, Any]:
-    unit = report.fit.unit.get(p.output, "")
-    factor, shown = wording.scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
+    factor, shown = wording.shown_in(report.fit, p.output, max(p.residual_rms_before, p.residual_rms_after))
     known = EFFECTS.get(p.name)
     return {
         "found": p,
@@ -109,7 +108,7 @@ def _bars(report: Report) -> list[dict[str, Any]]:
     """Per output the four figures of the fit as bars; one scale per output."""
     f = report.fit
     out: list[dict[str, Any]] = []
-    for o, unit in f.unit.items():
+    for o in f.unit:
         values = [("as given", "given", f.base_rms[o]), ("recalibrated", "before", f.recalibrated_rms[o])]
         if report.physics:
             values.append(("with physics", "after", f.fitted_rms[o]))
@@ -119,7 +118,7 @@ def _bars(report: Report) -> list[dict[str, Any]]:
         # one hopeless figure (an unstable twin) must not hide the others
         second = sorted(finite)[-2] if len(finite) > 1 else longest
         top = min(longest, 4 * second) or 1.0
-        factor, shown = wording.scaled(second, unit)
+        factor, shown = wording.shown_in(f, o, second)
         rows = [
             (label, kind, number(v * factor), min(100.0, 100 * v / top) if math.isfinite(v) else 100.0, not v <= top)
             for label, kind, v in values
@@ -160,7 +159,7 @@ def _limits(report: Report) -> dict[str, Any]:
     """Effects by output; a row per effect, least output first."""
     outputs = list(report.detection_limit)
     names = dict.fromkeys(n for of in report.detection_limit.values() for n in of)
-    units = {o: wording.scaled(report.fit.noise_floor_rms.get(o, 1.0), report.fit.unit.get(o, "")) for o in outputs}
+    units = {o: wording.shown_in(report.fit, o, report.fit.noise_floor_rms.get(o, 1.0)) for o in outputs}
 
     def shown(o: str, n: str) -> str:
         v = report.detection_limit[o].get(n)

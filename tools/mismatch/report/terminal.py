@@ -10,7 +10,7 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from tools.mismatch.engine.report import PhysicsFound, Report
+from tools.mismatch.engine.report import FitSummary, PhysicsFound, Report
 from tools.mismatch.report import wording
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.next_experiment import next_experiments
@@ -56,7 +56,7 @@ def _where(report: Report) -> RenderableType:
     return t
 
 
-def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
+def _physics(k: int, p: PhysicsFound, fit: FitSummary) -> RenderableType:
     head = Text.assemble(
         (f"{k}. {words(p.name)}", "bold yellow"),
         f" of {', '.join(p.outputs)}, at the {p.stage}; sure {percent(p.confidence)}",
@@ -66,7 +66,7 @@ def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
     for name, v in p.parameters.items():
         value, lo, hi = wording.interval(v)
         t.add_row(Text(wording.label(name, v.unit)), value, f"{lo} .. {hi}", Text(v.unit if v.unit != "1" else ""))
-    rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, unit)), ("source", p.source)]
+    rows = [("equation", plain(p.equation)), ("residual", wording.before_after(p, fit)), ("source", p.source)]
     if p.note:
         rows.append(("place", f"{p.note}: this recording cannot tell"))
     if p.at_bound:
@@ -77,8 +77,8 @@ def _physics(k: int, p: PhysicsFound, unit: str) -> RenderableType:
 def _fit(report: Report) -> Table:
     t = _table("output", "as given", "re-fitted", "with physics", "noise floor", "explained")
     f = report.fit
-    for o, unit in f.unit.items():
-        factor, shown = wording.scaled(f.recalibrated_rms[o], unit)
+    for o in f.unit:
+        factor, shown = wording.shown_in(f, o, f.recalibrated_rms[o])
         figures = (f.base_rms[o] * factor, f.recalibrated_rms[o] * factor, f.fitted_rms[o] * factor)
         floor = f"{wording.floor_of(f, o, factor)} ({f.noise_method.get(o, '')})"
         t.add_row(Text(f"{o} ({shown})"), *map(number, figures), floor, percent(wording.explained(f, o)))
@@ -98,7 +98,7 @@ def _runners_up(report: Report) -> Table:
     t = _table("effect", "output", "held-out residual", "why not")
     t.columns[1].justify = t.columns[3].justify = "left"
     for a in report.alternatives:
-        factor, unit = wording.scaled(a.residual_rms_after, report.fit.unit.get(a.output, ""))
+        factor, unit = wording.shown_in(report.fit, a.output, a.residual_rms_after)
         t.add_row(
             words(a.name), Text(a.output), f"{number(a.residual_rms_after * factor)} {unit}", Text(words(a.why_not))
         )
@@ -110,7 +110,7 @@ def _limits(report: Report) -> Table:
     rows: list[tuple[str, str]] = []
     for o, of in report.detection_limit.items():
         known = sorted((v, n) for n, v in of.items() if v is not None)
-        factor, unit = wording.scaled(report.fit.noise_floor_rms.get(o, 1.0), report.fit.unit.get(o, ""))
+        factor, unit = wording.shown_in(report.fit, o, report.fit.noise_floor_rms.get(o, 1.0))
         said = [f"{words(n)} {number(v * factor)}" for v, n in known]
         if report.verdict in ("missing_physics", "unexplained") and len(said) > 3:
             said = [f"{said[0]} .. {said[-1]} (all in --json and --html)"]
@@ -160,20 +160,14 @@ def render(report: Report) -> RenderableType:
         parts.append(_section("Where", _where(report)))
     if report.physics:
         title = "What is missing" if report.verdict == "missing_physics" else "What was explained before"
-        units = report.fit.unit
-        parts.append(
-            _section(title, Group(*(_physics(i + 1, p, units.get(p.output, "")) for i, p in enumerate(report.physics))))
-        )
+        parts.append(_section(title, Group(*(_physics(i + 1, p, report.fit) for i, p in enumerate(report.physics)))))
     parts.append(_section("Residual on data that no fit has seen (rms)", _fit(report)))
     if report.fit.base_parameters:
         parts.append(_section("Base parameters", _base(report)))
     if report.alternatives:
         parts.append(_section("Runners-up", _runners_up(report)))
     if report.withheld:
-        of = [
-            (words(w.name), f"{w.output}: {wording.why_withheld(w, report.fit.unit.get(w.output, ''))}")
-            for w in report.withheld
-        ]
+        of = [(words(w.name), f"{w.output}: {wording.why_withheld(w, report.fit)}") for w in report.withheld]
         parts.append(_section("Tried and not named", _pairs(of)))
     if report.equivalent:
         lines = [f"{' = '.join(words(n) for n in e.names)}: {words(e.tell_apart_by)}" for e in report.equivalent]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
+from tools.mismatch import units
 from tools.mismatch.engine.report import (
     BaseShift,
     FitSummary,
@@ -52,12 +53,21 @@ _PREFIXES = ((1.0, ""), (1e3, "m"), (1e6, "u"), (1e9, "n"))
 _SCALABLE = {"V", "A", "N", "m", "g", "rad", "m/s", "m/s^2", "rad/s"}
 
 
-def scaled(typical: float, unit: str) -> tuple[float, str]:
-    """A factor and a unit in which ``typical`` is at least 1 where an SI prefix can do it, e.g. (1e3, "mV")."""
+def scaled(typical: float, unit: str, file_unit: str = "") -> tuple[float, str]:
+    """A factor and a unit to show a difference in: that of the data file where it is another than ``unit``, else one in
+    which ``typical`` is at least 1 where an SI prefix can do it, e.g. (1e3, "mV").
+    """
+    if file_unit and file_unit != unit:
+        return units.convert_difference(1.0, unit, file_unit), file_unit
     if unit not in _SCALABLE or not math.isfinite(typical) or typical <= 0:
         return 1.0, unit
     factor, prefix = next(((f, p) for f, p in _PREFIXES if typical * f >= 1.0), _PREFIXES[-1])
     return (factor, prefix + unit) if typical < 0.1 else (1.0, unit)
+
+
+def shown_in(fit: FitSummary, output: str, typical: float) -> tuple[float, str]:
+    """A factor and a unit to show differences of an output in (``scaled``)."""
+    return scaled(typical, fit.unit.get(output, ""), fit.file_unit.get(output, ""))
 
 
 def percent(share: float | None) -> str:
@@ -163,7 +173,7 @@ def cautions(report: Report) -> list[str]:
             if noise > 0 and f.fitted_rms[o] > max(MUCH * most, f.tolerance.get(o, 0.0)):
                 out.append(f"what is left in {o} is {number(f.fitted_rms[o] / most)} times the noise floor")
     for o in report.doubtful:
-        factor, unit = scaled(report.fit.noise_floor_interval[o][1], report.fit.unit.get(o, ""))
+        factor, unit = shown_in(report.fit, o, report.fit.noise_floor_interval[o][1])
         out.append(
             f"the noise of {o} may be {floor_of(report.fit, o, factor)} {unit}: the verdict is that of the upper end"
         )
@@ -227,14 +237,14 @@ def step_s(report: Report) -> float | None:
     return float(min(p.t[i + 1] - p.t[i] for i in range(min(p.t.size - 1, 16))))
 
 
-def before_after(p: PhysicsFound, unit: str) -> str:
+def before_after(p: PhysicsFound, fit: FitSummary) -> str:
     """Return what one effect does to the held-out residual of its output."""
-    factor, unit = scaled(max(p.residual_rms_before, p.residual_rms_after), unit)
+    factor, unit = shown_in(fit, p.output, max(p.residual_rms_before, p.residual_rms_after))
     without, within = number(p.residual_rms_before * factor), number(p.residual_rms_after * factor)
     return f"{without} without it, {within} with it ({unit} rms, held out)"
 
 
-def why_withheld(w: Withheld, unit: str) -> str:
+def why_withheld(w: Withheld, fit: FitSummary) -> str:
     """Why an effect that lowered the residual is not named, with the figures that show it."""
     names = ", ".join(words(n) for n in w.shown_by)
     if w.reason == "below_tolerance":
@@ -248,7 +258,7 @@ def why_withheld(w: Withheld, unit: str) -> str:
             value, lo, hi = interval(p)
             shown.append(f"{label(n, p.unit)} {value} ({lo} .. {hi}) {'' if p.unit == '1' else p.unit}".rstrip())
         why = f"its size may be zero: {', '.join(shown)}"
-    factor, scaled_unit = scaled(max(w.residual_rms_without, w.residual_rms_with), unit)
+    factor, scaled_unit = shown_in(fit, w.output, max(w.residual_rms_without, w.residual_rms_with))
     without, within = number(w.residual_rms_without * factor), number(w.residual_rms_with * factor)
     instead = f"; {words(w.replaced_by)} is named instead" if w.replaced_by else ""
     return f"{why}; {without} without it, {within} with it ({scaled_unit} rms, held out){instead}"
