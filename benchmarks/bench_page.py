@@ -1,6 +1,8 @@
 """(j) What the bench page costs: the server with one viewer of 20 channels at 60 frames a second, and the firmware's
 tick with viewers beside the same without, in turns within one run. A viewer is a process that reads what it is sent,
-without drawing. ``make bench ONLY=bench_page`` prints it; ``benchmarks.loop`` takes ``measure`` for its own rows."""
+without drawing. Twelve processes cost the loop something on any machine: as many that read as much from a server of
+their own, which has nothing to do with the bench, say how much of it. ``make bench ONLY=bench_page`` prints it;
+``benchmarks.loop`` takes ``measure`` for its own rows."""
 
 from __future__ import annotations
 
@@ -13,6 +15,7 @@ import time
 import urllib.request
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,11 +28,13 @@ from tools.bench.started import started
 from tools.cli.bench_option import bench_path
 
 SECONDS = 10.0
-VIEWERS = {0: "no viewer", 1: "one viewer", 12: "twelve viewers"}
+NONE, ONE, TWELVE, STRANGERS = "no viewer", "one viewer", "twelve viewers", "twelve strangers"
+LOOKS = {NONE: 0, ONE: 1, TWELVE: 12, STRANGERS: 12}
+"""Number of processes; the strangers are the control: they read as many bytes as often from a server of their own."""
 ROUNDS = 4
 PART_S = 5.0
 """Each number of viewers looks for so long, ``ROUNDS`` times in turns: what else the machine does meets all alike."""
-MOST_CORE = {1: 0.10, 12: 0.40}
+MOST_CORE = {ONE: 0.10, TWELVE: 0.40}
 MOST_RATIO = 1.05
 PERIOD_NS = 1_000_000
 CHANNELS = [f"volts_{i}" for i in range(8)] + [f"accelerometer_{a}" for a in ("1x", "1z", "2y", "2z", "3x", "3y")]
@@ -45,6 +50,23 @@ with connect(url) as ws:
     while time.monotonic() < end:
         frames += isinstance(ws.recv(10), bytes)
 print(frames)
+"""
+FRAME_BYTES = 32 + 17 * (8 + 4 * len(CHANNELS))
+OTHER_SERVER = """
+import asyncio, contextlib, sys
+from websockets.asyncio.server import serve
+from websockets.exceptions import ConnectionClosed
+async def one(ws):
+    await ws.recv()
+    with contextlib.suppress(ConnectionClosed):
+        while True:
+            await asyncio.sleep(1 / 60)
+            await ws.send(bytes(int(sys.argv[1])))
+async def main():
+    async with serve(one, "127.0.0.1", 0, compression=None) as server:
+        print(server.sockets[0].getsockname()[1], flush=True)
+        await asyncio.Future()
+asyncio.run(main())
 """
 
 
@@ -147,11 +169,13 @@ def measure(bench: Path) -> dict[str, float]:
 
 @dataclass
 class Watched:
-    """What was seen with one number of viewers. ``ticks``: lower bound in ns and count of the firmware's ticks."""
+    """What was seen with one of ``LOOKS``. ``ticks``: lower bound in ns and count of the firmware's ticks; ``parts``:
+    the same of each round."""
 
     used_s: float = 0.0
     frames: int = 0
     ticks: Counter[int] = field(default_factory=Counter[int])
+    parts: list[Watched] = field(default_factory=list["Watched"])
 
     def tick_us(self, share: float) -> float:
         """Within its bucket (one sixteenth of an octave) the ticks are taken as spread evenly."""
@@ -164,13 +188,24 @@ class Watched:
         return 0.0
 
 
-def in_turns(bench: Path, *options: str) -> dict[int, Watched]:
-    """Server and loop with each number of ``VIEWERS``, in turns within one run. RuntimeError when the run ends."""
+@contextmanager
+def other_server() -> Iterator[str]:
+    """Address of a server that sends frames of the page's size to whoever asks."""
+    command = [sys.executable, "-c", OTHER_SERVER, str(FRAME_BYTES)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout is not None
+        yield f"ws://127.0.0.1:{int(server.stdout.readline())}"
+        server.kill()
+
+
+def in_turns(bench: Path, *options: str) -> dict[str, Watched]:
+    """Server and loop with each of ``LOOKS``, in turns within one run. RuntimeError when the run ends."""
     subscription = json.dumps({"type": "subscribe", "id": 1, "channels": CHANNELS, "rows": 5000, "pixels": 1200})
-    found = {number: Watched() for number in VIEWERS}
+    found = {title: Watched() for title in LOOKS}
     with (
         tempfile.TemporaryDirectory(prefix="micron-") as folder,
         started("--bench", str(bench), "--recordings", folder, *options) as (server, address),
+        other_server() as elsewhere,
     ):
         url = address.partition("/#")[0].replace("http", "ws") + "/live"
         while (now := state(url))["status"].get("state") != "running":
@@ -179,14 +214,17 @@ def in_turns(bench: Path, *options: str) -> dict[int, Watched]:
             time.sleep(0.5)
         time.sleep(2.0)
         for _ in range(ROUNDS):
-            for number, watched in found.items():
-                command = [sys.executable, "-c", VIEWER, url, str(PART_S), subscription]
-                viewers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(number)]
+            for title, watched in found.items():
+                place = elsewhere if title == STRANGERS else url
+                command = [sys.executable, "-c", VIEWER, place, str(PART_S), subscription]
+                viewers = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(LOOKS[title])]
                 time.sleep(1.5)  # until they have started and look
                 before, used_s = counts(url), cpu_s(server.pid)
                 time.sleep(PART_S - 2.0)
                 watched.used_s += cpu_s(server.pid) - used_s
-                watched.ticks.update(dict(between(before, counts(url), "tick")))
+                part = Watched(ticks=Counter(dict(between(before, counts(url), "tick"))))
+                watched.parts.append(part)
+                watched.ticks.update(part.ticks)
                 watched.frames += sum(int(viewer.communicate(timeout=60)[0]) for viewer in viewers)
         ended = state(url)
         if ended["phase"] != "running":
@@ -198,26 +236,26 @@ def rows() -> Iterator[Row]:
     """Paced emulated time, as the page runs by default, for the server; the wall clock for the loop's percentiles."""
     paced = in_turns(bench_path(None))
     seconds = ROUNDS * (PART_S - 2.0)
-    alone = paced[0].used_s / seconds
-    for number, title in VIEWERS.items():
-        if not number:
-            continue
-        share = paced[number].used_s / seconds
-        frames = paced[number].frames / (ROUNDS * PART_S * number)
+    alone = paced[NONE].used_s / seconds
+    for title, most in MOST_CORE.items():
+        share = paced[title].used_s / seconds
+        frames = paced[title].frames / (ROUNDS * PART_S * LOOKS[title])
         yield Row(
             f"bench page, server, {title}", f"share of a core, 20 channels at 1 kHz, {frames:.0f} frames a second each",
-            share, alone, "no viewer", "cores", share / alone, f"<= {MOST_CORE[number]:.2f}",
-            share <= MOST_CORE[number], must=True, why="see the machine's load",
+            share, alone, NONE, "cores", share / alone, f"<= {most:.2f}",
+            share <= most, must=True, why="see the machine's load",
         )  # fmt: skip
     real = in_turns(bench_path(None), "--realtime", "--stale-ms", "200")
     for share in (0.5, 0.9, 0.99):
-        peer = real[0].tick_us(share)
-        for number, title in VIEWERS.items():
-            if not number:
-                continue
-            mine, n = real[number].tick_us(share), sum(real[number].ticks.values())
+        peer = real[NONE].tick_us(share)
+        for title in (ONE, TWELVE, STRANGERS):
+            mine, n = real[title].tick_us(share), sum(real[title].ticks.values())
+            parts = sorted(part.tick_us(share) / peer for part in real[title].parts)
+            is_ours = title != STRANGERS
             yield Row(
-                f"bench page, tick p{100 * share:.0f}, {title}", f"wall clock, {n} ticks",
-                mine, peer, "no viewer", "us", mine / peer, f"<= {MOST_RATIO:.2f} x", mine / peer <= MOST_RATIO,
-                must=True, why="viewers are processes of the same machine here; the loop does not wait for them",
+                f"bench page, tick p{100 * share:.0f}, {title}",
+                f"wall clock, {n} ticks; {len(parts)} parts {parts[0]:.2f} to {parts[-1]:.2f}",
+                mine, peer, NONE, "us", mine / peer, f"<= {MOST_RATIO:.2f} x" if is_ours else "-",
+                mine / peer <= MOST_RATIO if is_ours else None, must=is_ours,
+                why="viewers are processes of this machine; strangers say what as many cost by themselves",
             )  # fmt: skip

@@ -262,11 +262,30 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
         yield served
 
 
-@pytest.fixture
-def still_page(browser: Any, still: Still) -> Iterator[Any]:
-    """The page of the module's still server, with the token."""
+@pytest.fixture(scope="module")
+def still_tab(browser: Any, still: Still) -> Iterator[Any]:
+    """One page of the module's still server, with the token: a page of its own per test costs a second of CPU."""
     with opened_tab(browser, still.address) as tab:
         yield tab
+
+
+FRESH = """() => {
+    for (const key of Object.keys(localStorage)) if (key !== "micron.token") localStorage.removeItem(key);
+    if (micron.link.replay) micron.link.replayTo({ close: true });
+    delete micron.scope;
+    micron.context.say("");
+    micron.context.reload("scope");
+}"""
+
+
+@pytest.fixture
+def still_page(still_tab: Any) -> Iterator[Any]:
+    """The module's page as it opens for somebody who was never there: live, on the scope, without settings."""
+    still_tab.evaluate(FRESH)
+    still_tab.wait_for_function(f"{READY} && micron.scope && micron.scope.traces.length && !micron.link.replay")
+    yield still_tab
+    still_tab.unroute_all()
+    assert not still_tab.errors
 
 
 @pytest.fixture

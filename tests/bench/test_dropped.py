@@ -157,7 +157,7 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
     write(own, 3.0)
     for name, body, part in (
         ("a.exe", csv, "must be .csv"),
-        ("torn.npz", b"PK\x03\x04 and no more", "not a readable npz"),
+        ("torn.npz", b"PK\x03\x04 and no more", "(File is not a zip file); write it again"),
         ("torn.mcap", b"\x89MCAP0\r\n" + bytes(40), "torn.mcap"),
         ("own.mcap", own.read_bytes()[:-3000], "micron recover"),
         ("words.csv", b"a,b\nx,y\n", "is not a number"),

@@ -50,6 +50,8 @@ READY = {  # what is there when the view's first answers have come
 }
 READ = ("390", "1280")
 """Sizes at which the texts are looked at as well: below and above the width at which tables become cards."""
+AS_MENU = ("320", "390", "1280 at 200 %", "1280 at 400 %")
+"""Sizes at which the views are behind a button; the others show all of them."""
 SAFE_PX = 44
 CONTRAST = 4.5
 
@@ -97,6 +99,9 @@ def test_every_view_is_safe_readable_and_in_shape(browser: Any, still: Still, si
     stands out from what is behind it, axe finds nothing serious and fingers find what they touch."""
     with opened(browser, still, size, theme, has_touch=size == "390") as tab:
         axe = load_axe(tab) if size in READ else None
+        as_menu = size in AS_MENU
+        assert tab.locator("#menu").is_visible() == as_menu
+        assert all(link.is_visible() != as_menu for link in tab.locator("#nav a").all())
         for view in VIEWS:
             show(tab, view)
             for where in ("0", "document.getElementById('view').scrollHeight"):
@@ -168,14 +173,6 @@ def test_the_menu_opens_goes_to_a_view_and_closes(browser: Any, still: Still, si
         tab.locator("#nav a[data-view=tremor]").tap()
         tab.wait_for_function("document.getElementById('view').dataset.view === 'tremor'")
         assert not tab.locator("#nav").is_visible()
-
-
-@pytest.mark.parametrize("size", ["768", "1920"])
-def test_larger_windows_show_all_views(browser: Any, still: Still, size: str):
-    with opened(browser, still, size) as tab:
-        assert not tab.locator("#menu").is_visible()
-        for link in tab.locator("#nav a").all():
-            assert link.is_visible()
 
 
 def test_two_fingers_that_enlarge_the_page_take_the_button_with_them(browser: Any, still: Still):

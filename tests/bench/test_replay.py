@@ -18,7 +18,7 @@ from firmware_py.recording.index import IndexedRecording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.recover import recover
 from firmware_py.recording.writer import RecordingWriter
-from tests.bench.conftest import go, opened_tab
+from tests.bench.conftest import go
 from tests.bench.still import Still, made_up_rows, still_server
 from tools.bench.history import History
 from tools.bench.overview import EXTREMES, SPANS, summarize
@@ -201,9 +201,8 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
 
 
 @pytest.fixture
-def page(browser: Any, still: Still) -> Iterator[Any]:
-    with opened_tab(browser, still.address, "window.micron && micron.scope && micron.link.mayOrder") as tab:
-        yield tab
+def page(still_page: Any) -> Any:
+    return still_page
 
 
 def row(page: Any, name: str) -> Any:

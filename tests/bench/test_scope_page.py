@@ -6,7 +6,6 @@ Over data that stand still (tests/bench/still.py): no firmware, no real time.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -14,8 +13,8 @@ import pytest
 from scipy import signal
 
 from firmware_py.frame import LAYOUT
-from tests.bench.conftest import go, opened_tab
-from tests.bench.still import TREMOR_HZ, Still, made_up_rows
+from tests.bench.conftest import go
+from tests.bench.still import TREMOR_HZ, made_up_rows
 
 pytestmark = pytest.mark.timeout(400)
 
@@ -27,27 +26,12 @@ FRAMES = "() => new Promise((done) => requestAnimationFrame(() => requestAnimati
 READY = "window.micron && micron.scope && micron.scope.subscription.buckets.n > 100"
 
 
-@pytest.fixture(scope="module")
-def tab(browser: Any, still: Still) -> Iterator[Any]:
-    """One page for the tests of this module."""
-    with opened_tab(browser, still.address, READY) as opened:
-        yield opened
-
-
 @pytest.fixture
-def scope(tab: Any) -> Any:
-    """The page, on the scope as it opens for somebody who was never there: no setting is kept, the view is anew."""
-    tab.evaluate(
-        """() => {
-            for (const key of Object.keys(localStorage)) if (key !== "micron.token") localStorage.removeItem(key);
-            delete micron.scope;
-            micron.context.reload("scope");
-        }"""
-    )
-    tab.wait_for_function(READY)
-    tab.evaluate(FRAMES)
-    assert tab.errors == []
-    return tab
+def scope(still_page: Any) -> Any:
+    """The scope as it opens, drawn."""
+    still_page.wait_for_function(READY)
+    still_page.evaluate(FRAMES)
+    return still_page
 
 
 def use(scope: Any, **settings: Any) -> None:

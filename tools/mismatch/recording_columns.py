@@ -118,7 +118,7 @@ def _npz_names(path: Path) -> list[str]:
     except RecordingError:
         raise
     except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
+        raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
 
 
 def _mat_names(path: Path) -> list[str]:
@@ -150,7 +150,7 @@ def read_scalars(path: Path) -> dict[str, float]:
     except RecordingError:
         raise
     except (OSError, ValueError) as error:
-        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
+        raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
 
 
 def _mcap_names(path: Path) -> list[str]:
@@ -207,7 +207,7 @@ def _npz(path: Path, names: list[str]) -> dict[str, Array]:
                     )
                 out[name] = np.asarray(a, np.float64)
     except OSError as error:
-        raise RecordingError(f"{path}: not a readable npz file ({error})") from None
+        raise RecordingError(f"{path}: {error}; write it again with numpy.savez") from None
     except ValueError as error:
         if isinstance(error, RecordingError):
             raise
