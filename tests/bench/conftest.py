@@ -265,10 +265,11 @@ def still(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Still]:
 @pytest.fixture(scope="module")
 def still_tab(browser: Any, still: Still) -> Iterator[Any]:
     """One page of the module's still server, with the token: a page of its own per test costs a second of CPU."""
-    with opened_tab(browser, still.address) as tab:
+    with opened_tab(browser, still.address, SCOPE_READY) as tab:
         yield tab
 
 
+SCOPE_READY = f"{READY} && micron.scope && micron.scope.traces.length"
 FRESH = """() => {
     for (const key of Object.keys(localStorage)) if (key !== "micron.token") localStorage.removeItem(key);
     if (micron.link.replay) micron.link.replayTo({ close: true });
@@ -282,7 +283,7 @@ FRESH = """() => {
 def still_page(still_tab: Any) -> Iterator[Any]:
     """The module's page as it opens for somebody who was never there: live, on the scope, without settings."""
     still_tab.evaluate(FRESH)
-    still_tab.wait_for_function(f"{READY} && micron.scope && micron.scope.traces.length && !micron.link.replay")
+    still_tab.wait_for_function(f"{SCOPE_READY} && !micron.link.replay")
     yield still_tab
     still_tab.unroute_all()
     assert not still_tab.errors

@@ -60,6 +60,14 @@ def test_it_opens_on_tip_and_commands_with_units_and_a_trigger(scope: Any):
     assert marks == 2, "its level and its instant"
 
 
+def test_a_view_that_is_asked_for_twice_at_once_is_there_once(scope: Any):
+    scope.evaluate("() => { micron.context.reload('scope'); micron.context.reload('scope'); }")
+    scope.wait_for_function(READY)
+    scope.evaluate(FRAMES)
+    assert scope.locator("#view .scope").count() == 1
+    assert scope.evaluate("micron.link.subscriptions.size") == 1
+
+
 def test_the_trigger_holds_where_the_trace_rises_through_the_level(scope: Any):
     held_s = scope.evaluate("micron.scope.trigger.heldAt")
     assert held_s > 0

@@ -32,6 +32,7 @@ const link = new Link(token);
 const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; }, view: () => shown, reload, say };
 let unmount = null;
 let shown = "";
+let shows = 0;
 
 /** One message at the top of the page; it goes when it is pressed. */
 function say(text) {
@@ -51,13 +52,14 @@ async function show(name) {
   if (!VIEWS.some(([key]) => key === name)) name = "scope";
   if (name === shown) return;
   shown = name;
+  const turn = ++shows; // a view that is asked for again while it is loaded is mounted once
   unmount?.();
   unmount = null;
   const root = byId("view");
   root.replaceChildren();
   byId("nav").querySelectorAll("a").forEach((a) => (a.dataset.view === name ? a.setAttribute("aria-current", "page") : a.removeAttribute("aria-current")));
   const view = await import(`./views/${name}.js`);
-  if (shown !== name) return;
+  if (turn !== shows) return;
   document.title = `${VIEWS.find(([key]) => key === name)[1]} · Micron bench`;
   unmount = view.mount(root, context) || null;
   root.dataset.view = name;

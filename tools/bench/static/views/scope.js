@@ -367,6 +367,11 @@ export function mount(root, { link, catalogue, bar }) {
   };
   document.addEventListener("keydown", onKey);
   const offData = link.on("data", (s) => { if ((s === subscription || s === over) && !paused) dirty = true; });
+  let holdsDrawn = "";
+  const offState = link.on("state", ({ holds }) => { // a hold is told with the status, perhaps after the last row
+    const now = JSON.stringify(holds);
+    if (now !== holdsDrawn) { holdsDrawn = now; dirty = true; }
+  });
   const offRun = link.on("run", ({ same }) => { if (paused && !same) paused.over = true; trigger.rearm(); strips.forEach(({ strip }) => strip.range.reset()); });
   const offJump = link.on("jump", () => { if (paused) resume(); trigger.rearm(); dirty = true; });
   const offReplay = link.on("replay", (replay) => { if ((replay?.second || "") !== overName) rebuild(); });
@@ -393,6 +398,7 @@ export function mount(root, { link, catalogue, bar }) {
     document.removeEventListener("keydown", onKey);
     window.removeEventListener("themechange", retheme);
     offData();
+    offState();
     offRun();
     offJump();
     offReplay();
