@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,13 +17,11 @@ from sim_devices.physics.exponential import exponential
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
+from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, modes_of, roots_of_mode, typical_size
 
 _NAMES = ("A", "B", "C", "D", "x0", "y0", "hold", "discrete", "states", "first")
 MAX_ORDER = 64
 """Modes of a plant at most."""
-
-
-Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True)
@@ -53,13 +50,16 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
             f" at most {MAX_ORDER} are handled"
         )
     s = poles.size
-    modes = _modes(poles, m.discrete, dt)
-    chains = _chains(modes, dt)
+    modes = modes_of(poles, m.discrete, dt)
+    chains = chains_of(modes, dt)
     blocks: list[tuple[int, int]] = []
     for chain in chains:
         at = blocks[-1][1] if blocks else 0
         blocks.append((at, at + sum(modes[i].order for i in chain)))
-    omegas = [_omega(np.concatenate([_roots(modes[i], m.discrete, dt) for i in c]), recording.n * dt) for c in chains]
+    omegas = [
+        typical_size(np.concatenate([roots_of_mode(modes[i], m.discrete, dt) for i in c]), recording.n * dt)
+        for c in chains
+    ]
     free = [mode for mode in modes if mode.kind != "fixed"]
     parameters: list[Parameter] = []
     begin: list[float] = []
@@ -84,14 +84,14 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
     def roots_of(i: int, theta: Array) -> Complex:
         mode = modes[i]
         if mode.kind == "fixed":
-            return _roots(mode, m.discrete, dt)
+            return roots_of_mode(mode, m.discrete, dt)
         at = place[i]
         if mode.kind == "pair":
             w, z = theta[at], theta[at + 1]
             value = complex(-z * w, w * np.sqrt(max(1 - z * z, 0.0)))
         else:
             value = complex(float(np.sign(mode.value.real)) * theta[at])
-        return _roots(Mode(mode.kind, value), m.discrete, dt)
+        return roots_of_mode(Mode(mode.kind, value), m.discrete, dt)
 
     def plant_of(theta: Array) -> Plant:
         a, b = np.zeros((s, s)), np.zeros(s)
@@ -268,119 +268,6 @@ def without_constant(m: Matrices, dt: float) -> Matrices:
         settled = np.linalg.solve(system, push)
     y0 = m.y0 + m.c[:, still] @ held + m.c[:, rest] @ settled
     return replace(m, a=a, b=m.b[rest], c=m.c[:, rest], x0=m.x0[rest] - settled, y0=y0)
-
-
-def _omega(roots: Complex, span: float) -> float:
-    """The typical size of some roots: companion states are scaled by its powers so that they are of one size."""
-    sizes = np.abs(roots)
-    sizes = sizes[sizes > 1e-9 * (sizes.max() if sizes.size else 1.0)]
-    return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0 / span
-
-
-@dataclass(frozen=True)
-class Mode:
-    """One mode in continuous terms: a ``pair`` of complex poles, a ``real`` one, or a pole that stays as given.
-
-    A pole is ``fixed`` where it integrates, or where no continuous one stands for it; ``value`` is then that of s or z.
-    """
-
-    kind: Literal["pair", "real", "fixed"]
-    value: complex
-
-    @property
-    def order(self) -> int:
-        """Return how many poles it has."""
-        return 2 if self.kind == "pair" else 1
-
-
-def _modes(poles: Complex, discrete: bool, dt: float) -> list[Mode]:
-    """The modes of a set of poles that is closed under conjugation."""
-    modes: list[Mode] = []
-    size = max(float(np.max(np.abs(poles))), 1e-300) if poles.size else 1.0
-    for p in poles:
-        z = complex(p)
-        if discrete:
-            if z.imag < -1e-12:
-                continue
-            if z.imag <= 1e-12 and (z.real <= 0 or abs(z.real - 1) < 1e-9):
-                modes.append(Mode("fixed", complex(z.real)))
-                continue
-            c = complex(np.log(z)) / dt
-            modes.append(Mode("pair", c) if z.imag > 1e-12 else Mode("real", complex(c.real)))
-            continue
-        if z.imag < -1e-9 * size:
-            continue
-        if abs(z) < 1e-9 * size:
-            modes.append(Mode("fixed", 0j))
-        else:
-            modes.append(Mode("pair", z) if z.imag > 1e-9 * size else Mode("real", complex(z.real)))
-    return modes
-
-
-def _roots(mode: Mode, discrete: bool, dt: float) -> Complex:
-    """Its poles: of s, or of z - 1 for a discrete twin (G. C. Goodwin et al., the delta operator: companion states
-    stay apart however fast it is sampled).
-    """
-    if mode.kind == "fixed":
-        return np.array([mode.value - (1.0 if discrete else 0.0)])
-    both = np.array([mode.value, mode.value.conjugate()] if mode.kind == "pair" else [mode.value], np.complex128)
-    return np.expm1(both * dt) if discrete else both
-
-
-def companion(roots: Complex, omega: float, discrete: bool) -> tuple[Array, Array]:
-    """Companion form (s, s) and its input (s,) of these roots of s or z - 1, states scaled by powers of ``omega``."""
-    s = roots.size
-    if s == 2:
-        den = np.array([1.0, -float(np.sum(roots).real), float(np.prod(roots).real)])
-    else:
-        den = np.real(np.poly(roots))
-    a = np.zeros((s, s))
-    a[:-1, 1:] = omega * np.eye(s - 1)
-    a[-1, :] = -den[:0:-1] / (omega ** np.arange(s - 1, -1, -1.0))
-    b = np.zeros(s)
-    b[-1] = omega
-    return (a + np.eye(s) if discrete else a), b
-
-
-SMALL = 4
-"""A plant of so few modes is one chain: its numerators keep the zeros that the engineer's have."""
-SPREAD = 1e3
-"""... unless its poles are of sizes that differ by more than this factor."""
-ALIKE = 0.98
-"""Correlation of the impulse responses of two modes above which their residues mean nothing one by one."""
-MOST_CHAINED = 6  # poles
-
-
-def _chains(modes: Sequence[Mode], dt: float) -> list[list[int]]:
-    """Which modes make one companion form: all of a small plant, else those too much alike for partial fractions.
-
-    Partial fractions stay well conditioned at any order as long as poles lie apart; companion forms do where they are
-    few and of one size.
-    """
-    sizes = [abs(x.value) for x in modes if x.kind != "fixed"]
-    narrow = not sizes or max(sizes) < SPREAD * min(sizes)
-    if sum(x.order for x in modes) <= SMALL and narrow:
-        return [list(range(len(modes)))] if modes else []
-    chains: list[list[int]] = []
-    order = sorted(range(len(modes)), key=lambda i: (modes[i].kind == "fixed", abs(modes[i].value)))
-    for i in order:
-        near = [c for c in chains if any(_alike(modes[i], modes[j]) > ALIKE for j in c)]
-        room = next((c for c in near if sum(modes[j].order for j in c) + modes[i].order <= MOST_CHAINED), None)
-        if room is None:
-            chains.append([i])
-        else:
-            room.append(i)
-    return [sorted(c) for c in chains]
-
-
-def _alike(a: Mode, b: Mode) -> float:
-    """Correlation of two decays; poles that are fixed go with each other."""
-    if "fixed" in (a.kind, b.kind):
-        return 1.0 if a.kind == b.kind else 0.0
-    p, q = a.value, b.value
-    least = 1e-6 * max(abs(p), abs(q), 1e-300)
-    decay = max(abs(p.real), least), max(abs(q.real), least)
-    return float(2 * np.sqrt(decay[0] * decay[1]) / abs(complex(sum(decay), p.imag - q.imag)))
 
 
 def felt_poles(m: Matrices) -> Complex:
