@@ -87,8 +87,8 @@ hold = "zero"
 noise_rms = 0.02
 ```
 
-A computer that puts the force out holds it over each sample: `hold` says so. Without it, friction is found here, and the
-verdict is `unexplained` all the same.
+A computer that puts the force out holds it over each sample: `hold` says so. Without it, friction is found here, and
+the verdict is `unexplained` all the same.
 A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
 
 ## 2. Diagnose, correct, run again
