@@ -49,14 +49,19 @@ def keep_what_is_there() -> Iterator[None]:
         note_stop()
 
 
+@contextmanager
+def begin_command() -> Iterator[None]:
+    """Remember a stop until the block ends, and no longer: who calls two commands stops one of them."""
+    before = _STOPPED.set(False)
+    try:
+        yield
+    finally:
+        _STOPPED.reset(before)
+
+
 def note_stop() -> None:
-    """Remember that Ctrl-C ended the work early."""
+    """Remember that Ctrl-C ended the work of this command early."""
     _STOPPED.set(True)
-
-
-def forget_stop() -> None:
-    """Begin a command."""
-    _STOPPED.set(False)
 
 
 def is_stopped() -> bool:

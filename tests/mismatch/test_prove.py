@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from tools.interrupt import forget_stop, is_stopped
+from tools.interrupt import begin_command, is_stopped
 from tools.mismatch.prove import draw, page, prove, seal
 from tools.mismatch.prove.nulls import clopper_pearson, document, kept, nulls
 from tools.mismatch.prove.score import coverage, score
@@ -102,9 +102,10 @@ def test_an_interrupted_proof_goes_on_in_its_folder(tmp_path: Path) -> None:
 
     plans = [draw.Plan("agrees", "piezo_stack", (), 2.0)] * 3
     more = {"plans": plans, "seed": 4, "jobs": 1, "diagnose": second_breaks, **QUIET}
-    assert len(prove(folder=tmp_path, **more).rows) == 1, "Ctrl-C keeps what was scored"
-    assert is_stopped()
-    forget_stop()
+    with begin_command():
+        assert len(prove(folder=tmp_path, **more).rows) == 1, "Ctrl-C keeps what was scored"
+        assert is_stopped()
+    assert not is_stopped()
     assert len(prove(folder=tmp_path, **more).rows) == 3
     assert asked == ["r000", "r001", "r001", "r002"]
 

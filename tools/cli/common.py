@@ -22,7 +22,7 @@ from firmware_py.exit_codes import Exit, exit_code_of
 from hal.errors import HalError
 from hal.trust import NotTrusted
 from tools.errors import InputError, OutputError
-from tools.interrupt import forget_stop, is_stopped, note_stop
+from tools.interrupt import begin_command, is_stopped, note_stop
 from tools.terminal import plain_console
 
 JsonOption = Annotated[
@@ -73,31 +73,31 @@ def print_note(message: str) -> None:
 @contextmanager
 def clear_errors() -> Iterator[None]:
     """Turn what went wrong into one message on standard error and the exit code of the contract; Ctrl-C too."""
-    forget_stop()
-    try:
-        yield
-    except KeyboardInterrupt:
-        note_stop()
-    except typer.Exit:
-        if not is_stopped():
-            raise
-    except OutputError as error:
-        _fail(error, Exit.FAILED)
-    except InputError as error:
-        _fail(error, Exit.BAD_INPUT)
-    except NotTrusted as error:
-        print_error(f"{error}.\n{_how_to_trust(error)}")
-        raise typer.Exit(Exit.BAD_INPUT) from error
-    except HalError as error:
-        _fail(error, exit_code_of(error))
-    except MemoryError as error:
-        print_error(
-            f"not enough memory: {error or 'nothing more could be allocated'}; end other programs, or ask for less"
-        )
-        raise typer.Exit(Exit.FAILED) from error
-    if is_stopped():
-        print_error("stopped by Ctrl-C")
-        raise typer.Exit(Exit.INTERRUPTED)
+    with begin_command():
+        try:
+            yield
+        except KeyboardInterrupt:
+            note_stop()
+        except typer.Exit:
+            if not is_stopped():
+                raise
+        except OutputError as error:
+            _fail(error, Exit.FAILED)
+        except InputError as error:
+            _fail(error, Exit.BAD_INPUT)
+        except NotTrusted as error:
+            print_error(f"{error}.\n{_how_to_trust(error)}")
+            raise typer.Exit(Exit.BAD_INPUT) from error
+        except HalError as error:
+            _fail(error, exit_code_of(error))
+        except MemoryError as error:
+            print_error(
+                f"not enough memory: {error or 'nothing more could be allocated'}; end other programs, or ask for less"
+            )
+            raise typer.Exit(Exit.FAILED) from error
+        if is_stopped():
+            print_error("stopped by Ctrl-C")
+            raise typer.Exit(Exit.INTERRUPTED)
 
 
 def _how_to_trust(error: NotTrusted) -> str:

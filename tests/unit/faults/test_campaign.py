@@ -12,7 +12,7 @@ from tools.faults import campaign
 from tools.faults.campaign import Trial, run_campaign
 from tools.faults.fault import Fault, InWorld
 from tools.faults.judge import Observation
-from tools.interrupt import forget_stop, is_stopped
+from tools.interrupt import begin_command, is_stopped
 
 FAULTS = (Fault("one", InWorld("x", ""), "noticed"), Fault("two", InWorld("y", ""), "noticed"))
 
@@ -33,15 +33,13 @@ def test_ctrl_c_keeps_what_is_done(monkeypatch: pytest.MonkeyPatch, done: int) -
     def run() -> list[campaign.FaultRow]:
         return run_campaign(DEFAULT_BENCH, FAULTS, seeds=[5], n_pairs=2, jobs=1, progress=lambda _: None)
 
-    try:
+    with begin_command():
         if done:
             assert sum(row.seeds for row in run()) == 2 * done
             assert is_stopped()
         else:
             with pytest.raises(KeyboardInterrupt):
                 run()
-    finally:
-        forget_stop()
 
 
 def test_what_is_kept_is_not_done_again(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
