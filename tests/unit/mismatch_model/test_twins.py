@@ -98,7 +98,7 @@ def test_state_space_round_trip() -> None:
     [
         ("A", [[1.0, 2.0]], "A has shape"),
         ("B", [[1.0]], "B has shape"),
-        ("C", [[float("nan"), 0.0]], "C has shape"),
+        ("C", [[0.0, float("nan")]], "C: row 1, column 2 is nan"),
         ("hold", "cubic", "hold must be"),
         ("discrete", 1, "discrete must be"),
         ("Q", 1, "'Q' is not a parameter"),
