@@ -25,20 +25,23 @@ def conducted(x: Array, knee: float, width: float, side: float) -> Array:
 def _grid(lo: float, hi: float, side: float) -> list[tuple[float, float]]:
     low, high = (lo, hi) if side > 0 else (-hi, -lo)
     span = high - low
-    return [(low + a * span, w * span) for a in (0.4, 0.5, 0.6, 0.7, 0.8, 0.9) for w in (0.01, 0.03, 0.08)]
+    return [(low + a * span, w * span) for a in (0.4, 0.55, 0.7, 0.85, 1.0, 1.15) for w in (0.01, 0.03, 0.1, 0.3)]
 
 
 def _ranked(x: Array, residual: Array, ctx: Context, lo: float, hi: float, side: float) -> list[tuple[float, ...]]:
     measured = ctx.to_output(x) + residual
     return rank_starts(
-        _grid(lo, hi, side), lambda q: ctx.to_output(conducted(x, q[0], q[1], side)), measured, thin(ctx.keep, 4000)
+        _grid(lo, hi, side),
+        lambda q: ctx.to_output(conducted(x, q[0], q[1], side)),
+        measured,
+        thin(ctx.keep, 4000),
+        ctx.bends,
     )
 
 
 def _misfit(x: Array, residual: Array, ctx: Context, q: Sequence[float], side: float) -> float:
     k = thin(ctx.keep, 4000)
-    columns = [np.ones(x.size), ctx.to_output(x), ctx.to_output(conducted(x, q[0], q[1], side))]
-    design = np.stack(columns, axis=1)[k]
+    design = np.column_stack([ctx.line(x, k), ctx.to_output(conducted(x, q[0], q[1], side))[k]])
     target = (ctx.to_output(x) + residual)[k]
     left = target - design @ np.linalg.lstsq(design, target, rcond=1e-10)[0]
     return float(left @ left)

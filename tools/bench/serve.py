@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import secrets
 import signal
@@ -75,6 +76,15 @@ def config_for(app: Guard) -> uvicorn.Config:
     )
 
 
+class Server(uvicorn.Server):
+    """uvicorn's server; signals are left to who runs it. Two handlers would take one Ctrl-C for two of them, and the
+    firmware would not be waited for."""
+
+    def capture_signals(self) -> contextlib.AbstractContextManager[None]:  # type: ignore[override]
+        """Capture none."""
+        return contextlib.nullcontext()
+
+
 def serve(
     choice: Choice,
     recordings: Path,
@@ -98,7 +108,7 @@ def serve(
         session = Session(choice, recordings)
         jobs = Jobs()
         app = make_app(session, access, more_routes(session, jobs))
-        server = uvicorn.Server(config_for(app))
+        server = Server(config_for(app))
         loop = asyncio.get_running_loop()
 
         def leave(number: int) -> None:
@@ -106,7 +116,6 @@ def serve(
             server.force_exit = server.should_exit  # the second one
             server.should_exit = True
 
-        server.install_signal_handlers = lambda: None  # type: ignore[attr-defined]
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, leave, number)
         shown = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
