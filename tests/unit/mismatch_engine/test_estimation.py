@@ -14,7 +14,7 @@ from tests.unit.mismatch_engine.cases import recording, stack, wave
 from tools.mismatch.engine.diagnose import nominated, prepared
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import fit, fit_base
-from tools.mismatch.engine.intervals import covariance
+from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reduce import fitted_part, is_long
@@ -86,7 +86,7 @@ def test_a_parameter_that_no_output_depends_on_stays_as_given(gear: float) -> No
     assert 0.5 < found["k2"] / 0.5 < 2.0
     assert found["offset"] == pytest.approx(0.3, abs=0.01)
     # nor does the interval of the gear claim that it is known
-    half = 1.96 * np.sqrt(np.diag(covariance(problem, fitted)))
+    half = 1.96 * uncertainty(problem, fitted).deviations()
     assert half[list(given).index("gear")] > abs(gear)
     assert half[list(given).index("offset")] < 0.01
 

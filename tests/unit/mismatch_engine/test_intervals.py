@@ -14,7 +14,7 @@ from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
 from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.found import human_values
-from tools.mismatch.engine.intervals import covariance, few_blocks
+from tools.mismatch.engine.intervals import few_blocks, uncertainty
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.engine.trial import extended
@@ -55,7 +55,7 @@ def test_slow_noise_widens_the_interval_of_a_level() -> None:
     for name, e in (("white", white / white.std()), ("slow", slow / slow.std())):
         problem, _, base = prepared(stack(0.02 * e), 0.3, 0, False)
         offset = [p.name for p in base.model.parameters].index("offset_um")
-        half[name] = float(np.sqrt(covariance(problem, base)[offset, offset]))
+        half[name] = float(uncertainty(problem, base).deviations()[offset])
     # a mean of AR(1) noise: sqrt((1 + a) / (1 - a)) = 6.2 times as wide
     assert 3.5 < half["slow"] / half["white"] < 9.0
 
@@ -67,7 +67,7 @@ def test_what_the_data_do_not_move_is_as_wide_as_its_bounds() -> None:
     model, theta = extended(problem, base, placed)
     rate = next(i for i, p in enumerate(model.parameters) if p.name.endswith(".rate"))
     theta[rate] = 1e5  # above everything that the command does
-    sd = float(np.sqrt(covariance(problem, replace(base, model=model, theta=theta))[rate, rate]))
+    sd = float(uncertainty(problem, replace(base, model=model, theta=theta)).deviations()[rate])
     p = model.parameters[rate]
     assert 1.96 * sd == pytest.approx(0.5 * (p.hi - p.lo), rel=1e-3)
 
@@ -84,7 +84,7 @@ def test_the_instant_of_a_step_has_an_interval() -> None:
     fitted = replace(
         base, model=model, theta=theta, residual={"displacement": 0.05 * rng.standard_normal(problem.index.size)}
     )
-    low, high = human_values(problem, fitted, covariance(problem, fitted))[placed.label]["time1_s"].ci95
+    low, high = human_values(problem, fitted, uncertainty(problem, fitted))[placed.label]["time1_s"].ci95
     # two samples and eleven times (0.05 / 0.1)^2, 10 ms each, either way
     assert 0.5 * (high - low) == pytest.approx(0.0475 + 0.0025, abs=0.02)
 

@@ -14,7 +14,7 @@ from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.found import alternatives, physics_found
 from tools.mismatch.engine.identifiability import detection
-from tools.mismatch.engine.intervals import covariance
+from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.one_way import one_way
 from tools.mismatch.engine.parsimony import Rule
@@ -46,12 +46,12 @@ from tools.mismatch.twins.ode import inside_of
 Array = NDArray[np.float64]
 
 
-def base_shifts(raw: Fit, base: Fit, fitted: Fit, cov: Array) -> list[BaseShift]:
+def base_shifts(raw: Fit, base: Fit, fitted: Fit, deviations: Array) -> list[BaseShift]:
     """Return how far the missing effects had pulled the base parameters."""
     shifts: list[BaseShift] = []
     for i in range(base.model.n_base):
         p = base.model.parameters[i]
-        half = 1.96 * float(np.sqrt(max(cov[i, i], 0.0)))
+        half = 1.96 * float(deviations[i])
         v = float(fitted.theta[i])
         shifts.append(BaseShift(p.name, p.unit, float(raw.theta[i]), float(base.theta[i]), v, (v - half, v + half)))
     return shifts
@@ -80,10 +80,10 @@ def assemble(
     fitted = selection.fitted
     decision = decision or judge(problem, raw, base, selection, left, rule)
     verdict, p = decision.verdict, decision.p_value
-    cov = covariance(problem, fitted)
-    shifts = base_shifts(raw, base, fitted, cov)
+    unsure = uncertainty(problem, fitted)
+    shifts = base_shifts(raw, base, fitted, unsure.deviations())
     runners, groups, alike = alternatives(problem, selection, rule)
-    physics = physics_found(problem, selection, cov, alike)
+    physics = physics_found(problem, selection, unsure, alike)
     exported = without_events(problem, fitted)
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]

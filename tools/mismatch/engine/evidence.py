@@ -17,7 +17,7 @@ from scipy.stats import norm
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.found import human_values, parameters_of
-from tools.mismatch.engine.intervals import covariance
+from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import ParameterValue, Withheld, WithheldReason
 from tools.mismatch.engine.revise import reduced, replaced, size
@@ -81,8 +81,7 @@ def weigh_evidence(
     current = selection
     for _ in range(2 * len(selection.fitted.model.placed)):
         fitted = current.fitted
-        cov = covariance(problem, fitted)
-        values = human_values(problem, fitted, cov)
+        values = human_values(problem, fitted, uncertainty(problem, fitted))
         doubts: list[tuple[float, Doubt, Fit]] = []
         for k, placed in enumerate(fitted.model.placed):
             doubt = doubt_of(placed, k, values.get(placed.label, {}), fitted.at_bound)

@@ -11,6 +11,7 @@ from scipy.stats import norm
 from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.identifiability import experiment
+from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.parsimony import Rule, as_good, complexity
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Alternative, Equivalent, ParameterValue, PhysicsFound
@@ -24,16 +25,17 @@ from tools.mismatch.twins.ode import inside_of
 Array = NDArray[np.float64]
 
 
-def human_values(problem: Problem, fitted: Fit, cov: Array) -> dict[str, dict[str, ParameterValue]]:
-    """Human parameters with 95 % intervals by the delta method from the parameters' covariance, per effect label and
+def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str, dict[str, ParameterValue]]:
+    """Human parameters with 95 % intervals by the delta method, per effect label and
     "base".
     """
     model, theta = fitted.model, fitted.theta
     values = model.human(theta)
     flat = np.array([h.value for group in values.values() for h in group])
     gradient = np.zeros((flat.size, theta.size))
+    deviations = unsure.deviations()
     for i in range(theta.size):
-        sd = float(np.sqrt(max(cov[i, i], 0.0)))
+        sd = float(deviations[i])
         p = model.parameters[i]
         h = min(0.1 * sd, 1e-2 * max(abs(theta[i]), p.scale)) or 1e-6 * max(abs(theta[i]), abs(p.scale))
         if not np.isfinite(h) or h == 0:
@@ -43,7 +45,7 @@ def human_values(problem: Problem, fitted: Fit, cov: Array) -> dict[str, dict[st
         moved = np.array([q.value for group in model.human(shifted).values() for q in group])
         gradient[:, i] = (moved - flat) / (shifted[i] - theta[i])
     gradient = np.nan_to_num(gradient)
-    spread = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", gradient, cov, gradient), 0.0))
+    spread = unsure.spread(gradient)
     read_off = {p.label: half_widths(problem, fitted, k) for k, p in enumerate(model.placed)}
     out: dict[str, dict[str, ParameterValue]] = {}
     # beyond its bounds a parameter was not searched
@@ -92,15 +94,15 @@ def parameters_of(
 
 
 def physics_found(
-    problem: Problem, selection: Selection, cov: Array, alike: Mapping[str, Sequence[Trial]]
+    problem: Problem, selection: Selection, unsure: Uncertainty, alike: Mapping[str, Sequence[Trial]]
 ) -> list[PhysicsFound]:
-    """Accepted effects in the order of their acceptance, parameters from the joint fit and its covariance.
+    """Accepted effects in the order of their acceptance, parameters from the joint fit.
     ``alike``: per label the rivals that this recording cannot tell from it.
     """
     fitted = selection.fitted
     if not fitted.model.placed:
         return []
-    values = human_values(problem, fitted, cov)
+    values = human_values(problem, fitted, unsure)
     rows = problem.held_rows
     out: list[PhysicsFound] = []
     for k, placed in enumerate(fitted.model.placed):

@@ -14,7 +14,7 @@ import numpy as np
 from tools.mismatch.engine.colour import fit_whitener, whiten
 from tools.mismatch.engine.fit import Fit, fit, fit_base
 from tools.mismatch.engine.found import human_values
-from tools.mismatch.engine.intervals import covariance, jacobian
+from tools.mismatch.engine.intervals import jacobian, uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.score import misfits
@@ -149,7 +149,7 @@ def delay_is_hold(problem: Problem, selection: Selection) -> Selection | None:
     """
     fitted = selection.fitted
     half = 0.5 * problem.recording.dt
-    values = human_values(problem, fitted, covariance(problem, fitted))
+    values = human_values(problem, fitted, uncertainty(problem, fitted))
     for k, placed in enumerate(fitted.model.placed):
         delay = values.get(placed.label, {}).get("delay_s") if placed.effect.name in DELAYS else None
         if delay is None or not abs(delay.value - half) < max(delay.ci95[1] - delay.value, 0.2 * half):

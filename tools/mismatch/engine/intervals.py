@@ -1,9 +1,9 @@
-"""How sure fitted parameters are: a covariance that colour, few blocks and a wrong form widen."""
+"""How sure fitted parameters are: colour, few blocks and a wrong form widen their intervals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,9 +55,40 @@ def _moved(problem: Problem, model: Model, theta: Array, rows: Rows, found: Arra
     return found
 
 
-def covariance(problem: Problem, fitted: Fit) -> Array:
-    """Covariance of theta for 95 % intervals of 1.96 standard deviations: block-clustered sandwich (Liang and Zeger,
-    Biometrika 73, 1986), wider where few blocks carry a parameter (Student's t with Satterthwaite's degrees of
+@dataclass(frozen=True)
+class Uncertainty:
+    """What the fitted parameters may be off by. Three accounts of it are kept apart, and the largest counts for each
+    quantity: weights that cancel one another leave their sum sure however unsure each is, and one matrix made of the
+    largest variances would not know that.
+
+    ``moved`` (blocks, parameters): what each block of the data shifts them by; ``plain`` and ``coloured`` (parameters,
+    parameters): their covariance if the residual were white, and if it had the spectrum of its autoregression;
+    ``own`` (parameters,): variance of those that the data do not move; ``beyond``: factor for the form of the model.
+    """
+
+    moved: Array
+    plain: Array
+    coloured: Array
+    own: Array
+    beyond: float
+
+    def spread(self, gradients: Array) -> Array:
+        """Standard deviations (k,) of quantities with these ``gradients`` (k, parameters); 1.96 of them either way are
+        a 95 % interval.
+        """
+        moved = self.moved @ gradients.T
+        accounts = [np.sum(moved**2, axis=0) * few_blocks(moved) ** 2]
+        accounts += [np.einsum("ij,jk,ik->i", gradients, c, gradients) for c in (self.plain, self.coloured)]
+        return np.sqrt(np.maximum(np.max(accounts, axis=0), 0.0) * self.beyond + gradients**2 @ self.own)
+
+    def deviations(self) -> Array:
+        """Standard deviation of each parameter (parameters,)."""
+        return self.spread(np.eye(self.own.size))
+
+
+def uncertainty(problem: Problem, fitted: Fit) -> Uncertainty:
+    """How sure the parameters are: what each block shifts them by (block-clustered sandwich, Liang and Zeger,
+    Biometrika 73, 1986), wider where few blocks carry a quantity (Student's t with Satterthwaite's degrees of
     freedom), never below what the residual's own colour or white residuals would give. What held-out samples leave
     beyond the fit is the form of the model, and counts. A parameter that the data do not move is as wide as its bounds.
     """
@@ -77,17 +108,13 @@ def covariance(problem: Problem, fitted: Fit) -> Array:
     scores = np.zeros((len(problem.fit_blocks), j.shape[1]))
     np.add.at(scores, blocks, js * r[:, None])
     moved = scores @ bread * np.sqrt(len(problem.fit_blocks) / max(len(problem.fit_blocks) - 1, 1))
-    sandwich = moved.T @ moved
     plain = bread * float(np.mean(r * r))
-    wide = np.maximum(np.diag(sandwich) * few_blocks(moved) ** 2, np.diag(plain))
-    if stride == 1:
-        wide = np.maximum(wide, np.diag(bread @ _coloured_meat(problem, js, r) @ bread))
-    inflate = np.sqrt(np.maximum(wide, 1e-300) / np.maximum(np.diag(sandwich), 1e-300))
-    found = sandwich * np.outer(inflate, inflate) / np.outer(size, size) * _beyond_fit(problem, fitted)
-    for i in np.flatnonzero(size < 1e-6 * np.sqrt(rows.size) / np.maximum(_ranges(fitted), 1e-300)):
-        found[i, :] = found[:, i] = 0.0
-        found[i, i] = (_ranges(fitted)[i] / 3.92) ** 2
-    return found
+    coloured = bread @ _coloured_meat(problem, js, r) @ bread if stride == 1 else plain
+    idle = size < 1e-6 * np.sqrt(rows.size) / np.maximum(_ranges(fitted), 1e-300)
+    scale = np.where(idle, 0.0, 1.0 / size)
+    own = np.where(idle, (_ranges(fitted) / 3.92) ** 2, 0.0)
+    both = np.outer(scale, scale)
+    return Uncertainty(moved * scale, plain * both, coloured * both, own, _beyond_fit(problem, fitted))
 
 
 def few_blocks(moved: Array) -> Array:
