@@ -137,6 +137,8 @@ def test_parts_of_a_long_record_nominate_what_the_whole_decides_on() -> None:
     rec = recording("piezo_stack", {"command": u}, {"displacement": z}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
     assert is_long(rec, make(rec))
     tried = tuple(EFFECTS[e] for e in ("saturation", "mains_interference", "creep", "spikes"))
-    names = [e.name for e in nominated(rec, 0.3, 0, 1, None, tried, Rule())]
+    effects, hints = nominated(rec, 0.3, 0, 1, None, tried, Rule())
+    names = [e.name for e in effects]
     assert "saturation" in names
     assert "mains_interference" not in names
+    assert [h.placed.effect.name for h in hints][:1] == ["saturation"], "the whole begins where the part ended"

@@ -21,13 +21,14 @@ from tools.mismatch.engine.join import joined
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.partition import SAMPLES, split_inside, splittable
-from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.problem import Hint, Problem
 from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
 from tools.mismatch.engine.report import Hold, Report, Withheld
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.select import Selection, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot
+from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
 from tools.mismatch.engine.verdict import Decision
@@ -193,8 +194,9 @@ def pose(
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
+    hints: tuple[Hint, ...] = ()
     if is_long(recording, make(recording)):
-        catalogue = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
+        catalogue, hints = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
     hold = None
     if holdable(problem):
@@ -205,7 +207,7 @@ def pose(
     elif said_hold(recording) in ("zero", "linear", "smooth") and hasattr(problem.twin, "hold"):
         said = said_hold(recording)
         hold = Hold("zero" if said == "zero" else "smooth" if said == "smooth" else "linear", "declared")
-    return Posed(recording, catalogue, problem, raw, base, hold)
+    return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, hold)
 
 
 def _diagnose(
@@ -390,12 +392,15 @@ def nominated(
     progress: Progress | None,
     catalogue: tuple[Effect, ...],
     rule: Rule,
-) -> tuple[Effect, ...]:
-    """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals."""
+) -> tuple[tuple[Effect, ...], tuple[Hint, ...]]:
+    """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals, and
+    what the excerpt found them to be.
+    """
     recording = fitted_part(recording)
     if recording.n < 2 * part_of(recording):
-        return catalogue
+        return catalogue, ()
     names: set[str] = set()
+    hints: list[Hint] = []
     parts = [(excerpt(recording, part_of(recording)), catalogue)]
     if getattr(make(recording), "hold", "") == "discrete":
         # its difference equation holds at its own rate alone
@@ -408,9 +413,20 @@ def nominated(
         stride = max(1, problem.fit_rows.size // 12000)
         # second thoughts are for the whole: here one way forward is enough
         way = forward(problem, base, base, (), Work(allowed, rule, stride, jobs, progress))
-        names |= {t.name for t in way.steps}
-        names |= {t.name for rivals in way.rivals for t in rivals[:2]}
-    return tuple(e for e in catalogue if e.name in names)
+        trials = [*way.steps, *(t for rivals in way.rivals for t in rivals[:2])]
+        names |= {t.name for t in trials}
+        if part is parts[0][0]:
+            hints = [hint for t in trials if (hint := _hint(t)) is not None]
+    return tuple(e for e in catalogue if e.name in names), tuple(hints)
+
+
+def _hint(trial: Trial) -> Hint | None:
+    """What a trial on a part found; None for what is about instants or the lattice of samples."""
+    if trial.fitted is None or trial.candidate.tested or not trial.placed.effect.driven:
+        return None
+    model, theta = trial.fitted.model, trial.fitted.theta
+    nonlinear, weights = model.slices(model.placed.index(trial.placed))
+    return Hint(trial.placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))
 
 
 __all__ = ["diagnose"]

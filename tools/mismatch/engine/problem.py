@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sim_devices.physics.statistics import after_jumps
 from tools.mismatch.engine.noise import NoiseFloor, spectral_floor
 from tools.mismatch.engine.split import Span, Split
+from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
@@ -21,11 +22,20 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Hint:
+    """What a part of the recording found an effect at a place to be: parameters of the ``base`` and ``own`` ones."""
+
+    placed: Placed
+    base: Array
+    own: tuple[Array, Array]
+
+
+@dataclass(frozen=True)
 class Problem:
     """What every step of a diagnosis shares. ``view`` covers fit and held-out samples, ``fit_view`` the fit alone:
     only the latter is shown to whatever chooses settings, starting points or parameters. ``settle``: the start state of
     a linear run is fitted to all samples of the fit, like any parameter; otherwise it is the engineer's, or the first
-    samples set it.
+    samples set it. ``hints``: from a part of the recording, to begin from beside what the whole suggests.
     """
 
     recording: Recording
@@ -35,6 +45,7 @@ class Problem:
     seed: int
     floors: Mapping[str, NoiseFloor] = field(default_factory=dict[str, NoiseFloor])
     settle: bool = False
+    hints: tuple[Hint, ...] = ()
 
     def __getstate__(self) -> dict[str, object]:
         """Fields alone: what is derived (and what views remember) is rebuilt in a worker process."""

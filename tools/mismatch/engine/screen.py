@@ -11,7 +11,7 @@ from scipy.stats import f as f_distribution
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.problem import Problem, spread
+from tools.mismatch.engine.problem import Hint, Problem, spread
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
@@ -119,7 +119,27 @@ def one_step(problem: Problem, current: Fit, place: Placed, ground: Ground) -> C
         share = max(share, gained)
         if not tested:
             p_value = min(p_value, min(1.0, p * len(begin)))
-    return Candidate(placed, share, p_value, tested, tuple(begin))
+    found = Candidate(placed, share, p_value, tested, tuple(begin))
+    if tested:
+        return found
+    hinted = (_from_hint(problem, current, hint, ground) for hint in problem.hints if _is_about(hint, place))
+    return max((found, *hinted), key=lambda c: c.share)
+
+
+def _is_about(hint: Hint, place: Placed) -> bool:
+    return hint.placed.label == place.label and hint.placed.effect.equation == place.effect.equation
+
+
+def _from_hint(problem: Problem, current: Fit, hint: Hint, ground: Ground) -> Candidate:
+    """One step from where a part of the recording had its best fit; its base, too, while no other effect is there."""
+    model = Model(problem.twin, (*current.model.placed, hint.placed))
+    theta = model.carry(current.model, current.theta, problem.recording)
+    if not current.model.placed:
+        theta[: model.n_base] = hint.base
+    for where, values in zip(model.slices(len(model.placed) - 1), hint.own, strict=True):
+        theta[where] = values
+    share, p_value = _step_gain(problem, current, model, theta, ground)
+    return Candidate(hint.placed, share, p_value, False, (theta,))
 
 
 def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, ground: Ground) -> tuple[float, float]:
