@@ -14,8 +14,9 @@ _HEAD = (
     "corrected twin is written as a file, and the file is run freely over the official test once, after all "
     "decisions (the accelerometer package: held-out blocks of its test sweep, since the lag differs from run to "
     "run). The rules of the engine were made by people who knew these recordings: they are development data; smooth "
-    "inputs, the lean of a hysteretic loop and the diode between two filters were added after a look at the fit parts "
-    "of Silverbox, Bouc-Wen and Wiener-Hammerstein. A row is of the revision in its last column. The recordings are "
+    "inputs, the lean of a hysteretic loop and the steps it is integrated with, the diode between two filters and the "
+    "intervals of weights that cancel were added after a look at the fit parts of Silverbox, Bouc-Wen, "
+    "Wiener-Hammerstein and the piezo stage; of the test, the figures of earlier revisions were known. A row is of the revision in its last column. The recordings are "
     "not part of the repository."
 )
 
