@@ -16,7 +16,8 @@ _HEAD = (
     "run). The rules of the engine were made by people who knew these recordings: they are development data; smooth "
     "inputs, the lean of a hysteretic loop and the steps it is integrated with, the diode between two filters and the "
     "intervals of weights that cancel were added after a look at the fit parts of Silverbox, Bouc-Wen, "
-    "Wiener-Hammerstein and the piezo stage; of the test, the figures of earlier revisions were known. A row is of the revision in its last column. The recordings are "
+    "Wiener-Hammerstein and the piezo stage; of the test, the figures of earlier revisions were known. A row is "
+    "of the revision in its last column. The recordings are "
     "not part of the repository."
 )
 
