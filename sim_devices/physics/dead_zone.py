@@ -69,6 +69,8 @@ DEAD_ZONE = Effect(
     guess=_dead_guess,
     basis=_dead_basis,
     report=_dead_report,
+    # a slope gained inside makes a limit of it; one that is lost whole scatters about 1
+    limits={"slope_lost_inside": (0.0, 1.1)},
     vanishes_with=(("half_width",), ("slope_lost_inside",)),
     essential=("half_width",),
 )

@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter, zpk2ss, zpk2tf
+from scipy.signal import butter, lfilter, lsim, zpk2ss, zpk2tf
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.diode import conducted
 from tests.unit.mismatch_engine.cases import recording
-from tools.mismatch.engine.diagnose import opened
+from tools.mismatch.engine.diagnose import diagnose, opened
+from tools.mismatch.engine.partition import Filter
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites, why_not
@@ -152,6 +153,32 @@ def test_a_curve_at_the_output_splits_nothing() -> None:
     believed = {**matrices(*PRODUCT, unit_gain(*PRODUCT)), "discrete": True}
     rec = recording("state_space", {"u": u}, {"y": y}, believed)
     assert opened(rec, 0.3, 0) is rec
+
+
+def test_a_limit_in_front_of_a_fast_filter_is_no_split_and_no_dead_zone() -> None:
+    """Rates of tens of thousands in rad/s, as in any circuit: a companion matrix in seconds overflows."""
+    rate_hz, n, rng = 51200.0, 10_000, np.random.default_rng(11)
+    u = 2 * lfilter(*butter(3, 0.12), rng.standard_normal(n))
+    poles, gain = np.array([]), 1.0
+    for corner_hz in (2000.0, 3500.0):
+        _, more, k = butter(3, 2 * np.pi * corner_hz, analog=True, output="zpk")
+        poles, gain = np.concatenate([poles, more]), gain * k
+    unit = 2e4  # time in these for the truth, too
+    a, b, c, d = (m.real for m in zpk2ss([], poles / unit, gain / unit**6))
+    limited = np.clip(u, -1.2, 1.2)
+    y = lsim((a, b, c, d), limited, unit / rate_hz * np.arange(n))[1]
+    whole = Filter((), tuple(complex(p) for p in poles), gain)
+    assert whole.run(limited, 1 / rate_hz, "linear") == pytest.approx(y, abs=1e-8)
+    rec = recording(
+        "state_space", {"u": u}, {"y": y + 2e-4 * rng.standard_normal(n)},
+        {"A": (unit * a).tolist(), "B": (unit * b).tolist(), "C": c.tolist(), "D": d.tolist()}, rate_hz=rate_hz,
+    )  # fmt: skip
+    assert opened(rec) is rec
+    tried = [EFFECTS[e] for e in ("saturation", "dead_zone", "static_nonlinearity", "resonance")]
+    report = diagnose(rec, effects=tried)
+    assert [(p.name, p.target) for p in report.physics] == [("saturation", "u")]
+    assert report.physics[0].parameters["upper_limit"].value == pytest.approx(1.2, abs=1e-3)
+    assert report.equivalent == ()
 
 
 def test_a_filter_in_front_needs_one_input_and_one_output() -> None:

@@ -297,8 +297,7 @@ def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Record
     if not splittable(recording):
         return recording
     part = excerpt(fitted_part(recording), 2 * SAMPLES)
-    problem, _, base = prepared(part, held_out, seed, False)
-    split = split_inside(problem, base)
+    split = split_inside(*prepared(part, held_out, seed, False))
     return recording if split is None else replace(recording, twin=split.twin)
 
 

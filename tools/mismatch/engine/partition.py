@@ -53,15 +53,17 @@ class Filter:
     poles: tuple[complex, ...]
     gain: float
 
-    def matrices(self) -> tuple[Array, Array, Array, Array]:
-        """A, B, C, D."""
-        found = zpk2ss(list(self.zeros), list(self.poles), self.gain)
+    def matrices(self, hold: Hold) -> tuple[Array, Array, Array, Array]:
+        """A, B, C, D. Time runs in units of the fastest pole inside: powers of a rate in rad/s overflow."""
+        rate = 1.0 if hold == "discrete" else max((abs(p) for p in self.poles), default=0.0) or 1.0
+        zeros, poles = ([q / rate for q in roots] for roots in (self.zeros, self.poles))
+        found = zpk2ss(zeros, poles, self.gain * rate ** (len(zeros) - len(poles)))
         a, b, c, d = (np.array(np.real(np.array(m, np.complex128)), np.float64) for m in found)
-        return a, b, c, d
+        return rate * a, rate * b, c, d
 
     def run(self, u: Array, dt: float, hold: Hold) -> Array:
         """The response (n,) from rest to u (n,)."""
-        a, b, c, d = self.matrices()
+        a, b, c, d = self.matrices(hold)
         direct = float(d[0, 0]) * u
         if not self.poles:
             return direct
@@ -80,9 +82,10 @@ def splittable(recording: Recording) -> bool:
     return len(recording.inputs) * len(recording.outputs) == 1 and 2 <= order <= MOST_ORDER
 
 
-def split_inside(problem: Problem, base: Fit) -> Recording | None:
+def split_inside(problem: Problem, raw: Fit, base: Fit) -> Recording | None:
     """The recording with its twin written as two filters, where a curve between them explains far more than one at
-    either end of the chain; else None.
+    either end of the chain; else None. ``raw``: the twin as given; a re-fitted one may have bent itself around a curve
+    at one of its ends.
     """
     twin, rec = problem.twin, problem.recording
     if not isinstance(twin, DynamicTwin) or not splittable(rec) or twin.restart or not base.ok:
@@ -100,7 +103,11 @@ def split_inside(problem: Problem, base: Fit) -> Recording | None:
     if min(used.size, judged.size) < 50 * len(KNOTS):
         return None
     pure = Filter((), (), 1.0)
-    ends = [_left(u, y, *s, rec.dt, twin.hold, used, judged) for s in ((pure, whole), (whole, pure))]
+    given = _filter_of(twin, raw.theta)
+    ends = [
+        _left(u, y, *s, rec.dt, twin.hold, used, judged)
+        for s in ((pure, whole), (whole, pure), (pure, given), (given, pure))
+    ]
     found: list[tuple[float, int, tuple[Filter, Filter]]] = []
     for i, pair in enumerate(itertools.islice(_splits(whole, twin.hold, rec.dt), MOST_SPLITS)):
         found.append((_left(u, y, *pair, rec.dt, twin.hold, used, judged), i, pair))
@@ -111,8 +118,8 @@ def split_inside(problem: Problem, base: Fit) -> Recording | None:
     if not left < BETTER * min(*ends, plain):
         return None
     keys = ("A", "B", "C", "D")
-    table = dict(zip(keys, (m.tolist() for m in first.matrices()), strict=True))
-    rest = dict(zip(keys, (m.tolist() for m in second.matrices()), strict=True))
+    table = dict(zip(keys, (m.tolist() for m in first.matrices(twin.hold)), strict=True))
+    rest = dict(zip(keys, (m.tolist() for m in second.matrices(twin.hold)), strict=True))
     kept = {k: v for k, v in rec.twin.parameters.items() if k in ("hold", "discrete")}
     offset = {"y0": [[float(base.theta[link.j])] for link in twin.links if link.row == -2]}
     split = replace(rec, twin=replace(rec.twin, parameters={**rest, **offset, **kept, "first": table}))
