@@ -76,15 +76,6 @@ def config_for(app: Guard) -> uvicorn.Config:
     )
 
 
-class Server(uvicorn.Server):
-    """uvicorn's server; signals are left to who runs it. Two handlers would take one Ctrl-C for two of them, and the
-    firmware would not be waited for."""
-
-    def capture_signals(self) -> contextlib.AbstractContextManager[None]:  # type: ignore[override]
-        """Capture none."""
-        return contextlib.nullcontext()
-
-
 def serve(
     choice: Choice,
     recordings: Path,
@@ -108,7 +99,9 @@ def serve(
         session = Session(choice, recordings)
         jobs = Jobs()
         app = make_app(session, access, more_routes(session, jobs))
-        server = Server(config_for(app))
+        server = uvicorn.Server(config_for(app))
+        # signals are ours: two handlers would take one Ctrl-C for two of them, and not wait for the firmware
+        server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]
         loop = asyncio.get_running_loop()
 
         def leave(number: int) -> None:
