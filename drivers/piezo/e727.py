@@ -152,6 +152,7 @@ class E727:
     def safe_step(self) -> bool:
         """One tick of the ramp; steps between two command times are not sent, the last one always is."""
         if not self._position_known:
+            self.link.settle()  # else an answer to ``ERR?`` that is under way is taken for this one
             self.guard.start_from([v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)])
             self._position_known = True
         done = self.guard.ramp()

@@ -197,11 +197,13 @@ class CompiledLoop(InstrumentLoop):
             if before is not None:
                 signal.set_wakeup_fd(before)
 
-    def _wait(self, ticker: ScanTicker) -> Ticks:
+    def _wait(self, ticker: ScanTicker) -> Ticks | None:
         while (place := self._place_to_enter(ticker)) is not None:
             result = self._enter(ticker, *place)
             if result != at.SPENT:
                 break
+        if self.supervisor.must_not_wait:  # found beside the thread: the ramp does not wait for the next scan
+            return None
         return super()._wait(ticker)
 
     def _place_to_enter(self, ticker: ScanTicker) -> tuple[int, int, int] | None:
@@ -228,7 +230,7 @@ class CompiledLoop(InstrumentLoop):
         if self._is_virtual:
             self._feed(last_due_ns)
         words[at.BEAT_NS] = self._clock.now_ns()
-        words[at.ORDER] = at.GO
+        words[at.ORDER] = at.CALLED_BACK if self._interrupted else at.GO  # a signal may have come in the meantime
         self.entries += 1
         self._is_inside.set()
         result = self._thread.serve(memory)

@@ -212,7 +212,8 @@ class InstrumentLoop:
             silent_after_ns=round(limits.stale_ms * 1e6),
         )
         while self.supervisor.state is not State.SAFE and not self.supervisor.must_not_wait:
-            ticks = self._wait(ticker)
+            if (ticks := self._wait(ticker)) is None:
+                continue
             awake_ns = self._clock.now_ns()
             self._ticks = ticks
             self.incidents.tick = ticks.k0
@@ -234,8 +235,9 @@ class InstrumentLoop:
                 self._look_after_hold()
             self.scheduler.run_slack(newest_ns + ticks.dt_ns + self._period_ns)
 
-    def _wait(self, ticker: ScanTicker) -> Ticks:
-        """Return the next ticks. A failed scan is reported, and the host clock drives the loop until it runs again."""
+    def _wait(self, ticker: ScanTicker) -> Ticks | None:
+        """Return the next ticks; a loop that ran some by itself returns None where it must not wait any more. A failed
+        scan is reported, and the host clock drives the loop until it runs again."""
         try:
             return ticker.wait()
         except HalError:

@@ -208,6 +208,7 @@ class Scheduler:
                 task.runs += runs
                 task.overruns += overruns
                 task.slips += slips
+                task.skipped += 0 if task.catch_up else caught_up
 
     def task_memory(self, name: str) -> tuple[DurationHistogram, DurationHistogram, int, int]:
         """Return the histograms of duration and lateness of the task ``name``, its budget and its deadline (ns)."""

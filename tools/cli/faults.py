@@ -13,6 +13,7 @@ import typer
 from rich.progress import BarColumn, Progress, TimeElapsedColumn
 from rich.table import Table
 
+from firmware_py.compiled.eligible import check_compiled
 from firmware_py.recording.revision import git_revision
 from hal.bench import load_bench, named_files
 from hal.trust import allow_name
@@ -39,6 +40,9 @@ def faults(
         list[str] | None,
         typer.Option(metavar="BENCH[#TEXT]", help="Another bench into the same page; faults whose name contains TEXT."),
     ] = None,
+    compiled: Annotated[
+        bool, typer.Option("--compiled", help="The ticks run in the compiled thread, over socket pairs.")
+    ] = False,
     keep: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Keep what is done there; a stopped campaign goes on from it.")
     ] = None,
@@ -73,6 +77,8 @@ def faults(
         benches = [(path, _chosen("--only", only)), *((file, _chosen("--beside", text)) for file, text in others)]
         for file, chosen in benches:
             _emulated(file, chosen)
+            if compiled:
+                check_compiled(load_bench(file), "realtime")  # emulated time has descriptors here
         with Progress(task_name(), BarColumn(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting", total=len(POINTS) * seeds * (len(PHASES) + 1) * len(benches))
             campaigns = (
@@ -85,6 +91,7 @@ def faults(
                     progress=lambda text: progress.update(task, advance=1, description=text),
                     keep=keep,
                     revision=revision,
+                    compiled=compiled,
                 )
                 for file, chosen in benches
             )
@@ -96,7 +103,8 @@ def faults(
         outputs = Outputs()
         if out is not None and not is_stopped():
             asked = "".join(f" --beside {shlex.quote(text)}" for text in beside or [])
-            command = f"micron faults --seeds {seeds} --seed {seed} --pairs {pairs}{asked} --out {out}"
+            kind = " --compiled" if compiled else ""
+            command = f"micron faults --seeds {seeds} --seed {seed} --pairs {pairs}{kind}{asked} --out {out}"
             with outputs.part("page"):
                 write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
         if json_file != "-":

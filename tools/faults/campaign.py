@@ -180,13 +180,14 @@ def run_campaign(
     progress: Callable[[str], None],
     keep: Path | None = None,
     revision: str = "",
+    compiled: bool = False,
 ) -> list[FaultRow]:
     """Every fault at every point in every phase with every seed, in virtual time, in ``jobs`` processes; after them
     the rows of ``n_pairs`` pairs of faults, which are drawn from the first seed. Deterministic.
 
     After Ctrl-C the rows hold what is there; KeyboardInterrupt if that is nothing. ``keep``: a folder in which what is
     done is kept; a campaign that was stopped goes on from there. Kept results of
-    another ``revision``, bench or choice of faults are not used.
+    another ``revision``, bench or choice of faults are not used. ``compiled``: the ticks run in the compiled thread.
     """
     if has_redundancy(bench):
         faults = [fault.with_redundancy() for fault in faults]
@@ -195,12 +196,13 @@ def run_campaign(
     folder = Path(tempfile.mkdtemp(prefix="micron-faults-"))
     try:
         benches = {point.name: write_bench(bench, point, folder) for point in points}
-        key = hashlib.sha256(repr((revision, bench.read_text(encoding="utf-8"), faults)).encode()).hexdigest()[:16]
+        what = repr((revision, bench.read_text(encoding="utf-8"), faults, compiled))
+        key = hashlib.sha256(what.encode()).hexdigest()[:16]
         kept = _Kept(keep, key)
         at_start = tuple(fault for fault in faults if fault.at_start)
         running = tuple(fault for fault in faults if not fault.at_start)
         planned = [
-            Trial(benches[point.name], point.name, phase, group, seed)
+            Trial(benches[point.name], point.name, phase, group, seed, compiled=compiled)
             for point in points
             for seed in seeds
             for phase, group in [(None, at_start), *((phase, running) for phase in phases)]
@@ -210,7 +212,7 @@ def run_campaign(
         for k, group in enumerate(pairs):
             point = points[k % len(points)]
             phase = phases[k // len(points) % len(phases)]
-            planned.append(Trial(benches[point.name], point.name, phase, group, seeds[0] + k, pairs=True))
+            planned.append(Trial(benches[point.name], point.name, phase, group, seeds[0] + k, True, compiled))
         trials = [trial for trial in planned if kept.read(trial) is None]
         done = [observations for trial in planned if (observations := kept.read(trial)) is not None]
         found: dict[tuple[str, str], list[Observation]] = {}
@@ -242,6 +244,7 @@ class Trial:
     faults: tuple[Fault, ...]
     seed: int
     pairs: bool = False
+    compiled: bool = False
 
     @property
     def name(self) -> str:
@@ -251,8 +254,10 @@ class Trial:
 
     def observe(self) -> list[Observation]:
         if self.phase is None:
-            return [observe_start(self.bench, self.point, fault, self.seed) for fault in self.faults]
-        return observe_running(self.bench, self.point, self.faults, self.seed, self.phase)
+            return [
+                observe_start(self.bench, self.point, fault, self.seed, compiled=self.compiled) for fault in self.faults
+            ]
+        return observe_running(self.bench, self.point, self.faults, self.seed, self.phase, compiled=self.compiled)
 
 
 @dataclass(frozen=True)

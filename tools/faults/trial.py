@@ -24,6 +24,7 @@ from hal.clock import VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import HalError
 from hal.middleware.faults import FaultCan, FaultI2c, FaultPlan, FaultSerial
+from tools.faults.carriers import SocketPort
 from tools.faults.fault import Both, Fault, How, InWorld, Kill, OnBus, OnHost, OutOfMemory
 from tools.faults.judge import Observation, Seen, judge
 from tools.faults.phases import SELF_TEST, START, STEADY, Phase, Stop
@@ -50,6 +51,9 @@ class FarBench:
     ports: dict[str, tuple[Sabotaged, Sabotaged]] = field(default_factory=dict[str, tuple[Sabotaged, Sabotaged]])
     demands: list[tuple[int, int, float]] = field(default_factory=list[tuple[int, int, float]])
     struck: How | None = None
+    compiled: bool = False
+    carriers: list[SocketPort] = field(default_factory=list[SocketPort])
+    """The socket pairs between a compiled loop and the serial ports, the faults behind them."""
 
     def attach(self, opened: OpenBench) -> None:
         self.clock, self.world = cast(VirtualClock, opened.clock), cast(Any, opened.world)
@@ -63,6 +67,9 @@ class FarBench:
         inner = _sabotaged(port, clock)
         outer = _sabotaged(inner, clock)
         self.ports[bus] = inner, outer
+        if self.compiled and isinstance(outer, FaultSerial):
+            self.carriers.append(SocketPort(outer))
+            return self.carriers[-1]
         return outer
 
     def strike(self, how: How, seed: int, *, second: bool = False) -> None:
@@ -122,16 +129,17 @@ class FarBench:
         return Seen(strike_ns, outcome, truth["t_ns"], truth["tip_m"], self.demands, self.scans())
 
 
-def observe_start(bench: Path, point: str, fault: Fault, seed: int) -> Observation:
-    """A fault that is there before the devices are opened."""
-    far = FarBench()
+def observe_start(bench: Path, point: str, fault: Fault, seed: int, *, compiled: bool = False) -> Observation:
+    """A fault that is there before the devices are opened. ``compiled``: the ticks run in the compiled thread."""
+    far = FarBench(compiled=compiled)
 
     def open_hook(opened: OpenBench) -> None:
         far.attach(opened)
         far.strike(fault.how, seed)
 
     try:
-        outcome, truth = run_in_process(RunRequest(bench, 0.2, pace="virtual", seed=seed), on_open=open_hook)
+        request = RunRequest(bench, 0.2, pace="virtual", seed=seed, compiled=compiled)
+        outcome, truth = run_in_process(request, on_open=open_hook, wrap=far.wrap if compiled else None)
     except HalError as error:
         return Observation.refusal(fault.name, point, seed, str(error), START.name)
     assert truth is not None
@@ -151,10 +159,11 @@ class _AllStruck(BaseException):
 
 
 def observe_running(
-    bench: Path, point: str, faults: Sequence[Fault], seed: int, phase: Phase = STEADY
+    bench: Path, point: str, faults: Sequence[Fault], seed: int, phase: Phase = STEADY, *, compiled: bool = False
 ) -> list[Observation]:
-    """Each of ``faults`` strikes the same run at the same instant of ``phase``."""
-    far = FarBench()
+    """Each of ``faults`` strikes the same run at the same instant of ``phase``. ``compiled``: the ticks run in the
+    compiled thread, over socket pairs."""
+    far = FarBench(compiled=compiled)
     begin_ns, at_ns = phase.instants_ns(seed)
     answers: list[Any] = []
     me = _Child()
@@ -171,6 +180,8 @@ def observe_running(
     def at_strike(_: int) -> None:
         for quiet, fault, watch_s in runs:
             if me.fork(answers):
+                for carrier in far.carriers:
+                    carrier.leave_to_parent()
                 if quiet:
                     far.world.world.plant.hush()
                 if fault is not None:
@@ -198,7 +209,7 @@ def observe_running(
         far.clock.at(begin_ns, begin)
         far.clock.at(at_ns, at_strike)
 
-    request = RunRequest(bench, 60.0, pace="virtual", seed=seed)
+    request = RunRequest(bench, 60.0, pace="virtual", seed=seed, compiled=compiled)
     try:
         outcome, truth = run_in_process(request, on_open=open_hook, wrap=far.wrap)
     except _AllStruck:

@@ -69,6 +69,14 @@ def test_from_the_probe_on_nothing_is_loaded_or_compiled_for_a_ramp_to_neutral(m
     port.done()
 
 
+def test_an_answer_under_way_is_not_taken_for_another_one():
+    """Armed again after a hold, while the answer to ``ERR?`` is under way: its "0" was taken for voltages."""
+    device, port, _ = armed(("w", b"ERR?\n"), ("r", b"0\n"), *ARM[len(PROBE) :])
+    device.link.ask_error()
+    device.arm()
+    port.done()
+
+
 FEW = b"1=5.000000000e+01 \n2=5.000000000e+01\n"
 
 

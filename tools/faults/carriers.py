@@ -11,16 +11,33 @@ from hal.errors import HalError
 from hal.types import PortInfo
 
 
+def _new_pair() -> tuple[socket.socket, socket.socket]:
+    pair = socket.socketpair()
+    for end in pair:
+        end.setblocking(False)
+    return pair
+
+
 class SocketPort:
     """``Fed`` over a port of virtual time: what the device sends passes a socket pair, and so does what is written to
     its descriptor. A read or write of Python goes around it, after what waits there."""
 
     def __init__(self, port: SerialPort) -> None:
         self._port = port
-        self._near, self._far = socket.socketpair()
-        for end in (self._near, self._far):
-            end.setblocking(False)
+        self._near, self._far = _new_pair()
         self._room = memoryview(bytearray(1 << 16))
+
+    def leave_to_parent(self) -> None:
+        """Go on over a pair of this process alone, with a copy of what waits in the one that a fork has shared."""
+        if self._far.fileno() < 0:
+            return
+        near, far = _new_pair()
+        for shared, opposite in ((self._near, far), (self._far, near)):
+            if select.select([shared], [], [], 0.0)[0]:
+                opposite.sendall(shared.recv(1 << 20, socket.MSG_PEEK))
+        for shared, own in ((self._near, near), (self._far, far)):
+            os.dup2(own.fileno(), shared.fileno(), inheritable=False)  # a compiled loop may know the number already
+            own.close()
 
     def fileno(self) -> int:
         return self._near.fileno()
@@ -36,7 +53,8 @@ class SocketPort:
 
     def flush(self) -> None:
         while self._far.fileno() >= 0 and select.select([self._far], [], [], 0.0)[0]:
-            self._port.write(self._far.recv(4096), 0.0)
+            for line in self._far.recv(4096).splitlines(keepends=True):
+                self._port.write(line, 0.0)  # one by one, as the driver writes them: a device draws its delays by write
 
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         if select.select([self._near], [], [], 0.0)[0]:
