@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import socket
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import tty
 from collections.abc import Iterator
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from benchmarks import step_input
+from benchmarks.latency import SERIAL, echo_us
 from benchmarks.row import Row
+from firmware_py.app import run_in_process
 from firmware_py.frame import COUNTS
-from firmware_py.run_request import LOOP_PRIORITY
+from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.realtime import RealtimeConfig, realtime
+from tools.cli.bench_option import bench_path
 
 TICKS = 3000
 PERIOD_NS = 1_000_000
@@ -29,6 +35,8 @@ KINDS = (BARE, FREE, STEP, BESIDE, BARE)
 """In the order of measurement; the bare echo is measured before and after."""
 GOALS = (("p50", 50.0, 1.5), ("p99", 99.0, 1.5), ("p99.9", 99.9, 2.0))
 BESIDE_GOAL = 1.1
+RUN_S = 8.0
+ALONE, SPINNING, RECORDING = "alone", "beside a spinning thread", "beside the recorder"
 
 
 class Measured(NamedTuple):
@@ -151,7 +159,87 @@ def rows() -> Iterator[Row]:
         core = next(run.core for kind, run in runs if kind == STEP)
         yield Row(f"one compiled thread, {where}, CPU", "share of a core at 1 kHz", core, 1.0, "one core",
                   "cores", core, "<= 0.15", core <= 0.15, must=True)  # fmt: skip
+    yield from run_rows()
+
+
+class Run(NamedTuple):
+    """Holds the firmware's own figures of a run, and the ``core`` share of its process from opening to end."""
+
+    outcome: dict[str, Any]
+    core: float
+
+    def latency_us(self, share: str) -> float:
+        return self.outcome["latency"]["sample_to_command_us"][share]
+
+    @property
+    def without_command(self) -> float:
+        """Share of scans, in %, that did not get a tick of their own: skipped, or caught up with in a later tick."""
+        ticks = self.outcome["ticks"]
+        without = ticks["caught_up"] + ticks["skipped"]
+        return 100.0 * without / max(ticks["run"] + without, 1)
+
+
+def run(beside: str) -> None:
+    """Be the firmware of ``micron run --compiled`` on the serial bench, and print its ``Run`` as JSON."""
+    bench = bench_path(None).with_name(SERIAL)
+    run_in_process(RunRequest(bench, 0.5, pace="realtime", compiled=True))  # everything is compiled or loaded
+    with tempfile.TemporaryDirectory(prefix="micron-") as folder:
+        record = Path(folder) / "run.mcap" if beside == RECORDING else None
+        if beside == SPINNING:
+            threading.Thread(target=_spin, daemon=True).start()
+        cpu_s, wall_s = time.process_time(), time.monotonic()
+        outcome, _ = run_in_process(
+            RunRequest(bench, RUN_S, pace="realtime", compiled=True, record=record), own_process=True
+        )
+        core = (time.process_time() - cpu_s) / (time.monotonic() - wall_s)
+    print(json.dumps([{key: outcome[key] for key in ("latency", "ticks", "loop", "safe_state")}, core]), flush=True)
+    os._exit(0)
+
+
+def run_beside(beside: str) -> Run:
+    command = [sys.executable, "-m", "benchmarks.wire", "run", beside]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    return Run(*json.loads(done.stdout.splitlines()[-1]))
+
+
+def run_rows() -> Iterator[Row]:
+    """``micron run --compiled`` itself, scan instant to the command's bytes in the pty, with everything in it."""
+    before = echo_us()
+    runs = {beside: run_beside(beside) for beside in (ALONE, SPINNING, RECORDING)}
+    echo = np.concatenate([before, echo_us()])
+    for beside, found in runs.items():
+        compiled, ticks = found.outcome["loop"]["ticks"], found.outcome["ticks"]["run"]
+        reason = found.outcome["safe_state"]["reason"]
+        for name, share, factor in GOALS:
+            ours, bare = found.latency_us(name.replace(".", "_")), float(np.percentile(echo, share))
+            must = beside == ALONE
+            yield Row(
+                f"run --compiled, pty, {beside}, {name}", f"{compiled} of {ticks} ticks were compiled; end: {reason}",
+                ours, bare, "bare echo, pty, same policy", "us", ours / bare, f"<= {factor:g} x" if must else "-",
+                ours <= factor * bare if must else None, must=must, why="the host's stalls are in it" if must else "",
+            )  # fmt: skip
+    alone = runs[ALONE]
+    for beside in (SPINNING, RECORDING):
+        ours, peer = runs[beside].latency_us("p50"), alone.latency_us("p50")
+        yield Row(
+            f"run --compiled, pty, {beside}, p50", "the whole run beside it, page and viewer not", ours, peer,
+            "the same alone", "us", ours / peer, f"<= {BESIDE_GOAL:g} x", ours <= BESIDE_GOAL * peer, must=True,
+            why="all share two processors with the world",
+        )  # fmt: skip
+    late = max(100.0 * float(np.mean(echo >= PERIOD_NS * 1e-3)), 100.0 / len(echo))
+    yield Row(
+        "run --compiled, pty, scans without a command", "skipped or caught up with in a later tick",
+        alone.without_command, late, "bare echo later than a period", "%", alone.without_command / late, "<= 2 x",
+        alone.without_command <= 2.0 * late, must=True, why="holds and self-test are Python's ticks; the host's stalls",
+    )  # fmt: skip
+    yield Row(
+        "run --compiled, pty, CPU", "the firmware's process from opening to end, self-test in it", alone.core, 1.0,
+        "one core", "cores", alone.core, "<= 0.15", alone.core <= 0.15, must=True,
+        why="the magnetometer, the supervision and the telemetry beside the thread are Python",
+    )  # fmt: skip
 
 
 if __name__ == "__main__":
+    if sys.argv[1] == "run":
+        run(sys.argv[2])
     answer(sys.argv[1], int(sys.argv[2]))
