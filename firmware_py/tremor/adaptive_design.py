@@ -151,15 +151,35 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
     """(m, m): the bank's covariance under ``quiet`` times the sensor's noise above the cancelled band.
 
     The penalty rises over one octave from the upper edge of the band and holds up to half the tick rate. A tip has
-    nothing to cancel there: all that a filter passes shakes it, and the stacks' resonance amplifies it.
+    nothing to cancel there: all that a filter passes shakes it, and the stacks' resonance amplifies it
+    (``shaking_power``).
     """
     a = config.adaptive
     hz = np.arange(a.cancel_to_hz[1], 0.5 * config.tick_hz, 0.5)
     above = np.clip(hz / a.cancel_to_hz[1] - 1.0, 0.0, 1.0)
     features = bank.response(_complex(np.exp(2j * pi * hz / config.tick_hz)))
-    density = a.quiet * above * sensor_noise(config, hz, axis)
+    density = a.quiet * above * sensor_noise(config, hz, axis) * np.maximum(1.0, shaking_power(config, hz))
     of_tip = np.real((features * density) @ features.conj().T) * 0.5
     return np.asarray(np.kron(noise_in_channels(config, axis), of_tip), dtype=np.float64)
+
+
+def shaking_power(config: TremorConfig, hz: Array) -> Array:
+    """Return (n,): how much of the power of a command at (n,) ``hz`` below half the tick rate shakes the actuators.
+
+    A command is held for a tick. So its spectrum repeats about the tick rate, under the hold's sinc, and the first image
+    can lie on the actuators' resonance although the command itself cannot. The resonance is anywhere in ``shaken_hz``:
+    the power is the mean over it. 1 everywhere without one.
+    """
+    a, tick_hz = config.adaptive, config.tick_hz
+    if not a.shaken_hz:
+        return np.ones(len(hz))
+    resonance_hz: Array = np.linspace(*a.shaken_hz, 11)[:, None]
+    power: Array = np.zeros(len(hz))
+    for at_hz in (hz, tick_hz - hz):
+        ratio = at_hz / resonance_hz
+        gain = 1.0 / np.abs(1.0 - ratio**2 + 2j * a.shaken_damping * ratio)
+        power += np.mean(gain**2, axis=0) * np.sinc(at_hz / tick_hz) ** 2
+    return power
 
 
 def spectra(config: TremorConfig, axis: int = 0) -> _Spectra:

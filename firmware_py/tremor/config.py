@@ -117,8 +117,10 @@ class AdaptiveConfig(_Table):
     and mixed by the motion's power over ``gate_s`` (of a band around ``gate_hz``) against ``gate_ratio`` times that of
     all that is no tremor. ``share``: what an axis takes from the others. ``lever_share``: part of the
     prior hand's motion (variance) that is a turn about the quiet point. ``quiet``: above the band, sensor noise counts
-    for so many times its power, so that the filter does not shake the tip there. ``ease_s``: time constant with which
-    a filter in use approaches the one that was solved last.
+    for so many times its power, so that the filter does not shake the tip there. ``shaken_hz``: lowest and highest
+    resonance of the actuators, with ``shaken_damping``; the penalty is as much larger as a held command shakes them
+    more. Empty: the penalty is flat. ``ease_s``: time constant with which a filter in use approaches the one that was
+    solved last.
     """
 
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
@@ -143,6 +145,8 @@ class AdaptiveConfig(_Table):
     gate_s: Positive = 0.05
     gate_ratio: Positive = 150.0
     quiet: Annotated[float, Field(ge=0.0, le=1e6)] = 100.0
+    shaken_hz: tuple[()] | Edge = ()
+    shaken_damping: Annotated[float, Field(gt=0.0, le=1.0)] = 0.04
     ease_s: Annotated[float, Field(ge=0.0, le=10.0)] = 0.1
     # the prior: a hand as it is expected
     tremor_rms_m: Positive = 15e-6
@@ -171,6 +175,8 @@ class AdaptiveConfig(_Table):
             raise ValueError("adaptive: cancel_from_hz and cancel_to_hz must rise: from low to high")
         if any(low >= high for low, high in pairwise(self.core_hz)):
             raise ValueError("adaptive: core_hz must rise: from low to high")
+        if self.shaken_hz and self.shaken_hz[0] > self.shaken_hz[1]:
+            raise ValueError("adaptive: shaken_hz must name the lowest resonance first, then the highest")
         if len(self.burst_dB) != len(self.burst_hz) or any(low >= high for low, high in pairwise(self.burst_hz)):
             raise ValueError("adaptive: burst_hz must rise, with one value of burst_dB for each")
         return self

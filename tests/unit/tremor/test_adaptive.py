@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 from firmware_py.tremor.adaptive_design import (
     GRID_STEP_HZ,
@@ -14,6 +14,7 @@ from firmware_py.tremor.adaptive_design import (
     design_adaptive,
     sensor_noise,
     sensor_response,
+    shaking_power,
     solve_scaled,
     spectra,
     target_taps,
@@ -238,6 +239,37 @@ def test_the_penalty_quietens_the_filter_above_the_band() -> None:
     loud, quiet, quieter = (_noise_above_band_um(q) for q in (0.0, 100.0, 1000.0))
     assert quiet < 0.5 * loud
     assert quieter < 0.7 * quiet
+
+
+def test_a_held_command_shakes_a_resonance_by_its_image() -> None:
+    """Against a resonator that is run: a command of 350 Hz held for 1 ms has an image at 650 Hz, where the mode is."""
+    config = TremorConfig(adaptive=AdaptiveConfig(shaken_hz=(650.0, 650.0)))
+    hz, over = np.array([100.0, 350.0]), 32
+    step_s = 1e-3 / over
+    n, w, damping = 2000, 2.0 * np.pi * 650.0, config.adaptive.shaken_damping
+    mode = cont2discrete(([w * w], [1.0, 2.0 * damping * w, w * w]), step_s)
+    power = []
+    for f in hz:
+        held = np.repeat(np.cos(2.0 * np.pi * f * 1e-3 * np.arange(n)), over)
+        moved = lfilter(np.ravel(mode[0]), mode[1], held)[n * over // 2 :]
+        power.append(2.0 * np.mean(moved**2))
+    # images beyond the first, which the formula leaves out, are a small part
+    np.testing.assert_allclose(power, shaking_power(config, hz), rtol=0.02)
+    assert power[1] > 20.0
+    np.testing.assert_array_equal(shaking_power(TremorConfig(), hz), 1.0)
+
+
+def test_the_penalty_is_larger_where_the_resonance_is_shaken() -> None:
+    """The filter of a bench with a resonance passes less to it, and its penalty is no smaller anywhere."""
+    hz = np.arange(250.0, 450.0, 0.5)
+    z = np.exp(2j * np.pi * hz / RATE_HZ).astype(np.complex128)
+    shaken = TremorConfig(adaptive=AdaptiveConfig(shaken_hz=(600.0, 700.0)))
+    flat, aware = design_adaptive(TremorConfig()), design_adaptive(shaken)
+    passed = [float(np.mean(np.abs(d.start[0, 0, 1] @ d.bank.response(z)) ** 2)) for d in (flat, aware)]
+    assert passed[1] < 0.5 * passed[0]
+    assert np.linalg.eigvalsh(aware.quiet[0] - flat.quiet[0])[0] > -1e-9 * np.linalg.norm(aware.quiet[0])
+    with pytest.raises(ValueError, match="lowest resonance first"):
+        AdaptiveConfig(shaken_hz=(700.0, 600.0))
 
 
 def test_what_is_learned_is_penalized_as_the_prior_is() -> None:
