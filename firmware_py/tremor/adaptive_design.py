@@ -166,9 +166,9 @@ def _penalty_above_band(config: TremorConfig, bank: Bank, axis: int) -> Array:
 def shaking_power(config: TremorConfig, hz: Array) -> Array:
     """Return (n,): how much of the power of a command at (n,) ``hz`` below half the tick rate shakes the actuators.
 
-    A command is held for a tick. So its spectrum repeats about the tick rate, under the hold's sinc, and the first image
-    can lie on the actuators' resonance although the command itself cannot. The resonance is anywhere in ``shaken_hz``:
-    the power is the mean over it. 1 everywhere without one.
+    A command is held for a tick. So its spectrum repeats about the tick rate, under the hold's sinc, and the first
+    image can lie on the actuators' resonance although the command itself cannot. The resonance is anywhere in
+    ``shaken_hz``: the power is the mean over it. 1 everywhere without one.
     """
     a, tick_hz = config.adaptive, config.tick_hz
     if not a.shaken_hz:
