@@ -10,7 +10,8 @@ import asyncio
 import json
 import os
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -29,6 +30,7 @@ from tools.bench.layouts import Layouts
 from tools.bench.routes import more_routes
 from tools.bench.serve import LOOPBACK, access_for, bind, config_for
 from tools.bench.session import Disk, Session
+from tools.bench.targets import Targets
 
 SECONDS = 12
 RATE_HZ = 1000
@@ -96,8 +98,9 @@ def status() -> dict[str, Any]:
 class StillSession(Session):
     """A session whose run has ended before anybody looks, and which still says that it runs."""
 
-    def __init__(self, recordings: Path) -> None:
+    def __init__(self, recordings: Path, read_clock_s: Callable[[], float]) -> None:
         super().__init__(Choice(DEFAULT_BENCH), recordings)
+        self.targets = Targets(recordings / "targets", read_clock_s)
         self.layouts = Layouts(recordings.parent / "layouts")  # the bench file is one of the project
         self.orders: list[str] = []
 
@@ -172,8 +175,16 @@ class Still:
 
 
 @contextmanager
-def still_server(recordings: Path, *, open_reading: bool = True, token: str = TOKEN, port: int = 0) -> Iterator[Still]:
-    """The page's own routes and guard in a thread of this process, on ``port`` (0: a free one)."""
+def still_server(
+    recordings: Path,
+    *,
+    open_reading: bool = True,
+    token: str = TOKEN,
+    port: int = 0,
+    read_clock_s: Callable[[], float] = time.monotonic,
+) -> Iterator[Still]:
+    """The page's own routes and guard in a thread of this process, on ``port`` (0: a free one). ``read_clock_s`` is
+    the time of the targeting experiment."""
     fill(recordings)
     sock = bind(LOOPBACK, port)
     port = sock.getsockname()[1]
@@ -181,7 +192,7 @@ def still_server(recordings: Path, *, open_reading: bool = True, token: str = TO
     held: list[Any] = []
 
     async def run() -> None:
-        session, jobs = StillSession(recordings), Jobs()
+        session, jobs = StillSession(recordings, read_clock_s), Jobs()
         access = replace(access_for(LOOPBACK, port, token), open_reading=open_reading)
         app = make_app(session, access, more_routes(session, jobs))
         server = uvicorn.Server(config_for(app))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Any
 
@@ -77,61 +76,6 @@ def test_a_spike_of_two_milliseconds_is_seen_at_full_zoom_out(page: Any, server:
     seen = page.evaluate(pixels)
     page.screenshot(path=artefacts / "spike.png")
     assert seen > 3, "the spike went from the screen"
-
-
-def test_the_game_is_won_with_a_scripted_mouse(page: Any, server: Server, artefacts: Path):
-    page.evaluate("micron.seed = 7")
-    go(page, "targets")
-    page.fill("input[placeholder='Your name']", "robot")
-    page.click("#target-start")
-    page.wait_for_function("micron.game() && micron.game().of === 5 && !micron.game().done")
-    box = page.locator("#target-screen").bounding_box()
-    assert box is not None
-    px_per_deg = box["width"] / 90.0
-    centre = (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
-    gain = 8.0
-
-    def state() -> dict[str, Any]:
-        return page.evaluate("micron.game()")
-
-    def move_to(psi: float, theta: float) -> None:
-        page.mouse.move(centre[0] + psi * px_per_deg, centre[1] + theta * px_per_deg, steps=8)
-
-    def press(seconds: float, status: int) -> None:
-        page.mouse.down()
-        page.wait_for_timeout(1000 * seconds)
-        page.mouse.up()
-        page.wait_for_function(f"micron.game().done || micron.game().status === {status}")
-
-    deadline_s = time.monotonic() + 240
-    while not (now := state())["done"]:
-        assert time.monotonic() < deadline_s, f"still at target {now['reached']}"
-        if now["status"]:
-            press(0.1, 0)
-            continue
-        reached = now["reached"]
-        size = (now["target"]["size"] - now["view"]["size"]) / gain
-        if abs(size * gain) > 5:
-            move_to(-size / 2, 0)
-            press(0.7, 2)
-            move_to(size / 2, 0)
-            page.wait_for_timeout(1500)
-            continue
-        psi, theta = ((now["target"][k] - now["view"][k]) / gain for k in "xy")
-        move_to(-psi / 2, -theta / 2)
-        press(0.1, 1)
-        move_to(psi / 2, theta / 2)
-        for _ in range(30):
-            page.wait_for_timeout(100)
-            if state()["reached"] > reached:
-                break
-    page.wait_for_function("micron.game().report")
-    page.screenshot(path=artefacts / "game.png")
-    final = state()
-    assert final["result"]["reached"] == 5
-    report = (server.recordings / "targets" / final["report"]).read_text()
-    assert report.startswith("# user robot\n")
-    assert len([line for line in report.splitlines() if line[0].isdigit()]) == 5
 
 
 def test_the_safe_button_reaches_the_safe_state(page: Any, server: Server, artefacts: Path):

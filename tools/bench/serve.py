@@ -87,7 +87,8 @@ def serve(
 ) -> None:
     """Run until SIGINT or SIGTERM; the firmware is then in its safe state. ``announce`` gets the page's address.
 
-    SIGINT ends with KeyboardInterrupt, as everywhere.
+    SIGINT ends with KeyboardInterrupt, as everywhere. A second signal ends the process at once; the firmware then
+    reaches its safe state by itself, because its parent has died.
     """
     address, port = sock.getsockname()[:2]
     token = token or secrets.token_urlsafe(24)
@@ -103,11 +104,15 @@ def serve(
         # signals are ours: two handlers would take one Ctrl-C for two of them, and not wait for the firmware
         server.capture_signals = contextlib.nullcontext  # type: ignore[method-assign]
         loop = asyncio.get_running_loop()
+        stopping: list[asyncio.Task[None]] = []
 
         def leave(number: int) -> None:
+            if server.should_exit:
+                signal.signal(number, signal.SIG_DFL)
+                signal.raise_signal(number)
             interrupted.append(number == signal.SIGINT)
-            server.force_exit = server.should_exit  # the second one
             server.should_exit = True
+            stopping.append(loop.create_task(session.stop()))  # the outputs do not wait for open connections
 
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, leave, number)
@@ -116,6 +121,7 @@ def serve(
         try:
             await server.serve(sockets=[sock])
         finally:
+            await asyncio.gather(*stopping)
             await session.targets.stop()
             await jobs.close()
             session.dropped.close()

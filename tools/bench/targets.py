@@ -27,13 +27,14 @@ MAX_ANGLE_DEG = 180.0
 
 
 class Game:
-    """One run of one user. ``tell`` gets every state, as the page draws it."""
+    """One run of one user. ``read_clock_s`` returns seconds that never run backwards."""
 
-    def __init__(self, config: GameConfig, user: str, folder: Path) -> None:
+    def __init__(self, config: GameConfig, user: str, folder: Path, read_clock_s: Callable[[], float]) -> None:
         self.user = check_name(user or "user")
         self._folder = folder
         self._game = TargetGame(config)
-        self._started_s = time.monotonic()
+        self._read_clock_s = read_clock_s
+        self._started_s = read_clock_s()
         self._report: Path | None = None
         self.state: GameState = self._game.state()
 
@@ -42,7 +43,7 @@ class Game:
         return self._game.config
 
     def _now_s(self) -> float:
-        return time.monotonic() - self._started_s
+        return self._read_clock_s() - self._started_s
 
     def pointer(self, psi_deg: float, theta_deg: float, pressed: bool) -> None:
         """What the mouse says; angles that are no angles are dropped."""
@@ -119,8 +120,9 @@ class CardReader:
 class Targets:
     """The experiment that is on; one for all viewers of the bench."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, read_clock_s: Callable[[], float] = time.monotonic) -> None:
         self._folder = folder
+        self._read_clock_s = read_clock_s
         self.game: Game | None = None
         self.source: Source = "mouse"
         self._reader: CardReader | None = None
@@ -130,7 +132,8 @@ class Targets:
         if mapping not in ("position", "speed"):
             raise InputError(f"{mapping!r} is not a mapping; there are position and speed")
         await self.stop()
-        game = Game(GameConfig(control=ControlConfig(mapping=mapping), seed=seed), user, self._folder)  # pyright: ignore[reportArgumentType]
+        config = GameConfig(control=ControlConfig(mapping=mapping), seed=seed)  # pyright: ignore[reportArgumentType]
+        game = Game(config, user, self._folder, self._read_clock_s)
         if source == "card":
             if bench is None:
                 raise InputError("name the bench file whose motion card shall be used")
