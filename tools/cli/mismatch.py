@@ -22,6 +22,7 @@ from tools.terminal import task_name
 if TYPE_CHECKING:
     from tools.mismatch.engine.report import Report
     from tools.mismatch.new import NewRecording
+    from tools.mismatch.recording import Recording
 
 # what a command needs is imported inside it: `micron --help` shall not wait for the engine
 
@@ -29,6 +30,12 @@ app = typer.Typer(help="Where simulation and recording differ, and which physics
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")
+]
+RecordingsArgument = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="RECORDING...", help="A recording (folder or .toml), a folder of them; several with --together."
+    ),
 ]
 EngineOption = Annotated[
     str, typer.Option(metavar="old|new", help="Which engine decides; new is an experiment beside the old one.")
@@ -77,7 +84,7 @@ def _check_folder(folder: Path | None, option: str = "--out") -> None:
 
 @app.command()
 def diagnose(
-    recording: RecordingArgument,
+    recordings: RecordingsArgument,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report with pictures.")] = None,
     out: Annotated[
@@ -94,19 +101,45 @@ def diagnose(
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
     engine: EngineOption = "old",
+    together: Annotated[
+        bool, typer.Option("--together", help="Recordings of one system: one answer for all, and what differs.")
+    ] = False,
+    per_recording: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME[.PARAMETER]", help="With --together: free in each recording; may be repeated."),
+    ] = None,
 ) -> None:
     """Locate the mismatch, name the physics that is missing, fit it, and show the fit improve on unseen data.
+
+    With --together several recordings of one system get one answer: one set of effects for all, scored on recordings
+    that the fit left out, and what changes between them.
 
     Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
     """
     with _clear_errors():
         _check_targets(json_file, html)
         _check_folder(out)
+        _check_engine(engine)
+        processes = jobs or os.cpu_count() or 1
+        if together:
+            if engine != "old" or dask is not None:
+                raise InputError("--together has one engine and runs on this machine; leave --engine and --dask out")
+            from tools.mismatch.together import load_together, recordings_of
+
+            decide_on([*recordings_of(recordings).values()], trust, allow_outside)
+            joined = load_together(recordings, per_recording or [])
+            _show(_diagnose_one(joined, held_out, seed, processes), json_file, html, out)
+            return
+        if per_recording:
+            raise InputError("--per-recording needs --together: it says what differs between recordings")
+        if len(recordings) > 1:
+            raise InputError(
+                f"{len(recordings)} recordings: add --together if they are of one system, or name one folder of them"
+            )
+        recording = recordings[0]
         decide_on([recording], trust, allow_outside)
         from tools.mismatch.batch import is_folder_of_recordings
 
-        _check_engine(engine)
-        processes = jobs or os.cpu_count() or 1
         if is_folder_of_recordings(recording):
             if engine != "old":
                 raise InputError("--engine new is for one recording at a time")
@@ -120,7 +153,7 @@ def diagnose(
         _show(report, json_file, html, out)
 
 
-def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int, engine: str = "old") -> Report:
+def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, engine: str = "old") -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from tools.mismatch.engine.diagnose import diagnose as run_old
@@ -128,7 +161,7 @@ def _diagnose_one(path: Path, held_out: float, seed: int, jobs: int, engine: str
     from tools.mismatch.recording_load import load
 
     run = run_new if engine == "new" else run_old
-    loaded = load(path)
+    loaded = load(recording) if isinstance(recording, Path) else recording
     for note in loaded.warnings:
         print_note(note)
     with Progress(

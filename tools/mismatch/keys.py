@@ -26,6 +26,12 @@ TOP = (
     Key("twin", "table", "the simulation that the recording is compared with"),
     Key("channels", "list of tables", "one per column that is used"),
     Key("segments", "list of samples", "where a new run begins: plants with states start there afresh", "one run"),
+    Key(
+        "conditions",
+        "table",
+        "what it was made under: numbers, texts, dates; compared by 'diagnose --together'",
+        "none",
+    ),
     Key("split", "table", "which samples may be fitted and which are the test", "the tool splits by itself"),
 )
 CHANNEL = (

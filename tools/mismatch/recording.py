@@ -48,6 +48,20 @@ class TwinText:
     fixed: tuple[str, ...] = ()
 
 
+Condition = float | str
+"""What a recording was made under: a number, or a word (the name of an operator)."""
+
+
+@dataclass(frozen=True)
+class Part:
+    """One of several recordings that were joined: its samples ``start`` to ``stop`` (excluded) and its conditions."""
+
+    name: str
+    start: int
+    stop: int
+    conditions: Mapping[str, Condition] = field(default_factory=dict[str, Condition])
+
+
 @dataclass(frozen=True)
 class Recording:
     """All columns float64 (n,), in the contract's units, uniformly sampled.
@@ -55,7 +69,11 @@ class Recording:
     ``noise``: declared rms noise of an output in its contract unit, or None. ``unit``: the contract unit of each
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
     ``tolerance``: differences of an output that do not matter to the user, in its contract unit. ``segments``: samples
-    other than the first at which a new run begins: plants with states start there afresh.
+    other than the first at which a new run begins: plants with states start there afresh. ``conditions``: the table
+    ``[conditions]``, dates as seconds since 1970. ``parts``: the recordings that were joined to this one (none: it is
+    one); memory of effects begins afresh in each. ``per_recording``: base parameters that are free in each part;
+    ``levels``: how far each part's base parameters (parts, parameters) lay from the shared ones, where that was taken
+    off the outputs.
     """
 
     path: Path
@@ -75,6 +93,10 @@ class Recording:
     warnings: tuple[str, ...] = ()
     declared_unit: Mapping[str, str] = field(default_factory=dict[str, str])
     segments: tuple[int, ...] = ()
+    conditions: Mapping[str, Condition] = field(default_factory=dict[str, Condition])
+    parts: tuple[Part, ...] = ()
+    per_recording: tuple[str, ...] = ()
+    levels: tuple[tuple[float, ...], ...] = ()
 
     @property
     def file_unit(self) -> dict[str, str]:

@@ -6,6 +6,7 @@ import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
+from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any, get_args
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from hal.trust import path_inside
 from tools.mismatch import units
-from tools.mismatch.recording import Array, Recording, RecordingError, Split, TwinText
+from tools.mismatch.recording import Array, Condition, Recording, RecordingError, Split, TwinText
 from tools.mismatch.recording_columns import SUFFIXES, column_units, read_columns
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
 
@@ -23,7 +24,7 @@ LONGEST_GAP = 20.0  # usual steps of a time column
 MOST_MISSING = 0.02  # of the time
 CUT = "'micron mismatch cut RECORDING --out FOLDER' keeps the longest stretch without gaps"
 MOST_SIZE = 1e100  # of any value: squares must stay finite
-_TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments"}
+_TOP = {"format", "title", "data", "rate_hz", "time_column", "twin", "channels", "split", "segments", "conditions"}
 _CHANNEL = {"column", "role", "signal", "unit", "noise_rms", "resolution", "tolerance"}
 
 
@@ -152,6 +153,7 @@ def from_table(
         },
         warnings=tuple(notes),
         segments=_segments(path, text.get("segments"), n, twin.kind, grid is not None),
+        conditions=_conditions(where, text.get("conditions")),
     )
     if twin.kind == "state_space":
         from tools.mismatch.recording_units import in_twin_units
@@ -439,6 +441,26 @@ def _segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> 
     if resampled:
         raise RecordingError(f"{path}: segments count samples, which an irregular time column does not keep; {CUT}")
     return tuple(value)
+
+
+def _conditions(where: str, value: object) -> dict[str, Condition]:
+    """What the recording was made under. A date without an offset is read as UTC."""
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping):
+        raise RecordingError(f"{where}: [conditions] must be a table of numbers, texts or dates, got {value!r}")
+    found: dict[str, Condition] = {}
+    for key, item in value.items():
+        if isinstance(item, date):
+            full = item if isinstance(item, datetime) else datetime(item.year, item.month, item.day)
+            found[key] = (full if full.tzinfo else full.replace(tzinfo=UTC)).timestamp()
+        elif isinstance(item, str):
+            found[key] = item
+        elif isinstance(item, int | float) and not isinstance(item, bool) and np.isfinite(item):
+            found[key] = float(item)
+        else:
+            raise RecordingError(f"{where}: [conditions] {key} must be a number, a text or a date, got {item!r}")
+    return found
 
 
 def _split(path: Path, value: object, n: int) -> Split:

@@ -437,7 +437,7 @@ def make_context(twin: Twin, run: Run, target: str, output: str) -> Context:
         target,
         output,
         twin.drive(output),
-        (0,),
+        run.afresh,
         None,
         None,
         twin.facts(output),

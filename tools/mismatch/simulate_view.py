@@ -112,4 +112,5 @@ def view_run(twin: Twin, view: View) -> Run:
         starts = (0, *rec.segments)
     setting = view.setting(twin)
     period = 0 if twin.restart else view.period
-    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting, period)
+    afresh = tuple(p.start for p in rec.parts) or (0,)
+    return Run(rec.t, rec.dt, rec.signals, twin.inputs, rec.outputs, starts, window, view.memo, setting, period, afresh)

@@ -18,16 +18,17 @@ from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
 from tools.mismatch.engine.forward import Work, forward
 from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, said_hold, with_hold
 from tools.mismatch.engine.join import joined
+from tools.mismatch.engine.many import compare_recordings, levelled, repeated_noise
 from tools.mismatch.engine.noise import noise_floor
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.partition import SAMPLES, split_inside, splittable
 from tools.mismatch.engine.problem import Hint, Problem
-from tools.mismatch.engine.reduce import OVER_ALL, SLOW, excerpt, fitted_part, is_long, part_of, thinned_copy
+from tools.mismatch.engine.reduce import OVER_ALL, SLOW, VERY_LONG, excerpt, fitted_part, is_long, part_of, thinned_copy
 from tools.mismatch.engine.report import Hold, Report, Withheld
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.select import Selection, search
-from tools.mismatch.engine.split import Split, given_split, own_split, shot
+from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
@@ -144,6 +145,9 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
             rec.outputs[o], r, 1 / rec.dt, declared=rec.noise.get(o), inputs=inputs, whole=whole.get(o),
             resolution=rec.declared_step.get(o, 0.0),
         )  # fmt: skip
+        again = repeated_noise(rec, o) if rec.noise.get(o) is None else None
+        if again is not None:
+            floors[o] = replace(floors[o], rms=again, white_rms=min(floors[o].white_rms, again), method="repeats")
     return problem.with_floors(floors)
 
 
@@ -194,8 +198,13 @@ def pose(
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
+    if recording.parts and recording.per_recording:
+        problem, _, base = prepared(recording, held_out, seed, False)
+        recording = levelled(problem, base)
     hints: tuple[Hint, ...] = ()
-    if is_long(recording, make(recording)):
+    # an effect that is too weak for one recording is too weak for an excerpt
+    long = recording.n > VERY_LONG if recording.parts else is_long(recording, make(recording))
+    if long:
         catalogue, hints = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
     hold = None
@@ -283,10 +292,15 @@ def conclude(
         official = None if problem.split.own else course
         base = over_the_whole(problem, course, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
-    return assemble(
+    report = assemble(
         problem, raw, base, selection, left, posed.effects, rule, remarks, official, jobs, withheld, posed.hold,
         decision,
     )  # fmt: skip
+    if posed.recording.parts:
+        # what is not named is not part of the model that recordings are compared under
+        named = selection.fitted if report.physics else base
+        report = replace(report, together=compare_recordings(problem, base, named, jobs))
+    return report
 
 
 def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Recording:
@@ -323,19 +337,23 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     """The problem with its noise floors, the twin as given and recalibrated."""
     twin = make(recording)
     init = recording.split.initialization or 0
-    own = ranges_of(recording) is None
+    parts = [(p.start, p.stop) for p in recording.parts]
+    own = ranges_of(recording) is None and not parts
     drifts = twin.restart
     if own:
         twin, init = free_run(recording, twin)
         drifts = twin.restart
-    split = make_split(recording, held_out, seed, drifts)
     dynamic = hasattr(twin, "fastest_per_s")
-    if not own and dynamic and not drifts and (was_joined or starts_anew(recording, twin, split, init)):
+    if parts:
+        twin, init, split = split_recordings(recording, twin, held_out, seed)
+    else:
+        split = make_split(recording, held_out, seed, drifts)
+    if not own and not parts and dynamic and not drifts and (was_joined or starts_anew(recording, twin, split, init)):
         # the second recording has a start of its own
         twin = restarting(twin, True)
-    if not own and twin.restart:
+    if not own and not parts and twin.restart:
         init = max(init, 20) if drifts or not init else init
-    if not own and drifts:
+    if not own and not parts and drifts:
         split = shot(split, init)
     else:
         # of a short record something must be left to score
@@ -351,6 +369,21 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     )
     problem = set_floors(problem, preferred(problem, fit_base(problem)))
     return problem, raw, preferred(problem, fit_base(problem))
+
+
+def split_recordings(recording: Recording, twin: Twin, held_out: float, seed: int) -> tuple[Twin, int, Split]:
+    """The twin that starts afresh in every recording of several, how many samples set its start, and the split that
+    holds whole recordings out.
+    """
+    parts = [(p.start, p.stop) for p in recording.parts]
+    init, skip = 0, UNKNOWN_START
+    fastest_per_s = getattr(twin, "fastest_per_s", None)
+    if fastest_per_s is not None:
+        twin, skip = restarting(twin, True), 0.0
+        shortest = min(b - a for a, b in parts)
+        init = int(np.clip(4.0 / max(fastest_per_s * recording.dt, 1e-9), 20, max(shortest // 4, 20)))
+    signals = np.column_stack([*recording.signals.values()])
+    return twin, init, split_of_parts(signals, parts, held_out=held_out, seed=seed, init=init, skip=skip)
 
 
 def starts_anew(recording: Recording, twin: Twin, split: Split, init: int) -> bool:

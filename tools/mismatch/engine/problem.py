@@ -189,7 +189,7 @@ def _first(recording: Recording, samples: int) -> Recording:
     signals = {
         kind: {s: x[:samples] for s, x in getattr(recording, kind).items()} for kind in ("inputs", "outputs", "context")
     }
-    return replace(recording, t=recording.t[:samples], segments=recording.segments_of(0, samples), **signals)
+    return replace(recording, t=recording.t[:samples], segments=recording.segments_of(0, samples), parts=(), **signals)
 
 
 def spread(rows: NDArray[np.int64], most: int, seed: int) -> NDArray[np.int64]:

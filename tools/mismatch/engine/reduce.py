@@ -92,6 +92,7 @@ def thinned_copy(recording: Recording, samples: int = LONG_PART) -> Recording:
         noise=dict.fromkeys(recording.noise),
         split=Split(),
         segments=tuple(s // k for s in recording.segments if 0 < s // k < m),
+        parts=(),
     )
 
 
@@ -105,4 +106,5 @@ def _part(recording: Recording, part: slice, dt: float) -> Recording:
         context={s: x[part] for s, x in recording.context.items()},
         split=Split(),
         segments=recording.segments_of(part.start, part.stop),
+        parts=(),
     )

@@ -169,6 +169,60 @@ class Checks:
 
 
 @dataclass(frozen=True)
+class HeldOutRecording:
+    """Rms of the residual per output on recordings that the fit left out: base parameters alone, and with physics."""
+
+    names: tuple[str, ...]
+    recalibrated_rms: Mapping[str, float]
+    fitted_rms: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class BetweenRecordings:
+    """A parameter estimated in each recording, to first order: ``values`` and ``standard_errors`` in the order of
+    ``Together.recordings``. ``free``: it was free in each; otherwise the recordings share one value.
+    """
+
+    name: str
+    unit: str
+    free: bool
+    values: tuple[float, ...]
+    standard_errors: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A parameter that changes with a condition. ``slope`` in the parameter's unit per unit of the condition (None: the
+    condition is a word), ``relative`` the same as a share of the mean; ``p_value`` corrected for all that was tried;
+    ``same`` conditions that go with it as well and that these recordings cannot tell from it.
+    """
+
+    parameter: str
+    condition: str
+    slope: float | None
+    relative: float | None
+    p_value: float
+    same: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Together:
+    """Several recordings of one system. ``held_out``: one entry per fold; ``rms_recalibrated`` and ``rms_fitted`` over
+    all folds; ``p_value`` one-sided, that physics does not help on a recording that was left out (None: none named).
+    """
+
+    recordings: tuple[str, ...]
+    held_out: tuple[HeldOutRecording, ...]
+    rms_recalibrated: Mapping[str, float]
+    rms_fitted: Mapping[str, float]
+    p_value: float | None
+    parameters: tuple[BetweenRecordings, ...]
+    conditions: Mapping[str, tuple[float | str, ...]]
+    changes: tuple[Change, ...]
+    tried: int
+
+
+@dataclass(frozen=True)
 class Pictures:
     """Arrays for the report: time (m,), inputs and, per output, measured, as given, recalibrated, fitted (m,);
     ``held_out`` (m,) bool; ``units`` of the signals. Not part of the JSON."""
@@ -220,6 +274,8 @@ class Report:
     one_way: OneWay | None = None
     """A load that moved one way only, so that its friction shows as an offset."""
     pictures: Pictures | None = field(default=None, repr=False, compare=False)
+    together: Together | None = None
+    """Several recordings that were diagnosed together: what differs between them."""
     not_tried: str = ""
     """What this kind of twin does not allow to be tried, and which kind would."""
 
@@ -227,6 +283,8 @@ class Report:
         """The JSON of the contract, with optional keys beside; numbers finite or null."""
         body = asdict(Report(**{**{f: getattr(self, f) for f in self.__dataclass_fields__}, "pictures": None}))
         body.pop("pictures")
+        if self.together is None:
+            body.pop("together")
         return _plain({"format": 1, **body})
 
 

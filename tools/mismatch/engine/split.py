@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,6 +131,37 @@ def given_split(n: int, fit: Span, test: Span, *, initialization: int = 0) -> Sp
     start = test[0] + max(initialization, 0)
     held = ((start, test[1]),)
     return Split(n, (fit,), held, cut(held, 30), cut((fit,), 48), own=False)
+
+
+def split_of_parts(
+    signals: Array, parts: Sequence[Span], *, held_out: float = 0.3, seed: int = 0, init: int = 0, skip: float = 0.0
+) -> Split:
+    """Split that holds whole recordings out: of 24 seeded choices the one whose parts resemble each other most.
+
+    ``signals`` (n, k); ``parts`` the samples of each recording (two at least); ``init`` samples set the start state of
+    a held-out one, the share ``skip`` at the start of each is simulated and not judged.
+    """
+    n = signals.shape[0]
+    count = min(max(1, round(held_out * len(parts))), len(parts) - 1)
+    rng = np.random.default_rng([seed, n, len(parts)])
+    thin = slice(None, None, max(1, n // 20000))
+    best: tuple[float, set[int]] | None = None
+    for _ in range(24):
+        chosen = {int(i) for i in rng.choice(len(parts), count, replace=False)}
+        mask = _mask(n, tuple(p for i, p in enumerate(parts) if i in chosen))[thin]
+        score = _coverage(signals[thin], mask, ~mask) if signals.size else 0.0
+        if best is None or score < best[0]:
+            best = (score, chosen)
+    assert best is not None
+    return leave_out(n, parts, best[1], init=init, skip=skip)
+
+
+def leave_out(n: int, parts: Sequence[Span], out: Collection[int], *, init: int = 0, skip: float = 0.0) -> Split:
+    """The split of ``n`` samples that holds the recordings with numbers ``out`` out and fits the others."""
+    begun = [(a + int(skip * (b - a)), b) for a, b in parts]
+    fit = tuple(s for i, s in enumerate(begun) if i not in out)
+    held = tuple((a + init, b) for i, (a, b) in enumerate(begun) if i in out)
+    return Split(n, fit, held, cut(held, 30), cut(fit, 48), own=False)
 
 
 def shot(split: Split, init: int, pieces: int = 24) -> Split:

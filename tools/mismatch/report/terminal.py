@@ -10,7 +10,8 @@ from rich.panel import Panel
 from rich.table import Table
 from rich.text import Text
 
-from tools.mismatch.engine.report import FitSummary, PhysicsFound, Report
+from tools.mismatch.engine.report import FitSummary, PhysicsFound, Report, Together
+from tools.mismatch.report import together as words_together
 from tools.mismatch.report import wording
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.next_experiment import next_experiments
@@ -133,6 +134,13 @@ def _checks(report: Report) -> Table:
     return _pairs(rows)
 
 
+def _together(together: Together, fit: FitSummary) -> RenderableType:
+    rows = [("left out", f"{o}: {said}") for o, said in words_together.score_rows(together, fit)]
+    rows += [("changes", line) for line in words_together.change_lines(together)]
+    rows += [(p.name, words_together.range_text(p)) for p in together.parameters]
+    return _pairs(rows)
+
+
 def _split(report: Report) -> Table:
     f = report.fit
     dt = wording.step_s(report)
@@ -162,6 +170,9 @@ def render(report: Report) -> RenderableType:
         title = "What is missing" if report.verdict == "missing_physics" else "What was explained before"
         parts.append(_section(title, Group(*(_physics(i + 1, p, report.fit) for i, p in enumerate(report.physics)))))
     parts.append(_section("Residual on data that no fit has seen (rms)", _fit(report)))
+    if report.together is not None:
+        title = f"Between {len(report.together.recordings)} recordings (each left out once, or in groups)"
+        parts.append(_section(title, _together(report.together, report.fit)))
     if report.fit.base_parameters:
         parts.append(_section("Base parameters", _base(report)))
     if report.alternatives:

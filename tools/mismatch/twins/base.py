@@ -61,6 +61,7 @@ class Run:
     after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,). ``setting``:
     sorted sample numbers that may set the states of a linear run instead (None: those of the window). ``period``:
     samples after which all inputs and outputs repeat from every start on (0: they do not): it sets the start states.
+    ``afresh``: samples where the memory of effects begins.
     """
 
     t: Array
@@ -73,6 +74,7 @@ class Run:
     memo: dict[object, object]
     setting: NDArray[np.int64] | None = None
     period: int = 0
+    afresh: tuple[int, ...] = (0,)
 
 
 class Twin(Protocol):

@@ -1,0 +1,47 @@
+"""What a report of several recordings says of them, in words."""
+
+from __future__ import annotations
+
+from tools.mismatch.engine.report import BetweenRecordings, Change, FitSummary, Together
+from tools.mismatch.report.wording import chance, number, shown_in
+
+
+def change_text(change: Change) -> str:
+    """One sentence: ``gain_um_per_V falls by 0.4 % per 1 of temperature_C (p = 0.001)``."""
+    if change.slope is None:
+        said = f"{change.parameter} differs with {change.condition}"
+    else:
+        way = "falls" if change.slope < 0 else "rises"
+        share = f"{number(100 * abs(change.relative))} %" if change.relative is not None else number(abs(change.slope))
+        said = f"{change.parameter} {way} by {share} per 1 of {change.condition}"
+    also = f"; {', '.join(change.same)} cannot be told from it" if change.same else ""
+    return f"{said} ({chance(change.p_value)}, corrected){also}"
+
+
+def score_rows(together: Together, fit: FitSummary) -> list[tuple[str, str]]:
+    """Rms on recordings that the fit left out, per output."""
+    rows: list[tuple[str, str]] = []
+    for o, before in together.rms_recalibrated.items():
+        factor, unit = shown_in(fit, o, before)
+        after = together.rms_fitted[o]
+        said = f"{number(before * factor)} {unit} re-fitted"
+        if together.p_value is not None:
+            said += f", {number(after * factor)} {unit} with physics ({chance(together.p_value)})"
+        rows.append((o, said))
+    return rows
+
+
+def range_text(parameter: BetweenRecordings) -> str:
+    """Lowest and highest estimate, with the unit, and whether the parameter was free in each recording."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    free = ", free in each" if parameter.free else ""
+    return f"{min(parameter.values):.4g} to {max(parameter.values):.4g}{unit}{free}"
+
+
+def change_lines(together: Together) -> list[str]:
+    """What changes between recordings; one sentence that nothing was found where that is so."""
+    if together.changes:
+        return [change_text(c) for c in together.changes]
+    if not together.tried:
+        return ["too few recordings, or no conditions, to say what changes between them"]
+    return [f"no parameter follows a condition ({together.tried} pairs were tried)"]
