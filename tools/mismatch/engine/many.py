@@ -181,7 +181,7 @@ def compare_recordings(problem: Problem, base: Fit, fitted: Fit, jobs: int = 1) 
     p_value = None
     if fitted.model.placed and len(held) > 1:
         gain = [sum(np.log(h.recalibrated_rms[o] / max(h.fitted_rms[o], 1e-300)) for o in outputs) for h in held]
-        p_value = float(stats.ttest_1samp(gain, 0.0, alternative="greater")[1]) if np.ptp(gain) > 0 else 1.0
+        p_value = _one_sided(np.array(gain)) if np.ptp(gain) > 0 else 1.0
     whole = everything(problem)
     model = fitted.model
     free = freed(model, problem.recording.per_recording)
@@ -196,6 +196,12 @@ def compare_recordings(problem: Problem, base: Fit, fitted: Fit, jobs: int = 1) 
     return Together(
         tuple(p.name for p in parts), held, total[0], total[1], p_value, parameters, conditions, changes, tried
     )
+
+
+def _one_sided(gain: Array) -> float:
+    """P-value of Student's t-test that the mean of ``gain`` (folds,) is not above zero."""
+    t = float(np.mean(gain)) / (float(np.std(gain, ddof=1)) / np.sqrt(gain.size))
+    return float(stats.t.sf(t, gain.size - 1))
 
 
 def in_words(
@@ -285,8 +291,11 @@ def _test(values: Array, condition: Sequence[Condition]) -> tuple[float | None, 
         x = np.array([float(c) for c in condition])
         if np.unique(x).size < 3:
             return None
-        slope, _, _, p_value, _ = stats.linregress(x, values)
-        return float(slope), float(p_value)
+        centred = x - x.mean()
+        slope = float(centred @ values) / float(centred @ centred)
+        left = values - values.mean() - slope * centred
+        error = np.sqrt(float(left @ left) / (values.size - 2) / float(centred @ centred))
+        return slope, float(2 * stats.t.sf(abs(slope) / max(float(error), 1e-300), values.size - 2))
     groups = [values[[c == w for c in condition]] for w in dict.fromkeys(condition)]
     if len(groups) < 2 or values.size - len(groups) < 2 or max(float(np.ptp(g)) for g in groups) == 0.0:
         return None
