@@ -29,6 +29,7 @@ from tests.bench.still import Still, still_server
 from tests.conftest import DEFAULT_BENCH, copy_of_default_bench
 
 START_S = 220.0
+"""Longest wait for anything. It ends a test that hangs; no test is about how long something takes."""
 ARTEFACTS = Path(__file__).parents[2] / "out" / "browser"
 
 
@@ -74,7 +75,7 @@ class Server:
         with closing(self.states()) as states:
             return next(states)
 
-    def wait_for(self, good: Callable[[dict[str, Any]], bool], what: str, limit_s: float = 60.0) -> dict[str, Any]:
+    def wait_for(self, good: Callable[[dict[str, Any]], bool], what: str, limit_s: float = START_S) -> dict[str, Any]:
         """The first status for which ``good`` holds."""
         deadline_s = time.monotonic() + limit_s
         with closing(self.states()) as states:
@@ -229,7 +230,7 @@ def opened_tab(browser: Any, address: str, ready: str = READY, **more: Any) -> I
     """A page of its own, 1280 x 720 and dark unless ``more`` says otherwise; an error in the page fails the test."""
     window = {"viewport": {"width": 1280, "height": 720}, "color_scheme": "dark", "bypass_csp": True}
     context = browser.new_context(**(window | more))
-    context.set_default_timeout(60_000)
+    context.set_default_timeout(1000 * START_S)
     tab = context.new_page()
     tab.errors = errors = []
     tab.on("pageerror", lambda error: errors.append(f"{error} {error.stack}"))

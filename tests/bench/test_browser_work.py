@@ -57,7 +57,7 @@ def test_a_recording_is_looked_at_downloaded_and_exported(page: Any, server: Ser
     assert all(server.token.encode() not in path.read_bytes() for path in server.recordings.glob("taken away*"))
     offered = [option.get_attribute("value") for option in row.locator("option").all()]
     assert offered == ["", *FORMATS, "recover"]
-    with page.expect_download(timeout=240_000) as download:
+    with page.expect_download() as download:
         row.locator("select").select_option("csv")
     download.value.save_as(tmp_path / "run.csv")
     with (tmp_path / "run.csv").open() as file:
@@ -163,13 +163,15 @@ hold_s = [0.0, 0.0]
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1500)
 def test_the_pose_wizard_takes_what_a_trembling_hand_shows_it(browser: Any, artefacts: Path):
     known = tomllib.loads((DEFAULT_BENCH.parent / "calibration" / "sensors.toml").read_text())["sensing"]
     with bench_server(TURNING) as server, opened_page(browser, server) as page:
         go(page, "calibrate")
         page.click("button:has-text('Arm nothing while I turn')")
         server.wait_for(lambda s: s["status"].get("state") == "sensing only", "sensing only", 220)
-        page.wait_for_selector("b:has-text('All poses are taken')", timeout=120_000)
+        # the hand repeats its poses: a starved page takes in a later round what it missed
+        page.wait_for_selector("b:has-text('All poses are taken')", timeout=0)
         page.click("button:has-text('Identify')")
         page.wait_for_selector("button:has-text('Apply to this bench')")
         page.screenshot(path=artefacts / "poses-taken.png")
