@@ -112,7 +112,7 @@ def diagnose(
     """Locate the mismatch, name the physics that is missing, fit it, and show the fit improve on unseen data.
 
     With --together several recordings of one system get one answer: one set of effects for all, scored on recordings
-    that the fit left out, and what changes between them.
+    that the fit left out, and what changes between them (docs/many-recordings.md).
 
     Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
     """

@@ -70,7 +70,7 @@ class Recording:
     signal. ``column``: the name in the data file. ``declared_step``: resolution of an output if declared.
     ``tolerance``: differences of an output that do not matter to the user, in its contract unit. ``segments``: samples
     other than the first at which a new run begins: plants with states start there afresh. ``conditions``: the table
-    ``[conditions]``, dates as seconds since 1970. ``parts``: the recordings that were joined to this one (none: it is
+    ``[conditions]``, dates as days since 1970. ``parts``: the recordings that were joined to this one (none: it is
     one); memory of effects begins afresh in each. ``per_recording``: base parameters that are free in each part;
     ``levels``: how far each part's base parameters (parts, parameters) lay from the shared ones, where that was taken
     off the outputs.

@@ -444,7 +444,7 @@ def _segments(path: Path, value: object, n: int, kind: str, resampled: bool) -> 
 
 
 def _conditions(where: str, value: object) -> dict[str, Condition]:
-    """What the recording was made under. A date without an offset is read as UTC."""
+    """What the recording was made under. Dates become days since 1970; one without an offset is read as UTC."""
     if value is None:
         return {}
     if not isinstance(value, Mapping):
@@ -453,7 +453,7 @@ def _conditions(where: str, value: object) -> dict[str, Condition]:
     for key, item in value.items():
         if isinstance(item, date):
             full = item if isinstance(item, datetime) else datetime(item.year, item.month, item.day)
-            found[key] = (full if full.tzinfo else full.replace(tzinfo=UTC)).timestamp()
+            found[key] = (full if full.tzinfo else full.replace(tzinfo=UTC)).timestamp() / 86400.0
         elif isinstance(item, str):
             found[key] = item
         elif isinstance(item, int | float) and not isinstance(item, bool) and np.isfinite(item):

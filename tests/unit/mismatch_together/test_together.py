@@ -177,7 +177,7 @@ def test_an_effect_for_all_and_a_gain_that_follows_temperature(tmp_path: Path) -
         write(tmp_path / "runs" / f"day{k}", k, play=0.0015)
     out = tmp_path / "report.json"
     arguments = ["mismatch", "diagnose", str(tmp_path / "runs" / "day*"), "--together", "--per-recording", "gain"]
-    found = CliRunner().invoke(app, [*arguments, "--jobs", "1", "--json", str(out)])
+    found = CliRunner().invoke(app, [*arguments, "--jobs", "1", "--json", str(out), "--html", str(tmp_path / "r.html")])
     assert found.exit_code == 0, found.output
     report = json.loads(out.read_text())
     assert "gain_um_per_V falls by" in " ".join(found.output.split())
@@ -189,3 +189,7 @@ def test_an_effect_for_all_and_a_gain_that_follows_temperature(tmp_path: Path) -
     (change,) = together["changes"]
     assert (change["parameter"], change["condition"]) == ("gain_um_per_V", "temperature_C")
     assert change["relative"] == pytest.approx(-0.004, rel=0.1)
+    page = (tmp_path / "r.html").read_text()
+    assert "Between the 5 recordings" in page
+    assert "between1-" in page
+    assert "falls by" in page

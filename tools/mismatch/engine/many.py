@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.fit import Fit, fit, moved_a_little
 from tools.mismatch.engine.intervals import jacobian
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import BetweenRecordings, Change, HeldOutRecording, Together
@@ -208,13 +208,18 @@ def in_words(
     recording: Recording, model: Model, theta: Array, deltas: Array, errors: Array, free: Sequence[int]
 ) -> tuple[BetweenRecordings, ...]:
     """Estimates of the parameters that people read, from deviations (parts, parameters) of the searched ones."""
-    groups = {i: p.placed for i, p in enumerate(model.parameters)}
-    loose = {("base" if groups[i] < 0 else model.placed[groups[i]].label) for i in free}
 
     def values(at: Array) -> dict[tuple[str, str], tuple[float, str]]:
         return {(g, h.name): (float(h.value), h.unit) for g, found in model.human(at).items() for h in found}
 
     here = values(theta)
+    # a parameter that people read is free where a searched one moves it
+    loose = {
+        k
+        for i in free
+        for k, v in values(moved_a_little(model, theta, i)).items()
+        if (k[0] == "base") == (model.parameters[i].placed < 0) and v[0] != here[k][0]
+    }
     each = [values(theta + d) for d in deltas]
     spread = [
         {
@@ -228,12 +233,12 @@ def in_words(
     out: list[BetweenRecordings] = []
     for (group, name), (_, unit) in here.items():
         found = np.array([v[(group, name)][0] for v in each])
-        if group != "base" and group not in loose:
+        if group != "base" and (group, name) not in loose:
             continue  # it moves only because the base does
         if np.all(np.isfinite(found)) and np.ptp(found) > 1e-9 * np.max(np.abs(found)):
             said = name if group == "base" else f"{group}.{name}"
             se = tuple(float(s[(group, name)]) for s in spread)
-            out.append(BetweenRecordings(said, unit, group in loose, tuple(map(float, found)), se))
+            out.append(BetweenRecordings(said, unit, (group, name) in loose, tuple(map(float, found)), se))
     return tuple(out)
 
 

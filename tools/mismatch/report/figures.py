@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.engine.report import Pictures, Report
+from tools.mismatch.engine.report import BetweenRecordings, Pictures, Report, Together
 from tools.mismatch.report import series
 from tools.mismatch.report.svg import AFTER, BEFORE, GIVEN, HELD, INK, MEASURED, NOISE, figure
 from tools.mismatch.report.wording import scaled, shown_in
@@ -187,4 +187,26 @@ def autocorrelations(report: Report, p: Pictures, output: str, name: str) -> str
         ax.margins(x=0)
         ax.set_ylim(None, 1.02)
         ax.legend(loc="upper right", fontsize=9)
+    return out[0]
+
+
+def between(together: Together, parameter: BetweenRecordings, name: str) -> str:
+    """A parameter in each recording, with 95 % intervals, against the condition that it follows (else their order)."""
+    change = next((c for c in together.changes if c.parameter == parameter.name), None)
+    condition = change.condition if change is not None else "order"
+    at = together.conditions[condition]
+    words = [] if all(isinstance(v, float) for v in at) else list(dict.fromkeys(map(str, at)))
+    x = np.array([float(words.index(str(v))) if words else float(v) for v in at])
+    y = np.array(parameter.values)
+    with figure(name, (HALF_IN, 3.2)) as (fig, out):
+        ax = fig.subplots()
+        ax.errorbar(x, y, 1.96 * np.array(parameter.standard_errors), fmt="o", color=AFTER, ms=4, lw=1.0, capsize=2)
+        if change is not None and change.slope is not None:
+            ends = np.array([x.min(), x.max()])
+            ax.plot(ends, y.mean() + change.slope * (ends - x.mean()), color=BEFORE, lw=1.3)
+        if words:
+            ax.set_xticks(range(len(words)), words)
+        ax.set_title(parameter.name + ("" if parameter.unit == "1" else f" ({parameter.unit})"))
+        ax.set_xlabel(condition)
+        ax.margins(x=0.08)
     return out[0]

@@ -11,6 +11,7 @@ from typing import Any
 from sim_devices.physics.catalogue import EFFECTS
 from tools.mismatch.engine.report import PhysicsFound, Report
 from tools.mismatch.report import figures, series, svg, wording
+from tools.mismatch.report import together as words_together
 from tools.mismatch.report.equations import plain
 from tools.mismatch.report.next_experiment import next_experiments
 from tools.mismatch.report.wording import number, percent, words
@@ -47,6 +48,7 @@ def html_page(report: Report) -> str:
         bars=_bars(report),
         base=_base_rows(report),
         pictures=_pictures(report),
+        between=_between(report),
         limits=_limits(report),
         experiments=next_experiments(report),
         split=_split(report),
@@ -153,6 +155,19 @@ def _pictures(report: Report) -> list[dict[str, str]]:
         }
         for i, o in enumerate(series.drawn_outputs(report))
     ]
+
+
+def _between(report: Report) -> dict[str, Any] | None:
+    """What several recordings say of each other, None for one."""
+    together = report.together
+    if together is None:
+        return None
+    return {
+        "count": len(together.recordings),
+        "changes": words_together.change_lines(together),
+        "scores": words_together.score_rows(together, report.fit),
+        "plots": [figures.between(together, p, f"between{i}") for i, p in enumerate(together.parameters)],
+    }
 
 
 def _limits(report: Report) -> dict[str, Any]:

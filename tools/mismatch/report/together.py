@@ -5,17 +5,26 @@ from __future__ import annotations
 from tools.mismatch.engine.report import BetweenRecordings, Change, FitSummary, Together
 from tools.mismatch.report.wording import chance, number, shown_in
 
+LONGEST_UNIT = 3
+"""Letters behind the last underscore of a condition that are read as its unit."""
+
 
 def change_text(change: Change) -> str:
-    """One sentence: ``gain_um_per_V falls by 0.4 % per 1 of temperature_C (p = 0.001)``."""
+    """One sentence: ``gain_um_per_V falls by 0.4 % per C of temperature (p = 0.001)``."""
     if change.slope is None:
         said = f"{change.parameter} differs with {change.condition}"
     else:
         way = "falls" if change.slope < 0 else "rises"
         share = f"{number(100 * abs(change.relative))} %" if change.relative is not None else number(abs(change.slope))
-        said = f"{change.parameter} {way} by {share} per 1 of {change.condition}"
+        said = f"{change.parameter} {way} by {share} per {step_of(change.condition)}"
     also = f"; {', '.join(change.same)} cannot be told from it" if change.same else ""
     return f"{said} ({chance(change.p_value)}, corrected){also}"
+
+
+def step_of(condition: str) -> str:
+    """One step of a condition: ``C of temperature`` for ``temperature_C``, ``1 of order`` where its name has no unit."""
+    name, _, unit = condition.rpartition("_")
+    return f"{unit} of {name}" if name and len(unit) <= LONGEST_UNIT else f"1 of {condition}"
 
 
 def score_rows(together: Together, fit: FitSummary) -> list[tuple[str, str]]:
