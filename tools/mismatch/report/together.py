@@ -22,7 +22,7 @@ def change_text(change: Change) -> str:
 
 
 def step_of(condition: str) -> str:
-    """One step of a condition: ``C of temperature`` for ``temperature_C``, ``1 of order`` where its name has no unit."""
+    """One step of a condition: ``C of temperature`` for ``temperature_C``; ``1 of order`` where it names no unit."""
     name, _, unit = condition.rpartition("_")
     return f"{unit} of {name}" if name and len(unit) <= LONGEST_UNIT else f"1 of {condition}"
 
