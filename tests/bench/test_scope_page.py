@@ -342,14 +342,35 @@ def test_channels_of_different_units_do_not_add_up(scope: Any):
 
 
 def test_every_figure_says_what_it_is(scope: Any):
-    for view, selector in (("scope", "#vitals dt"), ("latency", "thead th:not(:nth-child(3))"), ("tremor", "table th")):
+    for view, selector in (
+        ("scope", "#vitals dt"),
+        ("latency", "thead th:not(:nth-child(3))"),
+        ("tremor", "table th"),
+        ("attitude", "td.soft"),
+        ("actuators", ".big, .big + .num, .row.num > span"),
+        ("collect", "thead th:nth-child(4)"),
+    ):
         go(scope, view)
         scope.wait_for_selector(selector, state="attached")
         unexplained = scope.evaluate(
-            f"[...document.querySelectorAll('{selector}')].filter((e) => !e.querySelector('[data-hint][title]'))"
+            f"[...document.querySelectorAll('{selector}')]"
+            ".filter((e) => !e.matches('[data-hint][title]') && !e.querySelector('[data-hint][title]'))"
             ".map((e) => e.textContent)"
         )
         assert unexplained == []
+
+
+def test_what_is_pointed_at_stays_while_its_value_changes(scope: Any):
+    """A tooltip and a tap need an element that is still there a moment later."""
+    for view, selector in (("attitude", "td.soft .what"), ("actuators", ".row.num .what")):
+        go(scope, view)
+        scope.wait_for_selector(selector)
+        scope.evaluate(f"window.pointed = document.querySelector('{selector}')")
+        scope.wait_for_timeout(300)  # several pictures
+        assert scope.evaluate("pointed.isConnected")
+
+
+def test_a_figure_is_explained_where_it_is_tapped(scope: Any):
     scope.locator("#vitals .what", has_text="outputs held").click()
     assert "Normal: 0 %" in scope.locator("#hint").inner_text()
     assert scope.locator("#vitals div", has_text="outputs held").locator("dd").inner_text() == "0 %"

@@ -1,6 +1,6 @@
 // The three stacks: volts, strokes, hysteresis; and driving them by hand while a button is held.
 import { canvas, colours, css, digits, h, persistent, segments } from "../dom.js";
-import { explained } from "../figures.js";
+import { explained, figure } from "../figures.js";
 import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 
@@ -15,8 +15,8 @@ export function mount(root, { link }) {
   let jogTimer = 0;
 
   const cards = [0, 1, 2].map((c) => {
-    const volts = h("div.big");
-    const stroke = h("div.num.soft");
+    const volts = h("div.big", { tabIndex: 0, ...explained("command") });
+    const stroke = h("div.num.soft.what", { tabIndex: 0, ...explained("stroke") });
     const fill = h("i");
     const loop = canvas((g, w, hgt) => drawLoop(g, w, hgt, c), `Hysteresis loop of stack ${c + 1}`);
     const minus = holdButton("−", c, -1);
@@ -86,7 +86,9 @@ export function mount(root, { link }) {
   }
 
   const strip = new Strip([1, 2, 3].map((n) => ({ label: `command ${n}`, unit: "V" })), { least: 10, xTitle: "time, s", yTitle: "V" });
-  const limits = h("div.row.num", { style: "font-size:12px;gap:16px" });
+  const clips = CLIP.map(([, name]) => figure(name, ""));
+  const limited = h("span.soft.what", { tabIndex: 0, ...explained("limited") });
+  const limits = h("div.row.num", { style: "font-size:12px;gap:16px" }, clips, limited);
   root.append(h("div.cols.actuators", {},
     h("section.panel.row", {}, arm, h("span.soft", {}, "speed"),
       segments([[2, "2"], [20, "20"], [100, "100 V/s"]], settings.rate, (v) => { settings.rate = Number(v); settings.save(); }, "Jog speed"), manual, h("span.grow"), limits),
@@ -143,8 +145,11 @@ export function mount(root, { link }) {
     let bits = 0;
     for (const v of b.highs(6)) bits |= v;
     const s = link.state?.status || {};
-    limits.replaceChildren(...CLIP.map(([bit, name]) => h("span", { className: bits & bit ? "warn-text" : "faint" }, `${name} ${bits & bit ? "limited" : "ok"}`)),
-      h("span.soft", explained("limited"), `${s.clipped ?? 0} of ${s.commands ?? 0} commands limited`));
+    CLIP.forEach(([bit, name], i) => {
+      clips[i].className = `what ${bits & bit ? "warn-text" : "faint"}`;
+      clips[i].textContent = `${name} ${bits & bit ? "limited" : "ok"}`;
+    });
+    limited.textContent = `${s.clipped ?? 0} of ${s.commands ?? 0} commands limited`;
   }
   const off = link.on("state", showArm);
   const retheme = () => strip.build();

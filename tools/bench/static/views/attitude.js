@@ -1,6 +1,7 @@
 // The instrument in space, its numbers, its drift, and another filter beside it.
 import { get, post } from "../api.js";
 import { canvas, css, digits, h, persistent } from "../dom.js";
+import { explained, figure } from "../figures.js";
 import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 import { angleBetween, drawInstrument, euler, orbit } from "../solid.js";
@@ -16,6 +17,8 @@ function palette() {
   };
 }
 
+const NUMBERS = [["roll", "roll (x)"], ["pitch", "pitch (y)"], ["yaw", "yaw (z)"], ["quaternion", "q w, x"], ["quaternion", "q y, z"], ["turned since zero"]];
+
 export function mount(root, { link }) {
   const settings = persistent("attitude", { compare: "" });
   const subscription = link.subscribe(CHANNELS, 100, 100);
@@ -30,7 +33,7 @@ export function mount(root, { link }) {
   [main, second].forEach(orbit);
   const title = h("h2", {}, "Firmware");
   const choice = h("select", { "aria-label": "Filter beside it", onchange: () => compare(choice.value) });
-  const gap = h("span.num.soft");
+  const gap = h("span.num.soft.what", { tabIndex: 0, ...explained("apart") });
   const use = h("button", { id: "use-filter", onclick: () => change(() => post("/api/filters/use", { method: choice.value })) }, "Use it in the firmware");
   const back = h("button", { hidden: true, onclick: () => change(() => post("/api/calibrate/discard")) }, "Back to the original bench");
   const secondPanel = h("section.panel.fig", { hidden: true },
@@ -108,13 +111,15 @@ export function mount(root, { link }) {
     known = "";
     if (settings.compare && link.mayOrder) compare(settings.compare);
   });
+  const cells = NUMBERS.map(() => h("td.num")); // they stay: what is pointed at keeps its explanation
   const timer = setInterval(() => {
     if (!q || !reference) return; // a new run has not shown its first sample yet
     const [roll, pitch, yaw] = euler(q);
-    const rows = [["roll (x)", `${roll.toFixed(2)}°`], ["pitch (y)", `${pitch.toFixed(2)}°`], ["yaw (z)", `${yaw.toFixed(2)}°`],
-      ["q w, x", `${q[0].toFixed(5)}  ${q[1].toFixed(5)}`], ["q y, z", `${q[2].toFixed(5)}  ${q[3].toFixed(5)}`],
-      ["turned since zero", `${((angleBetween(reference, q) * 180) / Math.PI).toFixed(3)}°`]];
-    numbers.replaceChildren(...rows.map(([name, value]) => h("tr", {}, h("td", { style: "color:var(--soft)" }, name), h("td.num", {}, value))));
+    const values = [`${roll.toFixed(2)}°`, `${pitch.toFixed(2)}°`, `${yaw.toFixed(2)}°`,
+      `${q[0].toFixed(5)}  ${q[1].toFixed(5)}`, `${q[2].toFixed(5)}  ${q[3].toFixed(5)}`,
+      `${((angleBetween(reference, q) * 180) / Math.PI).toFixed(3)}°`];
+    if (!numbers.contains(cells[0])) numbers.replaceChildren(...NUMBERS.map(([name, text], i) => h("tr", {}, h("td.soft", {}, figure(name, text)), cells[i])));
+    values.forEach((value, i) => { cells[i].textContent = value; });
   }, 100);
   const retheme = () => { colours = palette(); strip.build(); };
   window.addEventListener("themechange", retheme);

@@ -2,6 +2,7 @@
 // the instrument has been steady in it for a second.
 import { post } from "../api.js";
 import { canvas, css, digits, h } from "../dom.js";
+import { figure } from "../figures.js";
 
 const VOLTS = [...[0, 1, 2, 3, 4, 5, 6, 7].map((i) => `volts_${i}`), "supply"];
 const FORCE = ["specific_force_x", "specific_force_y", "specific_force_z"];
@@ -127,9 +128,9 @@ export function poseWizard(link, apply, fail) {
     try {
       result = await post("/api/calibrate/poses", { means_V: [...taken.values()] });
       const names = ["1x", "1z", "2y", "2z", "3x", "3y"];
-      outcome.replaceChildren(h("table", {}, h("tr", {}, h("th", {}, "axis"), h("th.num", {}, "bias"), h("th.num", {}, "scale")),
+      outcome.replaceChildren(h("table", {}, h("tr", {}, h("th", {}, "axis"), h("th.num", {}, figure("bias")), h("th.num", {}, figure("scale"))),
         names.map((n, i) => h("tr", {}, h("td", {}, n), h("td.num", {}, `${result.table.bias_V[i].toFixed(4)} V`), h("td.num", {}, `${result.table.scale_V_per_g[i].toFixed(4)} V/g`)))),
-      h("div.row", {}, h("span.soft", {}, `left over: ${result.residual_m_s2.map((v) => digits(1000 * v, 2)).join(", ")} mm/s²`), h("button.primary", { onclick: () => apply("poses") }, "Apply to this bench")));
+      h("div.row", {}, h("span.soft", {}, figure("left over"), `: ${result.residual_m_s2.map((v) => digits(1000 * v, 2)).join(", ")} mm/s²`), h("button.primary", { onclick: () => apply("poses") }, "Apply to this bench")));
     } catch (error) { fail(error); }
   }
 

@@ -1,6 +1,7 @@
 // Recordings: start, stop, notes, list, quick look, export. The server records; this page may be closed.
 import { download, get, post } from "../api.js";
 import { bytes, colours, duration, exportOptions, h, unitText } from "../dom.js";
+import { explained, figure } from "../figures.js";
 import { holdSpans } from "../holds.js";
 import { Strip } from "../plot.js";
 
@@ -26,7 +27,7 @@ export function mount(root, context) {
   root.append(h("div.cols.collect", {},
     h("section.panel", {}, h("div.row", {}, start, stop, name, notes, note, status), problem),
     h("section.panel.list", {}, h("h2", {}, "Recordings ", folder),
-      h("table.cards", {}, h("thead", {}, h("tr", {}, ["name", "notes"].map((t) => h("th", {}, t)), ["length", "lost", "size", "when"].map((t) => h("th.num", {}, t)), h("th", {}, "actions"))), body)),
+      h("table.cards", {}, h("thead", {}, h("tr", {}, ["name", "notes"].map((t) => h("th", {}, t)), ["length", "lost", "size", "when"].map((t) => h("th.num", {}, t === "lost" ? figure(t) : t)), h("th", {}, "actions"))), body)),
     look));
 
   async function act(work) {
@@ -43,7 +44,7 @@ export function mount(root, context) {
       h("td.whole", {}, h("button.quiet.name", { onclick: () => show(r.name), disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
       h("td.soft.notes.whole", { title: r.notes.join("\n") }, r.notes.join(" · ")),
       h("td.num", { "data-label": "length" }, r.ticks === null ? "–" : duration(r.ticks / 1000)),
-      h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost" }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
+      h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost", ...explained("lost") }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
       h("td.num.soft.when", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
       h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r, list))))));
     if (!list.recordings.length) body.replaceChildren(h("tr", {}, h("td.soft.whole", { colSpan: 7 }, "None yet. Start one above; it goes on when this page is closed.")));

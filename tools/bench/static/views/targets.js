@@ -1,6 +1,7 @@
 // The targeting experiment: bring the square onto the target. Played with the mouse, or with the motion card.
 import { download, get, post } from "../api.js";
 import { canvas, css, h, persistent, segments } from "../dom.js";
+import { figure } from "../figures.js";
 
 const STATUS = ["not active: press to move", "moving", "zooming"];
 
@@ -9,6 +10,7 @@ export function mount(root, { link, navigate }) {
   let game = null;
   let pointer = [0, 0];
   let pressed = false;
+  let shown = "";
 
   const screen = canvas(draw, "Targets");
   screen.style.cursor = "crosshair";
@@ -99,10 +101,13 @@ export function mount(root, { link, navigate }) {
     if (!game) return;
     const rows = [["targets", `${game.reached} of ${game.of}`], ["time", `${game.elapsed_s.toFixed(1)} s`], ["clicks", game.clicks], ["", STATUS[game.status]]];
     if (game.target) rows.splice(3, 0, ["off by", `${game.off_px.map((v) => v.toFixed(0)).join(", ")} px (±${game.tolerance_px})`]);
-    facts.replaceChildren(...rows.map(([n, v]) => h("tr", {}, h("td.soft", {}, n), h("td.num", {}, v))));
+    const names = rows.map(([n]) => n).join();
+    if (shown !== names) facts.replaceChildren(...rows.map(([n]) => h("tr", {}, h("td.soft", {}, n ? figure(n) : n), h("td.num"))));
+    shown = names; // rows stay while their names do: what is pointed at keeps its explanation
+    rows.forEach(([, v], i) => { facts.rows[i].cells[1].textContent = v; });
     problem.textContent = game.error || "";
     if (game.result) {
-      results.replaceChildren(h("table", {}, h("tr", {}, h("th", {}, "#"), h("th.num", {}, "time"), h("th.num", {}, "clicks"), h("th.num", {}, "turns")),
+      results.replaceChildren(h("table", {}, h("tr", {}, h("th", {}, "#"), h("th.num", {}, "time"), h("th.num", {}, figure("clicks")), h("th.num", {}, figure("turns"))),
         game.result.rows.map((r) => h("tr", {}, h("td", {}, r.target), h("td.num", {}, `${r.elapsed_s.toFixed(1)} s`), h("td.num", {}, r.clicks), h("td.num", {}, r.activations)))));
       if (!was?.result) listReports();
     } else results.replaceChildren();
