@@ -12,7 +12,7 @@ import pytest
 
 from hal.trust import NotTrusted, digest_of, trust_program
 from tests.unit.mismatch_model.made import recording
-from tools.guest.fmu import OpenFmu
+from tools.guest.fmu import OpenFmu, over_the_step
 from tools.mismatch.recording import Recording, RecordingError
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
@@ -67,14 +67,46 @@ def truth(gain: float, tau: float, over_the_step: np.ndarray = POWER) -> np.ndar
     return y
 
 
-def test_linear_inputs_reach_a_co_simulation_as_their_mean_over_a_step(fmu: Path) -> None:
+def test_linear_inputs_are_held_over_half_steps_with_their_mean_and_first_moment(fmu: Path) -> None:
     """They are assumed where nothing is declared; ``hold = "zero"`` gives each step its first sample."""
     rec = of(fmu)
     got = Model(make(rec)).simulate(View.whole(rec), np.array([2.0, 0.5]))["position"]
-    np.testing.assert_allclose(got, truth(2.0, 0.5, 0.5 * (POWER + np.roll(POWER, -1))), atol=1e-12)
+    first, second = over_the_step(POWER, 2)
+    a, warm = np.exp(-DT / 2 / 0.5), np.zeros(N)
+    for k in range(N - 1):
+        half = a * warm[k] + (1 - a) * first[k]
+        warm[k + 1] = a * half + (1 - a) * second[k]
+    np.testing.assert_allclose(got, 2.0 * warm, atol=1e-12)
     assert make(rec).hold == "linear"  # type: ignore[attr-defined]
     with pytest.raises(RecordingError, match="hold must be 'zero' or 'linear'"):
         make(of(fmu, hold="smooth"))
+
+
+def test_both_integrals_of_what_is_held_are_those_of_the_line() -> None:
+    a, b = POWER[:-1], POWER[1:]
+    first, second = over_the_step(POWER, 2)[:, :-1]
+    np.testing.assert_allclose((first + second) / 2, (a + b) / 2, rtol=1e-14)  # over the step
+    # integral of the line times the time that is left: a double integrator's position
+    np.testing.assert_allclose(first * 3 / 8 + second / 8, a / 3 + b / 6, rtol=1e-14)
+    np.testing.assert_allclose(over_the_step(POWER)[0, :-1], (a + b) / 2, rtol=1e-14)
+
+
+def test_an_fmu_that_refuses_half_steps_gets_the_mean_over_whole_ones(fmu: Path) -> None:
+    run = OpenFmu(fmu, digest_of(fmu.read_bytes()), ("position",), DT)
+    step = run.instance.fmi2DoStep
+
+    def stubborn(component: object, t: float, h: float, keep: int) -> object:
+        if h < 0.9 * DT:
+            raise ValueError("step size")
+        return step(component, t, h, keep)
+
+    run.instance.fmi2DoStep = stubborn
+    inputs = {"power": POWER, "t": np.arange(N) * DT}
+    start = {"um_per_W": 2.0, "time_constant_s": 0.5, "hold": "linear"}
+    for _ in range(2):
+        got = run(inputs, start)["position"]
+        np.testing.assert_allclose(got, truth(2.0, 0.5, 0.5 * (POWER + np.roll(POWER, -1))), atol=1e-12)
+    assert run.parts == 1
 
 
 def test_runs_with_its_parameters_and_from_its_own_start(fmu: Path) -> None:
@@ -115,6 +147,10 @@ def test_stepping_it_ourselves_is_what_fmpy_does(fmu: Path) -> None:
     mine = run(inputs, start)["position"]
     run.instance.reset()
     np.testing.assert_allclose(mine, run.simulated(inputs, start)["position"], rtol=0.0, atol=1e-12)
+    mine = run(inputs, {**start, "hold": "linear"})["position"]
+    run.instance.reset()
+    theirs = run.simulated(inputs, start, "linear", 2)["position"]
+    np.testing.assert_allclose(mine, theirs, rtol=0.0, atol=1e-12)
 
 
 def test_values_that_the_fmu_cannot_take_end_no_search_but_the_engineers_own_do(fmu: Path) -> None:
