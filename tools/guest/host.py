@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import select
+import shutil
 import signal
 import subprocess
 import tempfile
@@ -55,10 +56,11 @@ class GuestProcess:
         self.name, self.opening, self.limits = name, dict(opening), limits
         self._process: subprocess.Popen[bytes] | None = None
         self._said: Any = None
+        self._folder = ""
         self._opened: tuple[dict[str, Any], dict[str, Array]] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_process": None, "_said": None, "_opened": None}
+        return {**self.__dict__, "_process": None, "_said": None, "_folder": "", "_opened": None}
 
     def opened(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Return the answer to the opening request. ``GuestError`` or ``GuestDied`` when it cannot be opened."""
@@ -83,14 +85,16 @@ class GuestProcess:
     def end(self) -> None:
         """End the process, if there is one."""
         if self._process is not None:
-            _end(self._process, self._said)
+            _end(self._process, self._said, self._folder)
             self._process = None
             self._opened = None
 
     def _start(self) -> None:
         self.end()
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it is read when the process has died
-        environment = child_environment()
+        # what it unpacks goes with it: a guest is killed, and tidies nothing up
+        self._folder = tempfile.mkdtemp(prefix="micron-guest-")
+        environment = child_environment() | {"TMPDIR": self._folder}
         # one program needs one thread, and each thread of a linear algebra library takes memory from its limit
         environment.update(dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"))
         self._process = subprocess.Popen(
@@ -103,7 +107,7 @@ class GuestProcess:
         )
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)  # a guest that never reads must not hold us
-        weakref.finalize(self, _end, self._process, self._said)
+        weakref.finalize(self, _end, self._process, self._said, self._folder)
 
     def _ask(
         self, head: Mapping[str, Any], arrays: Mapping[str, Array], limit_s: float
@@ -175,8 +179,8 @@ class GuestProcess:
         return GuestDied(f"{self.name}: the program {what}{tail}; repair it, or leave it out")
 
 
-def _end(process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
-    """Kill the process and all that it started; close what leads to it."""
+def _end(process: subprocess.Popen[bytes], said: IO[bytes], folder: str) -> None:
+    """Kill the process and all that it started; close what leads to it, and remove its temporary files."""
     if process.poll() is None:
         try:
             os.killpg(process.pid, signal.SIGKILL)
@@ -189,3 +193,4 @@ def _end(process: subprocess.Popen[bytes], said: IO[bytes]) -> None:
                 pipe.close()
             except OSError:
                 continue
+    shutil.rmtree(folder, ignore_errors=True)

@@ -58,6 +58,20 @@ def test_a_death_is_one_message_that_names_the_program(line: str, message: str) 
     assert guest._process is None
 
 
+def test_its_temporary_files_go_with_it() -> None:
+    """However it ends: it is killed, and so it tidies nothing up itself."""
+    line = "import tempfile; at = tempfile.mkdtemp(); return {'at': np.frombuffer(at.encode(), np.uint8) * 1.0}"
+    guest = module(simulate(line))
+    folder = Path(bytes(guest.run({"u": U}, {})["at"].astype(np.uint8)).decode())
+    assert folder.is_dir()
+    guest.end()
+    assert not folder.parent.exists()
+    crashing = module(simulate("ctypes.string_at(0)"))
+    with pytest.raises(GuestDied):
+        crashing.run({"u": U}, {})
+    assert not Path(crashing._folder).exists()
+
+
 def test_an_endless_loop_is_ended_at_its_limit() -> None:
     guest = module(simulate("while True: pass"), Limits(seconds=3.0, seconds_per_sample=0.0))
     with pytest.raises(GuestDied, match="did not answer within 3 s and was ended"):
