@@ -1,5 +1,5 @@
 """Half an hour in virtual time (MICRON_LONG_S), and a shift of eight hours without wires (MICRON_SHIFT_S): what
-``micron soak`` asks of both. ``docs/long-runs.md`` has the figures.
+``micron soak`` asks of both. ``docs/results/long-runs.json`` has the figures.
 """
 
 from __future__ import annotations

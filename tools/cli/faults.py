@@ -21,7 +21,8 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import is_stopped
-from tools.output import Outputs, check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_writable, write_json
+from tools.results.artefact import write_result
 from tools.stamp import revision_and_day
 from tools.terminal import task_name
 
@@ -46,7 +47,9 @@ def faults(
     keep: Annotated[
         Path | None, typer.Option(metavar="FOLDER", help="Keep what is done there; a stopped campaign goes on from it.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Break the emulated instrument in every way of the catalogue, and print what it did.
@@ -56,7 +59,7 @@ def faults(
     After Ctrl-C what is done is printed and goes into --json, not into --out. Exit status 1 when an output was unsafe,
     a sample uncounted, a message wrong or an answer not as expected.
 
-    Example: micron faults --seeds 5 --pairs 300 --out docs/reliability.md
+    Example: micron faults --seeds 5 --pairs 300 --out docs/results/reliability.json
     """
     from tools.faults.campaign import run_campaign, totals
     from tools.faults.drift_bound import drift_bounds
@@ -106,7 +109,7 @@ def faults(
             kind = " --compiled" if compiled else ""
             command = f"micron faults --seeds {seeds} --seed {seed} --pairs {pairs}{kind}{asked} --out {out}"
             with outputs.part("page"):
-                write_text_atomic(out, markdown(rows, command, revision_and_day(), bounds, besides))
+                write_result(out, markdown(rows, command, revision_and_day(), bounds, besides))
         if json_file != "-":
             with outputs.part("table"):
                 _print(rows, total)

@@ -13,7 +13,8 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_json
+from tools.results.artefact import write_result
 from tools.stamp import revision_and_day
 from tools.terminal import task_name
 
@@ -27,12 +28,14 @@ def hands(
         Path | None, typer.Option(metavar="FOLDER", help="Score every recorded hand of this folder instead.")
     ] = None,
     seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.
 
-    Example: micron hands --out docs/first-results.md
+    Example: micron hands --out docs/results/hands.json
 
     Hands that no setting has seen, with the bench's estimator: micron hands --heldout recordings
     """
@@ -63,7 +66,7 @@ def hands(
         stamp = revision_and_day()
         page = markdown(rows, seconds, stamp) if folder is None else heldout_page(folder, rows, seconds, stamp)
         if out is not None:
-            write_text_atomic(out, page)
+            write_result(out, page)
         if json_file != "-":
             typer.echo(page)
         write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)

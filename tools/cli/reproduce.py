@@ -13,13 +13,16 @@ from rich.text import Text
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_json
+from tools.results.artefact import write_result
 from tools.stamp import revision_and_day
 
 
 def reproduce(
     names: Annotated[list[str], typer.Argument(metavar="NAME...", help="sensing, real-sensors, ... or all.")],
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the tables as a page (Markdown).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
+    ] = None,
     json_file: JsonOption = None,
     sets: Annotated[
         list[str] | None, typer.Option("--set", metavar="NAME", help="Of measured: only sets with this in their name.")
@@ -32,7 +35,7 @@ def reproduce(
 
     Example: micron reproduce sensing --json out/sensing.json
 
-    A page: micron reproduce sensing real-sensors --out docs/sensing-tables.md
+    A result: micron reproduce sensing real-sensors --out docs/results/sensing.json
 
     Measured recordings, set by set: micron reproduce measured --set emps --rows out/measured.json
     """
@@ -97,6 +100,6 @@ def reproduce(
         if out is not None:
             command = f"micron reproduce {' '.join(names)} --out {out}"
             text = tables[0].page if len(tables) == 1 and tables[0].page else ""
-            write_text_atomic(out, text or markdown(tables, command, revision_and_day()))
+            write_result(out, text or markdown(tables, command, revision_and_day()))
         results = [table.as_dict() for table in tables]
         write_json(results[0] if len(results) == 1 else {"format": 1, "tables": results}, json_file)

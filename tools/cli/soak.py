@@ -13,7 +13,8 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import note_stop
-from tools.output import check_writable, write_json, write_text_atomic
+from tools.output import check_writable, write_json
+from tools.results.artefact import write_result
 from tools.stamp import revision_and_day
 
 
@@ -26,14 +27,16 @@ def soak(
     start_ns: Annotated[
         int, typer.Option(min=0, max=2**62, help="Where the bench clock begins: marks of time are crossed.")
     ] = 0,
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Put the result into this page (Markdown).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Put the block into this result (FILE.json or .md).")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Run the closed loop for very long in virtual time: memory, what is left of the tremor, every counter by eighths.
 
     Exit status 1 when memory grew, the figures drifted, or something is not accounted for.
 
-    Example: micron soak --seconds 28800 --without-wires --out docs/long-runs.md
+    Example: micron soak --seconds 28800 --without-wires --out docs/results/long-runs.json
     """
     from tools.faults.long_page import block, with_block
     from tools.faults.long_run import with_wires, without_wires
@@ -62,7 +65,7 @@ def soak(
         command = f"micron soak {asked}{'' if wires else '--without-wires '}--out {out or 'FILE'}"
         text = block(run, command, revision_and_day())
         if out is not None:
-            write_text_atomic(out, with_block(out, name, text))
+            write_result(out, with_block(out, name, text))
         if json_file != "-":
             data_console().print(text, markup=False, soft_wrap=True)
         write_json(run.as_dict(), json_file)

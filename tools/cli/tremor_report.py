@@ -9,14 +9,17 @@ import typer
 
 from tools.cli.common import clear_errors, console
 from tools.errors import InputError
-from tools.output import check_writable, write_text_atomic
+from tools.output import check_writable
+from tools.results.artefact import read_page, write_result
 
 
 def report(
     data: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the real recordings.")] = Path(
         "../shared/data"
     ),
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Write the page (Markdown).")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
+    ] = None,
     section: Annotated[
         Literal["inspect", "evaluate", "published", "cascade", "detectors"] | None,
         typer.Option(help="Make this section of --out again and keep the others."),
@@ -24,9 +27,9 @@ def report(
 ) -> None:
     """Everything that is measured on recorded hands, as one page; minutes of computing.
 
-    Example: micron tremor report --out docs/tremor-on-real-hands.md
+    Example: micron tremor report --out docs/results/tremor-on-real-hands.json
 
-    Example: micron tremor report --section evaluate --out docs/tremor-on-real-hands.md
+    Example: micron tremor report --section evaluate --out docs/results/tremor-on-real-hands.json
     """
     from tools.stamp import revision_and_day
     from tools.tremor.report import renewed
@@ -41,9 +44,9 @@ def report(
             elif out is None or not out.is_file():
                 raise InputError("--section makes a part of a page again: name the page with --out FILE")
             else:
-                page = renewed(out.read_text(encoding="utf-8"), section, data, revision, status.update)
+                page = renewed(read_page(out), section, data, revision, status.update)
         if out is None:
             typer.echo(page, nl=False)
         else:
-            write_text_atomic(out, page)
+            write_result(out, page)
             console().print(f"page: {out}")

@@ -1,10 +1,11 @@
 """``docs/data.md``: the public recordings, their licences and origins, from the list that ``micron data`` reads.
 
-``python -m tools.data.page`` writes the page; a test compares.
+``python -m tools.data.page --out docs/data.md`` writes the page; a test compares.
 """
 
 from __future__ import annotations
 
+import argparse
 from pathlib import Path
 
 from tools.data.registry import PublicSet, public_sets
@@ -12,8 +13,8 @@ from tools.data.registry import PublicSet, public_sets
 PAGE = Path("docs/data.md")
 _HEAD = """# Public recordings
 
-Made by `python -m tools.data.page`; do not edit. These recordings are other people's: none is part of this project, and
-what they ask for (licence, citation) is yours to keep.
+Made by `python -m tools.data.page --out docs/data.md`; do not edit. These recordings are other people's: none is
+part of this project, and what they ask for (licence, citation) is yours to keep.
 
 ```
 micron data list                # names, sizes, licences, what is here already
@@ -50,7 +51,9 @@ def _row(s: PublicSet) -> str:
 
 
 def main() -> None:
-    PAGE.write_text(page(), encoding="utf-8")
+    parser = argparse.ArgumentParser(prog="python -m tools.data.page", description="write docs/data.md")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
+    parser.parse_args().out.write_text(page(), encoding="utf-8")
 
 
 if __name__ == "__main__":

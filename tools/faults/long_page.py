@@ -7,6 +7,7 @@ from pathlib import Path
 
 from tools.errors import InputError
 from tools.faults.long_run import DRIFT, GROWTH_MB, LongRun
+from tools.results.artefact import read_page
 
 HEAD = f"""# Long runs: what grows, what drifts, what is not counted
 
@@ -46,7 +47,7 @@ def block(run: LongRun, command: str, revision: str) -> str:
 def with_block(path: Path, name: str, text: str) -> str:
     """The page at ``path`` (or a new one) with block ``name`` replaced; other blocks stay. ``InputError`` for a file
     that is not such a page."""
-    page = path.read_text(encoding="utf-8") if path.exists() else HEAD
+    page = read_page(path) if path.exists() else HEAD
     if not page.startswith(HEAD.splitlines()[0]):
         raise InputError(f"{path}: this is not a page of long runs; give another name to --out")
     others = re.findall(r"<!-- (\w+) -->\n(.*?)<!-- end -->\n", page, re.DOTALL)

@@ -1,4 +1,4 @@
-"""The campaign as a page: docs/reliability.md is made by ``micron faults --out``."""
+"""The campaign as a page: docs/results/reliability.json is made by ``micron faults --out``."""
 
 from __future__ import annotations
 
@@ -58,92 +58,7 @@ on one bus no longer replaces the first; neutral may come later than 21 ms where
 
 {unseen}
 
-{bound}{beside}## When the firmware is gone: the guardian
-
-A DAC has no watchdog. A second process (`firmware_py/guardian`) holds a heartbeat in shared memory, a mark there that
-the kernel sets when the firmware's loop dies (a robust mutex), and a connection of its own to the amplifier's bus. It
-starts with every `micron run` on a bench whose output is a `dac_amplifier` (`[firmware.safety] guardian = false`
-leaves it out). Death: the guardian looks at the mark every millisecond and ramps at once, 16 steps of a millisecond,
-reads back, and watches for 50 ms for a command that was still under way. The mark does not wait for the memory of the
-dead to be freed, as a pipe does: on a machine where neutral came 62 to 78 ms after `kill -9` with a pipe, it comes
-after 17 ms. Silence: noticed after 8 ms, taken over after 41 ms.
-
-The outputs belong to one of the two at any time. Every command of the firmware renews a lease of 40 ms; immediately
-before a transfer the firmware writes the command into shared memory, then looks whether the guardian has the outputs or
-its lease is over, and only then sends. A lease that is over stays over: the firmware goes to its safe state, says so,
-and sends nothing more. The guardian waits until the lease has certainly expired, takes the outputs, and a step later
-looks whether a command was going out: none, or one that the DAC holds already, and it ramps; one that is still to come
-(the firmware stands still between its look and the wire), and it ends the firmware's process first and waits for the
-kernel to confirm that. Where it may not end it (firmware inside another program) it waits 100 ms, and its report says
-that a command may have come afterwards. The other way round the firmware ends a guardian that has not reached neutral
-22 ms after it took the outputs, and then ramps itself. Heartbeats go both ways: a guardian whose process has ended
-(known within 10 ms) or that is not heard for 100 ms is a finding. The outputs ramp to neutral and hold there, a new
-guardian is started, and they move again once it watches; one that does not come up within 10 s latches. Nothing is
-armed without a sign of life of the guardian. `tests/unit/guardian/test_exclusive.py` tries stalls of twelve lengths at
-seven phases of a tick, in virtual time, exactly.
-
-When the bus or the amplifier does not answer, firmware and guardian try again for `[firmware.safety] neutral_retry_s`
-(10 s), every millisecond at first and then every 10 ms, and open a connection anew that failed. While the bus answers
-nobody, neither ends the other: a command that waits there is no command that stands still, and a guardian that cannot
-ramp is no guardian that does not come. A hold whose ramp fails for 40 ms becomes the end of the run; what comes back
-within the time is ramped and read back, and the report says after how many milliseconds (`late_ms`). What does not is
-called "neutral NOT confirmed"; an interrupt ends the tries. A run waits for its guardian before it ends the emulated
-world, and the world outlives a killed firmware until its guardian has done.
-
-`tests/unit/guardian` asserts neutral within 20 ms of death in virtual time, also with half of the transfers lost;
-`tests/hil/test_guardian_process.py` kills and stops the real processes (firmware, guardian, emulated world), and
-compares the time to neutral by the devices' own record with the time that a bare pipe needs on the same machine.
-Limits: it runs on the same host, so it does not help when the host or the bus adapter loses power or the kernel stops;
-that needs a watchdog at the amplifier (the CAN node has one, 10 ms). E-727 and NI outputs have no guardian. On a
-machine without real-time priority, or with more work than processors, the ramp begins when the guardian is given the
-processor.
-
-## What measures the amplifier
-
-`[device.monitor]` reads the voltages at the stacks through an ADS1115, each output every 7.5 ms, and compares with
-the mean of the commands that may have been in force during the conversion: within `tolerance_V`, and within
-`change_V` of what is usual for that output (`drivers/amplifier_monitor.py`). A bench without it does not see open,
-shorted, stuck, slow or weak amplifiers.
-
-## Recording
-
-Every finished block survives `kill -9`, truncation at any byte and flipped bits elsewhere; `fdatasync` once a second,
-so a power failure takes about a second (simulated by dropping pages that were not synced). A full disk ends the
-recording, not the run; a slow one fills a ring of 8 s, and every row that finds no room is counted: see
-`docs/recording-format.md`.
-
-## Long runs
-
-Half an hour on all buses and eight hours without wires, by eighths: [long runs](long-runs.md), made by `micron soak`.
-
-## Hostile input
-
-`tests/fuzz` damages sound inputs of every parser (bench files, recordings, csv, npz, mcap, descriptors, hands, FMU
-archives, DI-4108 streams, motion card lines, GCS replies, CAN frames, page orders, WebSocket messages, reports) in the
-default tests, and replays the corpus in `tests/fuzz/corpus`, which coverage-guided runs have collected; CI goes on from
-it with atheris (`make fuzz`, 60 s per parser). Recordings are also changed behind their CRCs (taken apart, changed, put
-together with right lengths and CRCs), in both. No declared size is believed: what is unpacked, searched and listed of a
-recording is bounded ([the bounds](recording-format.md)) and linear in the size of the file. npz files are read without
-pickle, sized before allocation, and unpack to 64 MiB and 200 times their size at most; FMU archives are checked for
-paths outside and for size.
-
-## Where else
-
-| what | where it is tried |
-|---|---|
-| kill -9 of the firmware, of the guardian, SIGSTOP; real processes | `tests/hil/test_guardian_process.py` |
-| kill -9 of the emulated world | `tests/hil/test_real_time.py` |
-| kill -9 of the recorder | `tests/unit/recording/test_recorder_process.py` |
-| slow disk, full disk under a running instrument | `tests/hil/test_disk_faults.py`, `tests/unit/recording` |
-| full disk under the results of a run | `tests/unit/reports/test_run_report.py`, `tests/unit/cli/test_output.py` |
-| a recording deleted, replaced, cut or moved under the recorder | `tests/unit/recording/test_disturbed.py` |
-| recordings copied by other programs, or made to hurt | `tests/unit/recording/test_copies.py`, `test_hostile.py` |
-| clocks and counters that wrap: 2^31, 2^32, 2^53 ns | `tests/hil/test_time_marks.py`, [long runs](long-runs.md) |
-| bit flips in frames with a checksum | `tests/wire/drivers/test_can_drivers_wire.py`, `test_e727_wire.py` |
-| real benches: `micron run --inject`, refused without `--max-effect` | `tests/unit/faults/test_inject.py` |
-| secrets in output, logs, recordings | `tests/bench/test_secrets.py` |
-
-## What says so, and what then
+{bound}{beside}## What says so, and what then
 
 Over all hands. "Names the part": runs in which what was said names the broken part (input, output, device), so that it
 is isolated and not only noticed. A safe state is latched: it ends the run, and a new one begins only when somebody

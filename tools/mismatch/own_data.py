@@ -1,6 +1,6 @@
 """``docs/own-data.md``: from a csv to a diagnosis, then every key and every twin, from the tables that the loader uses.
 
-``python -m tools.mismatch.own_data`` writes the page; a test compares.
+``python -m tools.mismatch.own_data --out docs/own-data.md`` writes the page; a test compares.
 """
 
 from __future__ import annotations
@@ -19,11 +19,9 @@ from tools.mismatch.recording_columns import SUFFIXES
 from tools.mismatch.text_table import SUFFIXES as TEXT
 from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 
-PAGE = Path("docs/own-data.md")
-
 _GUIDE = """# Your own data
 
-Made by `python -m tools.mismatch.own_data`; do not edit. The first part is run by the tests as it stands.
+Made by `python -m tools.mismatch.own_data --out docs/own-data.md`; do not edit. The tests run the first part.
 
 A recording is a folder: your data file and a `recording.toml` that says what its columns are and which simulation it is
 to be compared with. Here, a motor axis: force in, position out, `data.csv` with a header row.
@@ -193,7 +191,7 @@ def _signals(pattern: str) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="write docs/own-data.md")
-    parser.add_argument("--out", type=Path, default=PAGE)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE")
     parser.parse_args().out.write_text(page(), encoding="utf-8")
 
 

@@ -124,11 +124,11 @@ def _limits(bench: BenchFile, source: str | None, run: SimulatedRun, from_ns: in
 
 
 def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
-    """The page ``docs/first-results.md``."""
+    """The page ``docs/results/hands.json``."""
     lines = [
         "# First results: the closed loop in real hands",
         "",
-        f"Made by `micron hands --out docs/first-results.md`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"Made by `micron hands --out docs/results/hands.json`, firmware revision {revision}; {seconds:g} s of virtual",
         f"time each, scored from {SETTLE_S:g} s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the",
         "physical truth, manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p",
         "in 8-12 Hz over the whole part that was chosen; the emulated instrument has all its sensor and actuator",

@@ -1,4 +1,4 @@
-"""docs/mismatch-on-real-data.md, made of what ``micron reproduce measured`` found."""
+"""docs/results/mismatch-measured.json, made of what ``micron reproduce measured`` found."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tools.reproduce.measured_rows import Scored, explained, rows_of
 from tools.reproduce.measured_sets import SETS
 
 _HEAD = (
-    "Made by `micron reproduce measured --out docs/mismatch-on-real-data.md`; do not edit. Each set starts from "
+    "Made by `micron reproduce measured --out docs/results/mismatch-measured.json`; do not edit. Each set starts from "
     "the twin that its own papers give. The engine sees the fit part alone and splits that by itself; the "
     "corrected twin is written as a file, and the file is run freely over the official test once, after all "
     "decisions (the accelerometer package: held-out blocks of its test sweep, since the lag differs from run to "

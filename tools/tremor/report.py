@@ -1,4 +1,4 @@
-"""``docs/tremor-on-real-hands.md``: every section is computed from the recordings; nothing in it is typed."""
+"""``docs/results/tremor-on-real-hands.json``: every section is computed from the recordings; nothing in it is typed."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def report(data: Path, revision: str, progress: Progress) -> str:
     lines = [
         "# Tremor on real hands",
         "",
-        f"Made by `micron tremor report --out docs/tremor-on-real-hands.md`, revision {revision}.",
+        f"Made by `micron tremor report --out docs/results/tremor-on-real-hands.json`, revision {revision}.",
         "",
     ]
     for name in SECTIONS.values():

@@ -1,4 +1,4 @@
-"""The estimators' part of ``docs/tremor-on-real-hands.md``: every method beside the limit, per set and person."""
+"""The estimators' part of the tremor report: every method beside the limit, per set and person."""
 
 from __future__ import annotations
 

@@ -174,4 +174,4 @@ def test_the_shipped_list_is_whole():
 def test_the_page_is_current(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(registry.public_sets, "__defaults__", (registry.LIST,))
     root = Path(__file__).parents[3]
-    assert (root / PAGE).read_text(encoding="utf-8") == page(), "run python -m tools.data.page"
+    assert (root / PAGE).read_text(encoding="utf-8") == page(), "run python -m tools.data.page --out docs/data.md"

@@ -115,9 +115,9 @@ def rig() -> None:
 
 
 def pages() -> None:
-    """The pages that a result is put into."""
-    for page in ("long-runs", "tremor-on-real-hands"):
-        shutil.copy(DOCS / f"{page}.md", f"docs/{page}.md")
+    """The results that a new part is put into."""
+    for name in ("long-runs", "tremor-on-real-hands"):
+        shutil.copy(DOCS / "results" / f"{name}.json", f"docs/results/{name}.json")
 
 
 MADE: dict[str, Callable[[], object]] = {
@@ -156,8 +156,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder as a new user has it: the benches, and room for what is made."""
     shutil.copytree(BENCHES, tmp_path / "here" / "benches")
-    for folder in ("docs", "out"):
-        (tmp_path / "here" / folder).mkdir()
+    for folder in ("docs/results", "out"):
+        (tmp_path / "here" / folder).mkdir(parents=True)
     monkeypatch.chdir(tmp_path / "here")
     return tmp_path / "here"
 

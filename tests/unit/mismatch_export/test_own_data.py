@@ -29,7 +29,7 @@ def blocks(kind: str) -> list[str]:
 
 
 def test_the_page_is_current() -> None:
-    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tools.mismatch.own_data"
+    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tools.mismatch.own_data --out docs/own-data.md"
 
 
 def test_every_key_and_every_kind_is_on_the_page() -> None:

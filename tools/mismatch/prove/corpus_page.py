@@ -1,4 +1,4 @@
-"""`python -m tools.mismatch.prove.corpus_page OLD.json NEW.json`: docs/mismatch-engines.md from what
+"""`python -m tools.mismatch.prove.corpus_page OLD.json NEW.json`: docs/results/mismatch-engines.json from what
 `micron mismatch prove --corpus ... --json` wrote for both engines on the same cases.
 """
 
@@ -14,8 +14,8 @@ from typing import Any
 from tools.mismatch.infer.constants import FILE
 from tools.mismatch.prove.corpus_table import APART, LINES, share_text
 from tools.mismatch.prove.exact import compare_paired, summarise
+from tools.results.artefact import write_result
 
-DOC = Path("docs/mismatch-engines.md")
 PAIRED = {
     "verdict_right": "verdict right", "set_right": "set of names right",
     "grouped_right": "... up to stated equivalences", "no_false_name": "no false name",
@@ -134,13 +134,13 @@ def main() -> int:
     p = argparse.ArgumentParser(prog="python -m tools.mismatch.prove.corpus_page", description=__doc__)
     p.add_argument("old", type=Path)
     p.add_argument("new", type=Path)
-    p.add_argument("--doc", type=Path, default=DOC)
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the result (FILE.json) or its page")
     a = p.parse_args()
     try:
-        a.doc.write_text(document(read(a.old), read(a.new), json.loads(FILE.read_text())))
+        write_result(a.out, document(read(a.old), read(a.new), json.loads(FILE.read_text())))
     except (OSError, ValueError) as error:
         p.error(str(error))
-    print(f"page: {a.doc}", file=sys.stderr)
+    print(f"page: {a.out}", file=sys.stderr)
     return 0
 
 

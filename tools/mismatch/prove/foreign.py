@@ -2,7 +2,7 @@
 
 The motor of ``examples/motor`` is drawn anew, with and without physics that its twins lack, and each recording is
 diagnosed through equations, a Python object, both types of FMU, a state space and columns. Rows are kept after every
-case and continued from; the page is docs/mismatch-foreign.md.
+case and continued from; the page is docs/results/mismatch-foreign.json.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from hal.trust import decide, trust_program
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.report import Report
 from tools.mismatch.recording_load import load
+from tools.results.artefact import write_result
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "motor"
-DOC = Path("docs/mismatch-foreign.md")
 FRICTION = ("coulomb_friction", "stribeck_friction")
 TRUTH: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "nothing": (),
@@ -108,7 +108,7 @@ def diagnosed(recording: Path, variant: str, twin: str) -> Row:
 
 
 def page(runs: Sequence[Mapping[str, Any]]) -> str:
-    """The text of docs/mismatch-foreign.md."""
+    """The text of docs/results/mismatch-foreign.json."""
     rows = [row for run in runs for row in run["rows"]]
     tally = {
         w: sum(r["judged"] == w for r in rows) for w in ("right", "part", "advice", "unexplained", "unsure", "missed")
@@ -187,7 +187,7 @@ def main() -> int:
     p.add_argument("--kind", choices=("development", "result"), default="result", help="what the seed was drawn for")
     p.add_argument("--variants", nargs="*", choices=tuple(TRUTH), default=tuple(TRUTH))
     p.add_argument("--twins", nargs="*", choices=TWINS, default=TWINS)
-    p.add_argument("--doc", type=Path, default=DOC)
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the result (FILE.json) or its page")
     a = p.parse_args()
     if not EXAMPLE.is_dir():
         p.error(f"{EXAMPLE} is not here; run it in the project's folder")
@@ -195,10 +195,10 @@ def main() -> int:
         if a.seed is not None:
             run_cases(a.rows, a.seed, a.kind, a.variants, a.twins, a.minutes)
         runs = json.loads(a.rows.read_text())
-        a.doc.write_text(page([r for r in runs if r["kind"] == "result"]))
+        write_result(a.out, page([r for r in runs if r["kind"] == "result"]))
     except (OSError, ValueError) as error:
         p.error(str(error))
-    print(f"page: {a.doc}", file=sys.stderr)
+    print(f"page: {a.out}", file=sys.stderr)
     return 0
 
 

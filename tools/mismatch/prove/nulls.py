@@ -24,8 +24,7 @@ from tools.mismatch.prove.plans import NOTHING_TO_REFIT, SELDOM
 from tools.mismatch.prove.proof import draw_one
 from tools.mismatch.prove.runner import Diagnose, in_processes, timed, tool
 from tools.mismatch.prove.score import FALSE_ALARM, names_of
-
-DOC = Path("docs/mismatch-false-alarms.md")
+from tools.results.artefact import read_page, write_result
 
 
 @dataclass(frozen=True)
@@ -115,7 +114,7 @@ def nulls(
     seed: int | None = None,
     jobs: int = 2,
     *,
-    doc: Path | None = DOC,
+    doc: Path | None = None,
     rows_file: Path | None = None,
     max_samples: int = 12_000,
     diagnose: Diagnose = tool,
@@ -209,8 +208,9 @@ def earlier_states(page: str, revision: str) -> list[str]:
 
 
 def document(result: NullResult, before: str = "") -> str:
-    """The text of docs/mismatch-false-alarms.md; ``before``: the page that it takes the place of, whose figures stay
-    beside.
+    """Return the page of the result docs/results/mismatch-false-alarms.json.
+
+    ``before`` is the page that it replaces, whose figures stay beside the new ones.
     """
     k, n = result.count()
     failed = sum(r["failed"] for r in result.rows)
@@ -265,7 +265,7 @@ def main() -> None:
     p.add_argument("--seed", type=int, default=None)
     p.add_argument("--jobs", type=int, default=2)
     p.add_argument("--max-samples", type=int, default=12_000)
-    p.add_argument("--doc", type=Path, default=DOC)
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the result (FILE.json) or its page")
     p.add_argument("--rows", type=Path, default=None, help="JSON kept after every recording, and continued from")
     p.add_argument("--page-only", action="store_true", help="no further recording: the page of what --rows holds")
     a = p.parse_args()
@@ -277,8 +277,8 @@ def main() -> None:
             if a.page_only
             else nulls(a.n, a.seed, a.jobs, doc=None, rows_file=a.rows, max_samples=a.max_samples)
         )
-        text = document(result, a.doc.read_text() if a.doc.exists() else "")
-        a.doc.write_text(text)
+        text = document(result, read_page(a.out) if a.out.exists() else "")
+        write_result(a.out, text)
         print(text)
     except (ValueError, OSError) as error:  # rows of another run, a file that cannot be written
         p.error(str(error))

@@ -1,4 +1,4 @@
-"""`python -m tools.mismatch.prove.page A.json B.json`: docs/mismatch-proof.md from what `prove --json` wrote."""
+"""``python -m tools.mismatch.prove.page A.json --out FILE`` makes docs/results/mismatch-proof.json of proofs."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from typing import Any
 from tools.mismatch.prove.nulls import clopper_pearson
 from tools.mismatch.prove.score import summary
 from tools.mismatch.prove.table import LINES, failures
+from tools.results.artefact import write_result
 
-DOC = Path("docs/mismatch-proof.md")
 SEVERITIES = ("2", "4", "10", "30")
 
 
@@ -102,14 +102,14 @@ def main() -> int:
     """Exit 2 on bad input."""
     p = argparse.ArgumentParser(prog="python -m tools.mismatch.prove.page", description=__doc__)
     p.add_argument("proofs", type=Path, nargs="+", metavar="PROOF.json", help="what prove --json wrote")
-    p.add_argument("--doc", type=Path, default=DOC)
+    p.add_argument("--out", type=Path, required=True, metavar="FILE", help="the result (FILE.json) or its page")
     a = p.parse_args()
     try:
         text = document([read(path) for path in a.proofs])
-        a.doc.write_text(text)
+        write_result(a.out, text)
     except (ValueError, OSError) as error:
         p.error(str(error))
-    print(f"page: {a.doc}", file=sys.stderr)
+    print(f"page: {a.out}", file=sys.stderr)
     return 0
 
 
