@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import tomllib
 from pathlib import Path
 
@@ -12,12 +13,22 @@ HERE = Path(__file__).parent
 DOCS = HERE.parents[1] / "docs" / "adding"
 GUIDES = {folder.name: DOCS / f"{folder.name.replace('_', '-')}.md" for folder in HERE.iterdir() if folder.is_dir()}
 GUIDES.pop("__pycache__", None)
+PAGES = sorted(DOCS.parent.rglob("*.md"))
+with_code = runpy.run_path(str(HERE.parents[1] / ".ci" / "show_code.py"))["with_code"]
 
 
 @pytest.mark.parametrize("name", GUIDES)
 def test_the_guide_shows_every_file(name: str):
-    shown = re.findall(rf'--8<-- "tests/examples/{name}/(.+)"', GUIDES[name].read_text(encoding="utf-8"))
+    shown = re.findall(rf"<!-- file: tests/examples/{name}/(.+) -->", GUIDES[name].read_text(encoding="utf-8"))
     assert sorted(shown) == sorted(p.name for p in (HERE / name).iterdir() if p.is_file())
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_the_code_of_a_page_is_that_of_the_file(page: Path):
+    """The page holds the code itself, so that a plain git host shows it, too."""
+    text = page.read_text(encoding="utf-8")
+    assert with_code(text) == text, "python .ci/show_code.py"
+    assert "--8<--" not in text
 
 
 @pytest.mark.parametrize("name", GUIDES)
