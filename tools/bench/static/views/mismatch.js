@@ -75,9 +75,10 @@ export function mount(root, { link }) {
     const { job, before, after } = found;
     if (!inUse) return;
     applied.hidden = false;
-    const um = (v) => (v === null || v === undefined ? "–" : `${v.toFixed(2)} µm`);
+    const said = (v, n, unit) => (v === null || v === undefined ? "–" : `${v.toFixed(n)} ${unit}`); // a run that was cut short has none
+    const um = (v) => said(v, 2, "µm");
     const titles = ["tremor 8–12 Hz", "left of it", "less", "error, all bands"];
-    const row = (name, r) => h("tr", {}, h("td.whole", {}, name), ...(r ? [um(r.band[0]), um(r.band[1]), `${r.band[2].toFixed(1)} %`, um(r.all[1])] : ["…", "…", "…", "…"]).map((v, i) => h("td.num", { "data-label": titles[i] }, v)));
+    const row = (name, r) => h("tr", {}, h("td.whole", {}, name), ...(r ? [um(r.band[0]), um(r.band[1]), said(r.band[2], 1, "%"), um(r.all[1])] : ["…", "…", "…", "…"]).map((v, i) => h("td.num", { "data-label": titles[i] }, v)));
     const waiting = job.state === "running" ? `step ${job.step + 1} of ${job.steps}, ${duration(job.seconds)}` : job.state === "done" ? "" : `${job.state}: ${job.lines.at(-1) || ""}`;
     applied.replaceChildren(h("table.cards", { id: "difference" }, h("thead", {},
       h("tr", {}, h("th", {}, "same hand, 10 s of virtual time, truth at the tip"), titles.map((t) => h("th.num", {}, t)))),

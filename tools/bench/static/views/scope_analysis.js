@@ -174,7 +174,7 @@ export function analysis(settings, changed) {
       ...lines.map((line, i) => {
         const unit = data.traces[i].unit === "m" ? "µm" : data.traces[i].unit;
         const [va, vb] = [p, q].map((c) => (c ? amplitudeAt(line, c[0]) : NaN));
-        return `${line.name} ${withUnit(va, unit)}${q ? `, ${withUnit(vb, unit)} (× ${Number((vb / va).toPrecision(3))})` : ""}`;
+        return `${line.name} ${withUnit(va, unit)}${q ? `, ${withUnit(vb, unit)}${va ? ` (× ${Number((vb / va).toPrecision(3))})` : ""}` : ""}`;
       })] };
     grid(g, box, frequencies(most), true);
     grid(g, box, Array.from({ length: decades + 1 }, (_, i) => [i / decades, String(Number(`1e${high - decades + i}`))]), false);
