@@ -51,6 +51,22 @@ def test_a_cause_belongs_to_its_hold_whichever_is_told_first():
     assert len(holds.as_list()) == MOST_SPANS
 
 
+@pytest.mark.parametrize("rows_first", [True, False])
+def test_a_hold_that_no_status_told_is_named_by_the_outcome(rows_first: bool):
+    """Emulated time passes fast while the DAQ is silent: the run is over before the page has read the hold's rows."""
+    holds, t_s = HoldSpans(), np.array([3.0, 3.1, 9.0, 9.01])
+    told = [{"t_s": 3.01, "cause": "supply: 4.2 V"}, {"t_s": 9.0, "cause": CAUSE}]
+    holds.name("supply: 4.2 V")
+    holds.follow(t_s[:2], np.array([HELD, 0.0]))
+    holds.name("")
+    if rows_first:
+        holds.follow(t_s[2:], np.array([HELD, HELD]))
+    holds.name_by_outcome(told)
+    if not rows_first:
+        holds.follow(t_s[2:], np.array([HELD, HELD]))
+    assert [span.cause for span in holds.spans] == ["supply: 4.2 V", CAUSE]
+
+
 @pytest.fixture
 def page(still: Still, still_page: Any) -> Any:
     if not still.session.holds.spans:

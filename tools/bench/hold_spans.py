@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -33,6 +33,7 @@ class HoldSpans:
     def __init__(self) -> None:
         self.spans: deque[HoldSpan] = deque(maxlen=MOST_SPANS)
         self._cause = ""
+        self._told: list[tuple[float, str]] = []
 
     @property
     def current(self) -> HoldSpan | None:
@@ -49,6 +50,7 @@ class HoldSpans:
                 self.spans.append(HoldSpan(float(t_s[at]), None, self._cause))
             else:
                 self.spans[-1].to_s = float(t_s[at])
+        self._name_by_time()
 
     def name(self, cause: str) -> None:
         """Take the cause of the hold that lasts, or is about to be seen in the rows; empty: no hold lasts."""
@@ -59,14 +61,28 @@ class HoldSpans:
     def name_by_events(self, events: Iterable[Event]) -> None:
         """Take causes from the events of a recording, each for the nearest span without one within ``NEAR_S``."""
         for event in events:
-            content = event.content
-            if content.get("event") != "hold begins":
-                continue
-            t_s = event.time_ns * 1e-9
-            near = [s for s in self.spans if not s.cause and abs(s.from_s - t_s) < NEAR_S]
-            if near:
-                min(near, key=lambda s: abs(s.from_s - t_s)).cause = str(content.get("reason", ""))[:300]
+            if event.content.get("event") == "hold begins":
+                unnamed = [span for span in self.spans if not span.cause]
+                _name_nearest(unnamed, event.time_ns * 1e-9, str(event.content.get("reason", "")))
+
+    def name_by_outcome(self, holds: Iterable[Mapping[str, Any]]) -> None:
+        """Take causes from the ``holds`` of a run's outcome, for spans whose cause no status told: a hold that is over
+        before its rows are read. Its rows may come afterwards."""
+        self._told = [(float(hold["t_s"]), str(hold["cause"])) for hold in holds]
+        self._name_by_time()
+
+    def _name_by_time(self) -> None:
+        for t_s, cause in self._told:
+            _name_nearest(self.spans, t_s, cause)
 
     def as_list(self) -> list[dict[str, Any]]:
         """Return the spans for the page."""
         return [asdict(span) for span in self.spans]
+
+
+def _name_nearest(spans: Iterable[HoldSpan], t_s: float, cause: str) -> None:
+    """Give ``cause`` to the span that began nearest to ``t_s``, within ``NEAR_S``, unless it has one."""
+    near = [span for span in spans if abs(span.from_s - t_s) < NEAR_S]
+    nearest = min(near, key=lambda span: abs(span.from_s - t_s), default=None)
+    if nearest is not None and not nearest.cause:
+        nearest.cause = cause[:300]

@@ -178,6 +178,8 @@ class Session:
             run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
             # what was lost, or fell back, at the very end, too
             run.status |= {"lost": outcome["samples"]["lost"], "fallbacks": outcome["kinematics"]["fallbacks"]}
+            if run is self.run:
+                self.holds.name_by_outcome(outcome["holds"])
         else:
             run.phase, run.reason = "failed", failure
             self.note("error", f"the firmware failed: {failure}")
