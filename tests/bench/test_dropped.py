@@ -150,7 +150,7 @@ def test_who_may_send_what(still: Still, tmp_path: Path):
     assert put(still, "a.csv", b"", "wrong", 10)[0] == 403
     code, said = put(still, "a.csv", b"", still.token, 500_000_000)
     assert code == 413
-    assert f"{MAX_UPLOAD_BYTES >> 20} MB" in said
+    assert f"{MAX_UPLOAD_BYTES // 1_000_000} MB" in said
     code, said = put(still, "a.csv", csv, still.token)
     assert code == 200, said
     own = tmp_path / "own.mcap"
@@ -276,6 +276,21 @@ def test_from_a_dropped_csv_to_the_corrected_twin_that_is_downloaded(page: Any, 
     assert gains[0] == pytest.approx(0.15, rel=0.01), said
 
 
+def test_a_comparison_that_was_cancelled_shows_what_it_has(page: Any, still: Still):
+    """A run that was cut short has no percentage: its report says null."""
+    job = {"kind": "difference", "title": "both benches", "state": "cancelled", "step": 0, "steps": 2, "seconds": 1.0,
+           "lines": ["interrupted"], "files": ["before.json"]}  # fmt: skip
+    state = json.loads(get(still, "/api/mismatch")) | {"applied": ["corrected twin"], "difference": job}
+    found = {"job": job, "before": {"band": [25.0, None, None], "all": [30.0, None]}}
+    page.route("**/api/mismatch", lambda route: route.fulfill(json=state))
+    page.route("**/api/mismatch/difference", lambda route: route.fulfill(json=found))
+    page.evaluate("micron.context.reload('mismatch')")
+    page.wait_for_selector("#difference")
+    rows = [row.locator("td").all_inner_texts() for row in page.locator("#difference tbody tr, #difference > tr").all()]
+    assert [cells[1:] for cells in rows] == [["25.00 µm", "–", "–", "–"], ["…", "…", "…", "…"]]
+    assert "cancelled: interrupted" in page.locator("#view").inner_text()
+
+
 @pytest.fixture
 def fmu(still: Still) -> Iterator[Path]:
     """An FMU among the recordings; what is in it is read by nobody before it is trusted."""
@@ -328,9 +343,18 @@ def test_a_csv_of_500_mb_is_one_message_and_what_was_there_stays(page: Any, tmp_
     form = page.locator(".new-recording")
     form.wait_for()
     form.locator("[aria-label='Noise of x_mm']").fill("0.02")
+    form.locator("[aria-label='Unit of x_mm']").fill("parsnips")
+    form.locator("text=Make the recording").click()
+    form.locator("p[role=alert]", has_text="parsnips").wait_for()
     with (tmp_path / "large.csv").open("wb") as file:
         file.truncate(500_000_000)
     page.set_input_files(FILE, tmp_path / "large.csv")
-    page.wait_for_function("document.querySelector('.mismatch').innerText.includes('large.csv has 500.0 MB')")
+    said = "large.csv has 500.0 MB; the page takes 200.0 MB"
+    page.wait_for_function(f"document.querySelector('.mismatch').innerText.includes('{said}')")
+    alerts = [alert.inner_text() for alert in page.locator(".mismatch [role=alert]:visible").all()]
+    assert len([text for text in alerts if text]) == 1, "the form's message of before is gone"
+    box = page.locator(".mismatch [role=alert]", has_text="large.csv").bounding_box()
+    assert box["y"] >= 0, "it is seen"
+    assert box["y"] + box["height"] <= page.evaluate("innerHeight"), "it is seen"
     assert form.locator("[aria-label='Noise of x_mm']").input_value() == "0.02"
     assert "first.csv" in form.inner_text()

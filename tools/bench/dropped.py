@@ -228,7 +228,7 @@ async def _receive(request: Request, path: Path, name: str) -> None:
                     break
                 size += len(part)
                 if size > MAX_UPLOAD_BYTES:
-                    raise InputError(f"{name} is larger than {MAX_UPLOAD_BYTES >> 20} MB; {LARGER}")
+                    raise InputError(f"{name} is larger than {MAX_UPLOAD_BYTES // 1_000_000} MB; {LARGER}")
                 await asyncio.to_thread(file.write, part)
     except (TimeoutError, ClientDisconnect):
         raise InputError(f"{name} did not arrive whole; drop it again") from None

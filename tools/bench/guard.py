@@ -22,7 +22,7 @@ from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 MAX_BODY_BYTES = 65_536
-MAX_UPLOAD_BYTES = 200 << 20
+MAX_UPLOAD_BYTES = 200_000_000
 UPLOADS = "/api/upload/"
 """Files come here: with the token alone, read in parts by the route, which has limits of its own."""
 BODY_S = 10.0
@@ -94,7 +94,7 @@ class Guard:
         most = MAX_UPLOAD_BYTES if self._is_upload(scope, headers) else MAX_BODY_BYTES
         if not length.isdigit() or int(length) > most:
             known = self._access.knows(headers.get("x-micron-token")) or not scope["path"].startswith(UPLOADS)
-            what = f"{most >> 20} MB" if most == MAX_UPLOAD_BYTES else f"{most} bytes"
+            what = f"{most // 1_000_000} MB" if most == MAX_UPLOAD_BYTES else f"{most} bytes"
             return (413, f"a request may have {what}") if known else (403, "token missing or wrong")
         changes = scope["method"] not in SAFE_METHODS
         private = scope["path"].startswith("/api/") and not self._access.open_reading

@@ -28,11 +28,12 @@ export function newRecording(link, done) {
   const pick = h("input", { type: "file", hidden: true, "aria-label": "Data file", onchange: () => { const [f] = pick.files; pick.value = ""; take(f); } });
   const open = h("button", { onclick: () => pick.click() }, "Open a file …");
   const form = h("section.panel.new-recording", { hidden: true, "aria-label": "Describe the file" });
-  const fail = (error) => { problem.textContent = error.message; };
+  const wrong = h("p.bad", { role: "alert" }); // of the form
+  const fail = (error) => { problem.textContent = error.message; problem.scrollIntoView({ block: "nearest" }); };
 
   async function take(chosen) {
-    problem.textContent = "";
     if (!chosen || busy) return;
+    problem.textContent = wrong.textContent = ""; // one message: of what was done last
     if (!link.mayOrder) { fail(new Error("View only: a file needs the address that “micron bench” printed.")); return; }
     try {
       ({ kinds, most_bytes: most, suffixes } = await get("/api/mismatch/kinds"));
@@ -103,7 +104,6 @@ export function newRecording(link, done) {
     const othersName = h("b");
     const othersBox = h("label", {}, h("span", {}, othersName), others);
     const known = h("p.note");
-    const wrong = h("p.bad", { role: "alert" });
     let fields = [];
 
     function showKind() {
@@ -123,7 +123,7 @@ export function newRecording(link, done) {
     }
 
     async function make() {
-      wrong.textContent = "";
+      problem.textContent = wrong.textContent = "";
       const used = rows.filter((r) => ["input", "output", "context"].includes(r.role.value));
       const clock = rows.find((r) => r.role.value === "time")?.column.name || "";
       try {
