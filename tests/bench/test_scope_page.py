@@ -129,6 +129,8 @@ def test_eight_inputs_have_eight_lanes_and_each_is_seen(scope: Any):
     for i, (low, high) in enumerate(lanes):
         assert 7 - i <= low < high <= 8 - i, f"volts_{i} leaves its lane"
         assert high - low > 0.2, f"volts_{i} is flat"
+    low_lanes = scope.evaluate("micron.scope.strips[0].strip.options.ticks(8 * 25)")  # no room for divisions
+    assert [tick["text"] for tick in low_lanes] == ["0 V"] * 8
 
 
 def test_a_trace_a_hundred_times_smaller_is_seen_as_well(scope: Any):
@@ -300,6 +302,12 @@ def test_cursors_in_the_spectrum_name_frequencies_and_amplitudes(scope: Any):
     window = np.hanning(4097)[:-1]
     expected = np.abs(np.fft.rfft((samples - samples.mean()) * window))[round(9.5 / 1000 * 4096)] * 4 / 4096 * 1e6
     assert amplitude_um == pytest.approx(expected, rel=0.01)
+    use(scope, channels=["clip", TIP[0]])  # nothing is clipped: a ratio to zero is not shown
+    scope.evaluate("micron.scope.analysed.setCursor([9.5, 0], false); micron.scope.analysed.setCursor([19, 0], false)")
+    scope.locator(".analysis .marks", has_text="clip").wait_for()
+    said = scope.locator(".analysis .marks").inner_text()
+    assert "NaN" not in said
+    assert said.count("×") == 1
     box = scope.locator(".analysis canvas").bounding_box()
     assert box is not None
     x = box["x"] + 64 + (box["width"] - 74) / 3

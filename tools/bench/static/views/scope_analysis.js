@@ -160,7 +160,7 @@ export function analysis(settings, changed) {
 
   function drawFFT(g, w, hgt) {
     const most = Math.min(settings.top, data.rateHz / 2);
-    const units = [...new Set(data.traces.map((t) => (t.unit === "m" ? "µm" : t.unit)))];
+    const units = [...new Set(data.traces.map((t) => (t.unit === "m" ? "µm" : t.unit || "no unit")))];
     const box = frame(g, w, hgt, "frequency, Hz", `amplitude, ${units.join(" and ")}, logarithmic`);
     const palette = colours();
     const lines = data.traces.map((t, i) => {

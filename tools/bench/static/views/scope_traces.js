@@ -56,11 +56,11 @@ export function divisionOf(trace, { low, high, base }) {
 /** A value (less its base) of a trace to its place in the strip: lane `i` of `n`, each 1 high, from above. */
 export const placeIn = (i, n, div, offset) => (value) => n - 0.5 - i + (value / div + offset) / DIVS;
 
-/** Positions and texts of the vertical axis of a strip with lanes. */
+/** Positions and texts of the vertical axis of a strip with lanes. A lane that is too low for its divisions has its unit at zero. */
 export function laneTicks(n, divs, units, offsets, lanePx, text) {
   const steps = lanePx >= 56 ? [-1, 0, 1] : lanePx >= 30 ? [-1, 1] : [0];
   const ticks = divs.flatMap((div, i) => steps.map((s) => ({
-    at: n - 0.5 - i + (s + Number(offsets[i])) / DIVS, text: s ? text(s * div, units[i]) : "0",
+    at: n - 0.5 - i + (s + Number(offsets[i])) / DIVS, text: s ? text(s * div, units[i]) : steps.length > 1 ? "0" : text(0, units[i]),
   })));
   return ticks.sort((p, q) => p.at - q.at);
 }
