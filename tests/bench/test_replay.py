@@ -253,6 +253,17 @@ def test_a_run_is_opened_scrubbed_and_played_in_the_same_views(page: Any):
     page.wait_for_function(f"Math.abs({NEWEST} - 11.999) < 0.01")
 
 
+def test_a_list_that_did_not_change_keeps_its_buttons(page: Any):
+    """A button that is made anew between the press and the release of a finger does nothing."""
+    go(page, "collect")
+    row(page, "run one").locator("button", has_text="Open").wait_for()
+    page.evaluate("window.pressed = document.querySelector('.collect tbody button')")
+    with page.expect_response("**/api/recordings"):
+        page.evaluate("micron.link.emit('server', '')")
+    page.wait_for_timeout(100)  # the answer is taken
+    assert page.evaluate("pressed.isConnected")
+
+
 def test_two_runs_lie_over_one_another(page: Any):
     open_run(page)
     page.select_option("[aria-label='Second run over it']", "run two")

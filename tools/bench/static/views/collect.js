@@ -12,6 +12,7 @@ export function mount(root, context) {
   let chosen = null;
   let what = LOOKS[0][0];
   let strip = null;
+  let listed = ""; // the list that is shown, as text
 
   const name = h("input", { type: "text", placeholder: "Name (the time if empty)", maxLength: 80, "aria-label": "Name of the recording" });
   const notes = h("input.notes", { type: "text", placeholder: "Notes", maxLength: 2000, "aria-label": "Notes" });
@@ -39,6 +40,9 @@ export function mount(root, context) {
   async function refresh() {
     let list;
     try { list = await get("/api/recordings"); } catch (error) { problem.textContent = error.message; return; }
+    const now = JSON.stringify([list, chosen, link.mayOrder]);
+    if (now === listed) return; // a button that is made anew while it is pressed does nothing
+    listed = now;
     folder.textContent = list.folder;
     body.replaceChildren(...list.recordings.map((r) => h("tr", { style: r.name === chosen ? "background:var(--raised)" : "" },
       h("td.whole", {}, h("button.quiet.name", { onclick: () => show(r.name), disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
