@@ -69,6 +69,13 @@ class NumpyActuation:
     def watch_yielding(self, stroke: Array, core: Array) -> None:
         """Peaks as the firmware remembers them; that nothing has to yield is the regular way of this yardstick."""
         p, y = self.ap, self.a.yielding
+        keep, by = p.yield_keep, core - y.core_last
+        y.core_last[:] = core
+        y.core_power = keep * y.core_power + (1.0 - keep) * float(core @ core)
+        y.core_change = keep * y.core_change + (1.0 - keep) * float(by @ by)
+        ticks = np.sqrt(y.core_power / y.core_change) if y.core_change > 0.0 else 0.0
+        forget = np.exp(-1.0 / (np.pi * ticks)) if ticks > 0.0 else 0.0
+        y.core_over = 1.0 + forget * (max(1.0, y.core_over) - 1.0)
         rest = stroke - core
         mean = rest.mean()
         half = np.minimum(p.stroke_high, -p.stroke_low)

@@ -632,10 +632,36 @@ static int strokes(const double *tip, const actuate_params_geometry *g, double *
     return 0;
 }
 
+/* What the firmware remembers of the core's swing; a core beyond the stroke leaves the regular way. */
+static int swings_too_far(const double *core, const actuate_params *p, actuate_state_yielding *s)
+{
+    double mean = 0.0, turned = 0.0, power = 0.0, change = 0.0, keep = p->yield_keep;
+    for (int i = 0; i < 3; i++) {
+        double by = core[i] - s->core_last[i];
+        mean += core[i] / 3.0, turned += by / 3.0, power += core[i] * core[i], change += by * by;
+    }
+    s->core_power = keep * s->core_power + (1.0 - keep) * power;
+    s->core_change = keep * s->core_change + (1.0 - keep) * change;
+    double ticks = s->core_change > 0.0 ? sqrt(s->core_power / s->core_change) : 0.0;
+    turned *= ticks;
+    int beyond = 0;
+    for (int i = 0; i < 3; i++) {
+        double half = p->stroke_high[i] < -p->stroke_low[i] ? p->stroke_high[i] : -p->stroke_low[i];
+        double most = p->overdrive * half, side = core[i] - mean;
+        double across = ticks * (core[i] - s->core_last[i]) - turned, both = side * mean + across * turned;
+        s->core_last[i] = core[i];
+        beyond |= most > 0.0 && mean * mean + turned * turned + 2.0 * both > most * most - side * side - across * across;
+    }
+    double forget = ticks > 0.0 ? exp(-1.0 / (M_PI * ticks)) : 0.0;
+    s->core_over = 1.0 + forget * (fmax(1.0, s->core_over) - 1.0);
+    return beyond || s->core_over > 1.0001;
+}
+
 /* Nothing may be held back: that would leave the regular way. */
 static int yields(const double *stroke, const double *core, const actuate_params *p, actuate_state_yielding *s)
 {
     double mean = 0.0, room[3], over = 0.0, keep = p->yield_keep;
+    if (swings_too_far(core, p, s)) return 1;
     for (int i = 0; i < 3; i++) mean += (stroke[i] - core[i]) / 3.0;
     for (int i = 0; i < 3; i++) {
         double half = p->stroke_high[i] < -p->stroke_low[i] ? p->stroke_high[i] : -p->stroke_low[i];

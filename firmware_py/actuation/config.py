@@ -95,6 +95,9 @@ class ActuationConfig(BaseModel):
     yield_s: Positive = 2.0
     """Time for which the peaks that make slow motion yield to tremor are remembered
     (firmware_py/actuation/yielding.py)."""
+    overdrive: Annotated[float, Field(ge=0.0, le=100.0)] = 1.4
+    """Most that tremor beyond the stroke may swing, in strokes: a clipped swing still cancels more than one that just
+    fits, and shakes the tip above the band with its corners. 0: every swing is clipped."""
 
     low_V: float = 0.0
     high_V: float = 100.0

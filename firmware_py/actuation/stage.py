@@ -21,7 +21,7 @@ from firmware_py.actuation.hysteresis import (
 from firmware_py.actuation.limits import limit_slew, limit_voltage
 from firmware_py.actuation.manipulator import GEOMETRY, star_tip, strokes_from_tip, tip_from_strokes
 from firmware_py.actuation.reach import inside, nearest_reachable
-from firmware_py.actuation.yielding import YIELD_STATE, yield_rest
+from firmware_py.actuation.yielding import YIELD_STATE, shrink_core, yield_rest
 from firmware_py.frame import (
     ALIGNING,
     CLIP,
@@ -59,6 +59,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("min_confidence", "f8"),
             ("tick_hz", "f8"),
             ("yield_keep", "f8"),
+            ("overdrive", "f8"),
             ("mounting", "f8", (3, 3)),
             ("geometry", GEOMETRY),
             ("low_V", "f8"),
@@ -116,6 +117,7 @@ def actuate_params(config: ActuationConfig) -> Record:
         min_confidence=config.min_confidence,
         tick_hz=config.tick_hz,
         yield_keep=exp(-1.0 / (config.yield_s * config.tick_hz)),
+        overdrive=config.overdrive,
         mounting=config.mounting,
         geometry=geometry_of(config),
         low_V=config.low_V,
@@ -182,7 +184,8 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     """Fill the columns ``desired_tip`` to ``clip`` from ``tremor_ahead``, ``confidence`` and ``status``.
 
     Compensation of an axis fades in while its estimate is trusted and out while it is not. A wish that is not
-    finite counts as zero. What is not ``tremor_core`` yields before a stroke ends (``yielding``).
+    finite counts as zero. What is not ``tremor_core`` yields before a stroke ends, and a core beyond it is shrunk
+    (``yielding``).
     """
     state = states[0]
     param = params[0]
@@ -206,7 +209,9 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     clip = 0
     strokes_from_tip(tip, param.geometry, state.tilt, stroke)
     strokes_from_tip(core_tip, param.geometry, state.yielding.tilt, core_stroke)
-    if yield_rest(stroke, core_stroke, param.stroke_low, param.stroke_high, param.yield_keep, state.yielding):
+    low, high, keep = param.stroke_low, param.stroke_high, param.yield_keep
+    shrunk = shrink_core(stroke, core_stroke, low, high, param.overdrive, keep, state.yielding)
+    if yield_rest(stroke, core_stroke, low, high, keep, state.yielding) or shrunk:
         clip |= CLIP_YIELD
         tip_from_strokes(stroke, param.geometry, tip)
     if not inside(stroke, param.stroke_low, param.stroke_high):

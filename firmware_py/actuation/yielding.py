@@ -5,6 +5,9 @@ estimator says of 8 to 12 Hz) and the rest; the rest is scaled so that, beside t
 peaks stay inside. A peak is followed at once and forgotten slowly, so the scale falls as fast as a new peak grows
 (the product stays continuous) and is nearly constant in between: a scale that moved within a cycle would make harmonics
 itself. The part of the rest that tilts the shaft has room before the part along it: it costs an eighth of the stroke.
+
+A core that is itself beyond the stroke has corners where it is clipped, and these shake the tip above the band. So its
+swing along the shaft is kept within ``overdrive`` strokes, by a scale that follows the swing and not its phase.
 """
 
 from __future__ import annotations
@@ -21,13 +24,65 @@ Array = NDArray[np.float64]
 YIELD_STATE = np.dtype(
     [
         ("tilt", "f8", (2,)),  # of the shaft under the core alone, where the next inverse kinematics starts
+        ("core_last", "f8", (3,)),  # m of stroke, a tick ago
+        ("core_power", "f8"),  # m^2, recent mean square of the core
+        ("core_change", "f8"),  # m^2, that of its change in a tick
+        ("core_over", "f8"),  # recent peak of the core's swing over what is let through
         ("core_peak", "f8", (3,)),  # m of stroke
         ("side_peak", "f8", (3,)),  # m of stroke, as let through
         ("side_over", "f8"),  # recent peak of the tilting rest over its room
         ("axial_over", "f8"),
     ]
 )
+LEAST_SHRINK = 1e-4  # of the swing: less is nothing
 LEAST_ROOM = 0.1  # of a stroke's half range whatever the core takes, of that room whatever tilts the shaft
+
+
+@kernel
+def shrink_core(
+    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, keep: float, state: Record
+) -> bool:
+    """Shrink the swing of ``core`` (3,) m along the shaft to ``overdrive`` times the stroke at most, and ``stroke``
+    (3,) by as much. Return True if anything was shrunk.
+
+    A swing is x and its quadrature: the change in a tick over the angle that the core turns in a tick (the root of the
+    ratio of their mean squares, remembered by ``keep`` per tick). The scale falls at once and recovers within half a
+    turn. What the tilt takes of each stroke is added as a phasor. ``overdrive`` 0 shrinks nothing.
+    """
+    mean = turned = power = change = 0.0
+    for i in range(3):
+        if not (np.isfinite(stroke[i]) and np.isfinite(core[i])):
+            return False
+        by = core[i] - state.core_last[i]
+        mean += core[i] / 3.0
+        turned += by / 3.0
+        power += core[i] * core[i]
+        change += by * by
+    state.core_power = keep * state.core_power + (1.0 - keep) * power
+    state.core_change = keep * state.core_change + (1.0 - keep) * change
+    ticks = np.sqrt(state.core_power / state.core_change) if state.core_change > 0.0 else 0.0  # for one radian
+    turned *= ticks
+    along = mean * mean + turned * turned
+    share = 1.0
+    for i in range(3):
+        side, across = core[i] - mean, ticks * (core[i] - state.core_last[i]) - turned
+        state.core_last[i] = core[i]
+        most = overdrive * min(high[i], -low[i])
+        # the largest share for which |side phasor + share * axial phasor| <= most
+        both = side * mean + across * turned
+        room = most * most - side * side - across * across
+        if most > 0.0 and along + 2.0 * both > room:
+            share = min(share, (np.sqrt(both * both + along * room) - both) / along if room > 0.0 else 0.0)
+    forget = np.exp(-1.0 / (np.pi * ticks)) if ticks > 0.0 else 0.0
+    recent = 1.0 + forget * (max(1.0, state.core_over) - 1.0)
+    state.core_over = max(recent, 1.0 / max(share, LEAST_ROOM))
+    if state.core_over <= 1.0 + LEAST_SHRINK:
+        return False
+    for i in range(3):
+        excess = (1.0 - 1.0 / state.core_over) * mean
+        core[i] -= excess
+        stroke[i] -= excess
+    return True
 
 
 @kernel

@@ -35,6 +35,7 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     adaptive = tables.setdefault("tremor", {}).setdefault("adaptive", {})
     adaptive.setdefault("quiet", 0.0)
     adaptive.setdefault("ease_s", 0.0)
+    tables.setdefault("actuation", {}).setdefault("overdrive", 0.0)
     tables.setdefault("sensing", {}).setdefault("kinematics_guard", False)
     return StageConfigs.from_dict(tables, str(recording.path))
 

@@ -97,7 +97,7 @@ def test_compensation_fades_in_and_out_with_trust() -> None:
 
 def test_out_of_reach_is_the_nearest_point_flagged_and_without_a_jump() -> None:
     frames = trembling(1500, size=400e-6)
-    actuation = run(ActuationConfig(), frames)
+    actuation = run(ActuationConfig(overdrive=0.0), frames)
     clipped = frames[600:, CLIP].astype(int) & CLIP_WORKSPACE != 0
     assert 0.2 < np.mean(clipped) < 1.0
     wish, tremor = frames[600:, LAYOUT["desired_tip"]], frames[600:, LAYOUT["tremor_ahead"]]
@@ -187,7 +187,8 @@ def test_nan_is_no_command() -> None:
     frames[900:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = np.nan
     run(ActuationConfig(), frames)
     assert np.all(np.isfinite(frames[:, COMMAND : COMMAND + 3]))
-    np.testing.assert_array_equal(frames[900:, DESIRED_TIP : DESIRED_TIP + 3], 0.0)
+    # there and back through the kinematics, because its swing ended in a jump
+    np.testing.assert_allclose(frames[900:, DESIRED_TIP : DESIRED_TIP + 3], 0.0, atol=1e-18)
 
 
 def test_at_rest_the_amplifier_stays_at_neutral() -> None:

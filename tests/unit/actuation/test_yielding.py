@@ -9,7 +9,7 @@ from scipy.signal import butter, sosfiltfilt
 from firmware_py.actuation import yielding
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.actuation.yielding import YIELD_STATE, yield_rest
+from firmware_py.actuation.yielding import YIELD_STATE, shrink_core, yield_rest
 from firmware_py.frame import CLIP, CLIP_WORKSPACE, CLIP_YIELD, CONFIDENCE, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from firmware_py.records import attributes
 from tests.unit.pure_python import without_compiler
@@ -96,6 +96,48 @@ def test_what_has_no_inverse_is_left_alone_and_not_remembered() -> None:
     assert state[0].tobytes() == np.zeros(1, YIELD_STATE)[0].tobytes()
 
 
+TIMES = np.arange(4000) / 1000.0
+
+
+def shrunk(cores: np.ndarray, overdrive: float) -> np.ndarray:
+    """What is let through of ``cores`` (n, 3), m of stroke; what is wanted beside them stays."""
+    state, out = np.zeros(1, YIELD_STATE), cores.copy()
+    for core in out:
+        stroke = core + 1e-6
+        shrink_core(stroke, core, LOW, HIGH, overdrive, KEEP, state[0])
+        np.testing.assert_allclose(stroke - core, 1e-6, atol=1e-18)
+    return out
+
+
+@pytest.mark.parametrize("tremor_hz", [8.0, 9.7, 12.0])
+def test_a_swing_beyond_the_stroke_is_let_through_as_a_smaller_one(tremor_hz: float) -> None:
+    """A sine stays a sine, whatever its frequency: its scale does not know its phase."""
+    sine = np.sin(2 * np.pi * tremor_hz * TIMES)
+    wanted = np.repeat(20e-6 * sine[:, None], 3, axis=1)
+    through = shrunk(wanted, 1.2)[2500:, 0]
+    cosine = np.cos(2 * np.pi * tremor_hz * TIMES)
+    basis = np.column_stack([sine, cosine])[2500:]
+    weights = np.linalg.lstsq(basis, through, rcond=None)[0]
+    assert np.hypot(*weights) == pytest.approx(1.2 * 7e-6, rel=0.01)
+    assert np.std(through - basis @ weights) < 0.01 * np.std(through)
+
+
+def test_a_swing_within_overdrive_and_one_that_may_be_clipped_are_left_alone() -> None:
+    wanted = np.repeat(10e-6 * np.sin(2 * np.pi * 10.0 * TIMES)[:, None], 3, axis=1)
+    np.testing.assert_array_equal(shrunk(wanted, 1.5)[600:], wanted[600:])
+    np.testing.assert_array_equal(shrunk(3.0 * wanted, 0.0), 3.0 * wanted)
+
+
+def test_the_tilt_keeps_what_it_needs_and_each_stack_ends_at_its_stroke() -> None:
+    """The tilt turns a third of a cycle later: swings add up as phasors, not by their sizes."""
+    tilt = np.array([2e-6, -1e-6, -1e-6]) * np.sin(2 * np.pi * 10.0 * TIMES - 2.0)[:, None]
+    axial = 15e-6 * np.sin(2 * np.pi * 10.0 * TIMES)[:, None]
+    through = shrunk(tilt + axial, 1.0)
+    np.testing.assert_allclose(through - through.mean(axis=1, keepdims=True), tilt, atol=1e-15)
+    peaks = np.max(np.abs(through[2500:]), axis=0)
+    assert np.max(peaks) == pytest.approx(7e-6, rel=0.01)
+
+
 def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     rows = [(c + rng.standard_normal(3) * 1e-5, c) for c in rng.uniform(-3e-6, 3e-6, (50, 3))]
@@ -106,3 +148,11 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     for (stroke, core), found, flag in zip(rows, compiled, flags, strict=True):
         assert yielding.yield_rest(stroke, core, LOW, HIGH, KEEP, attributes(slow)[0]) == flag
         np.testing.assert_allclose(stroke, found, atol=1e-18)
+    fast, slow = np.zeros(1, YIELD_STATE), np.zeros(1, YIELD_STATE)
+    for k, core in enumerate(rng.uniform(-9e-6, 9e-6, (50, 3))):
+        found, stroke = core.copy(), core + 1e-6
+        monkeypatch.undo()
+        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, KEEP, fast[0])
+        without_compiler(monkeypatch)
+        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, KEEP, attributes(slow)[0]) == flag, k
+        np.testing.assert_allclose(core, found, atol=1e-18)
