@@ -11,6 +11,7 @@ from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import between_of
 from tools.mismatch.twins.equations import Place
+from tools.mismatch.twins.opaque import OpaqueTwin
 
 SAME = "input or output"
 AXIS = Place("", "motion", 0, 1, 1, "")
@@ -77,9 +78,10 @@ def _stage(twin: Twin, effect: Effect) -> Stage:
 def _commutes(twin: Twin) -> bool:
     """Return whether a linear effect before the twin is the same as behind it.
 
-    It is not where the twin's equations may be nonlinear, or where each stretch starts from measured states.
+    It is not where the twin's equations may be nonlinear, where each stretch starts from measured states, or where
+    nothing is known of the inside: a motor's angle keeps what its first command did to it.
     """
-    return not hasattr(twin, "places")
+    return not hasattr(twin, "places") and not isinstance(getattr(twin, "core", twin), OpaqueTwin)
 
 
 def _behind(twin: Twin, effect: Effect, stage: Stage) -> Stage:

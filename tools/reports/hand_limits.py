@@ -79,7 +79,8 @@ def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: A
     frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
     frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = whole
     frames[:, TREMOR_CORE : TREMOR_CORE + 3] = core
-    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3)))}))
+    # clipped, because nothing is to be kept still above the band here
+    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3))), "overdrive": 0.0}))
     for frame in frames:
         stage.step(frame)
     return band_rms_um(moved + frames[:, DESIRED_TIP : DESIRED_TIP + 3], keep)

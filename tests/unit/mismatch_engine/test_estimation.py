@@ -11,7 +11,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, stack, wave
-from tools.mismatch.engine.diagnose import nominated, prepared
+from tools.mismatch import notebook
+from tools.mismatch.engine.diagnose import diagnose, nominated, prepared
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import fit, fit_base
 from tools.mismatch.engine.intervals import uncertainty
@@ -55,6 +56,27 @@ def test_a_state_that_is_the_constant_one_leaves_every_figure_in_the_range_of_th
     assert problem.floors["level"].rms < size
     assert held_rms(problem, base)["level"] <= held_rms(problem, raw)["level"]
     assert fit_rms(problem, base)["level"] <= fit_rms(problem, raw)["level"]
+
+
+def test_a_late_command_of_a_program_that_keeps_what_happened_first_is_late_before_it() -> None:
+    """Behind an integrator a late command is no late output: what it did before it was late stays in the angle."""
+    rng = np.random.default_rng(4)
+    u, dt, late = 1.0 + wave(rng, 1200, 0.5, 4.0), 0.01, 2.3
+
+    def turned(x: Array, step: float) -> Array:
+        return 5.0 * step * np.concatenate([[0.0], np.cumsum(0.5 * (x[1:] + x[:-1]))])
+
+    def simulate(inputs: Mapping[str, Array], parameters: Mapping[str, float], dt: float) -> Array:
+        return parameters["gain"] / 5.0 * turned(inputs["volts"], dt)
+
+    t = np.arange(u.size)
+    fine = np.arange(0, u.size, 0.05)
+    angle = np.interp(t, fine, turned(np.interp(fine - late, t, u), 0.05 * dt))
+    angle += 1e-3 * rng.standard_normal(u.size)
+    rec = notebook.Recording({"volts": u}, {"angle": angle}, dt).with_twin(notebook.Twin(simulate, {"gain": 5.1}))
+    report = diagnose(rec, effects=[EFFECTS[n] for n in ("dead_time", "rate_dependent_hysteresis", "first_order_lag")])
+    assert [(p.name, p.site) for p in report.physics] == [("dead_time", "input")]
+    assert report.physics[0].parameters["delay_s"].value == pytest.approx(late * dt, abs=1e-4)
 
 
 def own_problem(rec: Recording, call: Any) -> Problem:
