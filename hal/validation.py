@@ -1,15 +1,20 @@
-"""A table of a configuration file into its model, with errors that name file and key."""
+"""Tables of configuration files: ranges that members share, and errors that name file and key."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from hal.errors import BenchError
 
 _Model = TypeVar("_Model", bound=BaseModel)
+
+Positive = Annotated[float, Field(gt=0.0, le=1e12)]
+"""Any quantity of a configuration in its unit; beyond the limit nothing is meant, and products overflow."""
+NotNegative = Annotated[float, Field(ge=0.0, le=1e12)]
+"""The same with zero."""
 
 
 def describe_validation_error(error: ValidationError, where: str) -> str:

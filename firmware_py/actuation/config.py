@@ -8,9 +8,8 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from hal.validation import validate_table
+from hal.validation import Positive, validate_table
 
-Positive = Annotated[float, Field(gt=0.0)]
 Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=16)]
 
 

@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from hal.validation import validate_table
+from hal.validation import NotNegative, Positive, validate_table
 
 Vector = tuple[float, float, float]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Pair = tuple[float, float]
 Input = Annotated[int, Field(ge=0, le=7)]
 Axis = Annotated[int, Field(ge=0, le=7)]
@@ -31,7 +30,6 @@ PER_AXIS = (
     "scale_out_of_plane",
 )
 """Keys with a value for each axis; absent ones are filled with the default of all."""
-Positive = Annotated[float, Field(gt=0.0)]
 STANDARD_GRAVITY = 9.80665
 DRIFT_S = 100.0
 """Time over which a slow drift is stated."""

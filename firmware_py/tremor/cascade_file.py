@@ -11,9 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from firmware_py.tremor.cascade import CascadeNetwork
 from hal.errors import BenchError
-from hal.validation import describe_validation_error
-
-Positive = Annotated[float, Field(gt=0.0)]
+from hal.validation import Positive, describe_validation_error
 
 
 class _File(BaseModel):

@@ -11,10 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from firmware_py.tremor.detector_config import DetectorConfig
 from hal.plugins import ESTIMATORS, offered
-from hal.validation import validate_table
+from hal.validation import NotNegative, Positive, validate_table
 
-Positive = Annotated[float, Field(gt=0.0)]
-NotNegative = Annotated[float, Field(ge=0.0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
 Edge = tuple[Positive, Positive]
 
