@@ -119,6 +119,11 @@ class OutputGuard:
         """
         return next_ramp_step(self.state, self._clock.now_ns())
 
+    def begin_ramp(self, since_ns: int) -> None:
+        """Let the ramp that ``ramp`` goes on with have begun at ``since_ns``: where the device is had to be asked since
+        then. The time is made up for as ``ramp`` says."""
+        next_ramp_step(self.state, since_ns)
+
     def not_before(self, t_ns: int) -> None:
         """``next_V`` cannot take force before ``t_ns``: its transfer takes so long."""
         self.state.words[OFFERED_NS] = t_ns

@@ -150,10 +150,13 @@ class E727:
         return mask
 
     def safe_step(self) -> bool:
-        """One tick of the ramp; steps between two command times are not sent, the last one always is."""
+        """One tick of the ramp; steps between two command times are not sent, the last one always is. The first tick
+        may have to ask where the outputs are, 8 ms at 115200 baud: the ramp began before that."""
         if not self._position_known:
+            asked_ns = self._clock.now_ns()
             self.link.settle()  # else an answer to ``ERR?`` that is under way is taken for this one
             self.guard.start_from([v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)])
+            self.guard.begin_ramp(asked_ns)
             self._position_known = True
         done = self.guard.ramp()
         now_ns = self._clock.now_ns()

@@ -77,6 +77,19 @@ def test_an_answer_under_way_is_not_taken_for_another_one():
     port.done()
 
 
+def test_the_time_of_the_question_where_the_outputs_are_is_the_ramps():
+    """A run that was stopped before it armed was at neutral 22 ms later, with a promise of 21 ms."""
+    asked: Script = [("w", b"SVA?\n"), ("at", 8 * MS), ("r", b"1=0.0 \n2=0.0 \n3=0.0\n")]
+    at_once_V = 6 * 50 / RAMP_STEPS  # at the slew limit: 20 V in the millisecond of one step
+    at_10_ms_V = 11 * 50 / RAMP_STEPS
+    ramp = [sva(V, V, V) for V in (at_once_V, at_10_ms_V, 50.0)]
+    device, port, clock = make(*asked, *ramp)
+    while not device.safe_step():
+        clock.burn_ns(MS)
+    assert clock.now_ns() <= RAMP_STEPS * MS
+    port.done()
+
+
 FEW = b"1=5.000000000e+01 \n2=5.000000000e+01\n"
 
 
