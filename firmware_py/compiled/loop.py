@@ -252,12 +252,12 @@ class CompiledLoop(InstrumentLoop):
         self._sync()
         self._warned = int(words[at.WARNED])
         ticker.go_on_from(int(words[at.LAST_K]), int(words[at.LAST_DUE_NS]))
+        if words[at.SILENT_OF_NS] == words[at.LAST_DUE_NS]:  # Python goes on with the same wait
+            ticker.silent_at_ns = int(words[at.SILENT_AT_NS])
         match result:
             case at.CALLED:
                 with contextlib.suppress(BlockingIOError):
                     os.read(self._wake_read, 4096)
-            case at.SILENT:
-                ticker.silent_at_ns = int(words[at.SILENT_AT_NS])
             case at.SCANS | at.REST:
                 self.scans.hand_over(self._block)
                 if result == at.REST:
@@ -399,12 +399,15 @@ class CompiledLoop(InstrumentLoop):
         daq, output = self._daq.port, self._output.port
         assert isinstance(daq, Fed)
         assert isinstance(output, Fed)
-        now_ns = self._clock.now_ns()
-        silent_ns = silent_at_ns(last_due_ns, int(self._words[at.STALE_NS]), now_ns)
+        words, now_ns = self._words, self._clock.now_ns()
+        if words[at.SILENT_OF_NS] != last_due_ns:
+            words[at.SILENT_AT_NS] = silent_at_ns(last_due_ns, int(words[at.STALE_NS]), now_ns)
+            words[at.SILENT_OF_NS] = last_due_ns
+        silent_ns = int(words[at.SILENT_AT_NS])
         daq.feed(max(0, silent_ns - now_ns) * 1e-9)
         output.feed(0.0)
-        self._words[at.FIXED_NS] = self._clock.now_ns()
-        self._words[at.READS_LEFT], self._words[at.SILENT_AT_NS] = 1, silent_ns
+        words[at.FIXED_NS] = self._clock.now_ns()
+        words[at.READS_LEFT] = 1
 
     def _flush(self) -> None:
         output = self._output.port

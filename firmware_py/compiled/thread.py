@@ -69,6 +69,7 @@ from firmware_py.compiled.memory import (
     SEQ_OF_TICK0,
     SILENT,
     SILENT_AT_NS,
+    SILENT_OF_NS,
     SLIPS,
     SPENT,
     STALE_NS,
@@ -342,8 +343,9 @@ def serve(m: Memory) -> int:
         if now - words[BEAT_NS] > words[BEAT_LIMIT_NS]:
             ramp_alone(m)
             return DEAF
-        if words[FIXED_NS] == REAL_TIME:  # in virtual time the wait is over
+        if words[SILENT_OF_NS] != words[LAST_DUE_NS]:  # a wait begins; bytes without a scan do not prolong it
             words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
+            words[SILENT_OF_NS] = words[LAST_DUE_NS]
         polls[0], polls[1] = poll_word(words[DAQ_FD], POLLIN), poll_word(words[WAKE_FD], POLLIN)
         ready = wait_fds(polls, words[SILENT_AT_NS] if words[FIXED_NS] == REAL_TIME else 0)
         now = clock_ns(words)
