@@ -258,6 +258,8 @@ class CompiledLoop(InstrumentLoop):
             case at.CALLED:
                 with contextlib.suppress(BlockingIOError):
                     os.read(self._wake_read, 4096)
+            case at.SILENT:
+                self.scans.hand_over(self._no_block)
             case at.SCANS | at.REST:
                 self.scans.hand_over(self._block)
                 if result == at.REST:
@@ -276,6 +278,9 @@ class CompiledLoop(InstrumentLoop):
     def _block(self) -> ScanBlock:
         n, t0_ns, seq, lost, shifted = (int(w) for w in self._words[at.BLOCK_N : at.BLOCK_SHIFTED + 1])
         return self._daq.block_of(n, t0_ns, seq, lost, bool(shifted))
+
+    def _no_block(self) -> ScanBlock:
+        return self._daq.block_of(0, 0, 0, 0, False)
 
     def _failed_block(self) -> ScanBlock:
         self._daq.obey(int(self._words[at.VERDICT]))
