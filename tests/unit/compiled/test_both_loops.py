@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from firmware_py.app import run_in_process
@@ -107,6 +107,7 @@ def scan_faults() -> st.SearchStrategy[FaultPlan]:
 
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(plan=scan_faults())
+@example(FaultPlan(duplication=0.0001, delay=0.05, delay_s=0.003, from_s=0.7))  # bytes without a scan until silence
 def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
     compare(tmp_path, {"daq0": plan})
 
