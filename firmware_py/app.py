@@ -12,7 +12,9 @@ import json
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,7 @@ from firmware_py.run_request import (
     RunRequest,
     count_interrupts,
     describe_host,
+    describe_machine,
     describe_scheduling,
     open_requested,
     scheduling,
@@ -95,11 +98,11 @@ def run_in_process(
             live = LiveLink(*request.live_fds)
             stack.callback(live.close)
             (opened.runtime_dir / "metadata.json").write_text(json.dumps(recording_metadata(bench, configs, opened)))
-        make_loop = InstrumentLoop
+        make_loop: Callable[..., InstrumentLoop] = InstrumentLoop
         if request.compiled:
             from firmware_py.compiled.loop import CompiledLoop
 
-            make_loop = CompiledLoop
+            make_loop = partial(CompiledLoop, spin_us=request.spin_us)
         loop = make_loop(
             devices,
             stages,
@@ -116,12 +119,14 @@ def run_in_process(
             on_status(
                 {"event": "devices", "identities": devices.identities, "histograms": list(loop.shown.histograms())}
             )
-        report = RealtimeReport()
+        report, machine, cpu_share = RealtimeReport(), describe_machine(opened), None
         summary: RecordingSummary | None = None
         interrupts = stack.enter_context(count_interrupts()) if own_process else lambda: 0
         try:
             with scheduling(request, opened) as report:
+                wall_s, cpu_s = time.monotonic(), time.process_time()
                 loop.run(request.seconds)
+                cpu_share = (time.process_time() - cpu_s) / max(time.monotonic() - wall_s, 1e-9)
         finally:
             if recorder is not None:
                 summary = recorder.stop(loop.scheduler.snapshot().as_dict())
@@ -132,6 +137,8 @@ def run_in_process(
         if devices.guardian is not None:
             last_word = devices.guardian.finish(hurry=lambda: interrupts() > so_far)
         outcome = make_outcome(request, opened, devices, loop, report, summary, last_word)
+        outcome["host"] = describe_host(opened, loop.scans.host_gaps, cpu_share)
+        outcome["machine"] = machine
         if injections:
             outcome["injected"] = injector.counts()
         return outcome, truth_of(opened)
@@ -244,7 +251,6 @@ def make_outcome(
             "fallbacks": loop.stages.sensing.fallbacks,
         },
         "loop": loop.describe(),
-        "host": describe_host(opened, loop.scans.host_gaps),
         "realtime": describe_scheduling(report, opened.virtual),
         "recording": str(recording.path) if recording is not None else None,
         "recorder": {

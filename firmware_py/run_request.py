@@ -13,6 +13,8 @@ from typing import Any
 
 from drivers.specs import check_devices
 from firmware_py.control.host_gaps import HostGaps
+from firmware_py.machine.settings import read_machine
+from firmware_py.machine.tree import Tree
 from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.bench import BenchFile, OpenBench, Port, open_bench
 from hal.clock import Pace, PacedClock, VirtualClock
@@ -43,6 +45,10 @@ class RunRequest:
     only."""
     compiled: bool = False
     """Runs the ticks in one compiled thread (``firmware_py.compiled``). Raises ``BenchError`` where a device cannot."""
+    spin_us: float = 0.0
+    """With ``compiled``: the thread waits awake from so long before each scan is expected until so long after."""
+    cpu: int | None = None
+    """In real time: the processor that the loop, and no other part of the run, stays on."""
     sense_only: bool = False
     """Runs without arming the outputs. Readings that would end a run are only noticed."""
     method: str | None = None
@@ -109,8 +115,21 @@ def scheduling(request: RunRequest, opened: OpenBench) -> Iterator[RealtimeRepor
     if opened.virtual or not request.policy:
         yield RealtimeReport()
         return
-    with realtime(RealtimeConfig(priority=LOOP_PRIORITY)) as report:
+    with realtime(RealtimeConfig(priority=LOOP_PRIORITY, cpu=request.cpu, idle_exit_us=0)) as report:
         yield report
+
+
+def serial_ports(bench: BenchFile) -> list[str]:
+    """Return the paths of the serial ports that the buses of ``bench`` name."""
+    uris = [spec.uri.partition("://") for spec in bench.description.bus.values()]
+    return [rest.split("?")[0] for scheme, _, rest in uris if scheme in ("serial", "slcan")]
+
+
+def describe_machine(opened: OpenBench) -> list[dict[str, object]]:
+    """Return, as JSON values, the machine's settings that a loop in real time depends on; none in emulated time."""
+    if opened.virtual:
+        return []
+    return [state.as_dict() for state in read_machine(Tree(), serial_ports(opened.file))]
 
 
 @contextlib.contextmanager
@@ -141,10 +160,11 @@ def describe_scheduling(report: RealtimeReport, virtual: bool) -> str:
     return ", ".join(s.wanted if s.done else f"no {s.wanted} ({s.detail})" for s in report.settings)
 
 
-def describe_host(opened: OpenBench, gaps: HostGaps | None = None) -> dict[str, Any]:
+def describe_host(opened: OpenBench, gaps: HostGaps | None = None, cpu_share: float | None = None) -> dict[str, Any]:
     """Return how the host kept up with the run, as JSON values: pace, number of stalls, and longest stall.
 
-    In real time these are the stalls of the loop (``gaps``) and of the emulated world, whichever is worse.
+    In real time these are the stalls of the loop (``gaps``) and of the emulated world, whichever is worse, and
+    ``cpu_share`` is what this process used of one processor while the loop ran.
     """
     clock = opened.clock
     if isinstance(clock, PacedClock):
@@ -153,4 +173,5 @@ def describe_host(opened: OpenBench, gaps: HostGaps | None = None) -> dict[str, 
         return {"pace": "virtual", "stalls": 0, "longest_stall_ms": 0.0}
     others = opened.world.stalls() if opened.world is not None else (0, 0.0)
     own = (gaps.stalls, gaps.longest_ms) if gaps is not None else (0, 0.0)
-    return {"pace": "realtime", "stalls": max(own[0], others[0]), "longest_stall_ms": max(own[1], others[1])}
+    stalls, longest_ms = max(own[0], others[0]), max(own[1], others[1])
+    return {"pace": "realtime", "stalls": stalls, "longest_stall_ms": longest_ms, "cpu_share": cpu_share}

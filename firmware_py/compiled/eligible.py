@@ -40,6 +40,20 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
     return reasons
 
 
+SPIN_PART = 0.25
+"""Longest spin before a scan, and after it, as a part of the tick: the loop then uses half of its processor at most."""
+
+
+def check_spin(bench: BenchFile, spin_us: float) -> None:
+    """Raise ``BenchError`` if the thread cannot wait awake for so long before and after each scan."""
+    most_us = SPIN_PART * 1e6 / bench.description.clock.tick_hz
+    if not 0.0 <= spin_us <= most_us:
+        raise BenchError(
+            f"{bench.path}: --spin-us {spin_us:g} is outside 0 .. {most_us:g} us, a quarter of a tick; other programs "
+            "need the rest of the processor"
+        )
+
+
 def check_compiled(bench: BenchFile, pace: Pace, *, injected: bool = False) -> None:
     """Raise ``BenchError`` for a bench that cannot run compiled."""
     if reasons := reasons_against_bench(bench, pace, injected=injected):

@@ -85,10 +85,11 @@ def reasons_against(devices: Devices, clock: Clock, n_axes: int) -> list[str]:
 class CompiledLoop(InstrumentLoop):
     """``InstrumentLoop``, with its arguments, over devices for which ``reasons_against`` is empty.
 
-    Raises ``BenchError`` for others. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks
-    that it ran."""
+    Raises ``BenchError`` for others. ``spin_us``: the thread waits awake from so long before each scan is expected
+    until so long after. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks that it
+    ran."""
 
-    def __init__(self, devices: Devices, *arguments: Any, **options: Any) -> None:
+    def __init__(self, devices: Devices, *arguments: Any, spin_us: float = 0.0, **options: Any) -> None:
         super().__init__(devices, *arguments, **options)
         reasons = reasons_against(devices, self._clock, len(devices.sensing_table["channels"]))
         if reasons:
@@ -108,6 +109,9 @@ class CompiledLoop(InstrumentLoop):
         self._beside_error: BaseException | None = None
         self._wake_read, self._wake_write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._words = np.zeros(at.N_WORDS, np.int64)
+        self._words[at.SPIN_NS] = round(spin_us * 1e3)
+        self._processors = os.sched_getaffinity(0)
+        self._inside_ns = 0
         self._told = self._words.copy()
         self._tasks_told = np.zeros((3, len(at.STAGES)), np.int64)
         self._memory: Memory | None = self._gather()
@@ -160,7 +164,11 @@ class CompiledLoop(InstrumentLoop):
 
     def describe(self) -> dict[str, Any]:
         """Return, as JSON values, what ran the ticks."""
-        return {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled}
+        spin = {}
+        if self._words[at.SPIN_NS]:
+            share = int(self._words[at.SPUN_NS]) / max(self._inside_ns, 1)
+            spin = {"spin_us": int(self._words[at.SPIN_NS]) * 1e-3, "spin_share": share}
+        return {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **spin}
 
     # -- running -----------------------------------------------------------------------------------------
 
@@ -233,7 +241,9 @@ class CompiledLoop(InstrumentLoop):
         words[at.ORDER] = at.CALLED_BACK if self._interrupted else at.GO  # a signal may have come in the meantime
         self.entries += 1
         self._is_inside.set()
+        entered_ns = self._clock.now_ns()
         result = self._thread.serve(memory)
+        self._inside_ns += self._clock.now_ns() - entered_ns
         with self._lock:
             self._is_inside.clear()
             words[at.ORDER] = at.CALLED_BACK
@@ -320,6 +330,7 @@ class CompiledLoop(InstrumentLoop):
     def _run_beside(self) -> None:
         with contextlib.suppress(OSError, AttributeError):  # what waits for buses must not press the tick
             os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
+            os.sched_setaffinity(0, self._processors)  # the loop may stay on one of its own
         last_k = -1
         while True:
             self._is_inside.wait()

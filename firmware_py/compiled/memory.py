@@ -12,23 +12,25 @@ Words = NDArray[np.int64]
 (
     # Python's words to the thread
     ORDER, BEAT_NS, BEAT_LIMIT_NS, FIXED_NS, READS_LEFT, DAQ_FD, OUTPUT_FD, WAKE_FD, PERIOD_NS, DT_NS, STALE_NS,
-    STALLED_NS, LATE_LIMIT_NS, STARTED_NS, END_NS,
+    STALLED_NS, LATE_LIMIT_NS, STARTED_NS, END_NS, SPIN_NS,
     # where the thread is in the stream of scans
     SEQ_OF_TICK0, LAST_K, LAST_DUE_NS, SILENT_AT_NS, SILENT_OF_NS,
     # the block under way, and how far it got
     BLOCK_N, BLOCK_T0_NS, BLOCK_SEQ, BLOCK_LOST, BLOCK_SHIFTED, VERDICT, DONE_ROW, DONE_STAGE, FOUND,
     # what the thread tells
     GAP_DUE_NS, GAP_NOW_NS, WARNED, PAIR_TOLD, RECEIVED, TICKS, CAUGHT_UP, COMMANDS, SUPERSEDED, CLIPPED, LATE_NS,
-    SCANS_LATE_NS, NOTES,
+    SCANS_LATE_NS, NOTES, ARRIVAL_NS, SPUN_NS,
     N_WORDS,
-) = range(43)  # fmt: skip
+) = range(46)  # fmt: skip
 """Places in ``Memory.words``.
 
 ``ORDER``: GO or CALLED_BACK; ``BEAT_NS``: when Python was last alive; ``FIXED_NS``: the time in virtual time, else
 REAL_TIME; ``READS_LEFT``: reads until the thread comes back by itself, negative for no limit. ``BLOCK_...``: what
-``decode`` returned; ``DONE_ROW`` and ``DONE_STAGE``: the first row and stage of it that are not done. ``SILENT_OF_NS``: the
-``LAST_DUE_NS`` for which ``SILENT_AT_NS`` holds: one wait has one limit, however often it is gone on with. ``LATE_NS`` and
-``SCANS_LATE_NS``: when a command or scans were late for the first time, 0 for never; ``NOTES``: warnings so far.
+``decode`` returned; ``DONE_ROW`` and ``DONE_STAGE``: the first row and stage of it that are not done. ``SILENT_OF_NS``:
+the ``LAST_DUE_NS`` for which ``SILENT_AT_NS`` holds: a wait has one limit, however often it is gone on with.
+``LATE_NS`` and ``SCANS_LATE_NS``: when a command or scans were late for the first time, 0 for never; ``NOTES``:
+warnings so far. ``SPIN_NS``: how long before and after a scan is expected the thread waits awake; ``ARRIVAL_NS``:
+running median of the time from a scan's instant to its arrival; ``SPUN_NS``: time that was waited awake.
 """
 
 GO, CALLED_BACK = 1, 0

@@ -19,6 +19,7 @@ from drivers.piezo.gcs import UNSENT
 from firmware_py.chain import COMMANDED, step_kernel
 from firmware_py.compiled.memory import (
     ACTUATE,
+    ARRIVAL_NS,
     BEAT_LIMIT_NS,
     BEAT_NS,
     BLOCK_LOST,
@@ -72,6 +73,8 @@ from firmware_py.compiled.memory import (
     SILENT_OF_NS,
     SLIPS,
     SPENT,
+    SPIN_NS,
+    SPUN_NS,
     STALE_NS,
     STALLED_NS,
     STARTED_NS,
@@ -113,6 +116,8 @@ silent_at = kernel(silent_at_ns)
 ring_put, ring_announce = kernel(put_row), kernel(announce_row)
 live_put, live_announce = kernel(put_over), kernel(announce)
 
+ARRIVAL_STEP_NS = 2000
+"""Change of the running median with each arrival: from 0 to 200 us in a tenth of a second at 1 kHz."""
 RAMP_LIMIT = 64
 """Largest number of steps of the thread's own ramp, ten times as many as it needs: a port that is stuck ends it."""
 
@@ -326,6 +331,30 @@ def ramp_alone(m: Memory) -> None:
             words[FIXED_NS] += 1_000_000
 
 
+@kernel
+def note_arrival(words: Words, now_ns: int) -> None:
+    """Follow the median of the time from the newest scan of a block to its arrival."""
+    late_ns = now_ns - (words[BLOCK_T0_NS] + (words[BLOCK_N] - 1) * words[DT_NS])
+    words[ARRIVAL_NS] += ARRIVAL_STEP_NS if late_ns > words[ARRIVAL_NS] else -ARRIVAL_STEP_NS
+
+
+@kernel
+def wait_awake(words: Words, polls: Words) -> int:
+    """Sleep until ``SPIN_NS`` before the next scan is expected, and wait awake until ``SPIN_NS`` after that. Return
+    what ``wait_fds`` does."""
+    expected_ns = words[LAST_DUE_NS] + max(1, words[BLOCK_N]) * words[DT_NS] + words[ARRIVAL_NS]
+    ready = wait_fds(polls, min(expected_ns - words[SPIN_NS], words[SILENT_AT_NS]))
+    if ready != 0:
+        return ready
+    began_ns = now = now_ns()
+    end_ns = min(expected_ns + words[SPIN_NS], words[SILENT_AT_NS])
+    while ready == 0 and now < end_ns:
+        ready = wait_fds(polls, 0)
+        now = now_ns()
+    words[SPUN_NS] += now - began_ns
+    return ready
+
+
 @thread_kernel
 def serve(m: Memory) -> int:
     """Run until Python is needed. Return why."""
@@ -347,7 +376,11 @@ def serve(m: Memory) -> int:
             words[SILENT_AT_NS] = silent_at(words[LAST_DUE_NS], words[STALE_NS], now)
             words[SILENT_OF_NS] = words[LAST_DUE_NS]
         polls[0], polls[1] = poll_word(words[DAQ_FD], POLLIN), poll_word(words[WAKE_FD], POLLIN)
-        ready = wait_fds(polls, words[SILENT_AT_NS] if words[FIXED_NS] == REAL_TIME else 0)
+        ready = 0
+        if words[SPIN_NS] > 0 and words[FIXED_NS] == REAL_TIME:
+            ready = wait_awake(words, polls)
+        if ready == 0:
+            ready = wait_fds(polls, words[SILENT_AT_NS] if words[FIXED_NS] == REAL_TIME else 0)
         now = clock_ns(words)
         if ready < 0:
             return READ_FAILED
@@ -375,6 +408,7 @@ def serve(m: Memory) -> int:
         got, t0_ns, seq0, lost, shifted = decode(stream, m.buffer, m.rows)
         words[BLOCK_N], words[BLOCK_T0_NS], words[BLOCK_SEQ] = got, t0_ns, seq0
         words[BLOCK_LOST], words[BLOCK_SHIFTED] = lost, shifted
+        note_arrival(words, clock_ns(words))
         result = take_block(m)
         if result != GO:
             return result

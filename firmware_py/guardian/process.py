@@ -54,7 +54,8 @@ class GuardianProcess:
     def __init__(self, order: dict[str, Any], runtime_dir: Path, *, may_end_us: bool = False) -> None:
         self.heart = Heart.shared()
         self.heart.mark.hold()
-        self._order = order
+        # the loop may be pinned to a processor when a guardian is replaced, which is not to be its guardian's
+        self._order = {**order, "processors": sorted(os.sched_getaffinity(0))}
         self._report = runtime_dir / REPORT
         self._may_end_us = may_end_us
         self._is_ready = False
@@ -162,6 +163,8 @@ def main(arguments: list[str]) -> int:
     order = json.loads(arguments[0])
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends with the firmware, not with its terminal
+    with suppress(OSError):
+        os.sched_setaffinity(0, order["processors"])
     clock = MonotonicClock()
     try:
         bus = open_i2c(order["uri"], speed_hz=order["speed_hz"], exclusive=False)

@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
+from firmware_py.machine.tree import MACHINE, Tree, hold_latency_limit
+
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4  # sys/mman.h, Linux
 _PR_SET_TIMERSLACK, _PR_GET_TIMERSLACK = 29, 30  # linux/prctl.h
 
@@ -22,7 +24,8 @@ class RealtimeConfig:
     """Sets which real-time settings to ask for. ``None`` or False leaves a setting alone.
 
     ``priority`` is SCHED_FIFO's 1..99 (the policy is not inherited by child processes), ``cpu`` the
-    processor to stay on. Child processes started while pinned inherit the pinning: start them before.
+    processor to stay on. Child processes and threads started while pinned inherit the pinning: start them before.
+    ``idle_exit_us``: the longest time that a processor may take to wake up (/dev/cpu_dma_latency), 0: no idle states.
     """
 
     priority: int | None = 50
@@ -30,6 +33,7 @@ class RealtimeConfig:
     cpu: int | None = None
     timer_slack_ns: int | None = 1
     freeze_gc: bool = True
+    idle_exit_us: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,9 +60,9 @@ class RealtimeReport:
 
 
 @contextmanager
-def realtime(config: RealtimeConfig) -> Iterator[RealtimeReport]:
+def realtime(config: RealtimeConfig, tree: Tree = MACHINE) -> Iterator[RealtimeReport]:
     """Apply ``config`` to the calling thread's process for the length of the ``with`` block. Never raises
-    because something is not permitted or not there; undoes in reverse order what it did."""
+    because something is not permitted or not there; undoes in reverse order what it did. ``tree``: of /dev."""
     report = RealtimeReport()
     with ExitStack() as undo:
 
@@ -70,7 +74,10 @@ def realtime(config: RealtimeConfig) -> Iterator[RealtimeReport]:
             else:
                 report.settings.append(Setting(name, wanted, True))
 
-        cpu, priority, slack_ns = config.cpu, config.priority, config.timer_slack_ns
+        cpu, priority, slack_ns, idle_us = config.cpu, config.priority, config.timer_slack_ns, config.idle_exit_us
+        if idle_us is not None:
+            wanted = "idle states off" if idle_us == 0 else f"idle states of {idle_us} us"
+            attempt("idle_states", wanted, lambda: hold_latency_limit(tree, idle_us))
         if cpu is not None:
             attempt("cpu", f"cpu {cpu}", lambda: _pin(cpu))
         if slack_ns is not None:

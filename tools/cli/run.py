@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
@@ -19,10 +20,11 @@ from rich.live import Live
 from rich.spinner import Spinner
 from rich.text import Text
 
-from firmware_py.compiled.eligible import check_compiled
+from firmware_py.compiled.eligible import check_compiled, check_spin
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
+from firmware_py.machine.processors import format_processors
 from firmware_py.run_request import RunRequest
 from hal.bench import check_pace, load_bench
 from hal.children import child_command, child_environment
@@ -53,6 +55,12 @@ def run(
     compiled: Annotated[
         bool, typer.Option("--compiled", help="The ticks run in one compiled thread, with Python beside it.")
     ] = False,
+    spin_us: Annotated[
+        float, typer.Option(min=0.0, help="With --compiled: wait awake so long before and after a scan is due, us.")
+    ] = 0.0,
+    cpu: Annotated[
+        int | None, typer.Option(min=0, help="In real time: the processor that the loop stays on (isolcpus).")
+    ] = None,
     hand: Annotated[
         str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
     ] = None,
@@ -108,9 +116,15 @@ def run(
             check_compiled(file, pace, injected=bool(inject))
             if sense_only:
                 raise InputError("--compiled runs while outputs move, and --sense-only moves none; give one of them")
+        _check_processor(pace, cpu)
+        if spin_us and not compiled:
+            raise InputError("--spin-us belongs to --compiled; give both or neither")
+        check_spin(file, spin_us)
         request = RunRequest(
             bench=bench_path(bench),
             compiled=compiled,
+            spin_us=spin_us,
+            cpu=cpu,
             seconds=seconds,
             pace=pace,
             hand_file=hand,
@@ -144,6 +158,16 @@ def run(
         steps = next_steps(result)
         write_report(result, truth, console(), json_file=json_file, html=html, image=image, more=steps)
         raise typer.Exit(exit_status(result))
+
+
+def _check_processor(pace: str, cpu: int | None) -> None:
+    if cpu is None:
+        return
+    if pace != "realtime":
+        raise InputError("--cpu belongs to real time; add --realtime, or leave it out")
+    there = sorted(os.sched_getaffinity(0))
+    if cpu not in there:
+        raise InputError(f"--cpu {cpu}: this process may use processors {format_processors(there)}; name one of them")
 
 
 def exit_status(result: Mapping[str, Any]) -> Exit:

@@ -8,6 +8,7 @@ import os
 import platform
 import resource
 import socket
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -15,6 +16,8 @@ from typing import Literal
 from drivers.bus_use import bus_shares, bus_uses
 from drivers.polling import polling_of
 from drivers.specs import check_devices
+from firmware_py.machine.settings import MachineState, read_machine
+from firmware_py.machine.tree import Tree
 from hal.bench import SIM_SCHEME, BenchFile
 
 Verdict = Literal["ok", "missing", "limited"]
@@ -28,6 +31,22 @@ class Finding:
     verdict: Verdict
     detail: str
     remedy: str = ""
+
+
+def setting_findings(tree: Tree, ports: Sequence[str] = ()) -> list[Finding]:
+    """Return one finding for each setting of the machine that decides how late a loop wakes up. ``ports``: those of
+    ``read_machine``."""
+    return [_setting_finding(state) for state in read_machine(tree, ports)]
+
+
+def _setting_finding(state: MachineState) -> Finding:
+    setting = state.setting
+    if state.is_good:
+        return Finding(setting.name, "ok", state.describe())
+    how = setting.remedy + ("; until then `micron doctor --set`" if setting.set is not None else "")
+    return Finding(
+        setting.name, "limited", f"{state.describe()}; wanted: {setting.wanted}", f"{setting.explain}: {how}"
+    )
 
 
 def machine_findings() -> list[Finding]:

@@ -112,7 +112,7 @@ def host_line(result: Mapping[str, Any]) -> str:
     """How the host kept up; a pause of the host is no fault in emulated time."""
     host = result.get("host", {})
     if host.get("pace") != "paced":
-        line = f"scheduling: {result['realtime']}"
+        line = f"scheduling: {result['realtime']}" + machine_lines(result)
         if host.get("stalls"):
             line += (
                 f"\nthis host stood still {host['stalls']} times, longest {host['longest_stall_ms']:.1f} ms: not fit "
@@ -126,6 +126,18 @@ def host_line(result: Mapping[str, Any]) -> str:
     if host["stalls"]:
         line += f"\n{host['stalls']} pauses of the host, longest {host['longest_stall_ms']:.0f} ms, were waited out"
     return line
+
+
+def machine_lines(result: Mapping[str, Any]) -> str:
+    """Return lines on what the loop used of its processor, and on settings of the machine that are not as wanted."""
+    lines: list[str] = []
+    if (cpu := result["host"].get("cpu_share")) is not None:
+        lines.append(f"processor: the firmware used {100 * cpu:.0f} % of one")
+        if "spin_share" in (loop := result.get("loop", {})):
+            lines[-1] += f"; {100 * loop['spin_share']:.0f} % was spinning for scans"
+    if slow := [setting["name"] for setting in result.get("machine", ()) if not setting["good"]]:
+        lines.append(f"machine: not as wanted: {', '.join(slow)}; see micron doctor")
+    return "".join(f"\n{line}" for line in lines)
 
 
 def summary_lines(result: Mapping[str, Any]) -> list[str]:

@@ -48,3 +48,24 @@ def test_asked_for_it_is_bad_input(tmp_path: Path):
     result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", "--compiled", "--record", str(record)])
     assert result.exit_code == 2
     assert not record.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "what"),
+    [
+        (["--spin-us", "50"], "--spin-us belongs to --compiled"),
+        (["--compiled", "--spin-us", "300"], "outside 0 .. 250 us"),
+        (["--cpu", "4095"], "name one of them"),
+    ],
+)
+def test_a_spin_or_a_processor_that_cannot_be_is_bad_input(words: list[str], what: str):
+    bench = str(BENCHES / "micron-e727.toml")
+    result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", *words])
+    assert result.exit_code == 2
+    assert what in " ".join(result.output.split())
+
+
+def test_a_processor_is_of_real_time():
+    result = CliRunner().invoke(app, ["run", "--virtual", "--cpu", "0"])
+    assert result.exit_code == 2
+    assert "--realtime" in result.output

@@ -46,6 +46,15 @@ def test_what_was_noticed_and_caught_up_is_told(sensed: dict[str, Any]):
     assert any("41 caught up without a command" in line for line in lines)
 
 
+def test_what_the_machine_and_the_processor_cost_is_told(sensed: dict[str, Any]):
+    host = {"pace": "realtime", "stalls": 0, "longest_stall_ms": 0.0, "cpu_share": 0.314}
+    machine = [{"name": "governor", "good": False}, {"name": "interrupts", "good": True}]
+    told = {**sensed, "host": host, "machine": machine, "loop": {"kind": "compiled", "spin_share": 0.2}}
+    lines = "\n".join(summary_lines(told)).splitlines()
+    assert "processor: the firmware used 31 % of one; 20 % was spinning for scans" in lines
+    assert "machine: not as wanted: governor; see micron doctor" in lines
+
+
 def test_no_figure_of_a_task_is_cut_on_eighty_columns():
     large = {"p50": 1234.4, "p99": 12345.4, "p99_9": 23456.4, "max": 34567.4}
     task = {
