@@ -21,6 +21,8 @@ class View:
     ``init`` samples at each start (of the recording, or of every range where the twin restarts) may set the state
     and are not scored; ``lead`` samples before a range may help to set it (a guard gap that nobody scores).
     ``fit``: ranges whose samples set the start states of a linear run, all of them (none: the first samples do).
+    ``afresh``: all samples of every range set its start state; the first ``init`` are still not scored: effects with a
+    memory need them.
     ``memo`` remembers columns that do not change between calls; do not share it between processes.
     """
 
@@ -29,6 +31,7 @@ class View:
     init: int = 0
     lead: int = 0
     fit: tuple[tuple[int, int], ...] = ()
+    afresh: bool = False
     memo: dict[object, object] = field(default_factory=dict[object, object], compare=False, repr=False)
 
     def __getstate__(self) -> dict[str, object]:
@@ -72,9 +75,11 @@ class View:
         return np.concatenate(out)
 
     def setting(self, twin: Twin) -> NDArray[np.int64] | None:
-        """Samples that set the start states of a linear run: those of the fit and, where a twin starts every range
-        afresh, the first ``init`` of the others. None: the first samples after each start.
+        """Samples that set the start states: all (``afresh``), or of a linear run those of the fit and, where a twin
+        starts every range afresh, the first ``init`` of the others. None: the first samples after each start.
         """
+        if self.afresh:
+            return self.index
         if not self.fit:
             return None
         spans = list(self.fit)

@@ -425,3 +425,32 @@ def test_a_parameter_may_follow_a_recorded_signal(tmp_path: Path) -> None:
     plain, by_effect, written = found
     assert np.allclose(by_effect, written, rtol=0, atol=1e-12)
     assert np.std(plain - written) > 0.01
+
+
+def noisy_motor(folder: Path) -> tuple[Recording, np.ndarray]:
+    """A recording of the motor with sensor noise of 10 mrad, and the angle without it (600,)."""
+    u = command()
+    plain = recorded(folder / "plain", MOTOR, u, 2.0 * u)
+    twin = make(plain)
+    true = Model(twin).simulate(View.whole(plain), twin.start(plain))["angle"]
+    noise = 0.01 * np.random.default_rng(7).standard_normal(u.size)
+    return recorded(folder / "noisy", MOTOR, u, true + noise), true
+
+
+def test_a_stretch_that_starts_afresh_is_met_by_all_its_samples_and_by_no_other(tmp_path: Path) -> None:
+    recording, true = noisy_motor(tmp_path)
+    twin = make(recording)
+    theta, ranges = twin.start(recording), ((0, 200), (220, 600))
+    inside = np.r_[40:200, 260:600]
+
+    def left(recording: Recording, afresh: bool) -> float:
+        view = View(recording, ranges, 40, afresh=afresh)
+        whole = Model(twin).whole(view, theta)["angle"]
+        return float(np.sqrt(np.mean((whole - true)[inside] ** 2)))
+
+    # two numbers from 200 and 380 samples of 10 mrad: 0.01 * sqrt(4 / 580) = 0.8 mrad; speed and angle from 40 more
+    assert left(recording, True) < 1.3e-3 < left(recording, False)
+    gap = recording.outputs["angle"].copy()
+    gap[200:220] += 5.0
+    beside = replace(recording, outputs={"angle": gap})
+    assert left(beside, True) == pytest.approx(left(recording, True), rel=1e-6)

@@ -43,7 +43,7 @@ from tools.mismatch.twins.corrected import CorrectedTwin
 from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make
-from tools.mismatch.twins.ode import OdeTwin
+from tools.mismatch.twins.ode import OdeTwin, inside_of
 
 Progress = Callable[[str, int, int], None]
 
@@ -288,7 +288,7 @@ def conclude(
         # the exported twin runs through: what adds up over a whole run is fitted in one
         through = restarting(twin, False) if problem.split.own else twin
         whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
-        course = Problem(posed.recording, through, whole, problem.init, problem.seed, problem.floors)
+        course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
         official = None if problem.split.own else course
         base = over_the_whole(problem, course, base)
         selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
@@ -358,7 +358,9 @@ def prepared(recording: Recording, held_out: float, seed: int, was_joined: bool)
     else:
         # of a short record something must be left to score
         init = min(init, min(b - a for a, b in split.held_out) // 3)
-    problem = Problem(recording, twin, split, init, seed)
+    # the first samples show a start state with their noise, and inside a play not at all; of an axis they have to
+    afresh = own and drifts and inside_of(twin) is not None
+    problem = Problem(recording, twin, split, init, seed, afresh=afresh)
     settle = dynamic and not drifts
     # the engineer's start state is that of one run
     raw = as_given(replace(problem, settle=settle and (twin.restart or "x0" not in recording.twin.parameters)))

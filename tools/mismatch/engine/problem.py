@@ -35,7 +35,8 @@ class Problem:
     """What every step of a diagnosis shares. ``view`` covers fit and held-out samples, ``fit_view`` the fit alone:
     only the latter is shown to whatever chooses settings, starting points or parameters. ``settle``: the start state of
     a linear run is fitted to all samples of the fit, like any parameter; otherwise it is the engineer's, or the first
-    samples set it. ``hints``: from a part of the recording, to begin from beside what the whole suggests.
+    samples set it. ``afresh``: the start states of every stretch, held-out ones too, are fitted to all its samples.
+    ``hints``: from a part of the recording, to begin from beside what the whole suggests.
     """
 
     recording: Recording
@@ -45,6 +46,7 @@ class Problem:
     seed: int
     floors: Mapping[str, NoiseFloor] = field(default_factory=dict[str, NoiseFloor])
     settle: bool = False
+    afresh: bool = False
     hints: tuple[Hint, ...] = ()
 
     def __getstate__(self) -> dict[str, object]:
@@ -57,11 +59,12 @@ class Problem:
     @cached_property
     def view(self) -> View:
         ranges = tuple(sorted((*self.split.fit, *_with_init(self.split.held_out, self.init, self.twin, self.split))))
-        return View(self.recording, ranges, self.init, fit=self.split.fit if self.settle else ())
+        return View(self.recording, ranges, self.init, fit=self.split.fit if self.settle else (), afresh=self.afresh)
 
     @cached_property
     def fit_view(self) -> View:
-        return View(self.recording, self.split.fit, self.init, fit=self.split.fit if self.settle else ())
+        fit = self.split.fit
+        return View(self.recording, fit, self.init, fit=fit if self.settle else (), afresh=self.afresh)
 
     @cached_property
     def index(self) -> NDArray[np.int64]:

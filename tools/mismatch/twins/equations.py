@@ -17,7 +17,6 @@ from tools.mismatch.twins.feedback import Rows
 from tools.mismatch.twins.ode_run import SWAY, rates_of, run_equations, run_readings
 
 LEAST_SHOWN = 3e-4  # of the best determined combination of start states: what shows less keeps its guess
-ROUNDS = 3  # Gauss-Newton steps to a start state
 
 
 @dataclass(frozen=True)
@@ -173,11 +172,12 @@ def meet_start(
     rows: NDArray[np.int64],
     typical: Array,
     limits: tuple[Array, Array],
+    rounds: int = 3,
 ) -> Array:
     """Start states (starts, s) that leave least of ``misses`` (rows, q), from ``x0`` on.
 
-    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. Gauss-Newton; what the window
-    does not show stays at the guess.
+    ``rows``: the stretch of each row, in order. ``typical`` (s,): size of each state. ``rounds`` of Gauss-Newton; what
+    the samples do not show stays at the guess.
     """
     s, step = x0.shape[1], 1e-4
     first = np.searchsorted(rows, np.arange(x0.shape[0]))
@@ -186,7 +186,7 @@ def meet_start(
         return np.add.reduceat(e, first, axis=0)
 
     best = misses(x0)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         slopes = np.stack([(best - misses(x0 + step * typical * np.eye(s)[i])) / step for i in range(s)], axis=-1)
         gram = together(np.einsum("rqi,rqj->rij", slopes, slopes))
         cross = together(np.einsum("rqi,rq->ri", slopes, best))

@@ -241,7 +241,7 @@ class OdeTwin(Head):
         return int(np.clip(sub, 1, MOST_SUBSTEPS))
 
     def _simulated(self, run: Run, signals: Mapping[str, Array], theta: Array, forces: Sequence[Force]) -> Array:
-        """States (n, s) in free run from start states that the first measured samples of each stretch set."""
+        """States (n, s) in free run from start states that the measured samples of each stretch set."""
         values = self.values(theta)
         inside = self.packed(forces)
         sub = self.substeps(run.dt, inside)
@@ -293,7 +293,26 @@ class OdeTwin(Head):
 
         x0 = remember(run.memo, ("about", run.starts), plain)
         x0 = np.where(np.isfinite(x0), x0, given)
-        return go(meet_start(x0, misses, rows, self.typical, limits), starts, ends, u, run.t)
+        x0 = meet_start(x0, misses, rows, self.typical, limits)
+        if run.setting is None or not self.integrates:
+            return go(x0, starts, ends, u, run.t)
+        # then all samples that may: first ones show it with their noise, and an effect behind may hide it in them
+        seen = run.setting
+        of = np.searchsorted(starts, seen, side="right") - 1
+        used, rows = np.unique(of, return_inverse=True)
+        y = np.column_stack([run.measured[o][seen] for o in self.outputs])
+
+        def with_some(some: Array) -> Array:
+            every = x0.copy()
+            every[used] = some
+            return every
+
+        def misses_all(some: Array) -> Array:
+            x = go(with_some(some), starts, ends, u, run.t)
+            return (y - self.equations.readings(x[seen], u[seen], run.t[seen], values)) * weight
+
+        found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
+        return go(with_some(found), starts, ends, u, run.t)
 
     # -- linearised -----------------------------------------------------------------------------------
 
@@ -312,7 +331,8 @@ class OdeTwin(Head):
         d = discretise(lin.a, b, run.dt, "zero" if self.held else "linear")
         c = dict(zip(self.outputs, lin.c, strict=True))
         window = max(run.window, min(LEAST_WINDOW, run.t.size))
-        ss = start_state(d.ad, c, run.measured, run.starts, run.t.size, window, run.memo)
+        setting = run.setting if self.integrates else None
+        ss = start_state(d.ad, c, run.measured, run.starts, run.t.size, window, run.memo, setting=setting)
         at = np.array(run.starts, np.int64)
 
         def carry(change: Array) -> Array:
