@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,6 +122,25 @@ class DurationHistogram:
     def add(self, value_ns: int, tick: int) -> None:
         """Count one value, seen at ``tick``."""
         add_duration(self.words, value_ns, tick)
+
+    def add_all(self, values_ns: Iterable[int]) -> None:
+        """Count values, seen at the ticks from ``n`` on."""
+        for k, value_ns in enumerate(values_ns, self.n):
+            add_duration(self.words, value_ns, k)
+
+    def add_histogram(self, other: DurationHistogram) -> None:
+        """Count what ``other`` has counted; its ticks come after those of this one."""
+        ours, theirs, before = self.words, other.words, self.n
+        if theirs[_MAX] > ours[_MAX]:
+            ours[_MAX], ours[_MAX_TICK] = theirs[_MAX], before + theirs[_MAX_TICK]
+        ours[_MIN] = min(ours[_MIN], theirs[_MIN])
+        ours[_TOTAL] += theirs[_TOTAL]
+        for i in range(_FIRST, self.STATE_WORDS):
+            ours[i] += theirs[i]
+
+    def count_beyond(self, limit_ns: int) -> int:
+        """Return the number of values above ``limit_ns``. Those in the limit's own bucket, 6 % wide, are left out."""
+        return int(self.counts()[bucket_of(limit_ns) + 1 :].sum())
 
     def counts(self) -> np.ndarray:
         """Return a copy of the bucket counts, int64."""

@@ -14,12 +14,16 @@ from rich.text import Text
 
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, VirtualOption, bench_path, pace_of
-from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_writable, write_json
 
 YesOption = Annotated[bool, typer.Option("-y", "--yes", help="Do not ask.")]
+
+
+TURN_S = 60.0
+"""Length of one turn of a loop, with --hours."""
 
 
 class ProbeChoice(StrEnum):
@@ -134,48 +138,66 @@ def scope(
 def latency(
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="Length of each measurement.")] = 5.0,
-    policy: Annotated[PolicyChoice, typer.Option(help="Scheduling policy to measure.")] = PolicyChoice.BOTH,
+    hours: Annotated[
+        float | None,
+        typer.Option(min=0.001, max=168.0, help="Instead of --seconds: all loops take turns for so long."),
+    ] = None,
+    policy: Annotated[
+        PolicyChoice | None, typer.Option(help="Scheduling policy to measure; default both, fifo with --hours.")
+    ] = None,
     firmware: Annotated[bool, typer.Option(help="Measure the firmware too, on the bench.")] = True,
     json_file: JsonOption = None,
 ) -> None:
-    """How late a 1 kHz loop is on this machine: bare, with a pty, as the firmware; with and without real time.
+    """How late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.
 
-    Example: micron latency --seconds 30 --policy both
+    With --hours the loops take turns of a minute, so that all have the same neighbours. The figures are those of
+    cyclictest. Without a C compiler the loop in C is left out.
+
+    Example: micron latency --hours 1
     """
-    from tools.diagnose.latency import Lateness, Policy, bare_loop, firmware_loop, octaves
+    from firmware_py.machine.settings import read_machine
+    from firmware_py.machine.tree import MACHINE
+    from tools.diagnose.c_reference import CReference, compile_reference
+    from tools.diagnose.latency import Lateness, Policy, loops_of, take_turns
+    from tools.diagnose.latency_tables import figures_table, histogram_table
 
     with clear_errors():
         check_writable(json_file)
         path = bench_path(bench)
         load_bench(path)
+        chosen = policy or (PolicyChoice.BOTH if hours is None else PolicyChoice.FIFO)
         every: tuple[Policy, ...] = ("other", "fifo")
-        policies: list[Policy] = [p for p in every if policy is PolicyChoice.BOTH or p == policy.value]
+        policies: list[Policy] = [p for p in every if chosen is PolicyChoice.BOTH or p == chosen.value]
+        reference = compile_reference()
+        if isinstance(reference, str):
+            print_note(f"no loop in C to compare with: {reference}")
+        loops = [
+            loop
+            for p in policies
+            for loop in loops_of(
+                p, reference if isinstance(reference, CReference) else None, path if firmware else None
+            )
+        ]
+        turn_s = seconds if hours is None else min(TURN_S, 3600.0 * hours / len(loops))
+        rounds = 1 if hours is None else max(1, round(3600.0 * hours / (turn_s * len(loops))))
         found: list[Lateness] = []
-        with keep_what_is_there():
-            for chosen in policies:
-                with console().status(f"bare loop, policy {chosen}, {seconds:g} s"):
-                    found.append(bare_loop(seconds, chosen))
-                with console().status(f"loop and pty, policy {chosen}, {seconds:g} s"):
-                    found.append(bare_loop(seconds, chosen, with_pty=True))
-                if firmware:
-                    with console().status(f"firmware, policy {chosen}, {seconds:g} s"):
-                        found.append(firmware_loop(path, seconds, chosen))
+        with keep_what_is_there(), console().status("") as status:
+            for what in take_turns(loops, rounds, turn_s, found):
+                status.update(what)
         need_some(found)
+        machine = read_machine(MACHINE)
         out = data_console()
-        table = Table(title="Lateness of a 1 ms tick, us", title_justify="left")
-        for heading in ("loop", "policy", "ticks", "p50", "p99", "p99.9", "worst", "scheduling granted"):
-            table.add_column(heading, justify="left" if heading in ("loop", "policy") else "right")
-        for one in found:
-            d = one.histogram.distribution()
-            numbers = (d.p50_us, d.p99_us, d.p99_9_us, d.max_us)
-            table.add_row(one.what, one.policy, str(d.n), *(f"{v:.0f}" for v in numbers), one.scheduling)
-        out.print(table)
-        for one in found:
-            out.print(f"{one.what}, {one.policy}:")
-            total = max(1, one.histogram.n)
-            for bound_us, n in octaves(one.histogram):
-                out.print(f"  < {bound_us:>9.1f} us {n:>8} {'█' * max(1, round(50 * n / total))}")
-        write_json({"format": 1, "seconds": seconds, "rows": [one.as_dict() for one in found]}, json_file)
+        for p in policies:
+            rows = [one for one in found if one.policy == p]
+            if rows:
+                out.print(figures_table(rows))
+                out.print(histogram_table(rows))
+                out.print(f"scheduling granted: {rows[0].scheduling}\n")
+        if slow := [state.setting.name for state in machine if not state.is_good]:
+            out.print(f"machine: not as wanted: {', '.join(slow)}; see micron doctor")
+        told = {"compiler": reference.compiler} if isinstance(reference, CReference) else {"missing": reference}
+        result = {"format": 1, "seconds": turn_s, "rounds": rounds, "rows": [one.as_dict() for one in found]}
+        write_json({**result, "reference": told, "machine": [state.as_dict() for state in machine]}, json_file)
 
 
 def ramp(

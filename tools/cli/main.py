@@ -76,7 +76,7 @@ COMMANDS = {
     ),
     "latency": (
         "diagnose:latency",
-        "How late a 1 kHz loop is on this machine: bare, with a pty, as the firmware; with and without real time.",
+        "How late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.",
     ),
     "ramp": (
         "diagnose:ramp",

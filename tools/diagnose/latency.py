@@ -1,4 +1,4 @@
-"""Our cyclictest: how late a 1 kHz loop wakes up on this machine, bare, beside a pty, and as the firmware."""
+"""Our cyclictest: how late a 1 kHz loop wakes up on this machine, in C, compiled, in Python, and as the firmware."""
 
 from __future__ import annotations
 
@@ -10,24 +10,33 @@ import subprocess
 import sys
 import tempfile
 import tty
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
 from firmware_py.run_request import LOOP_PRIORITY, RunRequest
 from firmware_py.scheduler.histogram import DurationHistogram, bucket_bounds_ns
-from firmware_py.scheduler.realtime import RealtimeConfig, realtime
+from firmware_py.scheduler.realtime import RealtimeConfig, RealtimeReport, realtime
 from hal.children import child_command, child_environment
 from hal.clock import MonotonicClock
 from hal.errors import HalError
+from tools.diagnose.c_reference import CReference
 
 Policy = Literal["other", "fifo"]
+Wake = Callable[[NDArray[np.int64], int, int], None]
+"""Fills how late it woke up, ns, with a period and a first due time, ns."""
 PERIOD_NS = 1_000_000
+TICKS_AT_ONCE = 1000
+BEYOND_US = (100.0, 1000.0)
+"""Limits beyond which ticks are counted, as ``cyclictest`` counts its overflows."""
 ECHO = """
 import os
 while data := os.read(0, 64):
@@ -53,6 +62,9 @@ class Lateness:
             **d.as_dict(),
             "min": d.min_us,
             "mean": d.mean_us,
+            "beyond_us": {
+                f"{limit_us:g}": self.histogram.count_beyond(round(limit_us * 1e3)) for limit_us in BEYOND_US
+            },
             "buckets_us": octaves(self.histogram),
         }
 
@@ -71,17 +83,90 @@ def octaves(histogram: DurationHistogram) -> list[tuple[float, int]]:
 def settings_of(policy: Policy) -> RealtimeConfig:
     """What the firmware asks for (``fifo``), or nothing at all."""
     if policy == "fifo":
-        return RealtimeConfig(priority=LOOP_PRIORITY)
+        return RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0)
     return RealtimeConfig(priority=None, lock_memory=False, timer_slack_ns=None, freeze_gc=False)
 
 
-def bare_loop(seconds: float, policy: Policy, *, with_pty: bool = False) -> Lateness:
-    """Wake up every millisecond; with ``with_pty`` also exchange 16 bytes with an echo process behind a pty."""
-    clock, histogram = MonotonicClock(), DurationHistogram()
+@dataclass(frozen=True)
+class Loop:
+    """A loop that can be measured. ``measure(seconds, histogram)`` runs it, counts how late it was, and returns what
+    scheduling it was granted."""
+
+    what: str
+    policy: Policy
+    measure: Callable[[float, DurationHistogram], str]
+
+
+def loops_of(policy: Policy, reference: CReference | None, bench: Path | None) -> list[Loop]:
+    """Return the loops that are compared under ``policy``: in C where there is a ``reference``, compiled, in Python,
+    with a pty, and the firmware on ``bench`` where one is given."""
+
+    def woken(wake: Wake) -> Callable[[float, DurationHistogram], str]:
+        return lambda seconds, histogram: wake_loop(wake, seconds, policy, histogram)
+
+    def python(with_pty: bool) -> Callable[[float, DurationHistogram], str]:
+        return lambda seconds, histogram: bare_loop(seconds, policy, histogram, with_pty=with_pty)
+
+    loops = [] if reference is None else [Loop("C reference", policy, woken(reference.wake))]
+    loops += [
+        Loop("compiled loop", policy, woken(_compiled_wake())),
+        Loop("bare loop", policy, python(False)),
+        Loop("loop and pty", policy, python(True)),
+    ]
+    if bench is not None:
+        loops.append(Loop("firmware", policy, partial(firmware_loop, bench, policy)))
+    return loops
+
+
+def _compiled_wake() -> Wake:
+    from tools.diagnose.wake_kernel import wake  # numba
+
+    wake(np.zeros(1, np.int64), PERIOD_NS, 0)  # compiles or loads
+    return wake
+
+
+def take_turns(loops: Sequence[Loop], rounds: int, turn_s: float, found: list[Lateness]) -> Iterator[str]:
+    """Let each of ``loops`` run for ``turn_s``, ``rounds`` times over, so that all have the same neighbours. Yields
+    what is about to run; results are in ``found`` as they come."""
+    for number in range(rounds):
+        for i, loop in enumerate(loops):
+            yield f"{loop.what}, policy {loop.policy}, {turn_s:g} s" + (
+                f", round {number + 1} of {rounds}" if rounds > 1 else ""
+            )
+            histogram, scheduling = DurationHistogram(), "interrupted"
+            try:
+                scheduling = loop.measure(turn_s, histogram)
+            finally:  # what was counted until Ctrl-C counts
+                if number:
+                    found[i].histogram.add_histogram(histogram)
+                elif histogram.n:
+                    found.append(Lateness(loop.what, loop.policy, scheduling, histogram))
+
+
+def wake_loop(wake: Wake, seconds: float, policy: Policy, histogram: DurationHistogram) -> str:
+    """Let ``wake`` wake up every millisecond, a second at a time: Ctrl-C is seen in between. Return the scheduling."""
+    clock, left = MonotonicClock(), max(1, round(seconds * 1e9 / PERIOD_NS))
+    with realtime(settings_of(policy)) as report:
+        while left > 0:
+            late_ns = np.zeros(min(left, TICKS_AT_ONCE), np.int64)
+            wake(late_ns, PERIOD_NS, clock.now_ns() + 5 * PERIOD_NS)
+            histogram.add_all(late_ns.tolist())
+            left -= len(late_ns)
+    return granted_by(report)
+
+
+def granted_by(report: RealtimeReport) -> str:
+    """Return the settings that took effect, in words."""
+    return ", ".join(s.wanted for s in report.settings if s.done) or "SCHED_OTHER, no settings"
+
+
+def bare_loop(seconds: float, policy: Policy, histogram: DurationHistogram, *, with_pty: bool = False) -> str:
+    """Wake up every millisecond; with ``with_pty`` also exchange 16 bytes with an echo process behind a pty. Return the
+    scheduling."""
+    clock = MonotonicClock()
     echo = _PtyEcho() if with_pty else None
     try:
         with realtime(settings_of(policy)) as report:
-            granted = ", ".join(s.wanted for s in report.settings if s.done) or "SCHED_OTHER, no settings"
             due_ns = clock.now_ns() + 5 * PERIOD_NS
             for k in range(round(seconds * 1e9 / PERIOD_NS)):
                 histogram.add(clock.sleep_until_ns(due_ns), k)
@@ -94,7 +179,7 @@ def bare_loop(seconds: float, policy: Policy, *, with_pty: bool = False) -> Late
     finally:
         if echo is not None:
             echo.close()
-    return Lateness("loop and pty" if with_pty else "bare loop", policy, granted, histogram)
+    return granted_by(report)
 
 
 class _PtyEcho:
@@ -119,8 +204,9 @@ class _PtyEcho:
         os.close(self._master)
 
 
-def firmware_loop(bench: Path, seconds: float, policy: Policy) -> Lateness:
-    """Lateness of the firmware's ticks on ``bench``, in a process of its own. ``HalError`` when it cannot run."""
+def firmware_loop(bench: Path, policy: Policy, seconds: float, histogram: DurationHistogram) -> str:
+    """Count how late the firmware's ticks are on ``bench``, in a process of its own. Return the scheduling. Raises
+    ``HalError`` when it cannot run."""
     memory = LiveMemory.create(LAYOUT.size)
     ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     fds = (memory.fd, theirs.fileno())
@@ -140,9 +226,9 @@ def firmware_loop(bench: Path, seconds: float, policy: Policy) -> Lateness:
                 raise HalError((done.stderr.strip().splitlines() or ["the firmware did not run"])[-1])
             outcome = json.loads(outcome_file.read_text(encoding="utf-8"))
         opening = next(line for line in map(json.loads, done.stdout.splitlines()) if "histograms" in line)
-        histogram = memory.histogram(opening["histograms"].index("lateness"))
+        histogram.add_histogram(memory.histogram(opening["histograms"].index("lateness")))
     finally:
         memory.close()
         ours.close()
         theirs.close()
-    return Lateness("firmware", policy, outcome["realtime"], histogram)
+    return str(outcome["realtime"])
