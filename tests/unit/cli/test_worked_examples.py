@@ -30,7 +30,7 @@ ADDED = {
     "faults": "--seeds 1 --jobs 1 --only 'clock steps by 2.5 ms'",
     "hands": "--seconds 8",
     "imu evaluate": "--seconds 5",
-    "latency": "--seconds 0.2 --policy other --no-firmware",
+    "latency": "--hours 0.001 --policy other --no-firmware",
     "mismatch calibrate": "--samples 500 --minutes 0.001",
     "mismatch prove": "--cases 1 --jobs 1",
     "ramp": "--virtual",
