@@ -5,10 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import minimize_scalar
 from scipy.stats import norm
 
+from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
-from sim_devices.physics.statistics import runs
+from sim_devices.physics.statistics import robust_rms, runs
 
 KNOTS = 48
 MOST_VALUES = 60_000_000  # columns times samples: half a gigabyte
@@ -123,6 +126,55 @@ def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
     return Signature(float(norm.sf(z)) if walk > 0 else 1.0, share, f"walk {walk:.3g} per sqrt(s)")
 
 
+@kernel
+def local_level(residual, gap_s, believed, ratio):
+    """One-step prediction errors and their deviations (both (n,)) of a walk under white noise of unit rms, whose
+    variance grows by ``ratio`` a second. A. C. Harvey, Forecasting, Structural Time Series Models (1989), eq. 4.1.2.
+    The first sample that is believed sets the level, and its own error is zero."""
+    n = residual.size
+    error = np.zeros(n)
+    deviation = np.ones(n)
+    level = 0.0
+    spread = -1.0
+    for i in range(n):
+        if spread < 0.0:
+            if believed[i]:
+                level = residual[i]
+                spread = 1.0
+            continue
+        spread += ratio * gap_s[i]
+        variance = spread + 1.0
+        error[i] = residual[i] - level
+        deviation[i] = np.sqrt(variance)
+        if believed[i]:
+            gain = spread / variance
+            level += gain * error[i]
+            spread = gain
+    return error, deviation
+
+
+RATIOS = (-6.0, 6.0)
+"""Decades that the growth of a walk's variance within one sample, over that of the white noise, is searched in."""
+
+
+def predict_walk(
+    residual: Array, gap_s: Array, believed: NDArray[np.bool_], learned: NDArray[np.bool_]
+) -> tuple[Array, Array]:
+    """``Effect.predict`` of a walk: the ratio of walk to noise is the likeliest on ``learned`` samples, with a scale
+    that outliers do not move."""
+    step = float(np.median(gap_s[1:])) if gap_s.size > 1 else 1.0
+
+    def badness(decades: float) -> float:
+        error, deviation = local_level(residual, gap_s, believed, 10.0**decades / step)
+        e, d = error[learned], deviation[learned]
+        return float(np.log(max(robust_rms(e / d), 1e-300)) + np.mean(np.log(d)))
+
+    tried = np.linspace(*RATIOS, 25)
+    best = tried[int(np.argmin([badness(v) for v in tried]))]
+    found = minimize_scalar(badness, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 0.01})
+    return local_level(residual, gap_s, believed, 10.0 ** float(found.x) / step)
+
+
 def _walk_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     return (
         Human("walk_per_sqrt_s", float(settings["walk"][0]), "{out}/s^0.5"),
@@ -147,4 +199,5 @@ RANDOM_WALK = Effect(
     driven=False,
     sites=("output",),
     stochastic=True,
+    predict=predict_walk,
 )

@@ -169,6 +169,9 @@ Basis = Callable[[Array, Context, Array, Settings], Array]
 Guess = Callable[[Array, Array, Context, Settings], Sequence[Sequence[float]]]
 Test = Callable[[Array, Array, Context], Signature]
 Report = Callable[[Array, Settings, float], Sequence[Human]]
+Predict = Callable[[Array, Array, NDArray[np.bool_], NDArray[np.bool_]], tuple[Array, Array]]
+"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), samples to learn from (n,)) -> errors
+of the prediction of each sample from those before it (n,), and their standard deviations up to a factor (n,)."""
 
 
 def no_settings(x: Array, residual: Array, ctx: Context) -> Settings:
@@ -234,6 +237,9 @@ class Effect:
     """Feedback only: (q, weights, settings) -> packed rows of ``forces.py`` (friction, spring, cogging, ...)."""
     stochastic: bool = False
     """Its course on unseen data cannot be predicted from parameters alone (random walk, spikes)."""
+    predict: Predict | None = None
+    """Its law, where it is noise: what the samples so far say of the next one. It is weighed by this, and not by the
+    course that was read off the data."""
     limits: Mapping[str, tuple[float, float]] = field(default_factory=dict[str, tuple[float, float]])
     """Human parameters (``report``) outside of which it is other physics in disguise; checked before it is named."""
     forbidden: Mapping[str, tuple[tuple[float, float], ...]] = field(

@@ -14,7 +14,7 @@ from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import log_density
+from tools.mismatch.infer.density import log_density, unpredicted
 from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
@@ -164,19 +164,21 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
         chosen = store.base
     else:
         strange = None
-    left = {o: leftover(p, chosen.fitted, o) for o in p.twin.outputs}
+    said = store.with_events(chosen)
+    rest_of = unpredicted(p, said.fitted)
+    left = {o: leftover(p, rest_of, o) for o in p.twin.outputs}
     if strange is not None:
         left[strange.output] = left[strange.output].led_by(strange)
     else:
         for o in [o for o in left if left[o].real]:
-            found = lead(p, chosen.fitted, o)
+            found = lead(p, rest_of, o)
             if found is not None:
                 left[o] = left[o].led_by(found)
     rest, taken = worst_left(p, store.base.fitted, left)
-    sets = [(s.names, store.score(s)) for s in good]
+    sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], c)
+    sure |= {name: stated(1.0 - p_value, c) for name, p_value in store.eventful[chosen.key][1].items()}
     return Answer(
-        chosen, surenesses(chosen.names, sets, c), rivals_of(store, chosen), strange, left,
-        strange is None and is_whole(rest, taken, c),
+        said, sure, rivals_of(store, chosen), strange, left, strange is None and is_whole(rest, taken, c)
     )  # fmt: skip
 
 

@@ -7,7 +7,8 @@ pays for it on the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,21 +43,69 @@ def student_log_density(r: Array, scale: float) -> Array:
     return _CONSTANT - math.log(scale) - 0.5 * (DEGREES + 1) * np.log1p((r / scale) ** 2 / DEGREES)
 
 
+def undone(problem: Problem, fitted: Fit, output: str, placed: Sequence[int]) -> Array:
+    """The residual (m,) of ``output`` with the fitted courses of the effects ``placed`` put back into it."""
+    model, theta = fitted.model, fitted.theta.copy()
+    for k in placed:
+        _, weights = model.slices(k)
+        theta[weights] = 0.0
+    return problem.measured[output] - model.simulate(problem.view, theta, (output,))[output]
+
+
+def prediction(problem: Problem, fitted: Fit, output: str) -> tuple[Array, Array]:
+    """Errors of the prediction of every sample (m,), and their standard deviations up to a common factor (m,).
+
+    The free run alone predicts, unless an effect of the set is noise with a law of its own: then what the samples
+    before a sample say of it by that law is part of its prediction.
+    """
+    model = fitted.model
+    laws = [k for k, p in enumerate(model.placed) if p.effect.predict is not None and output in p.outputs]
+    r = fitted.residual[output]
+    if not laws:
+        return r, np.ones(r.size)
+    law = model.placed[laws[0]].effect.predict
+    assert law is not None
+    learned = np.zeros(r.size, np.bool_)
+    learned[problem.fit_rows] = True
+    believed = learned.copy()
+    believed[problem.held_rows] = True
+    usual = ~model.excused(problem.view, output)
+    gap_s = np.diff(problem.index, prepend=problem.index[:1]) * problem.recording.dt
+    return law(undone(problem, fitted, output, laws), gap_s, believed & usual, learned & usual)
+
+
+def unpredicted(problem: Problem, fitted: Fit) -> Fit:
+    """``fitted`` with what nothing predicts as its residual: by the law of its noise where it has one, and without the
+    samples that are events of their own."""
+    left: dict[str, Array] = {}
+    for o in problem.twin.outputs:
+        error, deviation = prediction(problem, fitted, o)
+        left[o] = np.where(fitted.model.excused(problem.view, o), 0.0, error / deviation)
+    return replace(fitted, residual=left)
+
+
 def log_density(problem: Problem, fitted: Fit) -> dict[str, Array]:
     """Log density (m,) of every sample of the view, per output.
 
-    What an effect takes as its own event is predicted by nothing but the range of the recording: such a sample pays the
-    density of a uniform distribution over it.
+    A sample that an effect takes as its own event is predicted by nothing but the range of the recording: it pays the
+    density of a uniform distribution over it, and what it takes to say that it is an event; the others pay what it
+    takes to say that they are none (a mixture: R. K. Pearson, Mining Imperfect Data, 2005, section 3.2).
     """
     out: dict[str, Array] = {}
     for o in problem.twin.outputs:
-        r = fitted.residual[o]
+        error, deviation = prediction(problem, fitted, o)
+        e = error / deviation
         excused = fitted.model.excused(problem.view, o)
         usual = problem.fit_rows[~excused[problem.fit_rows]]
         floor = problem.floors[o]
+        # deviations of a law are at least one: the floor bounds its noise alone
         least = max(LEAST * floor.rms, LATTICE * floor.step, 1e-300)
-        d = student_log_density(r, student_scale(r[usual] if usual.size else r, least))
-        out[o] = np.where(excused, -math.log(max(float(np.ptp(problem.measured[o])), 1e-300)), d)
+        d = student_log_density(e, student_scale(e[usual] if usual.size else e, least)) - np.log(deviation)
+        share = float(np.mean(excused))
+        if share > 0.0:
+            event = math.log(share) - math.log(max(float(np.ptp(problem.measured[o])), 1e-300))
+            d = np.where(excused, event, d + math.log(max(1.0 - share, 1e-300)))
+        out[o] = d
     return out
 
 

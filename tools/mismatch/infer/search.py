@@ -47,8 +47,9 @@ class Search:
         self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
         jobs: int = 1, progress: Progress | None = None,
     ) -> None:  # fmt: skip
-        self.problem, self.effects, self.jobs, self.progress = problem, tuple(effects), jobs, progress
-        self.store = Store(problem, base, constants)
+        self.problem, self.jobs, self.progress = problem, jobs, progress
+        self.effects = tuple(e for e in effects if e.claims is None)
+        self.store = Store(problem, base, constants, [e for e in effects if e.claims is not None])
         self.expanded: set[Key] = set()
         self.moves = MOVES
         self.stride = max(1, problem.fit_rows.size // 12000)
@@ -73,8 +74,7 @@ class Search:
         if len(self.store.ranked()[0].names) > 1:
             self.swap(self.store.ranked()[0])
         for s in self.store.ranked()[:BEAM]:
-            if s.placed:
-                self.store.refined(s)
+            self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
 
     def swap(self, best: Scored) -> None:

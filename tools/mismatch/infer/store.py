@@ -9,11 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
+from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.revise import added, beyond_limits, size
 from tools.mismatch.engine.score import compare
-from tools.mismatch.engine.screen import Candidate
+from tools.mismatch.engine.screen import Candidate, bend, one_step, places
+from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import best_log_density, log_density
 from tools.mismatch.placed import Placed
@@ -72,31 +74,38 @@ class Scored:
 
 
 class Store:
-    """Every set that a search has fitted. ``tests``: how the screen saw an effect at its place, by its part."""
+    """Every set that a search has fitted. ``seen``: how the screen saw an effect at its place, by its part;
+    ``eventful``: sets with the events that were found beside them, by the set's key."""
 
-    def __init__(self, problem: Problem, base: Fit, constants: Constants) -> None:
+    def __init__(self, problem: Problem, base: Fit, constants: Constants, events: Sequence[Effect] = ()) -> None:
         self.problem = problem
+        self.events = tuple(events)
         self.constants = constants
         self.held = int(problem.held_rows.size)
         self.sets: dict[Key, Scored] = {}
         self.seen: dict[Part, Candidate] = {}
+        self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
         self._best = best_log_density(problem)
         self.base = self.put(base)
 
     def put(self, fitted: Fit) -> Scored:
         """The fit scored. Of two fits of one set the better one is kept."""
+        scored = self.scored(fitted)
+        old = self.sets.get(scored.key)
+        if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
+            self.sets[scored.key] = scored
+        return self.sets[scored.key]
+
+    def scored(self, fitted: Fit) -> Scored:
+        """The fit scored."""
         p = self.problem
-        key = key_of(fitted.model.placed)
         every = log_density(p, fitted)
         mean = {o: float(np.mean(d[p.held_rows])) for o, d in every.items()}
         blocks = np.array([[float(np.mean(every[o][a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
         proper = fitted.ok and not any(improper(fitted, e) for e in fitted.model.placed)
-        scored = Scored(key, fitted, mean, blocks, sum(size(e) for e in fitted.model.placed), proper)
-        old = self.sets.get(key)
-        if old is None or (scored.proper, self.score(scored)) > (old.proper, self.score(old)):
-            self.sets[key] = scored
-        return self.sets[key]
+        figures = sum(figures_of(e) for e in fitted.model.placed)
+        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
 
     def score(self, s: Scored) -> float:
         return s.score(self.constants, self.held) if s.proper else -np.inf
@@ -137,6 +146,37 @@ class Store:
         with np.errstate(all="ignore"):
             return self.put(fit(self.problem, s.fitted.model, [s.fitted.theta], iterations=15))
 
+    def with_events(self, s: Scored) -> Scored:
+        """The set with those events (bursts) beside it that their own tests find in what it leaves, clearly on one
+        output of all that were tested and at all on the others; ``eventful`` keeps it with the p-value per name.
+
+        Few samples are no reason to doubt the form of a course, and a tempered score would temper them: events have
+        no price, and a part in the density of whatever set they stand beside.
+        """
+        if s.key not in self.eventful:
+            with np.errstate(all="ignore"):
+                self.eventful[s.key] = self._with_events(s)
+        return self.eventful[s.key][0]
+
+    def _with_events(self, s: Scored) -> tuple[Scored, dict[str, float]]:
+        p = self.problem
+        tried = places(p, self.events, s.placed)
+        if not tried:
+            return s, {}
+        ground = bend(p, s.fitted)
+        found = [one_step(p, s.fitted, place, ground) for place in tried]
+        best: dict[str, float] = {}
+        for c in found:
+            self.seen[part_of(c.placed)] = c
+            best[c.placed.effect.name] = min(best.get(c.placed.effect.name, 1.0), c.p_value * len(found))
+        clear = {n: v for n, v in best.items() if _z_of_p(v) > self.constants.least_z}
+        more = [c.placed for c in found if c.placed.effect.name in clear and c.p_value < LEAST_P]
+        if not more:
+            return s, {}
+        model = Model(p.twin, (*s.placed, *more))
+        theta = model.carry(s.fitted.model, s.fitted.theta, p.recording)
+        return self.scored(fit(p, model, [theta], iterations=15)), clear
+
     def z_of(self, s: Scored, name: str) -> float:
         """Whitened held-out correlation of what ``name`` does with what the set without it leaves.
 
@@ -144,7 +184,7 @@ class Store:
         """
         if (s.key, name) not in self._tests:
             mine = [p for p in s.placed if p.effect.name == name]
-            if all(p.effect.stochastic or p.effect.claims is not None for p in mine):
+            if all(p.effect.stochastic for p in mine):
                 seen = [self.seen[part_of(p)] for p in mine if part_of(p) in self.seen]
                 z = max((_z_of_p(c.p_value * len(self.seen)) for c in seen if c.tested), default=0.0)
             else:
@@ -156,6 +196,17 @@ class Store:
     def least_z(self, s: Scored) -> float:
         """The weakest of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+EVENTS = 2
+"""Numbers that a law of noise has: how much of it there is, and of what size. What it did at which sample is not a
+number of the law: the density has paid for that, sample by sample."""
+
+
+def figures_of(placed: Placed) -> int:
+    """How many numbers an effect brings."""
+    noise = placed.effect.predict is not None or placed.effect.claims is not None
+    return EVENTS if noise else size(placed)
 
 
 def improper(fitted: Fit, placed: Placed) -> bool:
