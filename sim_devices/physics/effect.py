@@ -170,8 +170,8 @@ Guess = Callable[[Array, Array, Context, Settings], Sequence[Sequence[float]]]
 Test = Callable[[Array, Array, Context], Signature]
 Report = Callable[[Array, Settings, float], Sequence[Human]]
 Predict = Callable[[Array, Array, NDArray[np.bool_], NDArray[np.bool_]], tuple[Array, Array]]
-"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), samples to learn from (n,)) -> errors
-of the prediction of each sample from those before it (n,), and their standard deviations up to a factor (n,)."""
+"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), samples to learn from (n,)) ->
+errors of the prediction of each sample from those before it (n,), and their standard deviations up to a factor (n,)."""
 
 
 def no_settings(x: Array, residual: Array, ctx: Context) -> Settings:

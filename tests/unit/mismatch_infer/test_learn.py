@@ -125,3 +125,18 @@ def test_constants_are_written_whole(tmp_path: Path) -> None:
     body = {"format": 1, "constants": START.to_json(), "provenance": {"learned": True}}
     file = write_constants(body, tmp_path / "constants.json")
     assert Constants.of(json.loads(file.read_text())["constants"]) == START
+
+
+def test_few_cases_cannot_vouch_for_much() -> None:
+    few, many = (_cases(np.random.default_rng(5), n, 0.0) for n in (6, 60))
+    assert learn_sure(START, few).most_sure == pytest.approx(7 / 8)
+    assert learn_sure(START, many).most_sure == pytest.approx(61 / 62)
+
+
+def test_events_beside_a_set_are_part_of_its_answer_but_not_of_its_score() -> None:
+    plain, eventful = _set("a", 1.0), replace(_set("a", 1.0), events={"bursts": 1e-9, "doubtful": 0.2})
+    assert eventful.score(START, 900) == plain.score(START, 900)
+    assert eventful.with_events(START) == {"a", "bursts"}
+    case = Case("c", "pair", frozenset(("a", "bursts")), 900, (_set("", 0.0, 0), eventful), None)
+    assert case.right(START)
+    assert case.log_probability(START) > -1e-6

@@ -19,7 +19,8 @@ class Constants:
     ``samples``: independent samples that a held-out residual counts for at most (form errors are systematic);
     ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
     ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left and follow signals before the
-    account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones.
+    account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones;
+    ``most_sure``: the probability that is stated at most, by how many cases the map was learned on.
     """
 
     samples: float
@@ -30,6 +31,7 @@ class Constants:
     cut_share: float
     sure_offset: float
     sure_slope: float
+    most_sure: float
 
     @staticmethod
     def of(body: Mapping[str, Any]) -> Constants:
@@ -40,7 +42,7 @@ class Constants:
         return {k: float(f"{v:.6g}") for k, v in asdict(self).items()}
 
 
-START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0)
+START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 1.0)
 """Where learning begins, and what the fits that it learns from are searched with: the middle of the ranges that a
 prototype found on cases of another generator."""
 

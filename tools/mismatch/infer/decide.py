@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
@@ -23,6 +24,8 @@ TESTED = 6
 """Sets of names, best first, whose every name is tested."""
 CURVE = 12
 """Parameters that a free curve of a signal is charged for: the columns of a product of a curve and a mover."""
+LOUD = 1.5
+"""Mean square of what is left over that of the loudest noise, from which it is more than noise."""
 LEAST_LEAD = 0.1
 """Share of a residual that a free curve must take to be a rival of effects."""
 
@@ -91,7 +94,7 @@ def log_odds(p: float) -> float:
 
 def stated(p: float, c: Constants) -> float:
     """The probability that is stated for a raw one."""
-    return 1.0 / (1.0 + math.exp(-(c.sure_offset + c.sure_slope * log_odds(p))))
+    return min(1.0 / (1.0 + math.exp(-(c.sure_offset + c.sure_slope * log_odds(p)))), c.most_sure)
 
 
 def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
@@ -139,6 +142,20 @@ def curve_score(store: Store, s: Scored, found: Stranger) -> float:
     return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
 
 
+def leftovers(problem: Problem, fitted: Fit) -> tuple[Fit, dict[str, Leftover]]:
+    """(the fit with what nothing predicts as its residual, what that follows per output). It is real, too, where it is
+    louder than the noise can be, whether it follows anything or not."""
+    rest = unpredicted(problem, fitted)
+    left: dict[str, Leftover] = {}
+    for o in problem.twin.outputs:
+        v = leftover(problem, rest, o)
+        follows = max((d.strength for d in v.follows), default=0.0) if v.real else 0.0
+        held = rest.residual[o][problem.held_rows]
+        _, most = floor_interval(problem.floors[o], held, follows, 1 / problem.recording.dt)
+        left[o] = replace(v, real=v.real or v.ratio * problem.sigma(o) ** 2 > LOUD * most**2)
+    return rest, left
+
+
 def worst_left(problem: Problem, base: Fit, left: Mapping[str, Leftover]) -> tuple[float, float]:
     """(noise variances that follow something on the output where most does, those that were explained there)."""
     real = [v for v in left.values() if v.real]
@@ -165,8 +182,7 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     else:
         strange = None
     said = store.with_events(chosen)
-    rest_of = unpredicted(p, said.fitted)
-    left = {o: leftover(p, rest_of, o) for o in p.twin.outputs}
+    rest_of, left = leftovers(p, said.fitted)
     if strange is not None:
         left[strange.output] = left[strange.output].led_by(strange)
     else:
@@ -190,4 +206,4 @@ def recalibrated(store: Store, raw: Fit) -> bool:
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 
 
-__all__ = ["Answer", "Rival", "accepted", "decide", "recalibrated"]
+__all__ = ["Answer", "Rival", "accepted", "decide", "leftovers", "recalibrated"]

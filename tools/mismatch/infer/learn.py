@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.optimize import minimize
 
-from tools.mismatch.engine.unexplained import leftover
 from tools.mismatch.infer.constants import START, Constants
 from tools.mismatch.infer.decide import (
     CURVE,
@@ -22,12 +21,14 @@ from tools.mismatch.infer.decide import (
     candidate_signals,
     free_curve,
     is_whole,
+    leftovers,
     log_odds,
+    stated,
     surenesses,
     worst_left,
 )
 from tools.mismatch.infer.run import Inferred
-from tools.mismatch.infer.store import Scored, Store
+from tools.mismatch.infer.store import Scored, Store, z_of_p
 
 Traits = Mapping[str, Any]
 
@@ -36,6 +37,8 @@ CLIP = -4.0
 LOOKED_AT = 3
 """Sets of names, best first, whose leftovers are looked at."""
 FOLDS = 5
+TOP = 0.8
+"""Raw probability from which a name counts for the most that is stated."""
 SETS = 60
 """Sets kept of a search, best first."""
 
@@ -45,7 +48,7 @@ class SetTraits:
     """What a decision reads of one set of names.
 
     ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken``
-    are those of ``worst_left`` (None: not looked at).
+    are those of ``worst_left`` (None: not looked at); ``events`` the p-values of those that were found beside it.
     """
 
     names: frozenset[str]
@@ -54,6 +57,11 @@ class SetTraits:
     z: float | None
     rest: float | None
     taken: float | None
+    events: Mapping[str, float] = field(default_factory=dict[str, float])
+
+    def with_events(self, c: Constants) -> frozenset[str]:
+        """The names that a report of this set has."""
+        return self.names | {n for n, p in self.events.items() if z_of_p(p) > c.least_z}
 
     def score(self, c: Constants, held: int) -> float:
         """As ``Scored.score``."""
@@ -67,9 +75,11 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
     tested = {s.key: store.least_z(s) if s.names else None for s in ranked}
     ranked = store.ranked()  # tests may have fitted sets anew
     leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
+    events: dict[frozenset[tuple[str, ...]], dict[str, float]] = {}
     for s in [*ranked[:LOOKED_AT], store.base]:
-        left = {o: leftover(store.problem, s.fitted, o) for o in store.problem.twin.outputs}
+        _, left = leftovers(store.problem, store.with_events(s).fitted)
         leaves[s.key] = worst_left(store.problem, store.base.fitted, left)
+        events[s.key] = store.eventful[s.key][1]
     strange = free_curve(store.problem, store.base.fitted, candidate_signals(inferred.found.first))
     kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
     return {
@@ -77,7 +87,7 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         "outputs": len(store.problem.twin.outputs),
         "sets": [
             {"names": sorted(s.names), "density": s.mean_density, "parameters": s.parameters,
-             "z": tested.get(s.key), "left": leaves.get(s.key)}
+             "z": tested.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
             for s in [*kept, *([] if store.base in kept else [store.base])]
         ],
         "strange": None if strange is None else {
@@ -96,17 +106,20 @@ def sets_of(traits: Traits) -> list[SetTraits]:
     """The sets of a search. What was tested of one set of names stands for its other places and forms, too."""
     z: dict[frozenset[str], float] = {}
     left: dict[frozenset[str], tuple[float, float]] = {}
+    events: dict[frozenset[str], Mapping[str, float]] = {}
     for s in traits["sets"]:
         names = frozenset(s["names"])
         if s["z"] is not None:
             z.setdefault(names, float(s["z"]))
         if s["left"] is not None:
             left.setdefault(names, (float(s["left"][0]), float(s["left"][1])))
+            events.setdefault(names, {n: float(p) for n, p in s["events"].items()})
     out: list[SetTraits] = []
     for s in traits["sets"]:
         names = frozenset(s["names"])
         rest, taken = left.get(names, (None, None))
-        out.append(SetTraits(names, float(s["density"]), int(s["parameters"]), z.get(names), rest, taken))
+        of, beside = z.get(names), events.get(names, {})
+        out.append(SetTraits(names, float(s["density"]), int(s["parameters"]), of, rest, taken, beside))
     return out
 
 
@@ -157,20 +170,22 @@ class Case:
         rest = chosen.rest if chosen.rest is not None else 0.0
         if not is_whole(rest, chosen.taken or 0.0, c):
             return "unexplained", chosen
-        return ("named" if chosen.names else "nothing"), chosen
+        return ("named" if chosen.with_events(c) else "nothing"), chosen
 
     def right(self, c: Constants) -> bool:
         """Whether verdict (up to recalibration) and set are exact."""
         said, chosen = self.says(c)
         if self.kind == "unknown":
             return said == "unexplained"
-        return said == ("named" if self.names else "nothing") and chosen.names == self.names
+        return said == ("named" if self.names else "nothing") and chosen.with_events(c) == self.names
 
     def log_probability(self, c: Constants) -> float:
         """Log probability of the true set among those of the search, clipped."""
         ranked = self.ranked(c)
         values = np.array([s.score(c, self.held) for s in ranked])
-        mine = [v for s, v in zip(ranked, values, strict=True) if s.names == self.names]
+        mine = [
+            v for s, v in zip(ranked, values, strict=True) if s.names | (self.names & s.events.keys()) == self.names
+        ]
         if not mine:
             return CLIP
         top = float(values.max())
@@ -215,8 +230,9 @@ def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequenc
 
 def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
     """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases of their own, held
-    weakly at the identity."""
-    pairs = raw_surenesses(replace(c, sure_offset=0.0, sure_slope=1.0), cases)
+    weakly at the identity; and the most that is stated, by the rule of succession (Laplace 1774) over the sure ones: so
+    many cases cannot vouch for more."""
+    pairs = raw_surenesses(replace(c, sure_offset=0.0, sure_slope=1.0, most_sure=1.0), cases)
     if not pairs:
         return c
     x = np.array([log_odds(p) for p, _ in pairs])
@@ -227,7 +243,9 @@ def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
         return float(np.sum(np.logaddexp(0.0, z) - right * z) + 0.5 * (v[0] ** 2 + v[1] ** 2))
 
     found = minimize(loss, np.zeros(2), method="Nelder-Mead")
-    return replace(c, sure_offset=float(found.x[0]), sure_slope=float(np.exp(found.x[1])))
+    top = right[x > log_odds(TOP)]
+    most = (float(top.sum()) + 1.0) / (top.size + 2.0)
+    return replace(c, sure_offset=float(found.x[0]), sure_slope=float(np.exp(found.x[1])), most_sure=max(most, TOP))
 
 
 def raw_surenesses(c: Constants, cases: Sequence[Case]) -> list[tuple[float, float]]:
@@ -238,6 +256,8 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> list[tuple[float, flo
         sets = [(s.names, s.score(c, case.held)) for s in case.accepted(c)]
         for name, sure in surenesses(chosen.names, sets, c).items():
             out.append((sure, float(name in case.names)))
+        for name in chosen.with_events(c) - chosen.names:
+            out.append((stated(1.0 - chosen.events[name], c), float(name in case.names)))
     return out
 
 

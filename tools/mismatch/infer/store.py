@@ -169,7 +169,7 @@ class Store:
         for c in found:
             self.seen[part_of(c.placed)] = c
             best[c.placed.effect.name] = min(best.get(c.placed.effect.name, 1.0), c.p_value * len(found))
-        clear = {n: v for n, v in best.items() if _z_of_p(v) > self.constants.least_z}
+        clear = {n: v for n, v in best.items() if z_of_p(v) > self.constants.least_z}
         more = [c.placed for c in found if c.placed.effect.name in clear and c.p_value < LEAST_P]
         if not more:
             return s, {}
@@ -186,7 +186,7 @@ class Store:
             mine = [p for p in s.placed if p.effect.name == name]
             if all(p.effect.stochastic for p in mine):
                 seen = [self.seen[part_of(p)] for p in mine if part_of(p) in self.seen]
-                z = max((_z_of_p(c.p_value * len(self.seen)) for c in seen if c.tested), default=0.0)
+                z = max((z_of_p(c.p_value * len(self.seen)) for c in seen if c.tested), default=0.0)
             else:
                 small = self.without(s, lambda p: p.effect.name == name)
                 z = compare(self.problem, small.fitted, s.fitted).z
@@ -215,6 +215,6 @@ def improper(fitted: Fit, placed: Placed) -> bool:
     return stuck or beyond_limits(fitted, placed)
 
 
-def _z_of_p(p: float) -> float:
+def z_of_p(p: float) -> float:
     """Normal quantile of a p-value that was corrected for how many candidates were screened (Bonferroni)."""
     return float(norm.isf(min(max(p, 1e-300), 1.0 - 1e-9)))
