@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,8 @@ from scipy.stats import norm
 from hal.compiled import kernel
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, Signature
 from sim_devices.physics.statistics import robust_rms, runs
+
+Law = Callable[[float], tuple[Array, Array]]
 
 KNOTS = 48
 MOST_VALUES = 60_000_000  # columns times samples: half a gigabyte
@@ -127,10 +129,11 @@ def _walk_test(x: Array, residual: Array, ctx: Context) -> Signature:
 
 
 @kernel
-def local_level(residual, gap_s, believed, ratio):
+def local_level(residual, gap_s, believed, ratio, forgets_1_s):
     """One-step prediction errors and their deviations (both (n,)) of a walk under white noise of unit rms, whose
-    variance grows by ``ratio`` a second. A. C. Harvey, Forecasting, Structural Time Series Models (1989), eq. 4.1.2.
-    The first sample that is believed sets the level, and its own error is zero."""
+    variance grows by ``ratio`` a second, and which returns to zero at the rate ``forgets_1_s`` (0: never).
+    A. C. Harvey, Forecasting, Structural Time Series Models (1989), eq. 4.1.2. The first sample that is believed sets
+    the level, and its own error is zero."""
     n = residual.size
     error = np.zeros(n)
     deviation = np.ones(n)
@@ -142,7 +145,12 @@ def local_level(residual, gap_s, believed, ratio):
                 level = residual[i]
                 spread = 1.0
             continue
-        spread += ratio * gap_s[i]
+        if forgets_1_s > 0.0:
+            kept = np.exp(-forgets_1_s * gap_s[i])
+            level *= kept
+            spread = kept * kept * spread + ratio * (1.0 - kept * kept) / (2.0 * forgets_1_s)
+        else:
+            spread += ratio * gap_s[i]
         variance = spread + 1.0
         error[i] = residual[i] - level
         deviation[i] = np.sqrt(variance)
@@ -153,26 +161,92 @@ def local_level(residual, gap_s, believed, ratio):
     return error, deviation
 
 
+@kernel
+def local_slope(residual, gap_s, believed, ratio):
+    """The same of an integrated walk: its slope walks, by ``ratio`` a second (Harvey 1989, eq. 2.3.27)."""
+    n = residual.size
+    error = np.zeros(n)
+    deviation = np.ones(n)
+    level = slope = 0.0
+    # covariance of level and slope; a slope is not known before the second sample
+    p11 = p12 = p22 = 0.0
+    seen = 0
+    for i in range(n):
+        if seen == 0:
+            if believed[i]:
+                level, p11, p12, p22 = residual[i], 1.0, 0.0, 1e6 * ratio + 1e-12
+                seen = 1
+            continue
+        g = gap_s[i]
+        level += g * slope
+        p11 += 2.0 * g * p12 + g * g * p22 + ratio * g * g * g / 3.0
+        p12 += g * p22 + 0.5 * ratio * g * g
+        p22 += ratio * g
+        variance = p11 + 1.0
+        error[i] = residual[i] - level
+        deviation[i] = np.sqrt(variance)
+        if believed[i]:
+            k1, k2 = p11 / variance, p12 / variance
+            level += k1 * error[i]
+            slope += k2 * error[i]
+            p22 -= k2 * p12
+            p12 -= k2 * p11
+            p11 = k1
+    return error, deviation
+
+
 RATIOS = (-6.0, 6.0)
 """Decades that the growth of a walk's variance within one sample, over that of the white noise, is searched in."""
+OUTLIER = 6.0
+"""Robust rms beyond which an error counts as that."""
+FORGETS = (0.001, 0.01, 0.1)
+"""Times after which a stationary rival of a walk forgets, in lengths of the record."""
+
+
+def likeliest(law: Law, least: float, learned: NDArray[np.bool_], decades: Sequence[float]) -> tuple[float, float]:
+    """(ratio, minus the mean log density on ``learned`` samples) of the likeliest ratio. The scale is no less
+    than ``least``."""
+
+    def badness(v: float) -> float:
+        error, deviation = law(10.0**v)
+        d = deviation[learned]
+        e = error[learned] / d
+        limit = OUTLIER * robust_rms(e)
+        found = float(np.sqrt(np.mean(np.clip(e, -limit, limit) ** 2)))
+        scale = max(found, least, 1e-300)
+        value = float(np.log(scale) + np.mean(np.log(d)) + 0.5 * (found / scale) ** 2)
+        return value if np.isfinite(value) else np.inf
+
+    best = decades[int(np.argmin([badness(v) for v in decades]))]
+    wide = 0.5 * (decades[1] - decades[0])
+    found = minimize_scalar(badness, bounds=(best - wide, best + wide), method="bounded", options={"xatol": 0.02})
+    return 10.0 ** float(found.x), float(found.fun)
 
 
 def predict_walk(
-    residual: Array, gap_s: Array, believed: NDArray[np.bool_], learned: NDArray[np.bool_]
+    residual: Array, gap_s: Array, believed: NDArray[np.bool_], learned: NDArray[np.bool_], least: float
 ) -> tuple[Array, Array]:
-    """``Effect.predict`` of a walk: the ratio of walk to noise is the likeliest on ``learned`` samples, with a scale
-    that outliers do not move."""
-    step = float(np.median(gap_s[1:])) if gap_s.size > 1 else 1.0
-
-    def badness(decades: float) -> float:
-        error, deviation = local_level(residual, gap_s, believed, 10.0**decades / step)
-        e, d = error[learned], deviation[learned]
-        return float(np.log(max(robust_rms(e / d), 1e-300)) + np.mean(np.log(d)))
-
-    tried = np.linspace(*RATIOS, 25)
-    best = tried[int(np.argmin([badness(v) for v in tried]))]
-    found = minimize_scalar(badness, bounds=(best - 0.5, best + 0.5), method="bounded", options={"xatol": 0.01})
-    return local_level(residual, gap_s, believed, 10.0 ** float(found.x) / step)
+    """``Effect.predict`` of a walk. It predicts nothing where an integrated walk, which is smooth, or one that forgets
+    is likelier by more than a parameter costs (Schwarz 1978): then what drifts is no walk."""
+    gaps = gap_s[1:]
+    step_s = float(np.median(gaps)) if gaps.size else 1.0
+    length_s = float(np.sum(gaps))
+    here = np.log10(1.0 / step_s)
+    walks = np.linspace(RATIOS[0] + here, RATIOS[1] + here, 25)
+    ratio, own = likeliest(lambda v: local_level(residual, gap_s, believed, v, 0.0), least, learned, walks)
+    slopes = np.linspace(2 * RATIOS[0] + 3 * here, RATIOS[1] + 3 * here, 37)
+    _, smooth = likeliest(lambda v: local_slope(residual, gap_s, believed, v), least, learned, slopes)
+    rivals = [smooth]
+    for share in FORGETS:
+        rate_1_s = 1.0 / (share * length_s)
+        _, forgetful = likeliest(
+            lambda v, r=rate_1_s: local_level(residual, gap_s, believed, v, r), least, learned, walks
+        )
+        rivals.append(forgetful)
+    count = max(int(np.count_nonzero(learned)), 2)
+    if min(rivals) < own - 0.5 * np.log(count) / count:
+        return residual, np.ones(residual.size)
+    return local_level(residual, gap_s, believed, ratio, 0.0)
 
 
 def _walk_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:

@@ -169,9 +169,10 @@ Basis = Callable[[Array, Context, Array, Settings], Array]
 Guess = Callable[[Array, Array, Context, Settings], Sequence[Sequence[float]]]
 Test = Callable[[Array, Array, Context], Signature]
 Report = Callable[[Array, Settings, float], Sequence[Human]]
-Predict = Callable[[Array, Array, NDArray[np.bool_], NDArray[np.bool_]], tuple[Array, Array]]
-"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), samples to learn from (n,)) ->
-errors of the prediction of each sample from those before it (n,), and their standard deviations up to a factor (n,)."""
+Predict = Callable[[Array, Array, NDArray[np.bool_], NDArray[np.bool_], float], tuple[Array, Array]]
+"""(residual (n,), time since the sample before (n,) in s, samples to believe (n,), those to learn from (n,), least rms
+of what is white) -> errors of the prediction of each sample from those before (n,), and their standard deviations up to
+a factor (n,), which are at least one."""
 
 
 def no_settings(x: Array, residual: Array, ctx: Context) -> Settings:

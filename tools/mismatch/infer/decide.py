@@ -15,7 +15,7 @@ from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import log_density, unpredicted
+from tools.mismatch.infer.density import unpredicted, weigh
 from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
@@ -201,7 +201,7 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
 def recalibrated(store: Store, raw: Fit) -> bool:
     """Whether re-fitted base parameters predict better than the given ones by more than their price."""
     p, c = store.problem, store.constants
-    before = float(np.mean([np.mean(d[p.held_rows]) for d in log_density(p, raw).values()]))
+    before = float(np.mean([np.mean(w.density[p.held_rows]) for w in weigh(p, raw).values()]))
     gain = min(c.samples, store.held) * (store.base.mean_density - before)
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 

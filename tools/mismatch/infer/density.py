@@ -8,19 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import t as student
 
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.projected import robust_scale
 
 Array = NDArray[np.float64]
 
 DEGREES = 5.0
 """Degrees of freedom: tails that heavy-tailed noise has."""
 _CONSTANT = math.lgamma((DEGREES + 1) / 2) - math.lgamma(DEGREES / 2) - 0.5 * math.log(DEGREES * math.pi)
+NORMAL_SCALE = 0.8527
+"""Scale of the best such density of normal noise of unit rms (by quadrature)."""
 NORMAL = -1.4371
 """Mean log density of normal noise of unit rms under the best such density (by quadrature)."""
 LATTICE = 0.1
@@ -71,7 +75,9 @@ def prediction(problem: Problem, fitted: Fit, output: str) -> tuple[Array, Array
     believed[problem.held_rows] = True
     usual = ~model.excused(problem.view, output)
     gap_s = np.diff(problem.index, prepend=problem.index[:1]) * problem.recording.dt
-    return law(undone(problem, fitted, output, laws), gap_s, believed & usual, learned & usual)
+    # noise of the instrument that runs on from sample to sample is not the law's to predict
+    least = problem.sigma(output)
+    return law(undone(problem, fitted, output, laws), gap_s, believed & usual, learned & usual, least)
 
 
 def unpredicted(problem: Problem, fitted: Fit) -> Fit:
@@ -84,28 +90,90 @@ def unpredicted(problem: Problem, fitted: Fit) -> Fit:
     return replace(fitted, residual=left)
 
 
-def log_density(problem: Problem, fitted: Fit) -> dict[str, Array]:
-    """Log density (m,) of every sample of the view, per output.
+COLOUR = 8
+"""Samples before a sample from which what a law could not predict is tried once more."""
+
+
+def predictable(problem: Problem, e: Array) -> float:
+    """Nats per held-out sample by which an autoregression, learned on the fitted samples, predicts what the law of
+    noise could not: innovations ``e`` (m,) are white where the law holds."""
+    limit = 6.0 * robust_scale(e[problem.fit_rows], 1e-300)
+    e = np.clip(e, -limit, limit)
+    past = np.column_stack([np.concatenate([np.zeros(k), e[:-k]]) for k in range(1, COLOUR + 1)])
+    learned, held = problem.fit_rows, problem.held_rows
+    a = np.linalg.lstsq(past[learned], e[learned], rcond=None)[0]
+    before, after = float(np.mean(e[held] ** 2)), float(np.mean((e[held] - past[held] @ a) ** 2))
+    return 0.5 * math.log(before / after) if before > after > 0.0 else 0.0
+
+
+TAILS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
+"""Degrees of freedom of Student-t tails that noise without events may have."""
+
+
+def gain_of_events(r: Array, events: NDArray[np.bool_], span: float, least: float) -> float:
+    """Nats by which residuals ``r`` (n,) are likelier as a mixture of noise and of ``events`` (n,), which are anywhere
+    within ``span``, than as noise alone, each with the tails that suit it best."""
+    share = float(np.mean(events))
+    if not 0.0 < share < 1.0:
+        return 0.0
+
+    def tails(x: Array) -> float:
+        def total(nu: float) -> float:
+            s = max(1.4826 * float(np.median(np.abs(x))), least)
+            for _ in range(20):
+                s = max(float(np.sqrt(np.mean((nu + 1) / (nu + (x / s) ** 2) * x * x))), least)
+            return float(np.sum(student.logpdf(x, nu, scale=s)))
+
+        return max(total(nu) for nu in TAILS)
+
+    event = math.log(share) - math.log(max(span, 1e-300))
+    usual = tails(r[~events]) + float(np.sum(~events)) * math.log1p(-share)
+    return usual + float(np.sum(events)) * event - tails(r)
+
+
+@dataclass(frozen=True)
+class Weighed:
+    """``density`` (m,) log density of every sample of an output; of a law of noise the share of samples that it is free
+    to follow (``free``: trace of its smoother, Harvey 1989, section 4.5), and what an autoregression predicts of what
+    it could not (``predictable``, nats per sample). Both are 0 without one."""
+
+    density: Array
+    free: float = 0.0
+    predictable: float = 0.0
+
+
+def weigh(problem: Problem, fitted: Fit) -> dict[str, Weighed]:
+    """The log densities of all samples of the view, per output.
 
     A sample that an effect takes as its own event is predicted by nothing but the range of the recording: it pays the
     density of a uniform distribution over it, and what it takes to say that it is an event; the others pay what it
     takes to say that they are none (a mixture: R. K. Pearson, Mining Imperfect Data, 2005, section 3.2).
     """
-    out: dict[str, Array] = {}
+    out: dict[str, Weighed] = {}
+    best = best_log_density(problem)
     for o in problem.twin.outputs:
         error, deviation = prediction(problem, fitted, o)
         e = error / deviation
         excused = fitted.model.excused(problem.view, o)
         usual = problem.fit_rows[~excused[problem.fit_rows]]
         floor = problem.floors[o]
-        # deviations of a law are at least one: the floor bounds its noise alone
         least = max(LEAST * floor.rms, LATTICE * floor.step, 1e-300)
+        lawful = bool(np.any(deviation > 1.0))
+        if lawful:
+            least = max(least, NORMAL_SCALE * problem.sigma(o))
         d = student_log_density(e, student_scale(e[usual] if usual.size else e, least)) - np.log(deviation)
         share = float(np.mean(excused))
         if share > 0.0:
             event = math.log(share) - math.log(max(float(np.ptp(problem.measured[o])), 1e-300))
             d = np.where(excused, event, d + math.log(max(1.0 - share, 1e-300)))
-        out[o] = d
+        free = more = 0.0
+        if lawful:
+            # what a law makes of the colour of the instrument's own noise is no credit to it
+            d = d - max(float(np.mean(d[problem.held_rows])) - best[o], 0.0)
+            gain = 1.0 - deviation[problem.held_rows] ** -2.0
+            free = float(np.mean(gain / (2.0 - gain)))
+            more = predictable(problem, np.where(excused, 0.0, e))
+        out[o] = Weighed(d, free, more)
     return out
 
 

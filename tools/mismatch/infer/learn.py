@@ -53,7 +53,7 @@ class SetTraits:
 
     names: frozenset[str]
     density: float
-    parameters: int
+    parameters: float
     z: float | None
     rest: float | None
     taken: float | None
@@ -119,7 +119,7 @@ def sets_of(traits: Traits) -> list[SetTraits]:
         names = frozenset(s["names"])
         rest, taken = left.get(names, (None, None))
         of, beside = z.get(names), events.get(names, {})
-        out.append(SetTraits(names, float(s["density"]), int(s["parameters"]), of, rest, taken, beside))
+        out.append(SetTraits(names, float(s["density"]), float(s["parameters"]), of, rest, taken, beside))
     return out
 
 

@@ -17,7 +17,7 @@ from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import best_log_density, log_density
+from tools.mismatch.infer.density import LEAST, best_log_density, gain_of_events, unpredicted, weigh
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
@@ -47,7 +47,7 @@ class Scored:
     fitted: Fit = field(repr=False)
     density: dict[str, float]
     blocks: Array = field(repr=False)
-    parameters: int
+    parameters: float
     proper: bool
 
     @property
@@ -100,12 +100,20 @@ class Store:
     def scored(self, fitted: Fit) -> Scored:
         """The fit scored."""
         p = self.problem
-        every = log_density(p, fitted)
-        mean = {o: float(np.mean(d[p.held_rows])) for o, d in every.items()}
-        blocks = np.array([[float(np.mean(every[o][a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
+        every = weigh(p, fitted)
+        mean = {o: float(np.mean(w.density[p.held_rows])) for o, w in every.items()}
+        blocks = np.array([[float(np.mean(every[o].density[a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
         proper = fitted.ok and not any(improper(fitted, e) for e in fitted.model.placed)
-        figures = sum(figures_of(e) for e in fitted.model.placed)
+        proper = proper and all(self.lawful(w.predictable) for w in every.values())
+        # values that a law is free to follow have the price of parameters, among the samples that count
+        free = min(self.constants.samples, self.held) / len(every) * sum(w.free for w in every.values())
+        figures = free + sum(figures_of(e) for e in fitted.model.placed)
         return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
+
+    def lawful(self, predictable: float) -> bool:
+        """Whether so many nats per sample may be left in what a law of noise could not predict: no more than another
+        name would cost."""
+        return min(self.constants.samples, self.held) * predictable < self.constants.per_name
 
     def score(self, s: Scored) -> float:
         return s.score(self.constants, self.held) if s.proper else -np.inf
@@ -169,13 +177,28 @@ class Store:
         for c in found:
             self.seen[part_of(c.placed)] = c
             best[c.placed.effect.name] = min(best.get(c.placed.effect.name, 1.0), c.p_value * len(found))
-        clear = {n: v for n, v in best.items() if z_of_p(v) > self.constants.least_z}
+        clear = {n: v for n, v in best.items() if z_of_p(v) > self.constants.least_z and self.pays(s, n, found)}
         more = [c.placed for c in found if c.placed.effect.name in clear and c.p_value < LEAST_P]
         if not more:
             return s, {}
         model = Model(p.twin, (*s.placed, *more))
         theta = model.carry(s.fitted.model, s.fitted.theta, p.recording)
         return self.scored(fit(p, model, [theta], iterations=15)), clear
+
+    def pays(self, s: Scored, name: str, found: Sequence[Candidate]) -> bool:
+        """Whether what events ``name`` explain beyond heavy tails of the noise is worth a name: over all samples, since
+        no course is extrapolated."""
+        p = self.problem
+        rows = np.union1d(p.fit_rows, p.held_rows)
+        gain = 0.0
+        for c in found:
+            if c.placed.effect.name == name and c.p_value < LEAST_P and c.placed.effect.claims is not None:
+                o = c.placed.outputs[0]
+                r = unpredicted(p, s.fitted).residual[o][rows]
+                taken = c.placed.effect.claims(c.placed.settings, p.recording.n)[p.index][rows]
+                span = float(np.ptp(p.measured[o]))
+                gain += gain_of_events(r - np.median(r), taken, span, LEAST * p.floors[o].rms)
+        return gain > self.constants.per_name
 
     def z_of(self, s: Scored, name: str) -> float:
         """Whitened held-out correlation of what ``name`` does with what the set without it leaves.
