@@ -25,7 +25,7 @@ MOVES = 5
 SWAPS = 2
 """Rounds in which every effect of the best set is taken out and what fits beside the others is looked for."""
 RIVALS = 3
-"""Names that are tried in place of each name of the best set."""
+"""Names that are tried in place of each name of the best set, and beside it on each output that it leaves alone."""
 FITS, FITS_LATER = (3, 6), (2, 4)
 """(Least, most) candidates of each kind per output that the screen lets through to a fit, from the base and later."""
 HALF = 0.5
@@ -58,6 +58,7 @@ class Search:
     def run(self) -> Found:
         """Extend until nothing can gain, then swap; refine what the decision is between."""
         self.expand(self.store.base)
+        self.combine()
         self.grow()
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
@@ -76,6 +77,24 @@ class Search:
         for s in self.store.ranked()[:BEAM]:
             self.store.with_events(self.store.refined(s) if s.placed else s)
         return Found(self.store, self.first)
+
+    def combine(self) -> None:
+        """The best single effect of each output put together, the best first, while the score grows: where outputs
+        share nothing, what is missing on one says nothing about another, and no order of moves need find it.
+        """
+        if not self.problem.twin.apart or len(self.problem.twin.outputs) < 2:
+            return
+        alone = [s for s in self.store.sets.values() if len(s.placed) == 1 and s.proper]
+        alone.sort(key=lambda s: (-self.store.score(s), sorted(s.names)))
+        grown, tried = self.store.base, dict.fromkeys(self.problem.twin.outputs, 0)
+        for s in alone:
+            where = s.placed[0].outputs
+            if {o for p in grown.placed for o in p.outputs} & set(where) or max(tried[o] for o in where) >= RIVALS:
+                continue
+            tried.update({o: tried[o] + 1 for o in where})
+            more = self.store.joined(grown, s)
+            if more.proper and self.store.score(more) > self.store.score(grown):
+                grown = more
 
     def swap(self, best: Scored) -> None:
         """Every name of ``best`` replaced by those that do about as well alone on the same outputs: beside the base one

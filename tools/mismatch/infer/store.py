@@ -149,6 +149,20 @@ class Store:
         with np.errstate(all="ignore"):
             return self.put(added(self.problem, s.fitted, place))
 
+    def joined(self, s: Scored, one: Scored) -> Scored:
+        """The set with the single effect of another beside it, begun where that one ended."""
+        (place,) = one.placed
+        known = self.sets.get(s.key | one.key)
+        if known is not None:
+            return known
+        model = Model(self.problem.twin, (*s.placed, place))
+        theta = model.carry(s.fitted.model, s.fitted.theta, self.problem.recording)
+        own = zip(model.slices(len(s.placed)), one.fitted.model.slices(0), strict=True)
+        for here, there in own:
+            theta[here] = one.fitted.theta[there]
+        with np.errstate(all="ignore"):
+            return self.put(fit(self.problem, model, [theta], stride=2, iterations=12))
+
     def refined(self, s: Scored) -> Scored:
         """The set fitted on every row until nothing moves."""
         with np.errstate(all="ignore"):
