@@ -1,6 +1,6 @@
 """Motion card: its text line, its 15-byte packet, its button. Bytes and times in, values out; no port, no clock.
 
-Source: document 002 (Erat 2018), sections 4.2.1, 4.2.2, 6.2, 6.3, with ERRATA 112 (packet: big-endian int16
+Source: Erat 2018, sections 4.2.1, 4.2.2, 6.2, 6.3, with erratum 112 (packet: big-endian int16
 a_x a_y a_z w_x w_y w_z T, then status), 113 (the text says not whether its numbers are counts or scaled: both are
 read) and 121 (a press of exactly 0.5 s is long). Neither format has a checksum: a changed digit cannot be seen.
 """

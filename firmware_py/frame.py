@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 XYZ = ("x", "y", "z")
-AXES = ("1x", "1z", "2y", "2z", "3x", "3y")  # sensor order, 000 (2.34)
+AXES = ("1x", "1z", "2y", "2z", "3x", "3y")  # sensor order, Ang 2004 (2.34)
 MORE_AXES = ("7", "8")  # the converter has eight inputs
 PARITIES = ("1", "2")
 

@@ -2,7 +2,7 @@
 
 Every value has a default, so ``provider``, ``unit`` and ``seed`` alone describe a complete instrument. Spreads are
 standard deviations from which the seed draws one physical unit: the same seed is the same unit everywhere
-(bench, calibration recordings, tests). "000" is the instrument's dissertation (2004) with its errata.
+(bench, calibration recordings, tests). Ang 2004 is the instrument's dissertation, with its errata.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ class HandConfig(_Table):
     hold_s: tuple[NotNegative, NotNegative] = (0.3, 1.5)
 
     tremor_pp_um: NotNegative = 50.0
-    """Typical peak to peak per axis at the tip (000 sec. 6.1.1); rms = p-p / (2 sqrt 2)."""
+    """Typical peak to peak per axis at the tip (Ang 2004 sec. 6.1.1); rms = p-p / (2 sqrt 2)."""
     tremor_frequency_hz: Positive = 9.6
     tremor_frequency_spread_hz: NotNegative = 0.4
     """Between people (seeds); the person's mean stays within 8.5 to 11.5 Hz unless the mean itself does not."""
@@ -90,7 +90,7 @@ class HandConfig(_Table):
 
 
 class InstrumentConfig(_Table):
-    """Geometry in the body frame {B}: base of the back suite, z toward the tip (000 (2.54), errata no. 23).
+    """Geometry in the body frame {B}: base of the back suite, z toward the tip (Ang 2004 (2.54), errata no. 23).
 
     Only the differences d1 = 20.2, d2 = 14.3, d3 = 116.0 mm are published. Here the back suite is centred on the
     axis: {1} and {2} then fit the 26 mm box and {3} the handle.
@@ -117,14 +117,14 @@ class SensorConfig(_Table):
     scale_spread: NotNegative = 0.012
     misalignment_deg: NotNegative = 0.5
     cross_quadratic_V_per_g2: NotNegative = 0.003
-    """Bias that follows the square of another axis (000 (3.8), (3.10); form published, size ours)."""
+    """Bias that follows the square of another axis (Ang 2004 (3.8), (3.10); form published, size ours)."""
     cross_linear_V_per_g: NotNegative = 0.004
     scale_variation_per_g: NotNegative = 0.002
-    """Sensitivity that follows the out-of-plane axis (000 (3.12))."""
+    """Sensitivity that follows the out-of-plane axis (Ang 2004 (3.12))."""
     cross_fold_V: NotNegative = 0.001
     """Bias that follows the in-plane axis a as sqrt(1 + (a / 0.4 g)^2) - 1: no polynomial (ours)."""
     cross_product_V_per_g2: NotNegative = 0.001
-    """Sensitivity that follows the in-plane axis, which 000 (3.12) does not know (ours)."""
+    """Sensitivity that follows the in-plane axis, which Ang 2004 (3.12) does not know (ours)."""
     spring_per_g2: NotNegative = 0.0005
     """Relative change of sensitivity with the square of the own axis (data sheet: nonlinearity 0.5 % of full scale)."""
     bias_temperature_mg_per_K: NotNegative = 0.1
@@ -159,7 +159,7 @@ class StackConfig(_Table):
     """Quasi-static, 0 to 100 V and back."""
     stroke_spread: NotNegative = 0.03
     slip_sum: Annotated[float, Field(ge=0, lt=1)] = 0.52
-    """Sum of the slip weights: 1 - slip_sum is the small-signal part; sets the loop (000 Tables 7.1, 7.2)."""
+    """Sum of the slip weights: 1 - slip_sum is the small-signal part; sets the loop (Ang 2004 Tables 7.1, 7.2)."""
     slip_spread: NotNegative = 0.03
     slip_limit_V: Positive = 46.0
     """Largest threshold."""
@@ -200,7 +200,7 @@ class AmplifierConfig(_Table):
 
 
 class ManipulatorConfig(_Table):
-    """000 ch. 6, errata nos. 58 to 71: values that are not published are ours.
+    """Ang 2004 ch. 6, errata nos. 58 to 71: values that are not published are ours.
 
     With R = r = 5 mm and 120 um of ball travel, > 1000 um of total travel in x and y needs a shaft of at least
     36.1 mm; 40 mm gives 1280 x 1108 x 120 um.
@@ -218,7 +218,7 @@ class ManipulatorConfig(_Table):
     length_spread: NotNegative = 0.01
     """Relative, of circle and shaft."""
     rest_spread_um: NotNegative = 20.0
-    """Ball heights at neutral: what the calibration screws leave (000, 6.2)."""
+    """Ball heights at neutral: what the calibration screws leave (Ang 2004, 6.2)."""
 
 
 class EnvironmentConfig(_Table):
@@ -229,7 +229,7 @@ class EnvironmentConfig(_Table):
     ambient_C: float = 22.0
     ambient_wander_K: NotNegative = 0.2
     warm_up_K: float = 6.0
-    """Rise of the sensor board above ambient (000 Fig. 3.11: steady after about 7 h)."""
+    """Rise of the sensor board above ambient (Ang 2004 Fig. 3.11: steady after about 7 h)."""
     warm_up_s: Positive = 6300.0
     on_since_s: NotNegative = 900.0
     """Time for which the instrument has been switched on when the run starts."""

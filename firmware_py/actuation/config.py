@@ -14,7 +14,8 @@ Taps = Annotated[tuple[float, ...], Field(min_length=1, max_length=16)]
 
 
 class StackConfig(BaseModel):
-    """Holds the modified Prandtl-Ishlinskii model of one stack, 000 (7.9): weights in um per V, thresholds in V and um.
+    """Holds the modified Prandtl-Ishlinskii model of one stack, Ang 2004 (7.9): weights in um per V, thresholds in V
+    and um.
 
     The default is a P-885.50 by its data sheet shape: 15 um at 100 V on the first way up, a small-signal slope
     of 70 % of that. ``micron calibrate piezo`` replaces it by the stack's own.
@@ -36,11 +37,11 @@ class StackConfig(BaseModel):
     """Added to the plays' sum, so that every dead zone can be above zero."""
 
     slope_per_rate_s_per_V: tuple[float, ...] = ()
-    """c_i of W_i(v) = W_i + c_i v, 000 (7.17), um/V per um/s; empty: rate-independent."""
+    """c_i of W_i(v) = W_i + c_i v, Ang 2004 (7.17), um/V per um/s; empty: rate-independent."""
     rate_low_um_per_s: Annotated[float, Field(ge=0.0)] = 0.0
-    """Below, the slopes are those at this rate (000, 7.5: the law is not linear for slow motion)."""
+    """Below, the slopes are those at this rate (Ang 2004, 7.5: the law is not linear for slow motion)."""
     rate_high_um_per_s: tuple[Positive, ...] = ()
-    """Beyond, slope i is that at this rate (000, Fig. 7.11; ERRATA 79); empty: never."""
+    """Beyond, slope i is that at this rate (Ang 2004, Fig. 7.11; erratum 79); empty: never."""
     least_slope_um_per_V: Positive = 0.005
     """Slopes are held here when the rate would make them smaller: a slope of zero has no inverse."""
 
@@ -58,7 +59,7 @@ class StackConfig(BaseModel):
                 raise ValueError(f"{name}: as many thresholds as weights are needed")
             if thresholds[0] != 0.0 or np.any(np.diff(thresholds) <= 0.0):
                 raise ValueError(f"{name}: thresholds must start at 0 and increase")
-            # ERRATA 74: the inverse exists when every partial sum is positive; single weights may be negative
+            # erratum 74: the inverse exists when every partial sum is positive; single weights may be negative
             if np.any(np.cumsum(weights) <= 0.0):
                 raise ValueError(f"{name}: every partial sum of the weights must be positive, or there is no inverse")
         n = len(self.play_thresholds_V)
@@ -85,7 +86,7 @@ class ActuationConfig(BaseModel):
     ramp_s: Positive = 0.5
     min_confidence: Annotated[float, Field(ge=0.0, lt=1.0)] = 0.1
 
-    ball_circle_m: Positive = 0.005  # R = r, 000 (6.11)
+    ball_circle_m: Positive = 0.005  # R = r, Ang 2004 (6.11)
     shaft_m: Positive = 0.040  # ball plane to tip
     lever_gain: tuple[Positive, Positive, Positive] = (8.0, 8.0, 8.0)
     rest_heights_m: tuple[float, float, float] = (0.0, 0.0, 0.0)  # of the balls at neutral, against a level star

@@ -1,4 +1,4 @@
-"""A stable inverse of what follows the hysteresis (amplifier lag, resonance), with preview: 000 sec. 7.5, 5.1.
+"""A stable inverse of what follows the hysteresis (amplifier lag, resonance), with preview: Ang 2004 sec. 7.5, 5.1.
 
 The exact inverse of a sampled resonance is not stable (zeros outside the unit circle). A short FIR filter that may look
 a little ahead is, always: its taps are the least squares that make taps x answer = 1 over the tremor's band, with a

@@ -1,8 +1,9 @@
-"""Rate-dependent modified Prandtl-Ishlinskii hysteresis, creep, and the exact inverse (000, 7.2, 7.3; ERRATA 73-79).
+"""Rate-dependent modified Prandtl-Ishlinskii hysteresis, creep, and the exact inverse (Ang 2004, 7.2, 7.3; errata
+73-79).
 
 Forward: z = x + creep(x), x = w_s . S_d(w_h(v) . H_r[u]): plays H_r of the drive with memory, weighted by slopes
 W_i(v) = W_i + c_i v that depend on the rate v = |dz/dt| of the wanted stroke, then one-sided dead zones without
-memory, then creep. The inverse keeps the forward play states and transforms them anew in every step (ERRATA 78).
+memory, then creep. The inverse keeps the forward play states and transforms them anew in every step (erratum 78).
 Units: drive V, stroke m (slopes m/V), rate m/s; dead-zone thresholds in m.
 """
 
@@ -46,7 +47,7 @@ def operator_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
 
 
 def inverse_weights(w: Array) -> Array:
-    """000 (7.13), (7.14): weights of the inverse from the forward ones; partial sums must be positive."""
+    """Ang 2004 (7.13), (7.14): weights of the inverse from the forward ones; partial sums must be positive."""
     sums = np.cumsum(w)
     return np.concatenate([[1.0 / w[0]], -w[1:] / (sums[1:] * sums[:-1])])
 
@@ -115,9 +116,10 @@ def operator_params(stack: StackConfig, tick_hz: float = 1000.0, sizes: tuple[in
 
 @kernel
 def slopes_at(rate: float, stack: Record, out: Array) -> bool:
-    """``out`` (n,) = W_i at ``rate`` m/s, 000 (7.17), held at the ends of the law; True when one had to be limited.
+    """``out`` (n,) = W_i at ``rate`` m/s, Ang 2004 (7.17), held at the ends of the law; True when one had to be
+    limited.
 
-    A slope that is not positive has no inverse (000, 7.5): it is held at the least one.
+    A slope that is not positive has no inverse (Ang 2004, 7.5): it is held at the least one.
     """
     limited = False
     for i in range(len(stack.r)):
@@ -132,7 +134,7 @@ def slopes_at(rate: float, stack: Record, out: Array) -> bool:
 
 @kernel
 def play(x: float, states: Array, slopes: Array, r: Array) -> float:
-    """w . H_r[x] with w_i = W_i - W_(i-1), 000 (7.1), (7.4), (7.18): moves the ``states`` and sums them."""
+    """w . H_r[x] with w_i = W_i - W_(i-1), Ang 2004 (7.1), (7.4), (7.18): moves the ``states`` and sums them."""
     total = 0.0
     before = 0.0
     for i in range(len(r)):
@@ -145,7 +147,7 @@ def play(x: float, states: Array, slopes: Array, r: Array) -> float:
 
 @kernel
 def play_inverse(h: float, states: Array, slopes: Array, r: Array) -> float:
-    """x with w . H_r[x] = h, 000 (7.20), (7.21); ``states`` are the forward operator's and do not move.
+    """x with w . H_r[x] = h, Ang 2004 (7.20), (7.21); ``states`` are the forward operator's and do not move.
 
     y'_i = W_i y_i + sum_{j > i} w_j y_j is carried from play to play as y'_(i-1) less the change.
     """
@@ -167,7 +169,7 @@ def play_inverse(h: float, states: Array, slopes: Array, r: Array) -> float:
 
 @kernel
 def dead_zones(y: float, d: Array, s: Array) -> float:
-    """s . S_d(y), 000 (7.7), (7.8); d[0] = 0 passes y of either sign."""
+    """s . S_d(y), Ang 2004 (7.7), (7.8); d[0] = 0 passes y of either sign."""
     total = s[0] * y
     for i in range(1, len(d)):
         total += s[i] * max(y - d[i], 0.0)

@@ -1,7 +1,7 @@
-"""Three-legged manipulator: strokes of the three actuators <-> displacement of the tip (000, ch. 6; ERRATA 58-70).
+"""Three-legged manipulator: strokes of the three actuators <-> displacement of the tip (Ang 2004, ch. 6; errata 58-70).
 
 Each ball joint stays in the vertical plane of its leg, which makes the star's orientation a rotation about a
-horizontal axis: n_z = -a_x, o_z = -a_y, and moves the star's centre sideways in second order (ERRATA 68):
+horizontal axis: n_z = -a_x, o_z = -a_y, and moves the star's centre sideways in second order (erratum 68):
 x_c = r (a_y^2 - a_x^2) / (2 (1 + a_z)), y_c = r a_x a_y / (1 + a_z). Forward is closed; inverse is Newton's method on
 (a_x, a_y) with the analytic Jacobian. With a = a_x + i a_y the equation is l a - r conj(a)^2 / (2 (1 + a_z)) = d: in
 polar form a sextic (cos 3 phi stays), so no closed form is used.

@@ -1,6 +1,6 @@
 """Checks each input of a scan for physically impossible counts, before the motion that they indicate is used.
 
-Six axes and six unknowns leave no parity while the instrument moves (ERRATA no. 15). Three facts remain: a sensor
+Six axes and six unknowns leave no parity while the instrument moves (erratum 15). Three facts remain: a sensor
 behind its 15.2 Hz filter cannot jump, it is never without noise, and it stays off the rails. In addition, the slow
 parts of axes that point the same way at two places must agree, because turning hands do not accelerate for long.
 Natural figures (three hands, nine runs of 15 s): second differences reach 2.8 mV; parallel axes never differ by more
@@ -156,7 +156,7 @@ def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) 
     pair with the shortest lever the turns across the instrument that the other two measure are subtracted.
     ``positions_m``, ``axes`` (6, 3): order of AXES.
 
-    A difference is (r_i - r_j) x s . alpha (ERRATA, section 5: cluster); alpha along z, the instrument, is taken for 0.
+    A difference is (r_i - r_j) x s . alpha (docs/references.md); alpha along z, the instrument, is taken for 0.
     """
     mix = np.eye(len(PAIRS))
     lever = np.array([np.cross(positions_m[i] - positions_m[j], axes[i])[:2] for i, j, _ in PAIRS])

@@ -28,7 +28,7 @@ from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
 
 ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))
-"""Lists devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34))."""
+"""Lists devices and axes in the firmware's sensor order a1x, a1z, a2y, a2z, a3x, a3y (Ang 2004 (2.34))."""
 
 
 class Daq(AnalogInputScan, Protocol):

@@ -14,14 +14,14 @@ class EndoscopeConfig(BaseModel):
     """Holds the checked [firmware] table of an endoscope bench. ``steered_by`` names the device whose turning moves the
     view; empty: the motion card, else the first sensor.
 
-    ``initial_s``: the start attitude of every activation is the mean over this time (002, section 6.2: less than
+    ``initial_s``: the start attitude of every activation is the mean over this time (Erat 2018, section 6.2: less than
     0.1 s). ``silent_ms``: after this time without a sample the view is held and the run ends.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     fusion: FusionConfig = FusionConfig(method="error-state")
-    """Mahony, which document 002 chose, follows every acceleration; see docs/endoscope.md."""
+    """Mahony, which Erat 2018 chose, follows every acceleration; see docs/endoscope.md."""
     game: GameConfig = GameConfig()
     steered_by: str = ""
     silent_ms: float = Field(default=500.0, ge=20.0, le=60_000.0)

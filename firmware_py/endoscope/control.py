@@ -1,4 +1,4 @@
-"""Maps the motion card's angles to the camera's field of view: document 002 (Erat 2018), section 6.2.
+"""Maps the motion card's angles to the camera's field of view: Erat 2018 (Erat 2018), section 6.2.
 
 The field of view is a square on the screen: centre (x, y) and side ``size``, pixels, y downwards. Angles are the card's
 roll psi and pitch theta in degrees. Status 0: nothing moves; 1: psi and theta move x and y; 2: psi changes the size.

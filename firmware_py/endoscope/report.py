@@ -1,4 +1,5 @@
-"""Builds the targeting experiment's report for each user: elapsed time, clicks, rotations (002, sections 6.1, 6.3)."""
+"""Builds the targeting experiment's report for each user: elapsed time, clicks, rotations (Erat 2018, sections 6.1,
+6.3)."""
 
 from __future__ import annotations
 

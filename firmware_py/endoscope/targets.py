@@ -1,4 +1,4 @@
-"""The targeting experiment (document 002, section 6.3) as a pure state machine: no clock, no screen, no device.
+"""The targeting experiment (Erat 2018, section 6.3) as a pure state machine: no clock, no screen, no device.
 
 Five random squares, one after the other, are to be covered by the field of view; the next one appears when centre and
 side of the view are within the tolerance. Drive it with a pointer and a button, from a mouse, a web page or a hand::

@@ -1,7 +1,7 @@
 """Attitude without gyroscopes: angular acceleration integrated twice, held by gravity and the magnetic field.
 
 A third-order observer (attitude, rate, bias of the angular acceleration) with its three poles at one
-frequency, about the tool axis a higher one: there the placement (000 (2.54)) makes angular acceleration eight
+frequency, about the tool axis a higher one: there the placement (Ang 2004 (2.54)) makes angular acceleration eight
 times as noisy. The accelerations of the hand enter the gravity reference, so the corner sits far below the tremor
 band and the error passes a further low-pass: in the tremor band attitude is the double integral of alpha
 alone, behind the same RC filter as the specific force, so that the tilt part of gravity cancels with the right
@@ -221,7 +221,7 @@ def propagate(
         state.rate[i] += 0.5 * (alpha + state.previous[i]) * dt + 3.0 * corner * corner * state.error[i] * dt
         state.previous[i] = alpha
         state.bias[i] -= corner * corner * corner * state.error[i] * dt
-        # mean rate of the interval (ERRATA 42)
+        # mean rate of the interval (erratum 42)
         turn[i] = (0.5 * (before + state.rate[i]) + 3.0 * corner * state.error[i]) * dt
     rotate_by(state.quaternion, turn[0], turn[1], turn[2])
     to_matrix(state.quaternion, state.matrix)

@@ -31,7 +31,7 @@ GYRO_SCALE_ERROR = 0.002
 def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
     """(6, 6) two-sided densities of (f, alpha) from the axes' noise: what a random walk grows by per second.
 
-    The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of ERRATA 21, 44.
+    The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of errata 21, 44.
     """
     sigma = np.array(config.noise_ug_per_rtHz) * 1e-6 * STANDARD_GRAVITY / np.sqrt(2.0)
     solve = np.linalg.pinv(config.observation() / sigma[:, None])

@@ -5,7 +5,7 @@ behind the RC filter and the supply reading does not, so the supply passes the s
 divides; a supply ripple then cancels instead of being traded for a phase error.
 
 Each axis is read twice: with its line (3.3), then with the bias and the scale factor that the lines of its neighbours
-say, A = (L - g(L_y) - h(L_z)) / (1 + r(L_z)), which is 000 (3.11)-(3.14) with V_y and V_z counted from their zero.
+say, A = (L - g(L_y) - h(L_z)) / (1 + r(L_z)), which is Ang 2004 (3.11)-(3.14) with V_y and V_z counted from their zero.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def calibration_params(config: SensingConfig) -> Record:
         reference_C=config.reference_temperature_C,
         temperature_smoothing=1.0 - exp(-dt / TEMPERATURE_SMOOTHING_S),
         magnetometer_bias_V=config.magnetometer_bias_V,
-        # 000 (3.20): the rows of the inverted matrix are the sensing axes; scale first (ERRATA 33)
+        # Ang 2004 (3.20): the rows of the inverted matrix are the sensing axes; scale first (erratum 33)
         magnetometer_uT_per_V=np.linalg.inv(np.array(config.magnetometer_axes)) / magnetometer_scale,
     )
 
@@ -157,7 +157,7 @@ def calibrate(
 
 @kernel
 def composite(line: NDArray[np.float64], params: Record, out: NDArray[np.float64]) -> None:
-    """``out`` (N,) m/s^2 from the axes' lines (N,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (000 (3.4))."""
+    """``out`` (N,) m/s^2 from the axes' lines (N,) m/s^2: bias B(V_y, V_z), scale SF(V_z) (Ang 2004 (3.4))."""
     for i in range(len(line)):
         y, z = line[params.in_plane[i]], line[params.out_of_plane[i]]
         g, h, r = params.bias_in_plane[i], params.bias_out_of_plane[i], params.scale_out_of_plane[i]

@@ -44,7 +44,8 @@ UNIT_AXES: tuple[Vector, ...] = (
 
 
 class SensingConfig(BaseModel):
-    """Sets sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (000 (2.34)), then more.
+    """Sets sensors, geometry and attitude filter. Sensor order: a1x, a1z, a2y, a2z, a3x, a3y (Ang 2004 (2.34)), then
+    more.
 
     With seven or eight axes, ``channels``, ``positions_m`` and ``axes`` name them; supply and temperature give up
     inputs.
@@ -58,7 +59,7 @@ class SensingConfig(BaseModel):
     supply_channel: Input | None = 6  # None: the supply is taken as nominal
     temperature_channel: Input | None = 7  # None: the temperature is taken as the reference
 
-    # 000 (2.54), second: d1 = 20.2, d2 = 14.3, d3 = 116.0 mm; front sensor on the tool axis
+    # Ang 2004 (2.54), second: d1 = 20.2, d2 = 14.3, d3 = 116.0 mm; front sensor on the tool axis
     # packages of two axes in the order of the axes, or a place for each axis
     positions_m: tuple[Vector, ...] = (
         (0.0059, -0.0143, 0.0),
@@ -71,7 +72,7 @@ class SensingConfig(BaseModel):
     noise_ug_per_rtHz: tuple[float, ...] = (110.0,) * 6
     # rms of an axis' slow drift over 100 s, beside alpha_drift_rad_s2; both keys as `micron noise` measures them
     axis_drift_m_s2: tuple[NotNegative, ...] = (0.0,) * 6
-    filter_ohm: Positive = 32_000.0  # ADXL-203 output resistance with the external capacitor, 000 sec. 3.2.1.7
+    filter_ohm: Positive = 32_000.0  # ADXL-203 output resistance with the external capacitor, Ang 2004 sec. 3.2.1.7
     filter_farad: Positive = 0.33e-6
 
     nominal_supply_V: Positive = 5.0
@@ -84,8 +85,8 @@ class SensingConfig(BaseModel):
     bias_V_per_C: tuple[float, ...] = (0.0,) * 6
     scale_per_C: tuple[float, ...] = (0.0,) * 6
     range_g: Positive = 1.7
-    # composite model, 000 (3.4)-(3.14): which axes stand for V_y and V_z, and their polynomials without constant
-    # (ERRATA 29) in the first reading of those axes: linear part 1 and quadratic part 1/g of the bias in g; for the
+    # composite model, Ang 2004 (3.4)-(3.14): which axes stand for V_y and V_z, and their polynomials without constant
+    # (erratum 29) in the first reading of those axes: linear part 1 and quadratic part 1/g of the bias in g; for the
     # scale factor 1/g and 1/g^2
     in_plane: tuple[Axis, ...] = (1, 0, 3, 2, 5, 4)
     out_of_plane: tuple[Axis, ...] = (2, 2, 0, 0, 1, 1)
@@ -97,7 +98,8 @@ class SensingConfig(BaseModel):
     magnetometer_scale_V_per_uT: Vector = (0.01, 0.01, 0.01)
     magnetometer_axes: tuple[Vector, Vector, Vector] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
-    # numeric: force and rate of the same instant, iterated (000 (2.6)); analytic: centripetal part of the tick before
+    # numeric: force and rate of the same instant, iterated (Ang 2004 (2.6)); analytic: centripetal part of the tick
+    # before
     kinematics_method: Literal["analytic", "numeric"] = "analytic"
     # analytic: a tick whose centripetal part changes by more than a tenth of a sample's noise is solved numerically
     kinematics_guard: bool = True
@@ -177,7 +179,7 @@ class SensingConfig(BaseModel):
 
     @property
     def cutoff_rad_s(self) -> float:
-        """Return the corner of the RC filter behind every accelerometer axis (15.07 Hz, ERRATA 27)."""
+        """Return the corner of the RC filter behind every accelerometer axis (15.07 Hz, erratum 27)."""
         return 1.0 / (self.filter_ohm * self.filter_farad)
 
     def axis_positions(self) -> NDArray[np.float64]:

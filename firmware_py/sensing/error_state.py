@@ -207,7 +207,7 @@ def error_state_step(
         before = state.rate[i]
         state.rate[i] += 0.5 * (now + state.previous[i]) * dt
         state.previous[i] = now
-        turn[i] = (before + params.lead * (state.rate[i] - before)) * dt  # mean rate of the interval: ERRATA 42
+        turn[i] = (before + params.lead * (state.rate[i] - before)) * dt  # mean rate of the interval: erratum 42
     rotate_by(state.quaternion, turn[0], turn[1], turn[2])
     to_matrix(state.quaternion, c)
     up = scratch(3)

@@ -1,4 +1,4 @@
-"""Estimates the attitude of an inertial sensor with a gyroscope, by one of several filters (002, chapter 3)."""
+"""Estimates the attitude of an inertial sensor with a gyroscope, by one of several filters (Erat 2018, chapter 3)."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ NATIVE = {
 
 
 class FusionConfig(BaseModel):
-    """Selects the filter and its parameters. The defaults are document 002's printed choice (sections 3.3, 3.4).
+    """Selects the filter and its parameters. The defaults are Erat 2018's printed choice (sections 3.3, 3.4).
 
     ``error-state`` is the Kalman filter of ``error_state.py``: it finds the gyroscope's bias and needs force in m/s^2.
     """
@@ -199,7 +199,7 @@ def _open_vqf(rate_hz: float) -> Any:
 
 
 def angles_deg(quaternion: Array) -> tuple[float, float, float]:
-    """Roll psi, pitch theta, yaw phi in degrees of one quaternion (3.47)-(3.49), ERRATA 103."""
+    """Roll psi, pitch theta, yaw phi in degrees of one quaternion (3.47)-(3.49), erratum 103."""
     w, x, y, z = (float(v) for v in quaternion)
     roll = atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y))
     pitch = asin(max(-1.0, min(1.0, 2.0 * (w * y - x * z))))

@@ -1,4 +1,4 @@
-"""The attitude filters of document 002 (Erat 2018), chapter 3: one compiled step each, gyroscope and gravity.
+"""The attitude filters of Erat 2018 (Erat 2018), chapter 3: one compiled step each, gyroscope and gravity.
 
 Attitude is body to world, z up. ``field`` is optional: with a magnetometer, Madgwick's and Mahony's filters also hold
 the heading (Madgwick, Harrison, Vaidyanathan 2011; Mahony, Hamel, Pflimlin 2008); without one nothing turns it back.
@@ -77,7 +77,7 @@ def step_fusion(
     if method != TILT:
         rotate_by(q, rate[0] * dt_s, rate[1] * dt_s, rate[2] * dt_s)
     if method != GYROSCOPE:
-        # (3.28)-(3.30), about the axis between predicted and measured up instead of angle by angle (ERRATA 101)
+        # (3.28)-(3.30), about the axis between predicted and measured up instead of angle by angle (erratum 101)
         share = dt_s / (params.tau_s + dt_s) if method == COMPLEMENTARY else 1.0
         _lean(state, force, share)
 
@@ -139,7 +139,7 @@ def _madgwick(
     field_scale: float,
     dt_s: float,
 ) -> None:
-    """(3.65)-(3.74) with ERRATA 105, 107; the field's rows as in Madgwick 2011."""
+    """(3.65)-(3.74) with errata 105, 107; the field's rows as in Madgwick 2011."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     s0, s1, s2, s3 = 0.0, 0.0, 0.0, 0.0
     norm = sqrt(force[0] ** 2 + force[1] ** 2 + force[2] ** 2)
@@ -179,7 +179,7 @@ def _mahony(
     ki: float,
     dt_s: float,
 ) -> None:
-    """(3.75)-(3.80) with ERRATA 108."""
+    """(3.75)-(3.80) with erratum 108."""
     q = state.quaternion
     w, x, y, z = q[0], q[1], q[2], q[3]
     ex, ey, ez = 0.0, 0.0, 0.0

@@ -1,8 +1,8 @@
 """Solves for specific force and angular acceleration of a rigid body with six or more single-axis accelerometers.
 
 Axis i at r_i with unit direction s_i reads y_i = s_i.(f + alpha x r_i + omega x (omega x r_i)), f the specific
-force at the origin (000 (2.3) with ERRATA 2, 13, 30). With omega known this is linear in (f, alpha): all axes
-are solved at once, weighted by their noise; the three differences of 000 (2.14) are the special case N = 6.
+force at the origin (Ang 2004 (2.3) with errata 2, 13, 30). With omega known this is linear in (f, alpha): all axes
+are solved at once, weighted by their noise; the three differences of Ang 2004 (2.14) are the special case N = 6.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""Numeric differential kinematics: force and rate of the same instant, with its own centripetal part (000 (2.6)).
+"""Numeric differential kinematics: force and rate of the same instant, with its own centripetal part (Ang 2004 (2.6)).
 
 ``kinematics.solve_motion`` takes the centripetal part from the rate before. Here alpha = (rate - rate before) / dt goes
 into the readings' equation, which is then of second degree in alpha: Gauss-Newton with the analytic Jacobian, over all
-N >= 6 axes, weighted by their noise. (ERRATA 4, 5 correct the printed components; here they are vectors.)
+N >= 6 axes, weighted by their noise. (errata 4, 5 correct the printed components; here they are vectors.)
 """
 
 from __future__ import annotations

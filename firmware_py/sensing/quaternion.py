@@ -1,4 +1,4 @@
-"""Provides operations on quaternions: scalar first, Hamilton, body to world (ERRATA, section 5)."""
+"""Provides operations on quaternions: scalar first, Hamilton, body to world (docs/references.md, conventions)."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def rotate_by(q: NDArray[np.float64], x: float, y: float, z: float) -> None:
     """q <- q x exp(theta/2) in place: turn by the body-frame rotation vector (x, y, z) rad, and renormalise."""
     angle2 = x * x + y * y + z * z
     if angle2 < 1e-12:
-        scale = 0.5 - angle2 / 48.0  # ERRATA 38: the limit is 1/2
+        scale = 0.5 - angle2 / 48.0  # erratum 38: the limit is 1/2
         c = 1.0 - angle2 / 8.0
     else:
         angle = sqrt(angle2)
@@ -47,7 +47,7 @@ def rotate_by(q: NDArray[np.float64], x: float, y: float, z: float) -> None:
 
 @kernel
 def to_matrix(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Set ``out`` (3, 3) to C_WB, 000 (2.13)."""
+    """Set ``out`` (3, 3) to C_WB, Ang 2004 (2.13)."""
     w, x, y, z = q[0], q[1], q[2], q[3]
     out[0, 0] = w * w + x * x - y * y - z * z
     out[0, 1] = 2.0 * (x * y - w * z)
@@ -62,7 +62,7 @@ def to_matrix(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
 
 @kernel
 def from_matrix(c: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Set ``out`` (4,) from C_WB (3, 3), by its largest component, so that it is safe at all angles (ERRATA 45)."""
+    """Set ``out`` (4,) from C_WB (3, 3), by its largest component, so that it is safe at all angles (erratum 45)."""
     trace = c[0, 0] + c[1, 1] + c[2, 2]
     largest = 0
     best = trace

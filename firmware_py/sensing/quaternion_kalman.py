@@ -1,8 +1,9 @@
-"""Runs a quaternion Kalman filter with state x = [q, b], b the error of the rate (000 sec. 4.4, 001; ERRATA 36-48).
+"""Runs a quaternion Kalman filter with state x = [q, b], b the error of the rate (Ang 2004 sec. 4.4, Ang 2004b; errata
+36-48).
 
-The bias-corrected rate stands in the transition of q; F = [[Phi_Q, -T/2 Phi_Q Q~], [0, I]] carries P (ERRATA 38, 39).
+The bias-corrected rate stands in the transition of q; F = [[Phi_Q, -T/2 Phi_Q Q~], [0, I]] carries P (errata 38, 39).
 The measurement is TRIAD's quaternion with Shuster's covariance; that has rank three, so the same again along q
-itself is added (ERRATA 47). Joseph form, q normalised after each step, sign of the measurement nearest the state.
+itself is added (erratum 47). Joseph form, q normalised after each step, sign of the measurement nearest the state.
 Measurements while the specific force is not g, or the field not the learned one, are left out.
 """
 
@@ -21,7 +22,7 @@ from hal.compiled import kernel
 QUATERNION_KALMAN = np.dtype(
     [
         ("turn_density", "f8", (3,)),  # rad^2/s, body axes: white noise of the rate
-        ("rate_density", "f8", (3,)),  # (rad/s)^2/s: random walk of its error (Xi_alpha for accelerometers, ERRATA 44)
+        ("rate_density", "f8", (3,)),  # (rad/s)^2/s: random walk of its error (Xi_alpha for accelerometers, erratum 44)
         ("lead", "f8"),
         ("up_density", "f8"),  # rad^2 s of the direction of gravity, the hand's accelerations included
         ("field_density", "f8"),  # rad^2 s of the direction of the field
@@ -36,7 +37,7 @@ QUATERNION_KALMAN_STATE = np.dtype([("covariance", "f8", (7, 7)), ("field_size",
 
 @kernel
 def tilde(q: NDArray[np.float64], out: NDArray[np.float64]) -> None:
-    """Set ``out`` (4, 3) to Q~, which satisfies Q~ B = q x (0, B) (000 (4.13), ERRATA 37)."""
+    """Set ``out`` (4, 3) to Q~, which satisfies Q~ B = q x (0, B) (Ang 2004 (4.13), erratum 37)."""
     out[0, 0], out[0, 1], out[0, 2] = -q[1], -q[2], -q[3]
     out[1, 0], out[1, 1], out[1, 2] = q[0], -q[3], q[2]
     out[2, 0], out[2, 1], out[2, 2] = q[3], q[0], -q[1]

@@ -3,7 +3,7 @@
 With six axes the rate is an integral of alpha, and alpha needs the rate for its centripetal part: an error grows as
 exp(k |omega| t), k about the ratio of the largest to the smallest lever. A hand (below 1 rad/s) hardly shows it, at 3
 rad/s it is a thousandfold within a second, with ``solve_numeric`` as well: each of its steps takes the rate before for
-exact. More than six axes leave combinations that neither f nor alpha enters, only products of rates (000 (2.3)); a
+exact. More than six axes leave combinations that neither f nor alpha enters, only products of rates (Ang 2004 (2.3)); a
 Kalman filter of the rate uses those. The products are the same for omega and -omega: the sign is that of the start.
 """
 

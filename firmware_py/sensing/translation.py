@@ -66,7 +66,7 @@ def point_force(
     point: NDArray[np.float64],
     out: NDArray[np.float64],
 ) -> None:
-    """``out`` (3,) = specific force at a body point (3,) m: f + alpha x r + omega x (omega x r) (004 (31)).
+    """``out`` (3,) = specific force at a body point (3,) m: f + alpha x r + omega x (omega x r) (Latt 2011 (31)).
 
     ``motion`` is (f, alpha) of the origin, ``bias`` of alpha.
     """

@@ -1,4 +1,4 @@
-"""Computes attitude from up (specific force at rest) and magnetic north (000 (2.22)-(2.25), ERRATA 2, 9)."""
+"""Computes attitude from up (specific force at rest) and magnetic north (Ang 2004 (2.22)-(2.25), errata 2, 9)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,8 @@ def triad_covariance(
     field_variance: float,
     out: NDArray[np.float64],
 ) -> None:
-    """``out`` (3, 3) rad^2: covariance of TRIAD's error angles, body frame, anchored on up (000 (4.34), Shuster 1981).
+    """``out`` (3, 3) rad^2: covariance of TRIAD's error angles, body frame, anchored on up (Ang 2004 (4.34), Shuster
+    1981).
 
     ``up`` and ``field`` (3,) are unit vectors in the body frame, the variances those of their directions (rad^2, each
     of two angles).

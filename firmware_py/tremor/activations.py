@@ -1,4 +1,4 @@
-"""Provides the transfer functions of the cascade network's hidden units (000, 5.3.2), and their slopes."""
+"""Provides the transfer functions of the cascade network's hidden units (Ang 2004, 5.3.2), and their slopes."""
 
 from __future__ import annotations
 

@@ -56,9 +56,9 @@ class KalmanConfig(_Table):
 
 
 class WflcConfig(_Table):
-    """Weighted-frequency Fourier linear combiner and the combiner that trails it (000, 5.2).
+    """Weighted-frequency Fourier linear combiner and the combiner that trails it (Ang 2004, 5.2).
 
-    Gains belong to a signal of unit power: the input is normalised by its own (ERRATA 56).
+    Gains belong to a signal of unit power: the input is normalised by its own (erratum 56).
     """
 
     start_hz: Positive = 10.0

@@ -6,7 +6,7 @@ whatever the hand's tremor and the sensor's noise are, and a jerk is what stands
 values limited to ``limit`` sigma, so that a jerk does not hide the next one.
 
 Drift: what is left of gravity and bias must stay small. A cumulative sum of what the smoothed acceleration has beyond
-``drift_allowed_m_s2`` alarms at ``drift_limit_m_s``, a velocity: how wrong integration has become (000, 5.2.2).
+``drift_allowed_m_s2`` alarms at ``drift_limit_m_s``, a velocity: how wrong integration has become (Ang 2004, 5.2.2).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Fourier linear combiner at a frequency and phase given from outside (000 (5.11), (5.12)), with a bias weight."""
+"""Fourier linear combiner at a frequency and phase given from outside (Ang 2004 (5.11), (5.12)), with a bias weight."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hal.compiled import kernel
 def flc_step(signal: float, phase: float, weights: NDArray[np.float64], weight_gain: float, bias_gain: float) -> None:
     """One LMS step of ``weights`` (sine, cosine, bias) on ``signal``, in the signal's unit.
 
-    The weights settle with 1 / weight_gain samples (ERRATA 52).
+    The weights settle with 1 / weight_gain samples (erratum 52).
     """
     s = sin(phase)
     c = cos(phase)

@@ -1,4 +1,5 @@
-"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (000, 5.2.1; ERRATA 56), unless told otherwise.
+"""The band-pass in front of the WFLC: elliptic, sixth order, 7-13 Hz (Ang 2004, 5.2.1; erratum 56), unless told
+otherwise.
 
 Ripple and attenuation are not printed there; they are parameters here. Its response is known exactly at any
 frequency, so whoever uses its output can undo phase and gain.

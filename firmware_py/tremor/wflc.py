@@ -1,4 +1,4 @@
-"""Tracks the tremor's frequency by a weighted-frequency Fourier linear combiner (000 (5.6)-(5.10), ERRATA 51-56).
+"""Tracks the tremor's frequency by a weighted-frequency Fourier linear combiner (Ang 2004 (5.6)-(5.10), errata 51-56).
 
 The input is divided by the square root of its own smoothed power, so the gains hold for 5 um and for 500 um.
 Frequency is limited to the band, amplitude weights leak a little towards zero. It is locked while the combiner explains
@@ -57,7 +57,7 @@ def wflc_params(config: WflcConfig, tick_hz: float) -> Record:
 def wflc_step(signal: float, state: Record, params: Record) -> None:
     """Process one sample of the band-passed signal, any unit: advance phase, weights and frequency.
 
-    The frequency step follows -d(error^2)/d(omega) with the phase as a running sum (ERRATA 53).
+    The frequency step follows -d(error^2)/d(omega) with the phase as a running sum (erratum 53).
     """
     state.phase = (state.phase + state.omega) % (2.0 * pi)
     state.power += params.power_smoothing * (signal * signal - state.power)

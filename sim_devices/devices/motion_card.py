@@ -1,6 +1,6 @@
 """The endoscope's motion tracking card (MTC) behind its scanner card: an MPU-6050, a button, a battery, ASCII lines.
 
-Source: document 002, section 4.2 (card and packet), 6.2 (button, status), 6.3 with Fig. 6.5 (mechanical spike), with
+Source: Erat 2018, section 4.2 (card and packet), 6.2 (button, status), 6.3 with Fig. 6.5 (mechanical spike), with
 errata nos. 112, 113, 121. A line is ``#:ax:ay:az:wx:wy:wz:temperature:status:`` CR LF, sent by the scanner card at
 115200 baud each time a packet comes. Wire face: bytes. Truth face: an ``Imu``; ``press`` and ``release`` the button,
 ``battery_percent``; observables ``packet`` (the 15 bytes that go over the air, big-endian, errata no. 112), ``status``,
@@ -46,7 +46,7 @@ HOUR_NS = 3_600_000_000_000
 
 
 class MotionCard:
-    """Card and scanner card. ``baud`` paces the line, ``rate_hz`` is the card's sampling rate (100 Hz in 002)."""
+    """Card and scanner card. ``baud`` paces the line, ``rate_hz`` is the card's sampling rate (100 Hz in Erat 2018)."""
 
     def __init__(
         self,

@@ -3,17 +3,17 @@
 What is known, and what was chosen:
 
 - Physiological tremor of the hand is a linear stochastic process, driven by noise, not an oscillator (Gantert 1991
-  in 000 ch. 1; Timmer, Lauk, Pfleger, Deuschl 1998, chao-dyn/9805011): a Gaussian narrow-band signal whose amplitude
-  is Rayleigh distributed, fades and slips in phase. Its amplitude changes fast, its frequency slower (000 ch. 1), and
-  both widen the line (Gresty and Buckwell 1990). Here: a complex Gaussian envelope of 0.6 s correlation time on a
-  carrier near 9.6 Hz (0.78 Hz between half-power points), a frequency wander of 0.4 Hz rms over 2 s and a common gain
-  of +-30 % over 4 s. Together 0.9 to 1.5 Hz between half-power points, 0.6 Hz standard deviation of the spectrum. No
-  width is published in 000; the recordings at hand (shared/data: arm extended 0.75 Hz, mouse hand 1.0 Hz where the peak
-  stands out) are as wide. A sharper line would be easier to predict than a hand.
-- Size: 50 um peak to peak per axis at the tip (Hunter 1993 in 000), so 17.7 um rms per body axis and 30.7 um rms as a
-  vector (38 um: Singh 2002 in 000). The three axes share carrier and gain, their envelopes are correlated by 0.4.
-  60 % of the lateral motion is a turn about the grip, 90 mm behind the tip.
-- Jerk (normal myoclonus) and drift are often larger than tremor (Riviere, Rader, Khosla 1997, in 000 ch. 1);
+  in Ang 2004 ch. 1; Timmer, Lauk, Pfleger, Deuschl 1998, chao-dyn/9805011): a Gaussian narrow-band signal whose
+  amplitude is Rayleigh distributed, fades and slips in phase. Its amplitude changes fast, its frequency slower (Ang
+  2004 ch. 1), and both widen the line (Gresty and Buckwell 1990). Here: a complex Gaussian envelope of 0.6 s
+  correlation time on a carrier near 9.6 Hz (0.78 Hz between half-power points), a frequency wander of 0.4 Hz rms over 2
+  s and a common gain of +-30 % over 4 s. Together 0.9 to 1.5 Hz between half-power points, 0.6 Hz standard deviation of
+  the spectrum. No width is published in Ang 2004; the recordings at hand (shared/data: arm extended 0.75 Hz, mouse hand
+  1.0 Hz where the peak stands out) are as wide. A sharper line would be easier to predict than a hand.
+- Size: 50 um peak to peak per axis at the tip (Hunter 1993 in Ang 2004), so 17.7 um rms per body axis and 30.7 um rms
+  as a vector (38 um: Singh 2002 in Ang 2004). The three axes share carrier and gain, their envelopes are correlated by
+  0.4. 60 % of the lateral motion is a turn about the grip, 90 mm behind the tip.
+- Jerk (normal myoclonus) and drift are often larger than tremor (Riviere, Rader, Khosla 1997, in Ang 2004 ch. 1);
   between drift and tremor there is broadband unsteadiness of some micrometres.
 - Voluntary motion: minimum-jerk reaches (Flash and Hogan 1985) of 1.2 to 3 s with rests between them; no content
   above 1 Hz to speak of.

@@ -4,7 +4,7 @@ out = (I + S) u + b + k (T - 25 degC) + G f + drift, through one pole at the chi
 S: scale errors and misalignment, G: sensitivity of a gyroscope to specific force, drift: first-order Gauss-Markov.
 Noise has rms = density x sqrt(bandwidth) (errata no. 114). A seed draws one chip; data sheet limits are four
 standard deviations. Sources: MPU-6050 product specification rev. 3.4 sec. 6.1, 6.2; LSM6DS3 data sheet rev. 10
-Tables 3; BMX055 data sheet rev. 1.3 Tables 2 to 4; document 002, Tables 5.1 and 5.2.
+Tables 3; BMX055 data sheet rev. 1.3 Tables 2 to 4; Erat 2018, Tables 5.1 and 5.2.
 Not simulated: nonlinearity, structural resonance, vibration rectification, a delay beyond that of the pole.
 """
 

@@ -2,15 +2,14 @@
 
 ``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops|steps|set]
 [--twin FILE]``
-drives one stack through its amplifier under an interferometer (0.07 um rms, 000 sec. 7.4) and writes a recording of the
-contract; ``steps``: small ones, read at 8 kHz so that a resonance shows; ``set`` writes a folder of them, saw-teeth and
-sines of 0.1 to 40 Hz, loops and steps, all that a calibration needs.
-With ``--twin`` a corrected twin (``micron mismatch apply``) stands in the stack's place, as with a bench that
-names it.
-``... manipulator --out FOLDER`` moves all three stacks through a grid and tracks the tip.
-``... tumble --out FOLDER`` turns the resting instrument through many attitudes on two rotary stages (000 sec. 3.2.1.7)
-and logs all 8 DAQ channels and the 3 magnetometer outputs with the stage angles.
-``... rest --out FOLDER`` and ``... pivot --out FOLDER`` log the same at 1 kHz, lying still or swung about the tip.
+drives one stack through its amplifier under an interferometer (0.07 um rms, Ang 2004 sec. 7.4) and writes a recording
+of the contract; ``steps``: small ones, read at 8 kHz so that a resonance shows; ``set`` writes a folder of them,
+saw-teeth and sines of 0.1 to 40 Hz, loops and steps, all that a calibration needs. With ``--twin`` a corrected twin
+(``micron mismatch apply``) stands in the stack's place, as with a bench that names it. ``... manipulator --out FOLDER``
+moves all three stacks through a grid and tracks the tip. ``... tumble --out FOLDER`` turns the resting instrument
+through many attitudes on two rotary stages (Ang 2004 sec. 3.2.1.7) and logs all 8 DAQ channels and the 3 magnetometer
+outputs with the stage angles. ``... rest --out FOLDER`` and ``... pivot --out FOLDER`` log the same at 1 kHz, lying
+still or swung about the tip.
 """
 
 from __future__ import annotations
@@ -106,8 +105,8 @@ CALIBRATION_SET = (
     *(("sine", hz, 4.0, share) for hz, share in ((1.0, 0.3), (8.0, 0.3), (12.0, 0.15))),
     ("steps", 10.0, 4.0, 1.0),
 )
-"""Profile, Hz, seconds, share of the amplitude: rates as in 000, sec. 7.4, minor loops, loops of a tremor's size about
-neutral, and steps for lag and resonance."""
+"""Profile, Hz, seconds, share of the amplitude: rates as in Ang 2004, sec. 7.4, minor loops, loops of a tremor's size
+about neutral, and steps for lag and resonance."""
 
 
 def measure_piezo(
@@ -204,7 +203,7 @@ def tumble_attitudes(positions: int) -> tuple[Array, Array]:
 
 
 def measure_tumble(config: EmulationConfig, positions: int, seconds: float) -> tuple[dict[str, Array], str]:
-    """Mean over ``seconds`` at each position (5 s in 000), with the true attitude of the stages."""
+    """Mean over ``seconds`` at each position (5 s in Ang 2004), with the true attitude of the stages."""
     if not 12 <= positions <= 10_000:
         raise LabError(f"{positions} positions: give 12 to 10000")
     if not 0.01 <= seconds <= 60.0:

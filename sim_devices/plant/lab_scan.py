@@ -20,7 +20,7 @@ from sim_devices.plant.unit import build_unit, start_temperature_C
 Array = NDArray[np.float64]
 
 TRACKER_RMS_UM = 0.7
-"""Noise of one sample and axis of the optical reference that the authors of source 004 used."""
+"""Noise of one sample and axis of the optical reference that the authors of source Latt 2011 used."""
 INTERFEROMETER_RMS_UM = 0.07
 SAMPLES = 200
 SETTLE_S = 0.05

@@ -1,4 +1,4 @@
-"""The three-legged manipulator: ball heights to tip displacement (000 ch. 6, errata nos. 58 to 70).
+"""The three-legged manipulator: ball heights to tip displacement (Ang 2004 ch. 6, errata nos. 58 to 70).
 
 Balls sit on a circle of radius r in the planes y = 0, y = -sqrt3 x, y = +sqrt3 x and move up and down, so the heights
 give the pose in closed form (errata nos. 68, 69): no iteration, exact to rounding.

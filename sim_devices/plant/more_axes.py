@@ -60,6 +60,7 @@ class MoreAxes:
 
 
 def _felt(motion: BodyMotion, place_m: Array) -> Array:
-    """(3,) specific force at ``place_m``: f + alpha x r + omega x (omega x r), body frame (000 (2.3), ERRATA 2)."""
+    """(3,) specific force at ``place_m``: f + alpha x r + omega x (omega x r), body frame (Ang 2004 (2.3), erratum
+    2)."""
     r, w = place_m - motion.origin_m, motion.rate_rad_s
     return motion.specific_force_m_s2 + np.cross(motion.angular_acceleration_rad_s2, r) + np.cross(w, np.cross(w, r))

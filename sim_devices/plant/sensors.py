@@ -2,7 +2,7 @@
 
 ADXL-203 (data sheet: ratiometric, 1 V/g and 2.5 V at 5 V, 110 ug/rtHz, internal 32 kOhm against 0.33 uF), TMP36
 (0.5 V + 10 mV/degC), supply through a 2:1 divider, HMC-2003 (1 V/gauss, 2.5 V at zero field), DAQ inputs. Cross-axis
-terms have the form of 000 (3.8), (3.10), (3.12), and on top of them three that no polynomial in the other axes'
+terms have the form of Ang 2004 (3.8), (3.10), (3.12), and on top of them three that no polynomial in the other axes'
 outputs describes: a fold, a product with the in-plane axis and a hardening spring. Not simulated: the accelerometer's
 resonance (5.5 kHz), 1/f noise.
 """

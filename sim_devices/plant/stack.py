@@ -5,7 +5,8 @@ spring in series with a slider: s_k' = u' while |s_k| is below its threshold, an
 time constant (viscous slip), so the loop opens with the rate. The thresholds fall with the bias (minor loops at
 different bias are not congruent, which no Prandtl-Ishlinskii model can do). Then static curvature, a Kelvin-Voigt
 chain for creep (one element per decade of time), thermal expansion and one damped resonance of stack, lever and shaft.
-Sources: Goldfarb and Celanovic 1997 (Maxwell slip), Al-Bender, Lampaert, Swevers 2005 (generalised), 000 ch. 7 (size).
+Sources: Goldfarb and Celanovic 1997 (Maxwell slip), Al-Bender, Lampaert, Swevers 2005 (generalised), Ang 2004 ch. 7
+(size).
 
 Amplifier: limits, slew limit, first-order bandwidth, output resistance into the stack's capacitance.
 """

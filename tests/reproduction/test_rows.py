@@ -34,10 +34,10 @@ def test_meets_is_computed() -> None:
 
 
 def test_the_page_says_what_is_not_met_and_why() -> None:
-    missed = Row("000", "rms | x", "um", "at rest", 5.0, 5.2, "lower", "not reproducible", why="not printed")
+    missed = Row("Ang 2004", "rms | x", "um", "at rest", 5.0, 5.2, "lower", "not reproducible", why="not printed")
     page = markdown([Table("sensing", (row(1.0, 1.0, "equal"), missed), 0.0)], "micron reproduce sensing", "abc")
     assert "1 of 2 met" in page
-    assert "- rms \\| x (000): 5.2, published at most 5 um; cannot be reproduced: not printed" in page
+    assert "- rms \\| x (Ang 2004): 5.2, published at most 5 um; cannot be reproduced: not printed" in page
     assert page.count("\n| ") == 3
     assert "**no**" in page.splitlines()[-1]
 

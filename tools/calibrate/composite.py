@@ -1,9 +1,9 @@
-"""The physical model of 000 sec. 3.2.1 for single accelerometer axes, from poses whose attitude is known.
+"""The physical model of Ang 2004 sec. 3.2.1 for single accelerometer axes, from poses whose attitude is known.
 
     V = B + S ((theta . f) (1 + r1 Lz + r2 Lz^2) + p2 Ly^2 + q2 Lz^2),   L = (V - B) / S of the neighbour
 
 f in g, V at nominal supply. This is (3.11) solved for V. The linear parts p1, q1 of (3.8) and (3.10) are not fitted:
-at rest they look exactly as a turn of the sensing axis theta, which carries both (as ERRATA 29 for the constants).
+at rest they look exactly as a turn of the sensing axis theta, which carries both (as erratum 29 for the constants).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Hard and soft iron of a three-axis magnetometer from a log turned through all directions (000 sec. 3.2.2).
+"""Hard and soft iron of a three-axis magnetometer from a log turned through all directions (Ang 2004 sec. 3.2.2).
 
 m = A (raw - b) with |m| = 1: an ellipsoid is fitted algebraically for the start, then the distance from the unit sphere
 is made least, outliers losing weight (Tukey's biweight on the median absolute deviation). A is symmetric: the turn

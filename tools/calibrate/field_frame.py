@@ -1,4 +1,4 @@
-"""Bias, scale and direction of a three-axis magnetometer from poses whose attitude is known (000 sec. 3.2.2).
+"""Bias, scale and direction of a three-axis magnetometer from poses whose attitude is known (Ang 2004 sec. 3.2.2).
 
 V = b + M C_WB^T B with the world field B unknown: only the product M B shows, so the mean scale is taken as nominal
 and B comes out in those units. Hard iron turns with the body and is part of b, soft iron and misalignment part of M. A

@@ -1,4 +1,4 @@
-"""Geometry of the manipulator from a scan: strokes of the stacks beside the tip's position (000, ch. 6).
+"""Geometry of the manipulator from a scan: strokes of the stacks beside the tip's position (Ang 2004, ch. 6).
 
 Found together: circle of the balls, shaft, three levers, how the star leans at neutral, and the rotation from the
 body's frame to the manipulator's. What fixes each: levers the motion along the shaft, shaft length the drop of a

@@ -1,4 +1,4 @@
-"""Model of a piezo stack from recordings of drive and displacement (000, 7.2.3, 7.3.2; ERRATA 74-79).
+"""Model of a piezo stack from recordings of drive and displacement (Ang 2004, 7.2.3, 7.3.2; errata 74-79).
 
 Saw-teeth and sinusoids of different rates and sizes go in together. In order: how the displacement lags (a delay, or
 amplifier lag and resonance); which thresholds and which parts (dead zones, rate-dependent slopes and where their law
@@ -29,10 +29,10 @@ from tools.mismatch.recording import Recording
 
 Array = NDArray[np.float64]
 
-# fine where a tremor's small loops run, coarse beyond (000, 7.2.1); fractions of half the drive's range
+# fine where a tremor's small loops run, coarse beyond (Ang 2004, 7.2.1); fractions of half the drive's range
 FAMILIES: dict[str, tuple[float, ...]] = {
     "8 plays": (0.0, 0.03, 0.08, 0.16, 0.28, 0.44, 0.64, 0.88),
-    "10 plays, 000": (0.0, 0.08, 0.16, 0.24, 0.32, 0.4, 0.5, 0.62, 0.76, 0.9),
+    "10 plays, Ang 2004": (0.0, 0.08, 0.16, 0.24, 0.32, 0.4, 0.5, 0.62, 0.76, 0.9),
     "12 plays": (0.0, 0.02, 0.05, 0.09, 0.15, 0.22, 0.31, 0.41, 0.52, 0.64, 0.78, 0.93),
     "16 plays": (0.0, 0.01, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.29, 0.37, 0.46, 0.56, 0.66, 0.76, 0.86, 0.95),
 }
@@ -159,7 +159,7 @@ def rates_of(pieces: list[Piece], shape: Shape, centre_V: float) -> list[Piece]:
 
 
 def rate_of(x: Array, dt: float) -> Array:
-    """|dx/dt| by backward difference, 000 (7.16)."""
+    """|dx/dt| by backward difference, Ang 2004 (7.16)."""
     return np.abs(np.diff(x, prepend=x[0])) / dt
 
 

@@ -1,4 +1,4 @@
-"""Taps that undo amplifier lag and resonance of each stack, and the preview that they need (000, 7.5).
+"""Taps that undo amplifier lag and resonance of each stack, and the preview that they need (Ang 2004, 7.5).
 
 The tremor predictor has one horizon, so all stacks get the same preview: the lag of the slowest. More is taken only
 when that pays, because a tremor that is predicted further ahead is predicted worse.

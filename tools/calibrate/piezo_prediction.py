@@ -117,7 +117,7 @@ class Prediction:
 
 
 def tremor_profile_um(peak_to_peak_um: float, tick_hz: float = 1000.0, seconds: float = 5.0) -> Array:
-    """A tremor as 000 describes it: tones of 8 to 12 Hz whose amplitudes wander, from neutral."""
+    """A tremor as Ang 2004 describes it: tones of 8 to 12 Hz whose amplitudes wander, from neutral."""
     t = np.arange(round(seconds * tick_hz)) / tick_hz
     x = np.zeros(len(t))
     for hz, slow_hz, phase in ((8.3, 0.31, 0.0), (9.7, 0.23, 2.0), (11.4, 0.17, 4.0)):

@@ -3,7 +3,7 @@
 z = z0 + S(W . H[u]) + creep is not linear in its parameters, but S^-1(z - z0 - creep) = W . H is (Kuhnen): dead-zone
 slopes of the inverse, slopes W_i at rest and at the highest rate, and creep shares are found together. The unknowns
 are the slopes themselves (partial sums of the weights), so a lower bound on each keeps the inverse valid between the
-two rates (ERRATA 74). Creep follows the stroke, which is corrected by the last solution: three passes.
+two rates (erratum 74). Creep follows the stroke, which is corrected by the last solution: three passes.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Shape:
     """What the model has: thresholds as fractions of half the drive's (plays) and of the displacement's range (zones).
 
     ``rate``: slopes depend on the rate; ``rate_low_um_per_s`` and ``rate_high_um_per_s`` (for the first two slopes)
-    are where that law is held, 000 Fig. 7.11.
+    are where that law is held, Ang 2004 Fig. 7.11.
     """
 
     plays: tuple[float, ...]

@@ -1,4 +1,5 @@
-"""The three quick accelerometer calibrations of 002 sec. 5.2.1: slow turn through 360 degrees, fall, flat surface.
+"""The three quick accelerometer calibrations of Erat 2018 sec. 5.2.1: slow turn through 360 degrees, fall, flat
+surface.
 
 Each fits as many numbers as it has mean readings, so no residual is left: the intervals come from the readings within
 the poses, and know nothing of a pose that is not what the method takes it for (``limits``).
@@ -149,7 +150,7 @@ def _missing_turns(raw: Array, low: Rows, high: Rows, bias: Array, scale: Array)
 
 
 def turn(raw: Array) -> QuickResult:
-    """Offset (max + min) / 2 and scale (max - min) / 2 of every axis that was turned up and down (ERRATA 116)."""
+    """Offset (max + min) / 2 and scale (max - min) / 2 of every axis that was turned up and down (erratum 116)."""
     if len(raw) < 50:
         raise InputError(f"{len(raw)} samples: turn slowly through 360 degrees about two axes")
     step, steps = _step(raw), np.std(np.diff(raw, axis=0), axis=0)
@@ -228,7 +229,7 @@ def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float 
 
 
 def flat(raw: Array, counts_per_g: float, up: str) -> QuickResult:
-    """Offset while lying flat with axis ``up`` ("x", "-z", ...) up: its 1 g is taken off first (ERRATA 115)."""
+    """Offset while lying flat with axis ``up`` ("x", "-z", ...) up: its 1 g is taken off first (erratum 115)."""
     axis = "xyz".find(up[-1:]) if up else -1
     if axis < 0 or up[:-1] not in ("", "-", "+"):
         raise InputError(f"up = '{up}': name an axis, as z or -z")

@@ -1,7 +1,7 @@
 """Rotary-stage recordings: columns of sensors beside the two stage angles, a row a pose or many.
 
 Angles: ``alpha_deg``/``beta_deg``, ``alpha_rad``/``beta_rad``, or the lab's ``stage_y_rad``/``stage_z_rad``. Rows in
-a run at one pair of angles are one pose: the mean of its last 5 s (000 sec. 3.2.1.7) counts.
+a run at one pair of angles are one pose: the mean of its last 5 s (Ang 2004 sec. 3.2.1.7) counts.
 """
 
 from __future__ import annotations

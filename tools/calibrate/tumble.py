@@ -1,8 +1,8 @@
-"""The sensors of a resting instrument from a tumble on two rotary stages (000 sec. 3.2.1.7, 3.2.2.4).
+"""The sensors of a resting instrument from a tumble on two rotary stages (Ang 2004 sec. 3.2.1.7, 3.2.2.4).
 
-At rest every axis reads f = C_WB^T (0, 0, g) (ERRATA 2). Accelerometers: ``composite``, magnetometer: ``field_frame``.
-C_WB = R_y(alpha) R_z(beta) with the stage angles of 000 Fig. 3.3: alpha = 0 lays the x-y plane level, at alpha = 90
-degrees beta = 0 points x along gravity.
+At rest every axis reads f = C_WB^T (0, 0, g) (erratum 2). Accelerometers: ``composite``, magnetometer: ``field_frame``.
+C_WB = R_y(alpha) R_z(beta) with the stage angles of Ang 2004 Fig. 3.3: alpha = 0 lays the x-y plane level, at alpha =
+90 degrees beta = 0 points x along gravity.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def identify(
 ) -> TumbleResult:
     """Fit all axes. InputError when the attitudes do not span enough, or while the sensors still warm up.
 
-    ``quadratic`` off leaves bias, scale and direction alone (000 (3.1)-(3.3), (3.15)-(3.19)).
+    ``quadratic`` off leaves bias, scale and direction alone (Ang 2004 (3.1)-(3.3), (3.15)-(3.19)).
     """
     attitude, analog = data["attitude"], data["analog_V"]
     up_body = attitude.transpose(0, 2, 1) @ np.array([0.0, 0.0, 1.0])  # specific force in g

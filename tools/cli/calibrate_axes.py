@@ -35,7 +35,7 @@ class OnDrift(StrEnum):
 
 
 class Model(StrEnum):
-    """How much of 000 sec. 3.2.1 is identified."""
+    """How much of Ang 2004 sec. 3.2.1 is identified."""
 
     COMPOSITE = "composite"
     LINEAR = "linear"
@@ -71,7 +71,7 @@ def accelerometer(
         typer.Argument(metavar="RECORDING", help="Recording (folder, .toml, or a data file) with three columns."),
     ],
     method: Annotated[
-        Method, typer.Option(help="Still poses at unknown angles, a rotary stage, or a quick method of 002.")
+        Method, typer.Option(help="Still poses at unknown angles, a rotary stage, or a quick method of Erat 2018.")
     ] = Method.POSES,
     model: Annotated[Model, typer.Option(help="Stage: with cross-axis terms, or the line alone.")] = Model.COMPOSITE,
     columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
@@ -144,7 +144,7 @@ def _stage(
     out: Path | None,
     json_file: str | None,
 ) -> None:
-    """Three axes whose attitude two stages gave: x and y of one package, z of another (000 sec. 3.2.1.7)."""
+    """Three axes whose attitude two stages gave: x and y of one package, z of another (Ang 2004 sec. 3.2.1.7)."""
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.composite import fit_composite
     from tools.calibrate.stage_log import load_stage_log

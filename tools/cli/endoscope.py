@@ -14,7 +14,7 @@ from tools.cli.common import Exit, JsonOption, clear_errors, console, data_conso
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
 
-endoscope = typer.Typer(help="Steer a field of view with a motion card (document 002, chapter 6).")
+endoscope = typer.Typer(help="Steer a field of view with a motion card (Erat 2018, chapter 6).")
 
 MappingOption = Annotated[str, typer.Option("--mapping", help="position or speed.")]
 GainOption = Annotated[float, typer.Option(min=0.01, max=1000.0, help="Pixels per degree, or pixels/s per degree.")]

@@ -1,4 +1,4 @@
-"""``micron imu``: how good an inertial sensor is, from a recording or on the bench (document 002, chapter 5)."""
+"""``micron imu``: how good an inertial sensor is, from a recording or on the bench (Erat 2018, chapter 5)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def evaluate(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Tables 5.4 to 5.8 of document 002 for a sensor: from recordings, or measured now on a bench (auto-calibrated).
+    """Tables 5.4 to 5.8 of Erat 2018 for a sensor: from recordings, or measured now on a bench (auto-calibrated).
 
     Example: micron imu evaluate --bench imus --virtual --seconds 60
     """
@@ -141,7 +141,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
 def _show(found: dict[str, Any]) -> None:
     title = f"{found['sensor']}: {found['seconds']:.0f} s at {found['rate_hz']:g} Hz, |a| = {found['gravity_g']:.4f} g"
     table = Table(title=title, title_justify="left")
-    table.add_column("document 002")
+    table.add_column("Erat 2018")
     table.add_column("quantity")
     for axis in AXES:
         table.add_column(axis, justify="right")

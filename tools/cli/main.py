@@ -52,7 +52,7 @@ COMMANDS = {
     ),
     "placement": (
         "placement:placement",
-        "Positions and directions with the least angular (or tip) noise, checked against the propositions of 004.",
+        "Places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.",
     ),
     "recover": (
         "recordings:recover",
@@ -98,7 +98,7 @@ COMMANDS = {
         "trust:trust",
         "Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.",
     ),
-    "endoscope": ("endoscope:endoscope", "Steer a field of view with a motion card (document 002, chapter 6)."),
+    "endoscope": ("endoscope:endoscope", "Steer a field of view with a motion card (Erat 2018, chapter 6)."),
     "imu": ("imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
     "manipulator": ("manipulator:app", "The three-legged manipulator at the tip."),
     "mismatch": ("mismatch:app", "Where simulation and recording differ, and which physics is missing."),

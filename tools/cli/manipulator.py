@@ -43,7 +43,7 @@ def workspace(
         check_writable(json_file)
         config = load_plan(load_bench(bench_path(bench))).stages.actuation
         found = analyse(config)
-        table = Table(title="Workspace of the tip (000, Table 6.1, sec. 6.1.1)", title_justify="left")
+        table = Table(title="Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", title_justify="left")
         for heading in ("quantity", "required", "ours"):
             table.add_column(heading, justify="left" if heading == "quantity" else "right")
         x, y, z = found.extent_m * 1e6

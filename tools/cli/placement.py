@@ -15,7 +15,7 @@ from tools.output import check_writable, write_json
 
 def placement(
     space_file: Annotated[
-        Path, typer.Argument(metavar="SPACE.toml", help="Boxes, packages, noise; see benches/space-004.toml.")
+        Path, typer.Argument(metavar="SPACE.toml", help="Boxes, packages, noise; see benches/space-latt.toml.")
     ],
     image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the instrument.")] = Path(
         "out/placement.png"
@@ -23,9 +23,9 @@ def placement(
     seed: Annotated[int, typer.Option(help="Seed of the coarse search.")] = 0,
     json_file: JsonOption = None,
 ) -> None:
-    """Positions and directions with the least angular (or tip) noise, checked against the propositions of 004.
+    """Positions and directions with the least angular (or tip) noise, checked against the propositions of Latt 2011.
 
-    Example: micron placement benches/space-004.toml
+    Example: micron placement benches/space-latt.toml
     """
     from dataclasses import asdict
 
@@ -53,7 +53,7 @@ def placement(
         for p in rows:
             noise = angular_noise(p, space.noise_m_s2)
             at_tip = 1e3 * float(np.linalg.norm(point_noise(p, space.noise_m_s2, tip)))
-            name = p.name if p is best.placement else f"{p.name} (004)"
+            name = p.name if p is best.placement else f"{p.name} (Latt 2011)"
             table.add_row(name, *(f"{v:.3f}" for v in noise), f"{at_tip:.1f}")
         data_console().print(table)
         for i, (r, s) in enumerate(zip(best.placement.positions * 1e3, best.placement.axes, strict=True)):

@@ -125,7 +125,7 @@ def variance(
         for line in judged:
             data_console().print(line, highlight=False)
         console().print(
-            "an increment of the rate is not its error: that is a random walk (ERRATA 20), compare the bands"
+            "an increment of the rate is not its error: that is a random walk (erratum 20), compare the bands"
         )
         save_analysis_picture(found, image)
         console().print(f"picture: {image}")

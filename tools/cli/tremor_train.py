@@ -35,7 +35,9 @@ def train(
     centred: Annotated[
         bool, typer.Option(help="Take the window's mean out: where the hand is does not matter.")
     ] = True,
-    error_above_hz: Annotated[float, typer.Option(min=0.1, max=5.0, help="What counts as error (000, 5.3.3).")] = 2.0,
+    error_above_hz: Annotated[
+        float, typer.Option(min=0.1, max=5.0, help="What counts as error (Ang 2004, 5.3.3).")
+    ] = 2.0,
     seed: Annotated[int, typer.Option(min=0)] = 1,
     json_file: JsonOption = None,
 ) -> None:

@@ -1,4 +1,4 @@
-"""Elapsed times for both mappings and several response times: the shape of Tables 6.1 and 6.2 of document 002."""
+"""Elapsed times for both mappings and several response times: the shape of Tables 6.1 and 6.2 of Erat 2018."""
 
 from __future__ import annotations
 

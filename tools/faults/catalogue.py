@@ -84,7 +84,7 @@ def sensors() -> tuple[Fault, ...]:
         return Fault(f"sensor: {name}", InWorld(fault, target), expected, names, why=why, redundant="noticed")
 
     noise = (
-        "six axes have no parity in motion (ERRATA 15): a few mV move the tip as far as they would if they were true; "
+        "six axes have no parity in motion (erratum 15): a few mV move the tip as far as they would if they were true; "
     )
     slow = noise + "parallel axes disagree after 0.4 s, longer than this run"
     fast = noise + "parallel axes disagree after 0.05 to 0.08 s, by more than tremor spreads them"

@@ -1,6 +1,6 @@
 """How slow a drift of one accelerometer axis any detector can miss: the Neyman-Pearson bound in the hand's own motion.
 
-Six axes and six unknowns leave no parity (ERRATA no. 15): a drift can be told from motion only by what is known of the
+Six axes and six unknowns leave no parity (erratum 15): a drift can be told from motion only by what is known of the
 motion. Given to the detector for nothing: the spectra of hand and noise (a vector autoregression of a healthy run), the
 axis, the instant at which the drift begins and its rate. For a known signal in Gaussian noise no test sees it more
 often, at a given rate of false alarms, than the matched filter of the whitened readings: with d^2 = sum e' S^-1 e over

@@ -106,7 +106,7 @@ def resident_MB() -> float:
 
 
 def up(quaternions: Array) -> Array:
-    """(n, 3) the world's z axis in the body frame, of (n, 4) quaternions body to world (ERRATA, section 5)."""
+    """(n, 3) the world's z axis in the body frame, of (n, 4) quaternions body to world (docs/references.md)."""
     w, x, y, z = quaternions.T
     return np.stack([2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z], axis=1)
 

@@ -1,4 +1,4 @@
-"""All that chapter 5 of document 002 asks of a sensor, from one motionless recording and others made for a method."""
+"""All that chapter 5 of Erat 2018 asks of a sensor, from one motionless recording and others made for a method."""
 
 from __future__ import annotations
 

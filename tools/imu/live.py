@@ -1,4 +1,4 @@
-"""A sensor of a bench, measured now: recording at its rate, and auto-calibration (document 002, section 5.4)."""
+"""A sensor of a bench, measured now: recording at its rate, and auto-calibration (Erat 2018, section 5.4)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Offsets by the four methods of document 002: manual, free fall and simple (5.2.1), and the gyroscope's mean (5.3.1).
+"""Offsets by the four methods of Erat 2018: manual, free fall and simple (5.2.1), and the gyroscope's mean (5.3.1).
 
-An offset is what the sensor shows too much; its offset register takes the negative (ERRATA 115).
+An offset is what the sensor shows too much; its offset register takes the negative (erratum 115).
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ STILL_FACTOR = 4.0
 
 @dataclass(frozen=True)
 class ManualOffset:
-    """``offset_g`` (3,) = (max + min) / 2 and ``scale`` (3,) = (max - min) / 2 (ERRATA 116).
+    """``offset_g`` (3,) = (max + min) / 2 and ``scale`` (3,) = (max - min) / 2 (erratum 116).
 
     ``poles``: the axis directions (such as "-y") that no still moment came close to: their extremes say nothing.
     """
@@ -116,7 +116,7 @@ def _runs(here: NDArray[np.bool_], bridge: int) -> list[tuple[int, int]]:
 
 
 def simple(series: Series) -> Array:
-    """(3,) g: mean of a sensor that lies on a flat surface, minus 1 g on the axis that is vertical (ERRATA 115)."""
+    """(3,) g: mean of a sensor that lies on a flat surface, minus 1 g on the axis that is vertical (erratum 115)."""
     mean = series.accel_g.mean(axis=0)
     vertical = int(np.argmax(np.abs(mean)))
     mean[vertical] -= np.sign(mean[vertical])

@@ -1,4 +1,4 @@
-"""Readings of one inertial sensor at an even rate, from a recording or a bench, in the units of document 002's tables.
+"""Readings of one inertial sensor at an even rate, from a recording or a bench, in the units of Erat 2018's tables.
 
 Accelerations in g (specific force, +1 g on an axis that points up), rates in deg/s, temperature in degC.
 """

@@ -1,4 +1,4 @@
-"""Stability, drift and noise of a motionless sensor: Tables 5.4 to 5.8 of document 002."""
+"""Stability, drift and noise of a motionless sensor: Tables 5.4 to 5.8 of Erat 2018."""
 
 from __future__ import annotations
 

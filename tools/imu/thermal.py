@@ -1,4 +1,5 @@
-"""How the offset of an axis follows the chip's own temperature (002, 5.2.3 and 5.3.3), and what a line takes away."""
+"""How the offset of an axis follows the chip's own temperature (Erat 2018, 5.2.3 and 5.3.3), and what a line takes
+away."""
 
 from __future__ import annotations
 

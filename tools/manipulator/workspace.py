@@ -1,4 +1,4 @@
-"""Workspace analysis (000, 6.4; Table 6.1, Fig. 6.7) of a configured manipulator.
+"""Workspace analysis (Ang 2004, 6.4; Table 6.1, Fig. 6.7) of a configured manipulator.
 
 The workspace is the image of the box of strokes that every stack reaches whatever came before. It has no singularity
 inside: the determinant of the Jacobian keeps its sign as far as the tilt at which the shaft's direction and the tip no

@@ -1,7 +1,7 @@
-"""Overlapping Allan deviation and what it says of a sensor (IEEE 952-1997 annex C, IEEE 1293; 000 sec. 3.3).
+"""Overlapping Allan deviation and what it says of a sensor (IEEE 952-1997 annex C, IEEE 1293; Ang 2004 sec. 3.3).
 
-The variance is sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2 (ERRATA 34): white noise N at
-tau = 1, flicker B = flat / 0.664, random walk K at tau = 3, ramp R at sqrt 2.
+The variance is sigma^2(tau) = N^2 / tau + (2 ln 2 / pi) B^2 + K^2 tau / 3 + R^2 tau^2 / 2 (erratum 34): white noise N
+at tau = 1, flicker B = flat / 0.664, random walk K at tau = 3, ramp R at sqrt 2.
 """
 
 from __future__ import annotations

@@ -1,4 +1,5 @@
-"""Error variance of a whole configuration, all-accelerometer or 3G-3A: what 000 Table 2.4 compares, done in one band.
+"""Error variance of a whole configuration, all-accelerometer or 3G-3A: what Ang 2004 Table 2.4 compares, done in one
+band.
 
 In a band about omega an attitude error leans gravity into the acceleration as a lever of g / omega^2 does: tip error =
 (df + dalpha x (r - g / omega^2 up)) / omega^2 for accelerometers alone; with gyroscopes dalpha is j omega times theirs

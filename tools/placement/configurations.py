@@ -24,7 +24,7 @@ _X, _Y, _Z = np.eye(3)
 
 
 def micron_004(d1: float = 0.026, d2: float = 0.013, d3: float = 0.130) -> Placement:
-    """004 Fig. 8 with the missing d2 (ERRATA 131)."""
+    """Latt 2011 Fig. 8 with the missing d2 (erratum 131)."""
     first, second, third = np.array([d1 - d2, -d2, 0.0]), np.array([-d2, d1 - d2, 0.0]), np.array([0.0, 0.0, d3])
     return Placement(
         "Micron", np.array([first, first, second, second, third, third]), np.array([_X, _Z, _Y, _Z, _X, _Y])
@@ -32,7 +32,7 @@ def micron_004(d1: float = 0.026, d2: float = 0.013, d3: float = 0.130) -> Place
 
 
 def micron_004_turned() -> Placement:
-    """004 Fig. 8 with the in-plane axes of both back packages turned by 45 degrees, across the line between them.
+    """Latt 2011 Fig. 8 with the in-plane axes of both back packages turned by 45 degrees, across the line between them.
 
     All packages turned the same way would leave alpha_z unseen.
     """
@@ -41,7 +41,7 @@ def micron_004_turned() -> Placement:
 
 
 def cube_004(d1: float = 0.026) -> Placement:
-    """Six faces of a cube of edge d1, sensing along face diagonals (004 (45), ERRATA 129)."""
+    """Six faces of a cube of edge d1, sensing along face diagonals (Latt 2011 (45), erratum 129)."""
     h = d1 / 2.0
     positions = h * np.array([_Z, _Y, _X, -_X, -_Y, -_Z])
     axes = np.array([(-1, -1, 0), (-1, 0, -1), (0, -1, -1), (0, 1, -1), (1, 0, -1), (1, -1, 0)]) / sqrt(2.0)
@@ -49,7 +49,7 @@ def cube_004(d1: float = 0.026) -> Placement:
 
 
 def proposed_004(d1: float = 0.026, d3: float = 0.130) -> Placement:
-    """004 Fig. 10 at its optimum k = 1, l = 0, n = 1: y and z at both back corners, x and y in front."""
+    """Latt 2011 Fig. 10 at its optimum k = 1, l = 0, n = 1: y and z at both back corners, x and y in front."""
     h = d1 / 2.0
     first, second, third = np.array([h, 0.0, 0.0]), np.array([-h, 0.0, 0.0]), np.array([0.0, 0.0, d3])
     return Placement(
@@ -58,6 +58,6 @@ def proposed_004(d1: float = 0.026, d3: float = 0.130) -> Placement:
 
 
 def micron_000() -> Placement:
-    """000, second (2.54), with the front package on the axis (ERRATA 23)."""
+    """Ang 2004, second (2.54), with the front package on the axis (erratum 23)."""
     d1, d2, d3 = 0.0202, 0.0143, 0.116
     return micron_004(d1, d2, d3)

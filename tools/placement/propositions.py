@@ -1,4 +1,4 @@
-"""The propositions of 004 sec. 2.1 as checks on pairs of axes."""
+"""The propositions of Latt 2011 sec. 2.1 as checks on pairs of axes."""
 
 from __future__ import annotations
 
@@ -63,5 +63,5 @@ def verdicts(placement: Placement) -> list[str]:
     """What ``check_pairs`` found, a line a pair, or that there is no pair to judge."""
     checks = check_pairs(placement)
     if not checks:
-        return [f"{placement.name}: no two axes are parallel, so the propositions of 004 say nothing of it"]
+        return [f"{placement.name}: no two axes are parallel, so the propositions of Latt 2011 say nothing of it"]
     return [f"{placement.name}: {check.text}" for check in checks]

@@ -60,18 +60,18 @@ def load_space(path: Path) -> Space:
     try:
         return Space.model_validate(tomllib.loads(path.read_text()))
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}; benches/space-004.toml is an example") from error
+        raise InputError(f"{path}: {error.strerror}; benches/space-latt.toml is an example") from error
     except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: {error}") from error
     except ValidationError as error:
         raise InputError(describe_validation_error(error, str(path))) from error
 
 
-def space_004(packages: int = 3, axes_per_package: int = 2) -> Space:
-    """The space of 004 Fig. 8: a 26 mm square at the back end, the tool axis up to 130 mm (ERRATA 131)."""
+def space_latt(packages: int = 3, axes_per_package: int = 2) -> Space:
+    """The space of Latt 2011 Fig. 8: a 26 mm square at the back end, the tool axis up to 130 mm (erratum 131)."""
     return Space(
         format=1,
-        title="004, Fig. 8",
+        title="Latt 2011, Fig. 8",
         box=(
             Box(name="back", low_mm=(-13.0, -13.0, 0.0), high_mm=(13.0, 13.0, 0.0)),
             Box(name="handle", low_mm=(0.0, 0.0, 0.0), high_mm=(0.0, 0.0, 130.0)),

@@ -1,7 +1,7 @@
-"""Error variance of specific force, angular acceleration and rate, for any set of single axes (000 sec. 2.4).
+"""Error variance of specific force, angular acceleration and rate, for any set of single axes (Ang 2004 sec. 2.4).
 
 Linear propagation through the weighted least squares of the firmware, and the scaled unscented transform
-(000 (2.48)-(2.51)) through its numeric solver. The variances are the diagonal (ERRATA 18), not row sums.
+(Ang 2004 (2.48)-(2.51)) through its numeric solver. The variances are the diagonal (erratum 18), not row sums.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ def motion_covariance(placement: Placement, noise: Array | float) -> Array:
 
 
 def angular_noise(placement: Placement, noise: Array | float) -> Array:
-    """(4,) rms of alpha_x, alpha_y, alpha_z and of the vector, rad/s^2 (004 Table 1)."""
+    """(4,) rms of alpha_x, alpha_y, alpha_z and of the vector, rad/s^2 (Latt 2011 Table 1)."""
     variance = np.diag(motion_covariance(placement, noise))[3:]
     return np.sqrt(np.append(variance, variance.sum()))
 
 
 def point_noise(placement: Placement, noise: Array | float, point_m: Array) -> Array:
-    """(3,) rms of the acceleration of a body point, m/s^2: f + alpha x r (004 (31))."""
+    """(3,) rms of the acceleration of a body point, m/s^2: f + alpha x r (Latt 2011 (31))."""
     x, y, z = point_m
     carry = np.hstack([np.eye(3), np.array([[0.0, z, -y], [-z, 0.0, x], [y, -x, 0.0]])])
     return np.sqrt(np.diag(carry @ motion_covariance(placement, noise) @ carry.T))
@@ -48,7 +48,7 @@ def rate_covariance_linear(placement: Placement, noise: Array | float, dt_s: flo
 
 
 def unscented(covariance: Array, function, kappa: float = 0.0) -> tuple[Array, Array]:  # pyright: ignore[reportMissingParameterType]
-    """Mean and covariance of ``function(x)`` for x of zero mean and ``covariance`` (n, n) (000 (2.48)-(2.50))."""
+    """Mean and covariance of ``function(x)`` for x of zero mean and ``covariance`` (n, n) (Ang 2004 (2.48)-(2.50))."""
     n = len(covariance)
     root = np.linalg.cholesky((n + kappa) * covariance)
     points = np.vstack([np.zeros(n), root.T, -root.T])

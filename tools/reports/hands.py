@@ -167,7 +167,7 @@ def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
         "",
         *(line for row in rows if row.hand in missed and row.method == METHODS[0] for line in (*explain_miss(row), "")),
         *_played_again(rows, seconds),
-        "Published for comparison: 69 % with WFLC alone in one dimension, sensing excluded (000, section 5.2).",
+        "Published for comparison: 69 % with WFLC alone in one dimension, sensing excluded (Ang 2004, section 5.2).",
         "All bands: error against the intended path. It holds what the instrument does not try to cancel: drift, jerks",
         "and everything below 2 Hz. At a limit: the wanted displacement was out of the manipulator's reach or the",
         "amplifier's range. Motion below the tremor band yields its stroke to the band, so its error can stay large.",

@@ -1,4 +1,4 @@
-"""``micron reproduce actuation``: 000 chapters 6 and 7 on the emulated actuators, and a real micromanipulator."""
+"""``micron reproduce actuation``: Ang 2004 chapters 6 and 7 on the emulated actuators, and a real micromanipulator."""
 
 from __future__ import annotations
 
@@ -21,14 +21,15 @@ WHY = (
 NOTES = (
     "Emulated: three stacks of unit 2 (generalised Maxwell slip with viscous slip, thresholds that fall with the bias, "
     "curvature, creep, resonance), interferometer 0.07 um rms, 1 kHz. Models are identified on the lab's calibration "
-    "set (saw-teeth and sines of 0.1 to 40 Hz, loops, steps); the rate-independent one on a 10 Hz sine as in 000. No "
+    "set (saw-teeth and sines of 0.1 to 40 Hz, loops, steps); the rate-independent one on a 10 Hz sine as in Ang 2004. "
+    "No "
     "path tracked here was fitted. Errors are counted from rest before the approach, with its creep and the noise.",
     "'without model': nothing is compensated, neither hysteresis nor lag. The published models keep their thresholds "
     "and get our preview, so that what is left is the hysteresis model's. 'ours': model, creep, preview and taps that "
     "micron calibrate piezo writes, all on; it stands beside the published rate-dependent figure.",
 )
 
-# 000, Tables 7.1 to 7.3, um and % of 12.5 um p-p: (rms, max) for without, rate-independent, rate-dependent
+# Ang 2004, Tables 7.1 to 7.3, um and % of 12.5 um p-p: (rms, max) for without, rate-independent, rate-dependent
 TABLE_7_1 = {
     1.0: ((1.13, 2.11), (0.25, 0.63), (0.21, 0.57)),
     4.0: ((1.12, 2.07), (0.19, 0.67), (0.16, 0.46)),
@@ -48,7 +49,7 @@ def ways(kind: int) -> list[Controller]:
 
 
 def mean(runs: Sequence[Tracking]) -> tuple[float, float]:
-    """rms and largest error, means over runs as in 000, um."""
+    """rms and largest error, means over runs as in Ang 2004, um."""
     return float(np.mean([r.rms_um for r in runs])), float(np.mean([r.max_um for r in runs]))
 
 
@@ -82,13 +83,13 @@ def _pair(
 
 def table_7_1() -> list[Row]:
     """Stationary sinusoids: the uncompensated errors first, then each way of compensating."""
-    rows, source = [], "000, Table 7.1, stationary sinusoids"
+    rows, source = [], "Ang 2004, Table 7.1, stationary sinusoids"
     for kind in range(4):
         column = min(kind, 2)
         results = {hz: mean(all_runs([stationary(hz)], ways(kind))) for hz in FREQUENCIES_HZ}
         for hz, found in results.items():
             rows += _pair(source, f"{hz:g} Hz, 12.5 um p-p, 5 s, 3 stacks", kind, TABLE_7_1[hz][column], found, "um")
-        # ERRATA 81: the printed means 0.23, 0.18 are 0.22, 0.17
+        # erratum 81: the printed means 0.23, 0.18 are 0.22, 0.17
         theirs = tuple(float(np.mean([TABLE_7_1[hz][column][i] for hz in FREQUENCIES_HZ])) for i in (0, 1))
         found = tuple(float(np.mean([results[hz][i] for hz in FREQUENCIES_HZ])) for i in (0, 1))
         rows += _pair(source, "mean over 1 to 19 Hz", kind, (theirs[0], theirs[1]), (found[0], found[1]), "um")
@@ -106,7 +107,7 @@ def table_7_2() -> list[Row]:
     for kind in range(4):
         found = _percent(mean(all_runs(paths, ways(kind))))
         rows += _pair(
-            "000, Table 7.2, multi-frequency, non-stationary", "1, 10, 19 Hz, 7 paths of 5 s, 3 stacks", kind,
+            "Ang 2004, Table 7.2, multi-frequency, non-stationary", "1, 10, 19 Hz, 7 paths of 5 s, 3 stacks", kind,
             TABLE_7_2[min(kind, 2)], found, "% of p-p",
         )  # fmt: skip
     return rows
@@ -121,7 +122,8 @@ def table_7_3() -> list[Row]:
         for kind in range(4):
             found = _percent(mean(all_runs(paths, ways(kind))))
             rows += _pair(
-                "000, Table 7.3, recorded tremor", f"{name}, {len(paths)} windows of 5 s, each 12.5 um p-p, 3 stacks",
+                "Ang 2004, Table 7.3, recorded tremor",
+                f"{name}, {len(paths)} windows of 5 s, each 12.5 um p-p, 3 stacks",
                 kind, TABLE_7_3[min(kind, 2)], found, "% of p-p",
             )  # fmt: skip
     return rows

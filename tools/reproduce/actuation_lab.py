@@ -1,4 +1,4 @@
-"""The emulated lab of chapter 7 of 000: stacks under an interferometer, paths to track, four ways to command.
+"""The emulated lab of chapter 7 of Ang 2004: stacks under an interferometer, paths to track, four ways to command.
 
 Identification uses the lab's calibration set, tracking its own runs: no path that is tracked has been fitted.
 """
@@ -42,10 +42,10 @@ NEUTRAL_V = 50.0
 SWING_V = 41.7  # half of peak to peak, about 12.5 um
 TEMPERATURE_C = 25.0
 APPROACH = 2000  # ticks from rest to the start of a path, not scored
-SCORED = 5000  # 5 s, as in 000
+SCORED = 5000  # 5 s, as in Ang 2004
 LOW_UM = -5.0  # lowest point of a path of 12.5 um p-p, from rest at neutral: the middle of the range
 
-# 000, sec. 7.4: thresholds in V and dead zones of the published models (fractions of 41.7 V, of the displacement)
+# Ang 2004, sec. 7.4: thresholds in V and dead zones of the published models (fractions of 41.7 V, of the displacement)
 INDEPENDENT = Shape(tuple(v / SWING_V for v in range(0, 41, 5)), zones=(0.633, 0.748, 0.873))
 DEPENDENT = Shape(
     tuple(v / SWING_V for v in (0, 4, 8, 12, 16, 20, 25, 31, 38)),
@@ -68,8 +68,8 @@ class Controller:
 
 @dataclass(frozen=True)
 class Stand:
-    """One stack in the lab: ``late`` without a model, rate-independent and rate-dependent as in 000, without preview;
-    ``early`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and taps;
+    """One stack in the lab: ``late`` without a model, rate-independent and rate-dependent as in Ang 2004, without
+    preview; ``early`` the same three identified and driven with the lag of ``fit``; ``ours``: model, preview and taps;
     ``ours_late``: our model and no preview."""
 
     fit: PiezoFit

@@ -1,4 +1,4 @@
-"""Chapter 6 of 000: workspace of the nominal design; and the whole manipulator on a recorded three-axis tremor."""
+"""Chapter 6 of Ang 2004: workspace of the nominal design; and the whole manipulator on a recorded three-axis tremor."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SCORED_FROM = 1000
 def workspace_rows() -> list[Row]:
     """Table 6.1 and sec. 6.1.1 on the nominal geometry and stacks."""
     found = analyse(ActuationConfig(), grid=9)
-    source, condition = "000, Table 6.1, sec. 6.1.1", "R = r = 5 mm, l = 40 mm (ours), levers of 8, 15 um at 100 V"
+    source, condition = "Ang 2004, Table 6.1, sec. 6.1.1", "R = r = 5 mm, l = 40 mm (ours), levers of 8, 15 um at 100 V"
     rows = [
         Row(source, f"maximum tip displacement, {axis}", "um", condition, least, 1e6 * float(got), "higher", "exact")
         for axis, least, got in zip("xyz", (1000.0, 1000.0, 100.0), found.extent_m, strict=True)
@@ -84,7 +84,7 @@ def three_axes() -> list[Row]:
     """Recorded tremor in all three axes, 50 um p-p in the liveliest; then each axis alone for the cross-coupling."""
     config, stands = lab()
     actuation = instrument(config, [s.fit for s in stands])
-    source = "000, sec. 6.1.1 and 7.5, whole manipulator"
+    source = "Ang 2004, sec. 6.1.1 and 7.5, whole manipulator"
     rows: list[Row] = []
     for name, file in present().items():
         path = recorded_tip_m(file, TICKS)

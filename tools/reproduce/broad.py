@@ -122,7 +122,7 @@ def _fixed(trial: Trial, ours: tuple[float, ...], vqf: tuple[float, ...] | None)
     other = trial.errors_deg(gyroscope_attitude(trial.rate, trial.force, trial.field, BROAD_HZ, "quaternion-kalman"))
     found.append(
         Row(
-            "quaternion Kalman filter of 000 on the same trial",
+            "quaternion Kalman filter of Ang 2004 on the same trial",
             f"total error of the default (error-state) against it, trial {trial.name}",
             "deg",
             "one setting for all trials",

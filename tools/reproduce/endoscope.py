@@ -1,4 +1,4 @@
-"""``micron reproduce endoscope``: figures of document 002 (Erat 2018) beside ours."""
+"""``micron reproduce endoscope``: figures of Erat 2018 (Erat 2018) beside ours."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def settling() -> list[Row]:
         roll = filter_response(FusionConfig(method="madgwick", beta=beta, align_s=0.0), 20.0)
         rows.append(
             Row(
-                "002, section 3.4.2, Figures 3.20 to 3.23",
+                "Erat 2018, section 3.4.2, Figures 3.20 to 3.23",
                 f"Madgwick settling time, beta {beta:g}",
                 "s",
                 f"from level to {START_DEG} deg, 100 Hz, to 0.1 deg",
@@ -59,7 +59,7 @@ def settling() -> list[Row]:
     roll = filter_response(FusionConfig(method="mahony", align_s=0.0), 20.0)
     rows.append(
         Row(
-            "002, section 3.4.3, Figure 3.26",
+            "Erat 2018, section 3.4.3, Figure 3.26",
             "Mahony time to less than 1 deg, Kp 1.4, Ki 0.002",
             "s",
             f"from level to {START_DEG} deg",
@@ -75,7 +75,7 @@ def settling() -> list[Row]:
         roll = filter_response(FusionConfig(method="complementary", tau_s=tau_s, align_s=0.0), 1.0)
         rows.append(
             Row(
-                "002, section 3.3.3, Figures 3.12, 3.13",
+                "Erat 2018, section 3.3.3, Figures 3.12, 3.13",
                 f"complementary filter after tau = {tau_s:g} s",
                 "deg",
                 f"from level to {START_DEG} deg, 100 Hz",
@@ -91,7 +91,7 @@ def settling() -> list[Row]:
     at_tau = filter_response(fine, 1.0)[-1]
     rows.append(
         Row(
-            "002, section 3.3.3",
+            "Erat 2018, section 3.3.3",
             "complementary filter after tau, of the full response",
             "%",
             "tau = 1 s, 100 Hz",
@@ -125,7 +125,7 @@ def beta_sweep() -> list[Row]:
         pitch = np.arcsin(np.clip(2.0 * (w * y - x * z), -1.0, 1.0))
         spread[beta] = float(np.degrees(np.hypot(np.std(roll), np.std(pitch))))
     condition = "motionless MPU-6050 of a public recording, offset of the first 20 s taken off"
-    source = "002, section 3.4.2, Figure 3.16"
+    source = "Erat 2018, section 3.4.2, Figure 3.16"
     return [
         Row(
             source,
@@ -199,8 +199,8 @@ def mapping_tables() -> list[Row]:
     rows: list[Row] = []
     quick: dict[str, float] = {}
     tables: tuple[tuple[Mapping, str, dict[float, tuple[int, ...]]], ...] = (
-        ("position", "002, Table 6.1", POSITION_S),
-        ("speed", "002, Table 6.2", SPEED_S),
+        ("position", "Erat 2018, Table 6.1", POSITION_S),
+        ("speed", "Erat 2018, Table 6.2", SPEED_S),
     )
     for mapping, source, published in tables:
         ours = {tau: run_cell(mapping, tau, UserConfig()).mean_s for tau in RESPONSES_S}
@@ -251,7 +251,7 @@ def mapping_tables() -> list[Row]:
     ratio = position[0] / speed[0]
     rows.append(
         Row(
-            "002, Tables 6.1 and 6.2",
+            "Erat 2018, Tables 6.1 and 6.2",
             "elapsed time, position mapping over speed mapping",
             "1",
             "K = 8, tau = 0.25 s, means of 5",

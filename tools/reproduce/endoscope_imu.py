@@ -1,4 +1,4 @@
-"""Chapter 5 of document 002 on the emulated chips, and what public recordings of such sensors are said to show."""
+"""Chapter 5 of Erat 2018 on the emulated chips, and what public recordings of such sensors are said to show."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ PUBLISHED: dict[str, dict[str, tuple[float, float, float]]] = {
         "noise_dps": (0.0877, 0.0751, 0.0569),
     },
     "lsm6ds3": {
-        "difference_g": (0.0078, 0.0037, 0.0109),  # ERRATA 117
+        "difference_g": (0.0078, 0.0037, 0.0109),  # erratum 117
         "noise_dps": (0.0526, 0.0565, 0.0468),
     },
 }
@@ -66,7 +66,7 @@ def _emulated() -> list[Row]:
             condition = f"emulated {name.upper()} from its data sheet, +-2 g, +-2000 deg/s, {sensor.rate_hz:g} Hz"
             rows += [
                 Row(
-                    "002, Table 5.4",
+                    "Erat 2018, Table 5.4",
                     f"peak to peak of the accelerometer at rest, {name}, mean of axes",
                     "g",
                     condition + ", 2 min",
@@ -78,7 +78,7 @@ def _emulated() -> list[Row]:
                     why="another specimen (axes of one published chip differ by up to a factor 3), and 10 min there",
                 ),
                 Row(
-                    "002, Table 5.7",
+                    "Erat 2018, Table 5.7",
                     f"largest drift after auto-calibration, {name}",
                     "deg/min",
                     condition + ", 10 s settled, 10 s mean, written to the chip",
@@ -94,7 +94,7 @@ def _emulated() -> list[Row]:
                     ),
                 ),
                 Row(
-                    "002, Table 5.8",
+                    "Erat 2018, Table 5.8",
                     f"rms noise of the gyroscope, {name}, mean of axes",
                     "deg/s",
                     condition,
@@ -140,7 +140,7 @@ def _recordings() -> list[Row]:
                     "IMpack drops (names of the files)",
                     f"speed at the impact, {name[:4]}",
                     "m/s",
-                    "g times the time of free fall, free-fall method of 002, 5.2.1.2",
+                    "g times the time of free fall, free-fall method of Erat 2018, 5.2.1.2",
                     speed,
                     G * found["fall_s"],
                     "equal",

@@ -1,4 +1,4 @@
-"""``micron reproduce sensing``: documents 000 (chapters 2 to 4), 001 and 004."""
+"""``micron reproduce sensing``: documents Ang 2004 (chapters 2 to 4), Ang 2004b and Latt 2011."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from tools.reproduce import (
 from tools.reproduce.rows import Table, build
 
 NOTES = (
-    "000 Table 4.1 and sec. 4.2.1.2 belong to sensors whose coefficients are not printed. The emulated ones are drawn "
+    "Ang 2004 Table 4.1 and sec. 4.2.1.2 belong to sensors whose coefficients are not printed. The emulated ones are "
+    "drawn "
     "with cross-axis terms of our choice (tools/reproduce/sensing_static.py), so the figures stand side by side and "
     "none is met or missed by merit. The orders of drift of Fig. 3.1 are arithmetic and have no row.",
-    "000 Tables 4.2 and 4.3 are absent from the document (ERRATA 49).",
+    "Ang 2004 Tables 4.2 and 4.3 are absent from the document (erratum 49).",
 )
 
 

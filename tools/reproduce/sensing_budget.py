@@ -153,7 +153,7 @@ def rows() -> list[Row]:
     tremor = ", ".join(f"{v:.1f}" for v in truth)
     return [
         Row(
-            "000, sec. 2.1.1 (ii)",
+            "Ang 2004, sec. 2.1.1 (ii)",
             f"rms error of tip displacement, {what}",
             "um",
             condition,

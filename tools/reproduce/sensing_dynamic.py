@@ -1,4 +1,5 @@
-"""000 sec. 4.2.1 (translation) and 004 Fig. 16 (rotating arm) on emulated sensors, and half an hour in a hand."""
+"""Ang 2004 sec. 4.2.1 (translation) and Latt 2011 Fig. 16 (rotating arm) on emulated sensors, and half an hour in a
+hand."""
 
 from __future__ import annotations
 
@@ -77,7 +78,7 @@ def _sensed_x(sensing: SensingConfig, result: SceneResult) -> Array:
     """(n,) sensed acceleration along x, m/s^2, phase and attenuation of the RC filter undone, 20 Hz zero phase.
 
     The maker's line is axis 3x alone; the physical model goes on to the misalignment (3.17), (3.18), all axes weighted
-    by their noise, which is right here because the body does not turn (ERRATA 30).
+    by their noise, which is right here because the body does not turn (erratum 30).
     """
     readings = result["accelerometer_m_s2"]
     if all(pair == (0.0, 0.0) for pair in sensing.bias_in_plane):
@@ -120,10 +121,12 @@ def translation_rows() -> list[Row]:
     """The piezo shaker at alpha 45, beta 90 degrees, 60 um peak to peak at 10 Hz."""
     line, physical, limit = translation_rmse(True)
     bench_line, bench, _ = translation_rmse(False)
-    condition = f"axis x level at alpha 45, beta 90 deg, 60 um p-p at 10 Hz, {len(UNITS)} emulated units of 000's size"
+    condition = (
+        f"axis x level at alpha 45, beta 90 deg, 60 um p-p at 10 Hz, {len(UNITS)} emulated units of Ang 2004's size"
+    )
     return [
         Row(
-            "000, sec. 4.2.1.2",
+            "Ang 2004, sec. 4.2.1.2",
             "rmse of the acceleration, maker's line",
             "mm/s^2",
             condition,
@@ -135,7 +138,7 @@ def translation_rows() -> list[Row]:
             why="the real sensor's coefficients are not printed; its bias shift is ours to choose",
         ),
         Row(
-            "000, sec. 4.2.1.2",
+            "Ang 2004, sec. 4.2.1.2",
             "rmse of the acceleration, physical model",
             "mm/s^2",
             condition,
@@ -160,7 +163,7 @@ def translation_rows() -> list[Row]:
                 "gravity",
             )
             for what, found, by_line in (
-                (f"{len(UNITS)} units of 000's size", physical, line),
+                (f"{len(UNITS)} units of Ang 2004's size", physical, line),
                 (f"{len(UNITS)} units of the bench", bench, bench_line),
             )
         ),
@@ -168,7 +171,8 @@ def translation_rows() -> list[Row]:
 
 
 def arm_rows(both: Calibrated | None = None) -> list[Row]:
-    """004 Fig. 16: the arm shaken by hand at 1 to 5 Hz about the body's x axis, (49) against the arm's own motion."""
+    """Latt 2011 Fig. 16: the arm shaken by hand at 1 to 5 Hz about the body's x axis, (49) against the arm's own
+    motion."""
     both = both or calibrated(False, 1)
     t = np.arange(22_000) / RATE_HZ
     swing = sum(
@@ -199,7 +203,7 @@ def arm_rows(both: Calibrated | None = None) -> list[Row]:
     condition = "emulated sensors, calibrated; arm turned about body x, 1 to 5 Hz, zero-phase band-pass as in the paper"
     return [
         Row(
-            "004, (31) with the data sheet's noise",
+            "Latt 2011, (31) with the data sheet's noise",
             "rms of what is left of alpha_x, against the propagated noise",
             "rad/s^2",
             f"{condition}; rms of alpha_x {_rms(true):.2f}",
@@ -294,7 +298,7 @@ def orientation_rows() -> list[Row]:
         for name, ours, theirs in (("tilt", tilt, triad_tilt), ("heading", heading, triad_heading)):
             rows.append(
                 Row(
-                    "000, sec. 4.3.2",
+                    "Ang 2004, sec. 4.3.2",
                     f"{name}: rms of TRIAD alone over that of the filter",
                     "1",
                     f"{condition}; TRIAD {_rms(theirs[late]):.3f} deg",

@@ -1,19 +1,19 @@
-"""The placements of 004 sec. 3, optimised within the conditions that the paper sets."""
+"""The placements of Latt 2011 sec. 3, optimised within the conditions that the paper sets."""
 
 from __future__ import annotations
 
 from tools.placement.configurations import micron_004_turned
 from tools.placement.optimise import optimise
-from tools.placement.space import space_004
+from tools.placement.space import space_latt
 from tools.placement.variance import angular_noise
 from tools.reproduce.rows import Row
 
 
 def optimised_placements() -> list[Row]:
-    """The space of 004 with the least noise that it allows."""
-    space = space_004()
+    """The space of Latt 2011 with the least noise that it allows."""
+    space = space_latt()
     condition = (
-        "004's space, 10 mm/s^2 per axis, every direction seen by at least "
+        "space of Latt 2011, 10 mm/s^2 per axis, every direction seen by at least "
         f"{space.least_translation:g} axes, force at the tip to at most {space.largest_force_noise_m_s2:g} m/s^2 rms"
     )
     rows = [
@@ -23,20 +23,20 @@ def optimised_placements() -> list[Row]:
             "rad/s^2",
             condition,
             other,
-            float(optimise(space_004(packages, axes)).noise[3]),
+            float(optimise(space_latt(packages, axes)).noise[3]),
             "equal",
             "exact",
             tolerance=5e-5,
-            why="004, Table 1 has 0.78 for its proposed placement and 2.86 for Micron",
+            why="Latt 2011, Table 1 has 0.78 for its proposed placement and 2.86 for Micron",
         )
         for packages, axes, other in ((3, 2, 0.4073), (6, 1, 0.3415))
     ]
     rows.append(
         Row(
-            "004, Table 1 (proposed: 0.78; Micron: 2.86)",
+            "Latt 2011, Table 1 (proposed: 0.78; Micron: 2.86)",
             "vector noise, Micron with the back packages turned by 45 degrees",
             "rad/s^2",
-            "004's space, 10 mm/s^2 per axis",
+            "space of Latt 2011, 10 mm/s^2 per axis",
             0.78,
             float(angular_noise(micron_004_turned(), 0.010)[3]),
             "lower",

@@ -1,4 +1,4 @@
-"""000 Table 4.1 on emulated sensors: tilt from the maker's line and from the physical model, on poses no fit saw.
+"""Ang 2004 Table 4.1 on emulated sensors: tilt from the maker's line and from the physical model, on poses no fit saw.
 
 The printed errors belong to sensors whose coefficients are not printed; the emulated ones are drawn with cross-axis
 terms of our choice (``LARGE``), of a form that the calibration does not know: no row is met by it.
@@ -37,7 +37,7 @@ LARGE = SensorConfig(
 )
 WARMER_K = 2.0
 SAMPLES = 500
-"""Averaged at each test pose (000 sec. 4.2.2.1); 5 s at each calibration pose."""
+"""Averaged at each test pose (Ang 2004 sec. 4.2.2.1); 5 s at each calibration pose."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ def at_rest(config: EmulationConfig, attitudes: Array, samples: int, name: str) 
 
 
 def maker_line(config: EmulationConfig) -> dict[str, Any]:
-    """Bias and scale of each axis from its two poses along gravity (000 (3.1), (3.2)), nothing else."""
+    """Bias and scale of each axis from its two poses along gravity (Ang 2004 (3.1), (3.2)), nothing else."""
     bias, scale = [0.0] * 6, [0.0] * 6
     nominal = SensingConfig()
     for i, axis in enumerate(np.array(nominal.axes)):
@@ -111,7 +111,7 @@ def readings(sensing: SensingConfig, volts: Array) -> Array:
 
 
 def static_force(sensing: SensingConfig, volts: Array) -> Array:
-    """(n, 3) specific force at rest: all axes, weighted by their noise (000 (3.17), (3.18); ERRATA 30)."""
+    """(n, 3) specific force at rest: all axes, weighted by their noise (Ang 2004 (3.17), (3.18); erratum 30)."""
     axes, noise = np.array(sensing.axes), np.array(sensing.noise_ug_per_rtHz)
     solve = np.linalg.pinv(axes / noise[:, None]) / noise
     return readings(sensing, volts) @ solve.T
@@ -128,7 +128,7 @@ def tilt_errors_deg(force: Array, attitudes: Array) -> tuple[Array, Array]:
 
 
 def tilt_poses() -> Array:
-    """000 Figs. 4.5 to 4.7: the arm level, alpha alone, beta alone, both, -180 to 180 degrees in steps of 30."""
+    """Ang 2004 Figs. 4.5 to 4.7: the arm level, alpha alone, beta alone, both, -180 to 180 degrees in steps of 30."""
     steps = np.radians(np.arange(-180.0, 181.0, 30.0))
     zero = np.zeros_like(steps)
     alpha, beta = np.concatenate([steps, zero, steps]), np.concatenate([zero, zero + steps, steps])
@@ -165,7 +165,7 @@ def table_4_1() -> list[Row]:
     condition = f"{len(UNITS)} emulated units, 39 poses each, {WARMER_K:g} K warmer than at calibration"
     return [
         Row(
-            "000, Table 4.1",
+            "Ang 2004, Table 4.1",
             f"{angle}, {title}",
             "deg",
             condition,
@@ -174,7 +174,7 @@ def table_4_1() -> list[Row]:
             "equal",
             "not reproducible",
             tolerance=0.005,
-            why="p, q, r, B, SF and misalignments of the real sensors are not printed (ERRATA, section 6); how large "
+            why="p, q, r, B, SF and misalignments of the real sensors are not printed (docs/references.md); how large "
             "the emulated cross-axis terms are, and how much of them the model knows, is our choice",
         )
         for name, title in (("line", "maker's line"), ("physical", "physical model"))

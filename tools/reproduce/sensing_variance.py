@@ -1,4 +1,4 @@
-"""004 Tables 1 and 2, 000 Table 2.4: error variance of placements."""
+"""Latt 2011 Tables 1 and 2, Ang 2004 Table 2.4: error variance of placements."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ DEG = 180.0 / pi
 
 
 def placement_tables() -> list[Row]:
-    """004 Table 1 and Table 2."""
+    """Latt 2011 Table 1 and Table 2."""
     rows = []
     vectors: dict[str, float] = {}
     for placement in (micron_004(), cube_004(), proposed_004()):
@@ -40,7 +40,7 @@ def placement_tables() -> list[Row]:
         ):
             rows.append(
                 Row(
-                    "004, Table 1",
+                    "Latt 2011, Table 1",
                     f"rms noise of {what}, {placement.name} configuration",
                     "rad/s^2",
                     CONDITION_004,
@@ -51,14 +51,14 @@ def placement_tables() -> list[Row]:
                     tolerance=0.005,
                     why=""
                     if what != "alpha vector"
-                    else "the printed vector went through a second rounding (ERRATA 132)",
+                    else "the printed vector went through a second rounding (erratum 132)",
                 )
             )
     for name, published in (("Micron", 73.0), ("cube", 17.0)):
         reduction = 100.0 * (1.0 - vectors["proposed"] / vectors[name])
         rows.append(
             Row(
-                "004, Table 2",
+                "Latt 2011, Table 2",
                 f"noise reduction of the proposed configuration against {name}",
                 "%",
                 CONDITION_004,
@@ -67,37 +67,38 @@ def placement_tables() -> list[Row]:
                 "equal",
                 "exact",
                 tolerance=0.5,
-                why="ours is from unrounded vectors (ERRATA 132)",
+                why="ours is from unrounded vectors (erratum 132)",
             )
         )
     return rows
 
 
 def _row_sums(placement: Placement, dt_s: float) -> np.ndarray:
-    """Return what the printed figures are: (2.52)'s row sums with a variance of 1 mm^2/s^4 (ERRATA 19), deg/s."""
+    """Return what the printed figures are: (2.52)'s row sums with a variance of 1 mm^2/s^4 (erratum 19), deg/s."""
     return np.sqrt(np.abs(rate_covariance_linear(placement, 1e-3, dt_s).sum(axis=1))) * DEG
 
 
 def _alpha_known(placement: Placement) -> np.ndarray:
-    """(3,) rms of the force when alpha is not solved from the same readings (000 (2.53), sigma / sqrt 2), m/s^2."""
+    """(3,) rms of the force when alpha is not solved from the same readings (Ang 2004 (2.53), sigma / sqrt 2),
+    m/s^2."""
     return NOISE_000 * np.sqrt(np.diag(np.linalg.inv(placement.axes.T @ placement.axes)))
 
 
 def table_2_4() -> list[Row]:
-    """000 Table 2.4: the 6A column as printed does not follow from its definition; what does is beside it."""
+    """Ang 2004 Table 2.4: the 6A column as printed does not follow from its definition; what does is beside it."""
     placement = micron_000()
     linear = np.sqrt(np.diag(rate_covariance_linear(placement, NOISE_000, 1e-3))) * DEG
     sigma = np.sqrt(np.diag(rate_covariance_unscented(placement, NOISE_000, 1e-3))) * DEG
     sums = _row_sums(placement, 1e-3)
     band = band_rate_noise(placement, NOISE_000, RC_RAD_S) * DEG
     gyro_band = 0.75 * sqrt(_share_in_band(8.0, 12.0))
-    geometry = "000 (2.54), 2.25 mg per axis, T = 1 ms"
+    geometry = "Ang 2004 (2.54), 2.25 mg per axis, T = 1 ms"
     rows = []
     for i, axis, published in ((0, "x", 0.65e-2), (1, "y", 0.65e-2), (2, "z", 1.88e-2)):
-        digit = 0.02 * published  # ERRATA 19: within 4 % in variance, found by its authors and not by this code
+        digit = 0.02 * published  # erratum 19: within 4 % in variance, found by its authors and not by this code
         rows += [
             Row(
-                "000, Table 2.4",
+                "Ang 2004, Table 2.4",
                 f"6A, sigma of omega_{axis} per sample (unscented)",
                 "deg/s",
                 geometry,
@@ -106,13 +107,13 @@ def table_2_4() -> list[Row]:
                 "equal",
                 "not reproducible",
                 tolerance=5e-5,
-                why="printed: row sums (2.52) with sigma_A^2 = 1 mm^2/s^4 instead of 486.3 (ERRATA 18, 19)",
+                why="printed: row sums (2.52) with sigma_A^2 = 1 mm^2/s^4 instead of 486.3 (errata 18, 19)",
             ),
             Row(
-                "000, Table 2.4 as it was computed",
+                "Ang 2004, Table 2.4 as it was computed",
                 f"6A, omega_{axis} from row sums, sigma_A = 1 mm/s^2",
                 "deg/s",
-                "000 (2.54), T = 1 ms",
+                "Ang 2004 (2.54), T = 1 ms",
                 published,
                 float(sums[i]),
                 "equal",
@@ -120,7 +121,7 @@ def table_2_4() -> list[Row]:
                 tolerance=digit,
             ),
             Row(
-                "ERRATA 19",
+                "erratum 19",
                 f"6A, sigma of omega_{axis} per sample (linear)",
                 "deg/s",
                 geometry,
@@ -131,7 +132,7 @@ def table_2_4() -> list[Row]:
                 tolerance=(5e-5, 5e-5, 5e-4)[i],
             ),
             Row(
-                "ERRATA 20",
+                "erratum 20",
                 f"6A, omega_{axis} in 8-12 Hz",
                 "deg/s",
                 "2.25 mg behind 15 Hz RC",
@@ -149,7 +150,7 @@ def table_2_4() -> list[Row]:
     for axis, i, published in (("z", 2, 15.6), ("x", 0, 15.6), ("y", 1, 15.6)):
         rows.append(
             Row(
-                "000, Table 2.4",
+                "Ang 2004, Table 2.4",
                 f"6A, sigma of a_{axis} at the sensors' centroid",
                 "mm/s^2",
                 geometry,
@@ -160,17 +161,17 @@ def table_2_4() -> list[Row]:
                 tolerance=0.05,
                 why=""
                 if axis == "z"
-                else "six equations, six unknowns: no redundancy is left to average (ERRATA 15); "
+                else "six equations, six unknowns: no redundancy is left to average (erratum 15); "
                 f"{at_front[i]:.2f} at location 3",
             )
         )
         if axis != "z":
             rows.append(
                 Row(
-                    "000, Table 2.4 as it was computed",
+                    "Ang 2004, Table 2.4 as it was computed",
                     f"6A, sigma of a_{axis}, alpha taken as known",
                     "mm/s^2",
-                    "2.25 mg per axis, at rest or with alpha from elsewhere (ERRATA 15)",
+                    "2.25 mg per axis, at rest or with alpha from elsewhere (erratum 15)",
                     published,
                     float(known[i]),
                     "equal",

@@ -1,4 +1,4 @@
-"""Published tremor cancelling beside ours: 000 chapter 5, and the field as `algorithms.md` collected it."""
+"""Published tremor cancelling beside ours: Ang 2004 chapter 5, and the field as `algorithms.md` collected it."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _emulated() -> list[Row]:
         left = _one(lines, method, 0)
         rows.append(
             Row(
-                "000, 5.2.1",
+                "Ang 2004, 5.2.1",
                 f"tremor rms reduction, {method}",
                 "%",
                 f"one axis at a time, zero delay; {HELD}",

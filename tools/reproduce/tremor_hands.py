@@ -1,4 +1,5 @@
-"""Rows of ``micron reproduce tremor`` on inspection and on the cascade network (000, 5.3.4), from recorded hands."""
+"""Rows of ``micron reproduce tremor`` on inspection and on the cascade network (Ang 2004, 5.3.4), from recorded
+hands."""
 
 from __future__ import annotations
 
@@ -86,15 +87,15 @@ def cascade() -> list[Row]:
     pairs = len(cross)
     figures: tuple[tuple[str, str, float, float], ...] = (
         (
-            "000, Table 5.2",
+            "Ang 2004, Table 5.2",
             "NN_vm, mean rms reduction, other files",
             39.5,
             _mean([r.own_percent for r in done.results]),
         ),
-        ("000, Table 5.2", "NN_err, mean rms reduction", 29.9, _mean([r.own_percent for r in done.error_results])),
+        ("Ang 2004, Table 5.2", "NN_err, mean rms reduction", 29.9, _mean([r.own_percent for r in done.error_results])),
         # two printed entries (-243.1 and -85.5 %) make the mean -12.6 %, which is nothing to compare with
         (
-            "000, Table 5.3",
+            "Ang 2004, Table 5.3",
             "median rms reduction, other persons",
             float(np.median(PUBLISHED_CROSS)),
             float(np.median(cross)),
@@ -105,7 +106,7 @@ def cascade() -> list[Row]:
     harmed = 100.0 * done.worse_than_raw / pairs
     rows.append(
         Row(
-            "000, Table 5.3",
+            "Ang 2004, Table 5.3",
             "pairs that do harm",
             "%",
             condition,
@@ -120,7 +121,7 @@ def cascade() -> list[Row]:
     harder = study(subjects(signals, making), making, windows=((50, 4),), motions=1, with_error_target=False)
     rows.append(
         Row(
-            "000, Table 5.2",
+            "Ang 2004, Table 5.2",
             "the harder reading: mean rms reduction, trained on all other persons",
             "%",
             f"{len(done.results)} recorded hands, {name}",
@@ -135,7 +136,7 @@ def cascade() -> list[Row]:
 
 
 PUBLISHED_CROSS = (26.2, 38.1, 45.1, -85.5, 28.6, -243.1, 0.0, 15.4, -0.9, 32.7, -30.8, 22.7)
-"""The twelve entries of 000, Table 5.3 that are of different persons, %."""
+"""The twelve entries of Ang 2004, Table 5.3 that are of different persons, %."""
 
 
 def _mean(values: list[float] | tuple[float, ...]) -> float:

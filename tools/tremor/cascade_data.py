@@ -1,4 +1,4 @@
-"""Files for the cascade network: real hands' error plus a pseudo-voluntary motion, made as in 000, 5.3.3.
+"""Files for the cascade network: real hands' error plus a pseudo-voluntary motion, made as in Ang 2004, 5.3.3.
 
 There: surgeons held still, so all motion was error (16 s, 250 Hz, one dimension); a voluntary motion, white noise
 low-passed at 1 Hz of the same rms, was added. Our hands did not hold still, so what counts as error is what lies above

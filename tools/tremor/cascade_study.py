@@ -1,4 +1,5 @@
-"""The experiment of 000, 5.3.3 and 5.3.4 on recorded hands: search of the network, one training file, cross tests."""
+"""The experiment of Ang 2004, 5.3.3 and 5.3.4 on recorded hands: search of the network, one training file, cross
+tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""Training of a cascade network (000, 5.3.2): linear first, then one hidden unit at a time from a pool of candidates.
+"""Training of a cascade network (Ang 2004, 5.3.2): linear first, then one hidden unit at a time from a pool of
+candidates.
 
 Candidates (every kind, several random starts) are trained apart by quickprop on their correlation with what the network
 still misses; the best is installed. Its input weights and the output's are then trained together by node-decoupled

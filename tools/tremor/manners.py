@@ -1,4 +1,4 @@
-"""How a method behaves when things change: onset, frequency jump, growing bias (000, 5.2.2), on steady tones.
+"""How a method behaves when things change: onset, frequency jump, growing bias (Ang 2004, 5.2.2), on steady tones.
 
 Each figure is a time (s) until what is left, rms over 0.25 s, stays below ``SETTLED`` of the tone; nan: never.
 """

@@ -1,4 +1,4 @@
-"""The page's part on non-tremulous error: tables 5.1 to 5.3 of 000 on recorded hands."""
+"""The page's part on non-tremulous error: tables 5.1 to 5.3 of Ang 2004 on recorded hands."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def section(signals: list[TremorSignal], progress: Progress) -> list[str]:
     done = main_study(signals, progress)
     names = [r.name for r in done.results]
     lines = [
-        "## Non-tremulous error: the cascade network (000, 5.3)",
+        "## Non-tremulous error: the cascade network (Ang 2004, 5.3)",
         "",
         "Each person's five calmest stretches of 16 s (gyroscope, integrated once, the axis that trembles",
         "most) at 250 Hz; error",

@@ -134,8 +134,18 @@ def test_workspace_refuses_a_bench_that_is_none(tmp_path: Path) -> None:
 
 def test_reproduce_prints_rows_and_refuses_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     rows = (
-        Row("000, Table 7.3", "rms error, ours", "%", "hand", 1.4, 0.7, "lower", "emulated"),
-        Row("000, Table 7.3", "rms error, without model", "%", "hand", 8.3, 8.2, "higher", "emulated", why="smaller"),
+        Row("Ang 2004, Table 7.3", "rms error, ours", "%", "hand", 1.4, 0.7, "lower", "emulated"),
+        Row(
+            "Ang 2004, Table 7.3",
+            "rms error, without model",
+            "%",
+            "hand",
+            8.3,
+            8.2,
+            "higher",
+            "emulated",
+            why="smaller",
+        ),
     )
     monkeypatch.setattr(actuation, "table", lambda: Table("actuation", rows, 1.0, ("a note",)))
     out = tmp_path / "actuation.json"
@@ -188,8 +198,8 @@ def test_prediction_is_what_noise_and_unseen_recordings_leave() -> None:
 
 
 def test_beyond_36_hz_the_slopes_are_held_counted_and_the_drive_stays_monotonic() -> None:
-    """000, 7.5: 12.5 um p-p is singular at about 36 Hz (1414 um/s). The first slope reaches zero there; driven past
-    it, the command is still one that a stack of this model follows at the held slope."""
+    """Ang 2004, 7.5: 12.5 um p-p is singular at about 36 Hz (1414 um/s). The first slope reaches zero there; driven
+    past it, the command is still one that a stack of this model follows at the held slope."""
     first = StackConfig().play_weights_um_per_V[0]
     stack = StackConfig(slope_per_rate_s_per_V=(-first / 1414.0, *[0.0] * 9))
     t = np.arange(1000) / RATE_HZ

@@ -68,7 +68,7 @@ def test_poor_scans_are_named(tmp_path: Path) -> None:
 
 
 def test_workspace_holds_the_published_extents_and_sphere() -> None:
-    """000, Table 6.1 and 6.1.1. Width of the box of strokes along its own normal: 8 range / sqrt(1 + (r/l)^2)."""
+    """Ang 2004, Table 6.1 and 6.1.1. Width of the box of strokes along its own normal: 8 range / sqrt(1 + (r/l)^2)."""
     config = ActuationConfig()
     found = analyse(config, grid=5)
     assert np.all(found.extent_m * 1e6 > [1000.0, 1000.0, 100.0])

@@ -85,7 +85,7 @@ def test_plays_after_conditioning_are_what_the_operators_do() -> None:
 @pytest.mark.parametrize("start_V", [0.0, 50.0, 80.0])
 @pytest.mark.parametrize("config", [ZONES, FULL])
 def test_round_trip_is_exact_from_any_start_at_any_rate(start_V: float, config: StackConfig) -> None:
-    """The slopes change in every step; carried along untransformed the states would leave 2.9 % (ERRATA 78)."""
+    """The slopes change in every step; carried along untransformed the states would leave 2.9 % (erratum 78)."""
     stack = Stack(config, start_V)
     wanted = np.interp(wandering(), [0, 100], [1e-6, 12e-6])
     rates = np.abs(np.gradient(wanted)) * 1000.0

@@ -94,7 +94,7 @@ def test_equal_strokes_move_along_the_shaft_by_the_lever() -> None:
 
 
 def test_leg_one_up_tilts_the_tip_away_from_it() -> None:
-    """ERRATA 69: a_x = -(2 z1 - z2 - z3) / (3 r)."""
+    """Erratum 69: a_x = -(2 z1 - z2 - z3) / (3 r)."""
     tip = truth.tip_from_strokes(np.array([1e-6, 0.0, 0.0]), CONFIG)
     assert tip[0] == pytest.approx(-0.040 * 2 * 8e-6 / (3 * 0.005), rel=1e-3)
     assert tip[1] == pytest.approx(0.0, abs=1e-12)

@@ -115,7 +115,7 @@ def test_out_of_reach_is_the_nearest_point_flagged_and_without_a_jump() -> None:
 
 
 def test_too_fast_for_the_model_is_limited_and_flagged() -> None:
-    """000, 7.5: above 36 Hz (1414 um/s) a slope turns negative and the inverse would run backwards."""
+    """Ang 2004, 7.5: above 36 Hz (1414 um/s) a slope turns negative and the inverse would run backwards."""
     falling = tuple(-w / 1414.0 for w in np.cumsum(StackConfig().play_weights_um_per_V)[:2])
     law = (*falling, *[0.0] * 8)
     stack = StackConfig(slope_per_rate_s_per_V=law, least_slope_um_per_V=0.005)

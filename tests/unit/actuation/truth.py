@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from firmware_py.actuation.config import ActuationConfig
 
 Array = NDArray[np.float64]
-PINS = np.array([[1.0, 0.0], [-0.5, np.sqrt(3) / 2], [-0.5, -np.sqrt(3) / 2]])  # 000 (6.1), (6.2) for R = r = 1
+PINS = np.array([[1.0, 0.0], [-0.5, np.sqrt(3) / 2], [-0.5, -np.sqrt(3) / 2]])  # Ang 2004 (6.1), (6.2) for R = r = 1
 
 
 def tip_at_heights(heights: Array, ball_circle_m: float, shaft_m: float) -> Array:
@@ -39,7 +39,7 @@ def tip_from_strokes(strokes: Array, config: ActuationConfig) -> Array:
 
 
 class Plays:
-    """w . H_r of 000 (7.1)-(7.4), one operator after the other."""
+    """w . H_r of Ang 2004 (7.1)-(7.4), one operator after the other."""
 
     def __init__(self, r: Array, w: Array, start: Array) -> None:
         self.r, self.w, self.y = r, w, start.copy()

@@ -1,4 +1,5 @@
-"""The physical model of 000 sec. 3.2.1 against voltages made from it, and on an instrument that does not obey it."""
+"""The physical model of Ang 2004 sec. 3.2.1 against voltages made from it, and on an instrument that does not obey
+it."""
 
 from __future__ import annotations
 
@@ -160,7 +161,7 @@ def test_a_log_of_poses_is_averaged_over_their_last_five_seconds(tmp_path: Path)
     log = load_stage_log(tmp_path / "log.csv")
     np.testing.assert_allclose(log.columns["acc"], [0.0, 1.0, 2.0])
     np.testing.assert_allclose(log.attitude[1], stage_attitude(np.radians([30.0]), np.radians([-45.0]))[0])
-    # alpha 90, beta 0: x along gravity, so it reads -1 g (000 Fig. 3.3, ERRATA 2)
+    # alpha 90, beta 0: x along gravity, so it reads -1 g (Ang 2004 Fig. 3.3, erratum 2)
     np.testing.assert_allclose(stage_attitude(np.array([np.pi / 2]), np.zeros(1))[0, 2], [-1.0, 0.0, 0.0], atol=1e-12)
     (tmp_path / "other.csv").write_text("t_s,acc\n0,1\n0.1,1\n")
     with pytest.raises(InputError, match="no stage angles"):

@@ -1,4 +1,4 @@
-"""Mapping of the card's angles to the field of view against the closed forms of document 002, section 6.2."""
+"""Mapping of the card's angles to the field of view against the closed forms of Erat 2018, section 6.2."""
 
 from __future__ import annotations
 

@@ -167,7 +167,7 @@ def test_a_new_difference_of_parallel_axes_is_noticed_and_an_old_one_is_not():
 
 
 def readings(alpha: np.ndarray) -> np.ndarray:
-    """(6,) m/s^2 of axes that turn with ``alpha``: s . (alpha x r), ERRATA section 5."""
+    """(6,) m/s^2 of axes that turn with ``alpha``: s . (alpha x r), docs/references.md, conventions."""
     config = SensingConfig()
     return np.array([s @ np.cross(alpha, r) for s, r in zip(config.axes, config.axis_positions(), strict=True)])
 

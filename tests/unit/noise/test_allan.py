@@ -84,7 +84,7 @@ def test_averages_that_a_filter_bends_are_left_out() -> None:
 
 
 def test_the_flat_part_is_read_over_0_664() -> None:
-    """ERRATA 34; a curve made from the model itself."""
+    """Erratum 34; a curve made from the model itself."""
     from tools.noise.allan import AllanCurve
 
     tau = 2.0 ** np.arange(-6, 12)

@@ -25,9 +25,9 @@ def test_published_and_corrected_figures_of_table_2_4() -> None:
     found = all_accelerometers(micron_000(), np.full(6, NOISE), conditions())
     assert found.rate_linear is not None
     assert found.rate_unscented is not None
-    np.testing.assert_allclose(np.degrees(found.rate_linear), [0.0456, 0.0456, 0.370], rtol=2e-3)  # ERRATA 19
+    np.testing.assert_allclose(np.degrees(found.rate_linear), [0.0456, 0.0456, 0.370], rtol=2e-3)  # erratum 19
     np.testing.assert_allclose(found.rate_unscented, found.rate_linear, rtol=1e-3)
-    # 0.75 deg/s behind 15 Hz has 0.26 deg/s in 8-12 Hz (ERRATA 20) where the filter leaves 0.69 of the variance
+    # 0.75 deg/s behind 15 Hz has 0.26 deg/s in 8-12 Hz (erratum 20) where the filter leaves 0.69 of the variance
     band = np.degrees(conventional(np.zeros(3), NOISE, conditions()).rate_band[0])
     w = 2.0 * np.pi * np.linspace(8.0, 12.0, 100)
     assert band * np.sqrt(np.mean(1.0 / (1.0 + (w / RC_RAD_S) ** 2))) == pytest.approx(0.26, abs=0.005)

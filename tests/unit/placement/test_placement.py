@@ -1,4 +1,4 @@
-"""Variance, propositions and optimisation of placements, against 004 and against finite differences."""
+"""Variance, propositions and optimisation of placements, against Latt 2011 and against finite differences."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tools.placement import optimise as optimise_module
 from tools.placement.configurations import cube_004, micron_000, micron_004, micron_004_turned, proposed_004
 from tools.placement.optimise import cost_and_gradient, optimise, weakest_direction, weight_matrix
 from tools.placement.propositions import check_pairs
-from tools.placement.space import load_space, space_004
+from tools.placement.space import load_space, space_latt
 from tools.placement.variance import (
     angular_noise,
     motion_covariance,
@@ -21,7 +21,7 @@ from tools.placement.variance import (
 
 
 def test_the_cube_is_that_of_the_formula() -> None:
-    """004 (45): alpha = (...) / (sqrt(2) d1), exact for the geometry of ERRATA 129."""
+    """Latt 2011 (45): alpha = (...) / (sqrt(2) d1), exact for the geometry of erratum 129."""
     cube, alpha, force = cube_004(), np.array([0.3, -0.8, 1.1]), np.array([2.0, -1.0, 9.0])
     a1, a2, a3, a4, a5, a6 = np.sum(cube.axes * (force + np.cross(alpha, cube.positions)), axis=1)
     found = np.array([a1 - a2 + a5 - a6, -a1 + a3 - a4 - a6, a2 - a3 - a4 + a5]) / (np.sqrt(2.0) * 0.026)
@@ -69,7 +69,7 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
 def test_three_packages_in_the_papers_space(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optimise_module, "DRAWS", 60)
     monkeypatch.setattr(optimise_module, "REFINED", 3)
-    space = space_004()
+    space = space_latt()
     best = optimise(space)
     assert best.noise[3] == pytest.approx(0.4073, abs=5e-5)  # another program's optimum with the same limits
     assert weakest_direction(best.placement.axes)[0] >= space.least_translation
@@ -90,7 +90,7 @@ def test_without_a_limit_translation_is_given_up(monkeypatch: pytest.MonkeyPatch
     """That is why there is one: the angular noise hardly falls, and a direction is seen by a third of an axis."""
     monkeypatch.setattr(optimise_module, "DRAWS", 40)
     monkeypatch.setattr(optimise_module, "REFINED", 1)
-    free = optimise(space_004().model_copy(update={"least_translation": 0.0}))
+    free = optimise(space_latt().model_copy(update={"least_translation": 0.0}))
     assert 0.40 < free.noise[3] < 0.4073
     assert weakest_direction(free.placement.axes)[0] < 0.35
 
@@ -98,7 +98,7 @@ def test_without_a_limit_translation_is_given_up(monkeypatch: pytest.MonkeyPatch
 def test_limits_that_no_placement_keeps_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(optimise_module, "DRAWS", 2)
     monkeypatch.setattr(optimise_module, "REFINED", 1)
-    tight = space_004().model_copy(update={"largest_force_noise_m_s2": 1e-3})
+    tight = space_latt().model_copy(update={"largest_force_noise_m_s2": 1e-3})
     with pytest.raises(ValueError, match=r"no placement in this space keeps the force at the tip to 0\.001"):
         optimise(tight)
 

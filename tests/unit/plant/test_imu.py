@@ -71,7 +71,7 @@ def test_one_pole_of_a_ramp_is_exact_at_any_rate(step_ns: int) -> None:
 
 @pytest.mark.parametrize(("spec", "mg"), [(MPU6050_SPEC, 0.4), (LSM6DS3_SPEC, 0.09), (BMX055_SPEC, 0.15)])
 def test_noise_of_each_chip(spec: imu.ImuSpec, mg: float) -> None:
-    """Document 002, Table 5.1: density 400, 90, 150 ug/rtHz."""
+    """Erat 2018, Table 5.1: density 400, 90, 150 ug/rtHz."""
     chip = Imu(spec, lambda t: SPIN, errors=0.0)
     values = np.array([chip.accelerometer.sample(k * 20 * MS, 50.0)[0] for k in range(3000)])
     assert np.std(values) == pytest.approx(mg * 9.80665e-3 * np.sqrt(50.0), rel=0.05)

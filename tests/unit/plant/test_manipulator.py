@@ -15,7 +15,8 @@ R_MM, SHAFT_MM = 5.0, 40.0
 
 
 def constraint_solution_mm(z_mm):
-    """Tip displacement of the star whose balls lie in their planes (000 (6.13) with errata no. 59) at heights z."""
+    """Tip displacement of the star whose balls lie in their planes (Ang 2004 (6.13) with errata no. 59) at heights
+    z."""
     angle = np.radians([0.0, 120.0, 240.0])
     balls = R_MM * np.stack([np.cos(angle), np.sin(angle), np.zeros(3)], axis=1)
 

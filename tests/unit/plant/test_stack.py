@@ -1,4 +1,4 @@
-"""Stack and amplifier against closed forms, and the size of the loop against 000 Tables 7.1 and 7.2."""
+"""Stack and amplifier against closed forms, and the size of the loop against Ang 2004 Tables 7.1 and 7.2."""
 
 import math
 
@@ -47,7 +47,7 @@ def uncompensated_percent(config, frequency_hz, seed, axis, wanted_um=12.5):
 
 
 def test_uncompensated_loop_has_the_published_size_and_grows_with_rate():
-    """000 Table 7.1: 9.0 to 11.0 % rms, 16.6 to 20.9 % max, 1 to 19 Hz; Table 7.2: 8.7 and 15.5 %."""
+    """Ang 2004 Table 7.1: 9.0 to 11.0 % rms, 16.6 to 20.9 % max, 1 to 19 Hz; Table 7.2: 8.7 and 15.5 %."""
     config = StackConfig()
     frequencies = (1.0, 4.0, 7.0, 10.0, 13.0, 16.0, 19.0)
     table = np.array([[uncompensated_percent(config, f, 1, axis) for f in frequencies] for axis in range(3)])

@@ -171,7 +171,7 @@ def test_free_fall_and_standstill_do_not_break_it(method: str) -> None:
     fusion = Fusion(FusionConfig(method=method, align_s=0.0), RATE_HZ)  # type: ignore[arg-type]
     q = fusion.run(np.zeros((20, 3)), np.zeros((20, 3)))
     np.testing.assert_array_equal(q, np.tile([1.0, 0.0, 0.0, 0.0], (20, 1)))
-    # exactly level: Madgwick's gradient is zero (ERRATA 107)
+    # exactly level: Madgwick's gradient is zero (erratum 107)
     q = fusion.run(*still(20, 0.0))
     np.testing.assert_allclose(q[-1], [1.0, 0.0, 0.0, 0.0], atol=1e-15)
 

@@ -55,7 +55,7 @@ def test_more_than_six_axes_are_weighted_not_chosen() -> None:
 
 
 def test_an_axis_pointing_up_reads_plus_one_g_at_rest() -> None:
-    """ERRATA 2: specific force, not gravity."""
+    """Erratum 2: specific force, not gravity."""
     motion = Motion(np.zeros((5, 3)), Rotation.from_rotvec(np.zeros((5, 3))))
     readings = motion.readings()
     np.testing.assert_allclose(readings[2], GRAVITY * AXES[:, 2], atol=1e-12)
@@ -64,7 +64,7 @@ def test_an_axis_pointing_up_reads_plus_one_g_at_rest() -> None:
 
 
 def test_default_geometry_has_the_published_differences() -> None:
-    """000, second (2.54)."""
+    """Ang 2004, second (2.54)."""
     d1, d2, d3 = 0.0202, 0.0143, 0.116
     r1, r2, r3 = np.array(SensingConfig().positions_m)
     np.testing.assert_allclose(r2 - r1, [-d1, d1, 0.0], atol=1e-15)

@@ -1,4 +1,4 @@
-"""The numeric differential kinematics against a body moved through space (000 (2.6)), alone and in the step."""
+"""The numeric differential kinematics against a body moved through space (Ang 2004 (2.6)), alone and in the step."""
 
 from __future__ import annotations
 
@@ -182,7 +182,7 @@ def test_the_numeric_step_is_the_same_in_plain_python_and_allocates_nothing(monk
 
 
 def coning(noise_m_s2: float = 0.0) -> tuple[Array, Array, Array]:
-    """(3000, 6) readings of document 004's placement, (3001, 3) rates of 1.2 rad/s at 3 Hz about three axes, params."""
+    """(3000, 6) readings of Latt 2011's placement, (3001, 3) rates of 1.2 rad/s at 3 Hz about three axes, params."""
     place = micron_004()
     phase = np.radians([41.0, 147.0, 0.0])
     rates = 1.2 * np.sin(2.0 * np.pi * 3.0 * np.arange(3001)[:, None] * DT_S + phase)

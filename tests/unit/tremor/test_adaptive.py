@@ -172,7 +172,7 @@ def test_one_setting_serves_small_and_large_tremor(rms_m: float) -> None:
 
 
 def test_a_bias_that_grows_does_not_capture_it() -> None:
-    """000, 5.2.2: 5 mg in 10 s, then a step of 20 mg, under 20 um of tremor."""
+    """Ang 2004, 5.2.2: 5 mg in 10 s, then a step of 20 mg, under 20 um of tremor."""
     n, size = 12_000, 20e-6
     t = np.arange(n) / RATE_HZ
     drift = rc_filter(np.minimum(0.005 * 9.81 * t, 0.05) + 0.2 * (t > 10.5))

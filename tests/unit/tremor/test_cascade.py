@@ -30,7 +30,7 @@ def network(units: int = 2, **changes: object) -> CascadeNetwork:
 
 
 def plain(net: CascadeNetwork, path: np.ndarray) -> np.ndarray:
-    """The network written with matrices, from 000 Fig. 5.6."""
+    """The network written with matrices, from Ang 2004 Fig. 5.6."""
     x = windows(path, net.window, net.spacing)
     middle = x.mean(axis=1) if net.centred else np.zeros(len(x))
     features = np.concatenate([np.ones((len(x), 1)), (x - middle[:, None]) / net.scale], axis=1)

@@ -1,4 +1,4 @@
-"""Motion card: the ends of what is accepted, and what stands before a line. Forms of document 002, section 4.2."""
+"""Motion card: the ends of what is accepted, and what stands before a line. Forms of Erat 2018, section 4.2."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Motion card: text line and packet of document 002, section 4.2, with ERRATA 112, 113 and 121; BLE of 4.3.2."""
+"""Motion card: text line and packet of Erat 2018, section 4.2, with errata 112, 113 and 121; BLE of 4.3.2."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_packet_of_the_document():
     reading = decode_packet(EXAMPLE)
     assert reading == CardReading((858, -1362, 16142, 0, 1, 0, -5305), 0)
     ax, ay, az = reading.values[:3]
-    assert math.hypot(ax, ay, az) / 16384 == pytest.approx(0.990, abs=5e-4)  # ERRATA 112
+    assert math.hypot(ax, ay, az) / 16384 == pytest.approx(0.990, abs=5e-4)  # erratum 112
     assert reading.values[6] / 340 + 36.53 == pytest.approx(20.9, abs=0.05)
 
 

@@ -1,4 +1,4 @@
-"""The emulated motion card against document 002, sections 4.2 and 6.2, and errata nos. 112, 113, 121."""
+"""The emulated motion card against Erat 2018, sections 4.2 and 6.2, and errata nos. 112, 113, 121."""
 
 from __future__ import annotations
 
