@@ -23,7 +23,7 @@ def placement(
     seed: Annotated[int, typer.Option(help="Seed of the coarse search.")] = 0,
     json_file: JsonOption = None,
 ) -> None:
-    """Positions and directions with the least angular (or tip) noise, checked against the propositions of Latt 2011.
+    """Places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.
 
     Example: micron placement benches/space-latt.toml
     """

@@ -7,7 +7,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[3]
 ROOMS = ("firmware_py", "drivers", "hal", "sim_devices", "tests", "tools", "docs", "benches", "examples", "benchmarks")
-KINDS = {".py", ".toml", ".md"}
+KINDS = {".py", ".toml", ".md", ".json"}
 # "(000" and "004, Table 2" cite; "10 000 s" counts and "PGA 000 (6.144 V)" is a field of a register.
 NUMBER = re.compile(r"(?<![\w.,/-])(?<!\w )00[0124](?=$|,|\)|:|'s|;| \(| [A-Z]| sec| eq| ch)", re.M)
 
