@@ -112,3 +112,19 @@ def test_an_effect_that_is_not_in_the_vocabulary_is_a_full_member() -> None:
     report = diagnose(_stack(0.12 * (np.clip(u, -22.0, 25.0) - u), u), jobs=1, constants=START, effects=[*others, mine])
     assert {p.name for p in report.physics} == {"clipped_by_a_stranger"}
     assert {a.name for a in report.alternatives} <= {e.name for e in others}
+
+
+@pytest.mark.parametrize(("follows", "named"), [(True, set[str]()), (False, {"random_walk"})])
+def test_a_walk_is_no_name_for_what_follows_a_recorded_signal(follows: bool, named: set[str]) -> None:
+    """Nothing in the vocabulary is about humidity, which walks; the change is a curve of it, or a walk of its own."""
+    rng = np.random.default_rng(6)
+    u = 40.0 * wave(rng, N)
+    humidity, other = np.cumsum(rng.standard_normal((2, N)), axis=1) / np.sqrt(N)
+    change = 0.08 * np.sqrt(np.abs(humidity)) if follows else 0.08 * other
+    y = 0.12 * u + change + 0.005 * rng.standard_normal(N)
+    stack = {"gain_um_per_V": 0.12, "offset_um": 0.0}
+    r = recording("piezo_stack", {"command": u}, {"displacement": y}, stack, context={"humidity": humidity})
+    shapeless = [EFFECTS[n] for n in ("random_walk", "step_shift", "thermal_drift")]
+    report = diagnose(r, jobs=1, constants=START, effects=shapeless)
+    assert {p.name for p in report.physics} == named
+    assert report.verdict == ("unexplained" if follows else "missing_physics")

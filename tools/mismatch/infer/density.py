@@ -7,16 +7,18 @@ pays for it on the others.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import t as student
 
+from tools.mismatch.engine.features import curve
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import robust_scale
+from tools.mismatch.placed import Placed
 
 Array = NDArray[np.float64]
 
@@ -99,11 +101,68 @@ def predictable(problem: Problem, e: Array) -> float:
     noise could not: innovations ``e`` (m,) are white where the law holds."""
     limit = 6.0 * robust_scale(e[problem.fit_rows], 1e-300)
     e = np.clip(e, -limit, limit)
-    past = np.column_stack([np.concatenate([np.zeros(k), e[:-k]]) for k in range(1, COLOUR + 1)])
-    learned, held = problem.fit_rows, problem.held_rows
-    a = np.linalg.lstsq(past[learned], e[learned], rcond=None)[0]
-    before, after = float(np.mean(e[held] ** 2)), float(np.mean((e[held] - past[held] @ a) ** 2))
+    learned = np.zeros(e.size, np.bool_)
+    learned[problem.fit_rows] = True
+    held = problem.held_rows
+    before, after = float(np.mean(e[held] ** 2)), float(np.mean(innovations(e, learned)[held] ** 2))
     return 0.5 * math.log(before / after) if before > after > 0.0 else 0.0
+
+
+KNOTS = 10
+"""Knots of the curve of a recorded signal that what is independent must not follow."""
+
+
+def recorded(problem: Problem, fitted: Fit, output: str) -> list[Array]:
+    """Curves (m, k) of every input and condition, and of what is simulated of ``output``."""
+    r = problem.recording
+    signals = [x[problem.index] for of in (r.inputs, r.context) for x in of.values()]
+    signals.append(problem.measured[output] - fitted.residual[output])
+    return [c for c in (curve(x, KNOTS) for x in signals) if c.shape[1]]
+
+
+def innovations(e: Array, learned: NDArray[np.bool_]) -> Array:
+    """What an autoregression, learned on the samples ``learned``, does not predict of ``e`` (both (m,))."""
+    limit = 6.0 * robust_scale(e[learned], 1e-300)
+    clipped = np.clip(e, -limit, limit)
+    past = np.column_stack([np.concatenate([np.zeros(k), clipped[:-k]]) for k in range(1, COLOUR + 1)])
+    return e - past @ np.linalg.lstsq(past[learned], clipped[learned], rcond=None)[0]
+
+
+def follower(problem: Problem, fitted: Fit, output: str, figures: Callable[[Placed], int]) -> bool:
+    """Whether a curve of one recorded signal, with the colour of what it leaves, says more about ``output`` than the
+    effects there which depend on nothing that is recorded (a walk, steps, a drift in time), each with its price
+    (Schwarz 1978). ``figures``: how many numbers an effect brings."""
+    own = [
+        k
+        for k, p in enumerate(fitted.model.placed)
+        if output in p.outputs and not p.effect.driven and not p.effect.needs and p.effect.claims is None
+    ]
+    if not own:
+        return False
+    learned = np.zeros(problem.index.size, np.bool_)
+    learned[problem.fit_rows] = True
+    learned &= ~fitted.model.excused(problem.view, output)
+    least = NORMAL_SCALE * problem.sigma(output)
+    one = 0.5 * math.log(max(int(np.count_nonzero(learned)), 2))
+
+    def nats(e: Array, deviation: Array | float = 1.0) -> float:
+        d = student_log_density(e[learned], student_scale(e[learned], least))
+        return float(np.sum(d - np.log(np.broadcast_to(deviation, e.shape)[learned])))
+
+    error, deviation = prediction(problem, fitted, output)
+    e = error / deviation
+    with_it = max(nats(e, deviation), nats(innovations(e, learned), deviation))
+    with_it -= one * sum(figures(fitted.model.placed[k]) for k in own)
+    r = undone(problem, fitted, output, own)
+    bare = max(with_it, nats(innovations(r - np.median(r[learned]), learned)))
+    for columns in recorded(problem, fitted, output):
+        design = np.column_stack([np.ones(r.size), columns])
+        size = np.maximum(np.linalg.norm(design[learned], axis=0), 1e-300)
+        weight = np.linalg.lstsq(design[learned] / size, r[learned], rcond=1e-8)[0] / size
+        rest = r - design @ weight
+        if max(nats(rest), nats(innovations(rest, learned))) - one * columns.shape[1] > bare:
+            return True
+    return False
 
 
 TAILS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)

@@ -17,7 +17,7 @@ from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import LEAST, best_log_density, gain_of_events, unpredicted, weigh
+from tools.mismatch.infer.density import LEAST, best_log_density, follower, gain_of_events, unpredicted, weigh
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
@@ -105,6 +105,7 @@ class Store:
         blocks = np.array([[float(np.mean(every[o].density[a:b])) for o in p.twin.outputs] for a, b in p.held_blocks])
         proper = fitted.ok and not any(improper(fitted, e) for e in fitted.model.placed)
         proper = proper and all(self.lawful(w.predictable) for w in every.values())
+        proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
         free = min(self.constants.samples, self.held) / len(every) * sum(w.free for w in every.values())
         figures = free + sum(figures_of(e) for e in fitted.model.placed)
