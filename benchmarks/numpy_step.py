@@ -1,6 +1,6 @@
 """The step in plain numpy, as one would write it without a compiler: vectors over axes, sensors and plays.
 
-A peer for ``benchmarks.step``, on the firmware's records. Same mathematics as ``firmware_py.chain`` in the regular way
+A peer for ``benchmarks.step``, on the firmware's records. Same mathematics as ``control.chain`` in the regular way
 (aligned, no gap, reachable tip), equal to rounding; checked before it is timed.
 """
 

@@ -12,7 +12,7 @@ from benchmarks import step_input
 from benchmarks.numpy_step import NumpyStep
 from benchmarks.row import Row, side_by_side
 from benchmarks.yardstick import STAGES, Yardstick, compiler
-from firmware_py.chain import actuate_kernel, detect_kernel, estimate_kernel, sense_kernel
+from firmware_py.control.chain import actuate_kernel, detect_kernel, estimate_kernel, sense_kernel
 from firmware_py.control.stages import Stages
 from firmware_py.frame import LAYOUT, STATUS, TICK, VOLTS
 from hal.compiled import kernel

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from drivers.daq.di4108_kernels import READY, WAIT, accept, decode, new_stream
 from drivers.piezo.e727_kernels import TEXT_BYTES, encode
-from firmware_py.chain import COMMANDED, step_kernel
+from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.control.plausibility import (
     NO_SLOPE,
     PAIR_PLACES,

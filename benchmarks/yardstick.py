@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py import frame
-from firmware_py.chain import COMMANDED, GIVEN_BITS
+from firmware_py.control.chain import COMMANDED, GIVEN_BITS
 from firmware_py.control.stages import Stages
 
 SOURCE = Path(__file__).with_suffix(".c")

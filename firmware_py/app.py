@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.control.guarded import guarded
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.plan import load_plan
 from firmware_py.control.safety import RAMP_TICKS
@@ -28,7 +29,6 @@ from firmware_py.control.wiring import Devices, open_devices
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.exit_codes import exit_code_of
 from firmware_py.frame import LAYOUT
-from firmware_py.guardian.start import guarded
 from firmware_py.inject import Injector, check_injections, parse_injection
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary

@@ -33,7 +33,7 @@ from hal.clock import MonotonicClock
 from hal.errors import HalError
 from sim_devices.config import ServeConfig
 from sim_devices.control import WorldControl
-from sim_devices.devices.faces import ByteFace
+from sim_devices.faces import ByteFace
 from sim_devices.faults import inject
 from sim_devices.lateness import Lateness
 from sim_devices.transports.can_carrier import free_udp_port, on_multicast, on_socketcan

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 from hal.plugins import DEVICES, Registry
-from sim_devices.devices.faces import VoltageSource
+from sim_devices.faces import VoltageSource
 from sim_devices.plant.body_motion import BodyMotion
 
 
@@ -47,7 +47,7 @@ class HasOutputs(Protocol):
 class Device:
     """Describes an emulated device; its module holds it as ``DEVICE``.
 
-    ``make(surroundings)`` returns the wire face that its bus requires (``devices.faces``); for a device on a DAQ it
+    ``make(surroundings)`` returns the wire face that its bus requires (``faces``); for a device on a DAQ it
     returns functions from bench time in ns to volts, by input. A face with ``output_V`` (``HasOutputs``) drives the
     amplifier of the stacks. A part of ours that is more than one face, or that the plant reaches in more ways, has
     ``build(world, name, entry)`` instead, which puts its faces on the world's buses.

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.devices.faces import VoltageSource, Volts
+from sim_devices.faces import VoltageSource, Volts
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim_devices.devices.faces import Volts
+from sim_devices.faces import Volts
 
 SUPPLY_V = 5.0
 MIDDLE_V = 2.5

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from hal.errors import BenchError
 from sim_devices.config import DaqConfig, ImuConfig, emulation_config
-from sim_devices.devices.faces import ByteFace, TimedFace, VoltageSource, Volts
+from sim_devices.faces import ByteFace, TimedFace, VoltageSource, Volts
 from sim_devices.plant.body_motion import BodyMotion, Mount, rotation
 from sim_devices.registry import REGISTRY, HasOutputs, Surroundings, find_device
 from sim_devices.stimuli import Stimuli

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
+
 
 class InputError(ValueError):
     """The message says what, where and what to do; commands end with exit status 2."""
@@ -9,3 +12,13 @@ class InputError(ValueError):
 
 class OutputError(InputError):
     """A result could not be written after the work was done; commands end with exit status 1."""
+
+
+class RecordingError(InputError):
+    """A recording, or its description, cannot be used. The message names file, key, line or sample, and what to do."""
+
+
+def missing_column(path: Path, name: str, have: Sequence[str]) -> RecordingError:
+    """Return the error for a column that a file does not have."""
+    shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
+    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from drivers.daq.di4108_kernels import READY, WAIT, accept, decode
 from drivers.piezo.e727_loop import HANDED_OVER, SENT, step_ramp, write
 from drivers.piezo.gcs import UNSENT
-from firmware_py.chain import COMMANDED, step_kernel
 from firmware_py.compiled.memory import (
     ACTUATE,
     ARRIVAL_NS,
@@ -89,6 +88,7 @@ from firmware_py.compiled.memory import (
     Timing,
     Words,
 )
+from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.control.fresh_field import fill_field
 from firmware_py.control.plausibility import TICK as CHECK_TICK
 from firmware_py.control.plausibility import check_frame, check_scan

@@ -1,4 +1,4 @@
-"""Holds the stages with their parameters and state, and the compiled call that runs them (``firmware_py.chain``).
+"""Holds the stages with their parameters and state, and the compiled call that runs them (``control.chain``).
 
 The live loop and replay use this one implementation: whoever fills the frame's input columns gets the same
 estimates and commands.
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from firmware_py.actuation.config import ActuationConfig
 from firmware_py.actuation.stage import Actuation
-from firmware_py.chain import COMMANDED, HELD, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
+from firmware_py.control.chain import COMMANDED, HELD, MANUAL, PARTS, memory_dtype, run_kernel, step_kernel
 from firmware_py.frame import COMMAND, LAYOUT, STATUS
 from firmware_py.records import Record
 from firmware_py.sensing.config import SensingConfig

@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sim_devices.devices.faces import VoltageSource
+from sim_devices.faces import VoltageSource
 
 CONVERSION, CONFIG, LO_THRESH, HI_THRESH = range(4)
 RESET_VALUES = (0x0000, 0x8583, 0x8000, 0x7FFF)  # Register Map

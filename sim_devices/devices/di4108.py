@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sim_devices.devices.faces import VoltageSource, Volts
+from sim_devices.faces import VoltageSource, Volts
 
 DIVIDEND_HZ = 60_000_000  # page 48, table of srate variables
 FIFO_SAMPLES = 1024  # page 50

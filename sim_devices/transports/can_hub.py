@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable
 
-from sim_devices.devices.faces import CanFace
+from sim_devices.faces import CanFace
 
 HOST = -1
 EXTENDED = 1 << 31

@@ -11,7 +11,7 @@ from collections.abc import Generator, Sequence
 from enum import IntEnum
 
 from hal.types import I2cOp, I2cWrite
-from sim_devices.devices.faces import I2cFace
+from sim_devices.faces import I2cFace
 
 
 class I2cStatus(IntEnum):

@@ -13,7 +13,7 @@ from hal.backends.i2c_checks import check_address
 from hal.clock import VirtualClock
 from hal.errors import BenchError, BusError, Closed, Disconnected, ErrorKind, I2cNack
 from hal.types import CanFrame, CanStats, I2cOp, PortInfo, TimeSource
-from sim_devices.devices.faces import ByteFace
+from sim_devices.faces import ByteFace
 from sim_devices.transports.can_hub import EXTENDED, CanHub
 from sim_devices.transports.i2c_line import I2cLine, I2cStatus, TransferResult
 

@@ -16,7 +16,7 @@ import struct
 import termios
 import tty
 
-from sim_devices.devices.faces import ByteFace
+from sim_devices.faces import ByteFace
 
 LINE_BUFFER_BYTES = 4095
 READ_BYTES = 4096

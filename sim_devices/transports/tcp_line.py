@@ -16,7 +16,7 @@ import time
 from typing import Any
 
 from hal.errors import BenchError
-from sim_devices.devices.faces import ByteFace
+from sim_devices.faces import ByteFace
 
 SNIFF_S = 0.2
 IAC = 0xFF

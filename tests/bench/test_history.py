@@ -7,8 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tools.bench.history import BLOCK, History, extremes, rows_per_bucket
+from tools.bench.history import BLOCK, History, rows_per_bucket
 from tools.bench.wire import HEADER, encode
+from tools.diagnose.extremes import extremes
 
 
 def filled(

@@ -40,7 +40,7 @@ from tools.bench.viewer import Nonsense
 from tools.bench.viewer import _parse as parse_message
 from tools.cli.mismatch import _report as read_report
 from tools.errors import InputError
-from tools.mismatch.recording import RecordingError as TwinRecordingError
+from tools.errors import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.fmu import check_archive

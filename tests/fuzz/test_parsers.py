@@ -21,7 +21,7 @@ from hal.npz import NpzError, open_npz
 from sim_devices.plant.hand_file import load_hand
 from tests.fuzz.mcap_parts import change, change_some_bytes, put_together, take_apart
 from tests.fuzz.targets import TARGETS, seeds
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 from tools.mismatch.twins.fmu import check_archive
 

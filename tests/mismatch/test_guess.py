@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from tools.errors import RecordingError
 from tools.mismatch.guess import POINTS, guess, main
 from tools.mismatch.guess_roles import guess_role, split_unit
-from tools.mismatch.recording import RecordingError
 
 
 @pytest.mark.parametrize(

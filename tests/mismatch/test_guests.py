@@ -9,12 +9,12 @@ import pytest
 
 from hal import plugins
 from hal.trust import require_package
+from tools.errors import RecordingError
 from tools.mismatch import units
 from tools.mismatch.prove import draw, guests
 from tools.mismatch.prove.disk import contract_unit
 from tools.mismatch.prove.plans import plans
 from tools.mismatch.prove.proof import draw_one, generate
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View

@@ -11,6 +11,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.diagnose.extremes import extremes
+
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
 
@@ -26,18 +28,6 @@ class Buckets(NamedTuple):
     t_s: Float64Array
     low: Float32Array
     high: Float32Array
-
-
-def extremes(low: Float32Array, high: Float32Array, k: int) -> tuple[Float32Array, Float32Array]:
-    """Smallest of ``low`` and largest of ``high`` [channels, n] in groups of ``k``, the last may be shorter.
-
-    NaN counts only where a group has nothing else.
-    """
-    n = low.shape[1]
-    starts = np.arange(0, n, k)
-    if n == 0 or k == 1:
-        return low, high
-    return np.fmin.reduceat(low, starts, axis=1), np.fmax.reduceat(high, starts, axis=1)
 
 
 def rows_per_bucket(rows: float, pixels: int) -> int:

@@ -50,7 +50,7 @@ MOST_SHARED = 1_000_000
 @contextmanager
 def _clear_errors() -> Iterator[None]:
     """As ``clear_errors``; a bad recording is bad input."""
-    from tools.mismatch.recording import RecordingError
+    from tools.errors import RecordingError
 
     with clear_errors():
         try:

@@ -193,7 +193,7 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
         "voluntary": {"gain": None, "delay_ms": None},
     }
     if truth is not None and outcome["armed_ns"] is not None:
-        from tools.reports.tremor_figures import tremor_figures
+        from tools.tremor.figures import tremor_figures
 
         scored = tremor_figures(truth, from_ns=outcome["armed_ns"] + round(SETTLE_S * 1e9), to_ns=outcome["safe_ns"])
         if scored is not None:

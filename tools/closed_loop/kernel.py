@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.chain import COMMANDED, step_kernel
+from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.frame import (
     CLIP,
     CLIP_YIELD,

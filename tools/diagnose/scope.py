@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from firmware_py.control.wiring import open_devices
 from hal.bench import OpenBench
-from tools.bench.history import extremes
+from tools.diagnose.extremes import extremes
 
 BLOCKS = "▁▂▃▄▅▆▇█"
 MAX_SCANS = 1024

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from firmware_py.recording.errors import RecordingError as OwnRecordingError
 from firmware_py.recording.reader import Recording
 from hal.npz import NpzError, open_npz
-from tools.errors import InputError
-from tools.mismatch.recording import RecordingError
+from tools.errors import InputError, RecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 
 FORM = "PART.CHANNEL=FILE:COLUMN, or FILE:COLUMN@RATE where the file has no time column"

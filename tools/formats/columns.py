@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 
 Array = NDArray[np.float64]
 MOST_SAMPLES = 50_000_000

@@ -13,12 +13,10 @@ import numpy as np
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError, missing_column
 from tools.formats.blocks import batches
 from tools.formats.columns import Array, as_numbers, check_size
 from tools.formats.packages import need
-from tools.mismatch.recording import RecordingError
-from tools.mismatch.text_table import missing_column
 
 EXTRA = "lab"
 _MAGIC = b"MDF     4."

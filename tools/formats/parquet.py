@@ -10,11 +10,10 @@ from typing import Any
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
+from tools.errors import RecordingError, missing_column
 from tools.formats.blocks import batches
 from tools.formats.columns import Array, as_numbers, check_size
 from tools.formats.packages import need
-from tools.mismatch.recording import RecordingError
-from tools.mismatch.text_table import missing_column
 
 EXTRA = "parquet"
 _BATCH_BLOCKS = 200

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
-from tools.errors import InputError
-from tools.mismatch.recording import Recording, RecordingError, TwinText
+from tools.errors import InputError, RecordingError
+from tools.mismatch.recording import Recording, TwinText
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore

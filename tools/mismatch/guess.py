@@ -19,10 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.mismatch import units
 from tools.mismatch.guess_roles import Assignment, GuessedRole, Parts, assign, choose_kinds, split_unit
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_columns import Array, column_names, column_units, first_line, read_blocks, read_scalars
 from tools.mismatch.recording_columns import word_columns as words_in
 from tools.mismatch.recording_load import MIN_SAMPLES

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 
 Array = NDArray[np.float64]
 MOST_BYTES = 2 << 30

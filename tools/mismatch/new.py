@@ -12,13 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.mismatch import units
 from tools.mismatch.cut import Stretch, cut_columns
 from tools.mismatch.guess import Guess, guess
 from tools.mismatch.key_tables import of_kind
 from tools.mismatch.new_text import recording_text
-from tools.mismatch.recording import Array, RecordingError
+from tools.mismatch.recording import Array
 from tools.mismatch.recording_columns import read_columns
 from tools.mismatch.recording_load import APART, from_table
 from tools.mismatch.twins.vocabulary import KINDS, user_kinds, vocabulary

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.errors import InputError
-
 Array = NDArray[np.float64]
-
-
-class RecordingError(InputError):
-    """Bad input. The message names file, key, line or sample, and what to do."""
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from firmware_py.recording.errors import RecordingError as McapRecordingError
 from firmware_py.recording.scan import ChunkMessage, mcap_records
 from hal.npz import open_npz
+from tools.errors import RecordingError, missing_column
 from tools.formats import mdf, netcdf, parquet
 from tools.mismatch import mat_file, text_table
-from tools.mismatch.recording import RecordingError
-from tools.mismatch.text_table import missing_column
 
 Array = NDArray[np.float64]
 SUFFIXES = (*text_table.SUFFIXES, ".npz", ".mat", ".mcap", ".parquet", ".nc", ".mf4")

@@ -13,8 +13,9 @@ from typing import Any, get_args
 import numpy as np
 
 from hal.trust import path_inside
+from tools.errors import RecordingError
 from tools.mismatch import units
-from tools.mismatch.recording import Array, Condition, Recording, RecordingError, Split, TwinText
+from tools.mismatch.recording import Array, Condition, Recording, Split, TwinText
 from tools.mismatch.recording_columns import SUFFIXES, column_units, read_columns
 from tools.mismatch.twins.vocabulary import KINDS, Role, Vocabulary, user_kinds, vocabulary
 

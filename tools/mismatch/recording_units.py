@@ -12,8 +12,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from tools.errors import RecordingError
 from tools.mismatch import units
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 
 SI = ("V", "m", "rad", "N", "N m", "A", "T", "m/s", "m/s^2", "rad/s", "rad/s^2", "Pa", "s", "Hz", "W", "ohm")
 MOST_INPUTS = 4  # with a choice; more are read as SI

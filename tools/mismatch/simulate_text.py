@@ -9,8 +9,9 @@ import numpy as np
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Array, Effect, Settings, Stage
+from tools.errors import RecordingError
 from tools.mismatch.placed import Placed
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import between_of

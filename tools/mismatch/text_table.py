@@ -17,8 +17,8 @@ from typing import TextIO
 import numpy as np
 from numpy.typing import NDArray
 
+from tools.errors import RecordingError, missing_column
 from tools.mismatch import units
-from tools.mismatch.recording import RecordingError
 
 Array = NDArray[np.float64]
 SUFFIXES = (".csv", ".tsv", ".txt")
@@ -154,12 +154,6 @@ def text_table(path: Path) -> TextTable:
     said = (*row_of_units, *[""] * len(names))[: len(names)]
     samples = begin < len(plain)
     return TextTable(path, encoding, delimiter, decimal, tuple(names), said, tuple(words), first, has_header, samples)
-
-
-def missing_column(path: Path, name: str, have: list[str]) -> RecordingError:
-    """Return the error for a column that a file does not have."""
-    shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
-    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
 
 
 def _head(path: Path) -> tuple[str, str, bool]:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.mismatch.batch import find, is_folder_of_recordings
-from tools.mismatch.recording import Part, Recording, RecordingError, Split
+from tools.mismatch.recording import Part, Recording, Split
 from tools.mismatch.recording_load import APART, load
 
 CLOSE_RATE = 1e-6

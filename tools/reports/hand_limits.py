@@ -13,8 +13,8 @@ from firmware_py.actuation.stage import Actuation
 from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
 from firmware_py.tremor.adaptive_design import band
 from firmware_py.tremor.config import AdaptiveConfig
-from tools.reports.tremor_figures import TREMOR_BAND_HZ, band_pass
 from tools.tremor.cases import RATE_HZ
+from tools.tremor.figures import TREMOR_BAND_HZ, band_pass
 from tools.tremor.ideal import bound_residual
 
 Array = NDArray[np.float64]

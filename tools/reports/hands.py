@@ -21,7 +21,7 @@ from sim_devices.plant.hand_file import load_hand
 from sim_devices.plant.recorded_hand import make_hand
 from tools.closed_loop.simulate import SimulatedRun, simulate
 from tools.reports.hand_limits import Swing, causal_um, known_tremor_um, strongest
-from tools.reports.tremor_figures import TremorFigures, tremor_figures
+from tools.tremor.figures import TremorFigures, tremor_figures
 
 METHODS = ("adaptive", "kalman", "wflc_flc")
 SETTLE_S = 5.0

@@ -17,8 +17,8 @@ from typing import Any
 
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
-from tools.reports.tremor_figures import tremor_figures
 from tools.tremor.bench_variant import write_variant
+from tools.tremor.figures import tremor_figures
 from tools.tremor.ideal import LINE, LOOP_DELAY_S, PERFECT_EMULATION, POSITIONS_M, ideal_changes
 
 SETTLE_S = 5.0

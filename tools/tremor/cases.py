@@ -18,7 +18,7 @@ from scipy.signal import butter, lfilter, sosfiltfilt
 
 from firmware_py.tremor.config import TremorConfig
 from tools.errors import InputError
-from tools.reports.tremor_figures import band_pass
+from tools.tremor.figures import band_pass
 from tools.tremor.signal import TremorSignal
 from tools.tremor.signals import load_signals
 from tools.tremor.spectrum import highest_line, periodogram

@@ -28,10 +28,10 @@ from firmware_py.tremor.config import TremorConfig
 from firmware_py.tremor.estimator import Estimator
 from hal.bench import load_bench
 from tools.closed_loop.simulate import simulate
-from tools.reports.tremor_figures import tremor_figures
 from tools.tremor.bench_variant import merged, write_variant
 from tools.tremor.bound import bank_features, lift
 from tools.tremor.cases import RATE_HZ, involuntary_band, rc_filter, sensor_noise
+from tools.tremor.figures import tremor_figures
 
 Array = NDArray[np.float64]
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from scipy.signal import hilbert
 
 from firmware_py.tremor.adaptive_design import AdaptiveDesign
-from tools.reports.tremor_figures import TREMOR_BAND_HZ, VOLUNTARY_HZ, band_pass
 from tools.tremor.bound import SKIP_S, lift
 from tools.tremor.cases import RATE_HZ, Case, low_pass
+from tools.tremor.figures import TREMOR_BAND_HZ, VOLUNTARY_HZ, band_pass
 
 Array = NDArray[np.float64]
 _EDGE_S = 1.0  # zero-phase filters and targets are not trusted this close to the end

@@ -18,7 +18,7 @@ from tools.cli import main
 from tools.cli.common import DECIDING
 from tools.cli.main import COMMANDS, app
 from tools.cli.trust import decide_on
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.make import make
 from tools.programs import named_in

@@ -17,10 +17,9 @@ from tests.unit.recording.samples import COLUMNS, METADATA, make_rows, same_bits
 from tools.bench import open_run
 from tools.calibrate.logs import load_log
 from tools.cli.main import app
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.formats.export import export
 from tools.formats.netcdf import dataset
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_columns import column_names, column_units, read_columns
 from tools.mismatch.recording_load import load
 

@@ -17,9 +17,9 @@ from typer.testing import CliRunner
 from hal.trust import NotTrusted, trust_program
 from sim_devices.physics.catalogue import EFFECTS
 from tools.cli.main import app
+from tools.errors import RecordingError
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.export.run import simulate_file
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_load import load
 
 runner = CliRunner()

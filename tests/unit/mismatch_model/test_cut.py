@@ -7,9 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.errors import InputError
+from tools.errors import InputError, RecordingError
 from tools.mismatch.cut import cut
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_load import load
 
 TEXT = """format = 1

@@ -12,8 +12,9 @@ import pytest
 
 from hal.trust import NotTrusted, digest_of, trust_program
 from tests.unit.mismatch_model.made import recording
+from tools.errors import RecordingError
 from tools.guest.fmu import OpenFmu, over_the_step
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from hal.trust import trust_program
+from tools.errors import RecordingError
 from tools.guest.fmu_linear import linear_map
 from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.export.run import free_run
-from tools.mismatch.recording import RecordingError
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.recording_load import load
 
 GOOD = """

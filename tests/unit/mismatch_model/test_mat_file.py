@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.recording_columns import column_names, read_blocks, read_columns, read_scalars
 
 T, U = np.arange(200) * 0.01, np.sin(np.arange(200) * 0.1)

@@ -12,9 +12,10 @@ from scipy.integrate import solve_ivp
 
 from hal.trust import trust_program
 from sim_devices.physics.catalogue import EFFECTS
+from tools.errors import RecordingError
 from tools.guest.equations import Builder, EquationError, trace
 from tools.mismatch.engine.reach import not_tried
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites

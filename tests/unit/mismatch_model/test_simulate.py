@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
+from tools.errors import RecordingError
 from tools.mismatch.placed import Placed
-from tools.mismatch.recording import Recording, RecordingError, TwinText
+from tools.mismatch.recording import Recording, TwinText
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites, why_not
 from tools.mismatch.simulate_start import prepare

@@ -7,7 +7,8 @@ import pytest
 from scipy.linalg import expm
 
 from tests.unit.mismatch_engine.cases import RATE, recording
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make

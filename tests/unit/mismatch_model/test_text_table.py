@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.text_table import text_table
 
 N = 120

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from tests.recording_text import stack_channels
-from tools.mismatch.recording import RecordingError
+from tools.errors import RecordingError
 from tools.mismatch.recording_load import load, on_grid
 
 TEXT = """format = 1

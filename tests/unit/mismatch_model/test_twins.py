@@ -18,8 +18,9 @@ from scipy.signal import StateSpace, dlsim, lsim
 from hal.trust import NotTrusted, trust_package
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
+from tools.errors import RecordingError
 from tools.mismatch.placed import Placed
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import prepare

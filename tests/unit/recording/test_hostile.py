@@ -48,7 +48,7 @@ from tests.fuzz.mcap_parts import (
 from tests.unit.recording.samples import same_bits
 from tools.bench.collect import collect_routes, listing, quick_look
 from tools.errors import InputError
-from tools.mismatch.recording import RecordingError as TwinRecordingError
+from tools.errors import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 
 COLUMNS = [("tick", "1"), ("t", "s")]

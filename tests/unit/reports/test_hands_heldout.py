@@ -17,7 +17,7 @@ from tools.reports import hands_heldout
 from tools.reports.hand_limits import Swing
 from tools.reports.hands import HandRow
 from tools.reports.hands_heldout import Folder, Source, development_sums, find_recordings, heldout_page
-from tools.reports.tremor_figures import BandFigures, TremorFigures
+from tools.tremor.figures import BandFigures, TremorFigures
 
 
 def trembling(

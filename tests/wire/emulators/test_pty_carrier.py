@@ -9,7 +9,7 @@ import pytest
 import serial
 
 from sim_devices.devices.di4108 import Di4108
-from sim_devices.devices.faces import HeldVoltages
+from sim_devices.faces import HeldVoltages
 from sim_devices.transports.pty_carrier import PtyCarrier
 
 MS = 1_000_000

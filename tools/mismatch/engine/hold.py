@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from tools.errors import RecordingError
 from tools.mismatch.engine.colour import fit_whitener, whiten
 from tools.mismatch.engine.fit import Fit, fit, fit_base
 from tools.mismatch.engine.found import human_values
@@ -19,7 +20,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.score import misfits
 from tools.mismatch.engine.select import Selection
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.make import make
 

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tools.mismatch.recording import Recording, RecordingError, Split
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording, Split
 from tools.mismatch.recording_load import load
 
 

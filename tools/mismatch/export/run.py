@@ -11,9 +11,10 @@ import numpy as np
 
 from hal.trust import trusted_program
 from sim_devices.physics.effect import Array
+from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load, load_twin
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View

@@ -8,8 +8,9 @@ import numpy as np
 from scipy.signal import bilinear, lfilter
 
 from sim_devices.physics.effect import Array, Human, Parameter
+from tools.errors import RecordingError
 from tools.mismatch.keys import PARAMETERS, names
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 
 _NAMES = names(PARAMETERS["mechanical_axis"])

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human
-from tools.mismatch.recording import Recording, RecordingError, TwinText
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording, TwinText
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, discretise_blocks
 from tools.mismatch.twins.head import Head

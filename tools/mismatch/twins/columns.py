@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.static import StaticTwin, gain_and_offset
 
 PREFIX = "simulated_"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.axis import axis_twin
 from tools.mismatch.twins.base import Twin
 from tools.mismatch.twins.cascade import cascade_twin

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, Twin, fold

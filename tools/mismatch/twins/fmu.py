@@ -16,8 +16,9 @@ from typing import Any
 
 from hal.trust import digest_of, path_inside, trusted_program
 from sim_devices.physics.effect import Array
+from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.opaque import OpaqueTwin, opaque_twin
 
 OWN_KEYS = ("path", "hold")

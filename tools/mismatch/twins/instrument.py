@@ -27,8 +27,9 @@ from sim_devices.config import EmulationConfig, emulation_config
 from sim_devices.plant.hand import holding_frame
 from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
+from tools.errors import RecordingError
 from tools.mismatch.keys import PARAMETERS, names
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.opaque import OpaqueTwin
 from tools.mismatch.units import convert, same_dimension
 

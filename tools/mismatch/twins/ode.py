@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human
 from sim_devices.physics.forces import FLOW, UNCENTRED
+from tools.errors import RecordingError
 from tools.mismatch import units
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.dynamic import shot_to_repeat
 from tools.mismatch.twins.equations import NOTHING, Equations, Inside, Linearised, Place, State, linearise, meet_start

@@ -7,7 +7,8 @@ from dataclasses import replace
 from typing import Any
 
 from sim_devices.physics.effect import Array
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.ode import OdeTwin
 from tools.mismatch.twins.ode_text import ode_twin
 from tools.mismatch.twins.state_space import Matrices

@@ -12,10 +12,11 @@ import numpy as np
 
 from hal.trust import path_inside, trusted_program
 from sim_devices.physics.effect import Array, Parameter
+from tools.errors import RecordingError
 from tools.guest.equations import Builder, EquationError, builder_of
 from tools.guest.host import GuestError, GuestProcess
 from tools.mismatch import units
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.equations import NOTHING, Equations, Place, Programs, State, linearise, rates_at
 from tools.mismatch.twins.ode import FORGOTTEN, OdeTwin
 from tools.mismatch.twins.program import parse

@@ -16,8 +16,9 @@ import numpy as np
 from hal import plugins
 from hal.trust import require_package
 from sim_devices.physics.effect import STAGES, Array, Human, Parameter, Stage
+from tools.errors import RecordingError
 from tools.guest.host import GuestError, GuestProcess
-from tools.mismatch.recording import Recording, RecordingError, Simulate
+from tools.mismatch.recording import Recording, Simulate
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 
 

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Array, Human, Parameter
 from sim_devices.physics.exponential import exponential
-from tools.mismatch.recording import Recording, RecordingError
+from tools.errors import RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.dynamic import CONSTANT, DynamicTwin, Link, Plant
 from tools.mismatch.twins.linear import Hold
 from tools.mismatch.twins.modes import Complex, Mode, chains_of, companion, modes_of, roots_of_mode, typical_size

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Array, Human, Parameter, Stage
+from tools.errors import RecordingError
 from tools.mismatch.keys import PARAMETERS, names
-from tools.mismatch.recording import Recording, RecordingError
+from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold
 from tools.mismatch.twins.head import ScaledOutputs
 
