@@ -13,6 +13,7 @@ import typer
 
 from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
+from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 # what a command needs is imported inside it: `micron --help` shall not wait for the engine
 
 app = typer.Typer(help="Where simulation and recording differ, and which physics is missing.")
+app.command()(watch)
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")

@@ -107,6 +107,13 @@ def diagnosed() -> None:
     assert done.exit_code == 0, done.output
 
 
+def recorded_twin() -> None:
+    """A stack and the twin that its recording names."""
+    assert lab(["piezo", "--profile", "sawtooth", "--rate-hz", "5", "--seconds", "90", "--out", "rec"]) == 0
+    said = Path("rec/recording.toml").read_text()
+    Path("twin.toml").write_text(f"format = 1\n\n{said[said.index('[twin]') : said.index('[[channels]]')]}")
+
+
 def rig() -> None:
     """Somebody's measurement: a force and where it moved something."""
     t = np.arange(400) / 100.0
@@ -134,6 +141,7 @@ MADE: dict[str, Callable[[], object]] = {
     "mismatch cut": lambda: recorded_stack("rec"),
     "mismatch diagnose": lambda: recorded_stack("recordings/stack"),
     "mismatch new": rig,
+    "mismatch watch": recorded_twin,
     "noise": logs,
     "read": lambda: shutil.copy(CHIP / "bench.toml", "lab.toml"),
     "soak": pages,

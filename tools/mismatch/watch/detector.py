@@ -16,17 +16,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from tools.mismatch.watch.reference import FIGURES, TILTS, Array, Reference
+from tools.mismatch.watch.reference import CLIP, FIGURES, TILTS, Array, Reference
 
 SIDES = (1.0, -1.0)
 MEMBERS = len(FIGURES) * len(SIDES) * len(TILTS)
+
+NAMES_SHARE = 0.7
+"""Share of the largest CUSUM from which a member may name a change."""
 
 
 @dataclass(frozen=True)
 class Alarm:
     """A channel left its twin. ``t_s``: end of the block that raised the alarm; ``onset_s``: estimated begin of the
     change; both since the first sample. ``figure``: level or power of the whitened residual; ``rises``: its direction;
-    ``size``: its mean since the onset, in deviations of a block, clipped ones included.
+    ``size``: its mean since the onset, in deviations of a block.
     """
 
     channel: str
@@ -83,7 +86,7 @@ def follow(reference: Reference, state: State, residual: Array) -> tuple[State, 
     for k in range(figures.shape[0]):
         block = state.blocks + k
         z = figures[k]
-        gains = (z[:, :, None, None] * steps).reshape(log_m.shape) - bounds
+        gains = (np.clip(z, -CLIP, CLIP)[:, :, None, None] * steps).reshape(log_m.shape) - bounds
         spread = np.repeat(z, MEMBERS // 2, axis=1)
         if np.isnan(z).any():
             lost = np.isnan(gains)
@@ -113,8 +116,10 @@ def evidence(reference: Reference, state: State) -> Array:
 def _alarm(
     reference: Reference, i: int, cusum: Array, at_s: float, block: int, since: NDArray[np.int64], sums: Array
 ) -> Alarm:
-    member = int(np.argmax(cusum))
-    count = block + 1 - int(since[member])
+    counts = np.maximum(block + 1 - since, 1)
+    # clipped figures are alike: among the members with the evidence, the one that moved most names the change
+    member = int(np.argmax(np.where(cusum >= NAMES_SHARE * cusum.max(), np.abs(sums) / counts, -1.0)))
+    count = int(counts[member])
     per = len(SIDES) * len(TILTS)
     return Alarm(
         channel=reference.channels[i].name,
@@ -122,5 +127,5 @@ def _alarm(
         onset_s=max(0.0, at_s - count * reference.block * reference.dt),
         figure=FIGURES[member // per],
         rises=SIDES[member % per // len(TILTS)] > 0,
-        size=float(sums[member]) / max(count, 1),
+        size=float(sums[member]) / count,
     )

@@ -85,8 +85,8 @@ class Reference:
         return len(self.channels) * 3600.0 / (self.false_alarms_per_hour * self.block * self.dt)
 
     def figures(self, residual: Array) -> Array:
-        """Figures of all whole blocks of ``residual`` (n, channels) behind the warm-up: (blocks, channels, 2), clipped;
-        NaN where a sample of the block or of its warm-up is not finite.
+        """Figures of all whole blocks of ``residual`` (n, channels) behind the warm-up: (blocks, channels, 2), in
+        deviations; NaN where a sample of the block or of its warm-up is not finite.
         """
         warm, block = self.warm_up, self.block
         count = max(0, (residual.shape[0] - warm) // block)
@@ -96,7 +96,7 @@ class Reference:
         for i, c in enumerate(self.channels):
             x = np.where(good[:, i], used[:, i], 0.0) - c.offset
             raw = block_figures(c.whitener.apply(x[warm - c.whitener.warm_up :]).reshape(count, block))
-            out[:, i] = np.clip((raw - c.centre) / c.scale, -CLIP, CLIP)
+            out[:, i] = (raw - c.centre) / c.scale
             if not good[:, i].all():
                 bad = np.concatenate(([0], np.cumsum(~good[:, i])))
                 first = np.arange(count) * block
