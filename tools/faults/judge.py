@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +21,8 @@ ENDED_WELL = ("run finished", "stopped by the operator")
 @dataclass(frozen=True)
 class Seen:
     """From both sides of one run: outcome of the firmware; path of the tip, demands at the amplifier (t_ns, channel,
-    volts) and scans taken from the world; whether a fault that strikes at random did."""
+    volts) and scans taken from the world; whether a fault that strikes at random did. ``wire_ns``: longest time from
+    a command's way into the port until it is a demand, where nobody waits for it."""
 
     strike_ns: int
     outcome: dict[str, Any]
@@ -29,6 +31,7 @@ class Seen:
     demands: list[tuple[int, int, float]]
     scans: int
     happened: bool = True
+    wire_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -38,8 +41,9 @@ class Observation:
     ``held_ms``: the first hold began, 0 if the outputs held already and went on to; ``resumed``: the last one ended and
     the outputs moved again.
     ``rough``: demands at the amplifier beyond its range, faster than the slew limit, or anything but the ramp and
-    neutral in a hold. ``false_neutral``: a channel was not neutral 21 ms after the decision, or later when the
-    report says that it was. ``uncounted``: scans of the device that the firmware cannot account for.
+    neutral in a hold, commands left out that were on the wire when it began. ``false_neutral``: a channel was not
+    neutral 21 ms after the decision, or later when the report says that it was. ``uncounted``: scans of the device that
+    the firmware cannot account for.
     ``lost``: scans that the firmware reports as lost.
     ``phase``: of the run, when the fault struck (``phases.py``).
     ``happened``: the fault did something; one that strikes at random may not have, while it was watched.
@@ -112,10 +116,12 @@ def judge(
     reference_m: NDArray[np.float64],
     tip_m: NDArray[np.float64] | None = None,
     phase: Phase = STEADY,
+    usual: Mapping[str, int] | None = None,
 ) -> Observation:
     """Judge one run. ``reference_m`` (n, 3): the tip in the same run without the fault, row k at k ms. ``tip_m``: it is
     compared with that instead of the tip that was seen: for faults that redraw the noise both are of runs without
-    noise."""
+    noise. ``usual``: what the run without the fault noticed, and when; a fault that has not struck is not credited with
+    it."""
     outcome = seen.outcome
     safe = outcome["safe_state"]
     reason = str(safe["reason"])
@@ -127,6 +133,8 @@ def judge(
     decided_ns = holds[0]["t_ns"] if holds else ended_ns
     confirmed = bool(safe["reached"])
     noticed = {what: t_ns for what, t_ns in outcome["noticed"].items() if t_ns >= seen.strike_ns}
+    if not seen.happened and usual:
+        noticed = {what: t_ns for what, t_ns in noticed.items() if usual.get(what) != t_ns}
     first = min(noticed, key=noticed.__getitem__) if noticed else ""
     path_m = seen.tip_m if tip_m is None else tip_m
     n = min(len(seen.tip_m), len(path_m), len(reference_m))
@@ -151,7 +159,10 @@ def judge(
         message=reason if tripped or not holds else str(holds[0]["cause"]),
         confirmed=confirmed,
         rough=rough_demands(seen.demands)
-        + sum(driven_in_hold(seen.demands, hold["t_ns"], hold["t_ns"] + hold["length_s"] * 1e9) for hold in all_holds),
+        + sum(
+            driven_in_hold(seen.demands, hold["t_ns"] + seen.wire_ns, hold["t_ns"] + hold["length_s"] * 1e9)
+            for hold in all_holds
+        ),
         false_neutral=confirmed and (neutral is None or neutral > max(RAMP_MS, 1.0 + told_ms)),
         uncounted=max(0, seen.scans - counted),
         astray_um=1e6 * float(away_m[before].max(initial=0.0)) if phase.works else 0.0,

@@ -16,10 +16,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn, cast
 
+from drivers.bus_use import bus_uses
+from drivers.polling import polling_of
+from drivers.registry import find_driver
+from drivers.specs import check_devices
 from firmware_py.app import run_in_process
 from firmware_py.guardian.process import describe
 from firmware_py.run_request import RunRequest
-from hal.bench import OpenBench, Port, Processes
+from hal.bench import OpenBench, Port, Processes, load_bench
 from hal.clock import VirtualClock
 from hal.contracts import CanBus, Clock, I2cBus, SerialPort
 from hal.errors import HalError
@@ -225,7 +229,8 @@ def observe_running(
             raise RuntimeError(f"the run ended before the strike: {outcome['safe_state']['reason']}")
         assert truth is not None
         happened = far.struck is None or far.happened(far.struck)
-        me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans(), happened))
+        wire_ns = command_wire_ns(bench)
+        me.answer(Seen(at_ns, outcome, truth["t_ns"], truth["tip_m"], far.demands, far.scans(), happened, wire_ns))
     finished = [answer for answer in answers if isinstance(answer, Seen)]
     if any("SIGTERM" in str(seen.outcome["safe_state"]["reason"]) for seen in finished):
         raise SystemExit("the campaign was ended from outside")  # the run heard it, and took it for its operator
@@ -237,9 +242,21 @@ def observe_running(
             return Observation.refusal(fault.name, point, seed, seen.message, phase.name)
         quiet = fault in shifting
         tip_m = of[True, fault.name].tip_m if quiet else None
-        return judge(fault.name, point, seed, seen, of[quiet, None].tip_m, tip_m, phase)
+        usual = of[False, None].outcome["noticed"]
+        return judge(fault.name, point, seed, seen, of[quiet, None].tip_m, tip_m, phase, usual)
 
     return [judged(fault) for fault in faults]
+
+
+def command_wire_ns(bench: Path) -> int:
+    """Return how long a command of the output of ``bench`` is under way after the driver has given it to the port: 0
+    where the driver waits for the end of the transfer."""
+    file = load_bench(bench)
+    options = check_devices(file.description, str(bench))
+    uses = bus_uses(file.description, options, polling_of(file.description, options)[0])
+    devices = file.description.device
+    queued = [u for u in uses if find_driver(devices[u.device].driver).role == "output" and not u.task]
+    return round(1e3 * max((use.bus_us for use in queued if use.what == "command"), default=0.0))
 
 
 class _Child:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
+from tests.conftest import DEFAULT_BENCH
 from tools.faults.campaign import FaultRow, moved_unseen, totals
 from tools.faults.fault import Fault, InWorld, Kill
 from tools.faults.judge import Observation, Seen, judge, neutral_ms, rough_demands
 from tools.faults.pairs import draw_pairs
 from tools.faults.phases import HOLD, LEARNING, PHASES, SELF_TEST, STEADY, accepted_answers
+from tools.faults.trial import command_wire_ns
 
 MS = 1_000_000
 
@@ -71,6 +74,32 @@ def test_rough_demands():
     assert rough_demands([(0, 0, 50.0), (MS, 0, 69.0), (2 * MS, 0, 90.0)]) == 1  # 21 V in one tick
     assert rough_demands([(0, 0, 50.0), (MS, 0, 101.0)]) == 2  # out of range, and too fast
     assert rough_demands([(0, 0, 0.0), (50 * MS, 0, 99.0)]) == 0  # five ticks' worth after a pause
+
+
+def test_a_command_that_was_on_the_wire_when_a_hold_began_is_not_driven_in_it():
+    hold = {"t_ns": 50 * MS, "length_s": 0.03, "cause": "overflow", "resumed": True}
+    answer = seen(outcome("run finished", 99) | {"holds": [hold]}, np.zeros(100))
+    answer.demands.extend([(40 * MS, 0, 31.0), (53 * MS, 0, 30.0), (63 * MS, 0, 50.0)])
+    at_once, on_serial = answer, replace(answer, wire_ns=round(3.2 * MS))
+    assert judge("f", "p", 1, at_once, np.zeros((100, 3))).rough == 1
+    assert judge("f", "p", 1, on_serial, np.zeros((100, 3))).rough == 0
+    on_serial.demands.insert(-1, (54 * MS, 0, 29.0))
+    assert judge("f", "p", 1, on_serial, np.zeros((100, 3))).rough == 1
+
+
+@pytest.mark.parametrize(("bench", "least_ms", "most_ms"), [("micron-e727", 2.5, 3.5), ("micron-can", 0.1, 0.4)])
+def test_the_time_of_a_command_on_the_wire_is_that_of_the_bus(bench: str, least_ms: float, most_ms: float):
+    assert least_ms < 1e-6 * command_wire_ns(DEFAULT_BENCH.with_name(f"{bench}.toml")) < most_ms
+    assert command_wire_ns(DEFAULT_BENCH) == 0, "a transfer over I2C has ended when the driver goes on"
+
+
+def test_what_the_run_without_the_fault_noticed_as_well_is_not_the_answer_to_one_that_did_not_strike():
+    late = outcome("run finished", 99, {"no scans": 27 * MS})
+    none = replace(seen(late, np.zeros(100)), happened=False)
+    reference = np.zeros((100, 3))
+    assert judge("f", "p", 1, none, reference, usual={"no scans": 27 * MS}).answer == "none"
+    assert judge("f", "p", 1, none, reference, usual={"no scans": 26 * MS}).answer == "noticed"
+    assert judge("f", "p", 1, seen(late, np.zeros(100)), reference, usual={"no scans": 27 * MS}).answer == "noticed"
 
 
 def test_neutral_counts_from_the_decision_and_needs_every_channel():
