@@ -122,7 +122,8 @@ def calibrate(
 
 def _left_out(constants: Any, cases: list[Case], k: int) -> list[tuple[float, float]]:
     """Names of one case with the map of "sure" that the others give."""
-    return raw_surenesses(learn_sure(constants, cases[:k] + cases[k + 1 :]), [cases[k]])
+    others = learn_sure(constants, cases[:k] + cases[k + 1 :])
+    return [(n.sure, float(n.right)) for n in raw_surenesses(others, [cases[k]])]
 
 
 def case_of(number: int, row: dict[str, Any]) -> Case:

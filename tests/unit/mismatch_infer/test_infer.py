@@ -56,11 +56,11 @@ def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_numbe
 
 def test_two_equal_sets_share_the_probability_and_the_map_is_monotone() -> None:
     sets = [(frozenset("ab"), 1.0), (frozenset("ac"), 1.0), (frozenset(), -60.0)]
-    sure = surenesses(frozenset("ab"), sets, START)
+    sure = surenesses(frozenset("ab"), sets, True, START)
     assert sure["b"] == pytest.approx(0.5)
     assert sure["a"] > 0.999
     cautious = replace(START, sure_offset=-0.5, sure_slope=0.3)
-    values = [stated(p, cautious) for p in (0.01, 0.5, 0.9, 1.0)]
+    values = [stated(p, True, cautious) for p in (0.01, 0.5, 0.9, 1.0)]
     assert values == sorted(values)
     assert values[-1] < 0.99
     assert math.isfinite(log_odds(1.0))

@@ -86,9 +86,9 @@ def test_boastful_probabilities_are_lowered_on_cases_of_their_own() -> None:
         true = "a" if rng.random() < 0.75 else "b"
         sets = (_set("", -1.0, 0), _set("a", 0.0), _set("b", -0.015))
         cases.append(Case(f"c{i}", "single", frozenset(true), 900, sets, None))
-    before = np.mean([p for p, _ in raw_surenesses(START, cases)])
+    before = np.mean([n.sure for n in raw_surenesses(START, cases)])
     c = learn_sure(START, cases[:150])
-    after = np.mean([p for p, _ in raw_surenesses(c, cases[150:])])
+    after = np.mean([n.sure for n in raw_surenesses(c, cases[150:])])
     assert before > 0.97
     assert after == pytest.approx(0.75, abs=0.06)
 
@@ -140,3 +140,17 @@ def test_events_beside_a_set_are_part_of_its_answer_but_not_of_its_score() -> No
     case = Case("c", "pair", frozenset(("a", "bursts")), 900, (_set("", 0.0, 0), eventful), None)
     assert case.right(START)
     assert case.log_probability(START) > -1e-6
+
+
+def test_names_beside_something_unexplained_are_stated_as_seldom_as_they_are_right() -> None:
+    rng = np.random.default_rng(8)
+    cases: list[Case] = []
+    for i in range(200):
+        whole = i % 2 == 0
+        true = "a" if rng.random() < (0.95 if whole else 0.4) else "b"
+        left = 0.0 if whole else 50.0
+        sets = (_set("", -1.0, 0), replace(_set("a", 0.0), rest=left, taken=60.0), _set("b", -0.5))
+        cases.append(Case(f"c{i}", "single", frozenset(true), 900, sets, None))
+    names = list(raw_surenesses(learn_sure(START, cases[:100]), cases[100:]))
+    for whole, share in ((True, 0.95), (False, 0.4)):
+        assert np.mean([n.sure for n in names if n.whole == whole]) == pytest.approx(share, abs=0.12)

@@ -19,8 +19,9 @@ class Constants:
     ``samples``: independent samples that a held-out residual counts for at most (form errors are systematic);
     ``per_name`` and ``per_parameter``: prices in nats; ``least_z``: least whitened held-out correlation of every name.
     ``cut`` (noise variances) and ``cut_share`` (of what was explained): what may be left and follow signals before the
-    account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones;
-    ``most_sure``: the probability that is stated at most, by how many cases the map was learned on.
+    account is no account. ``sure_offset`` and ``sure_slope``: the map from the log odds of a name to stated ones, less
+    ``sure_open`` where the account is none; ``most_sure``: the probability that is stated at most, by how many cases the
+    map was learned on.
     """
 
     samples: float
@@ -31,6 +32,7 @@ class Constants:
     cut_share: float
     sure_offset: float
     sure_slope: float
+    sure_open: float
     most_sure: float
 
     @staticmethod
@@ -42,7 +44,7 @@ class Constants:
         return {k: float(f"{v:.6g}") for k, v in asdict(self).items()}
 
 
-START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 1.0)
+START = Constants(300.0, 7.0, 0.6, 3.0, 0.5, 0.05, 0.0, 1.0, 0.0, 1.0)
 """Where learning begins, and what the fits that it learns from are searched with: the middle of the ranges that a
 prototype found on cases of another generator."""
 

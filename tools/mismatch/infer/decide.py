@@ -69,9 +69,11 @@ def accepted(store: Store) -> list[Scored]:
     return out if any(not s.names for s in out) else [*out, store.base]
 
 
-def surenesses(names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], c: Constants) -> dict[str, float]:
+def surenesses(
+    names: frozenset[str], sets: Sequence[tuple[frozenset[str], float]], whole: bool, c: Constants
+) -> dict[str, float]:
     """How sure each of ``names`` is among ``sets`` (names, score): the share of the tempered posterior on sets
-    that have it, on a log odds scale that was calibrated on cases of its own.
+    that have it, on a log odds scale that was calibrated on cases of its own. ``whole``: nothing more is left.
     """
     top = max(v for _, v in sets)
     weights = [(of, math.exp(v - top)) for of, v in sets]
@@ -79,7 +81,7 @@ def surenesses(names: frozenset[str], sets: Sequence[tuple[frozenset[str], float
     out: dict[str, float] = {}
     for name in names:
         p = sum(w for of, w in weights if name in of) / total
-        out[name] = stated(p, c)
+        out[name] = stated(p, whole, c)
     return out
 
 
@@ -92,9 +94,11 @@ def log_odds(p: float) -> float:
     return math.log(p / (1.0 - p))
 
 
-def stated(p: float, c: Constants) -> float:
-    """The probability that is stated for a raw one."""
-    return min(1.0 / (1.0 + math.exp(-(c.sure_offset + c.sure_slope * log_odds(p)))), c.most_sure)
+def stated(p: float, whole: bool, c: Constants) -> float:
+    """The probability that is stated for a raw one. The raw one is among what is known: where the account is not
+    ``whole``, something else is at work that may have been taken for it."""
+    odds = c.sure_offset + c.sure_slope * log_odds(p) - (0.0 if whole else c.sure_open)
+    return min(1.0 / (1.0 + math.exp(-odds)), c.most_sure)
 
 
 def rivals_of(store: Store, chosen: Scored) -> tuple[Rival, ...]:
@@ -191,11 +195,10 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
             if found is not None:
                 left[o] = left[o].led_by(found)
     rest, taken = worst_left(p, store.base.fitted, left)
-    sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], c)
-    sure |= {name: stated(1.0 - p_value, c) for name, p_value in store.eventful[chosen.key][1].items()}
-    return Answer(
-        said, sure, rivals_of(store, chosen), strange, left, strange is None and is_whole(rest, taken, c)
-    )  # fmt: skip
+    whole = strange is None and is_whole(rest, taken, c)
+    sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
+    sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
+    return Answer(said, sure, rivals_of(store, chosen), strange, left, whole)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
@@ -39,6 +39,8 @@ LOOKED_AT = 3
 FOLDS = 5
 TOP = 0.8
 """Raw probability from which a name counts for the most that is stated."""
+WIDE = 4.0
+"""Log odds that an account which is not whole may take from a name before the cases have spoken."""
 SETS = 60
 """Sets kept of a search, best first."""
 
@@ -230,35 +232,47 @@ def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequenc
 
 def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
     """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases of their own, held
-    weakly at the identity; and the most that is stated, by the rule of succession (Laplace 1774) over the sure ones: so
-    many cases cannot vouch for more."""
-    pairs = raw_surenesses(replace(c, sure_offset=0.0, sure_slope=1.0, most_sure=1.0), cases)
-    if not pairs:
+    weakly at the identity; and the most that is stated, by the rule of succession (Laplace 1774) over the sure ones of
+    whole accounts: so many cases cannot vouch for more."""
+    raw = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
+    stated_names = list(raw_surenesses(raw, cases))
+    if not stated_names:
         return c
-    x = np.array([log_odds(p) for p, _ in pairs])
-    right = np.array([r for _, r in pairs])
+    x = np.array([log_odds(n.sure) for n in stated_names])
+    right = np.array([float(n.right) for n in stated_names])
+    is_open = np.array([float(not n.whole) for n in stated_names])
 
     def loss(v: np.ndarray) -> float:
-        z = v[0] + np.exp(v[1]) * x
-        return float(np.sum(np.logaddexp(0.0, z) - right * z) + 0.5 * (v[0] ** 2 + v[1] ** 2))
+        z = v[0] + np.exp(v[1]) * x - v[2] * is_open
+        return float(np.sum(np.logaddexp(0.0, z) - right * z) + 0.5 * float(v[0] ** 2 + v[1] ** 2 + (v[2] / WIDE) ** 2))
 
-    found = minimize(loss, np.zeros(2), method="Nelder-Mead")
-    top = right[x > log_odds(TOP)]
+    offset, slope, less = minimize(loss, np.zeros(3), method="Nelder-Mead", options={"maxiter": 2000}).x
+    top = right[(x > log_odds(TOP)) & (is_open == 0.0)]
     most = (float(top.sum()) + 1.0) / (top.size + 2.0)
-    return replace(c, sure_offset=float(found.x[0]), sure_slope=float(np.exp(found.x[1])), most_sure=max(most, TOP))
+    return replace(
+        c, sure_offset=float(offset), sure_slope=float(np.exp(slope)), sure_open=max(float(less), 0.0),
+        most_sure=max(most, TOP),
+    )  # fmt: skip
 
 
-def raw_surenesses(c: Constants, cases: Sequence[Case]) -> list[tuple[float, float]]:
-    """(stated probability, 1 if right) of every name that would be reported."""
-    out: list[tuple[float, float]] = []
+class StatedName(NamedTuple):
+    """A name of a report: the probability that it states, whether it is right, and whether the account is whole."""
+
+    sure: float
+    right: bool
+    whole: bool
+
+
+def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
+    """Every name that would be reported."""
     for case in cases:
-        _, chosen = case.says(c)
+        said, chosen = case.says(c)
+        whole = said != "unexplained"
         sets = [(s.names, s.score(c, case.held)) for s in case.accepted(c)]
-        for name, sure in surenesses(chosen.names, sets, c).items():
-            out.append((sure, float(name in case.names)))
-        for name in chosen.with_events(c) - chosen.names:
-            out.append((stated(1.0 - chosen.events[name], c), float(name in case.names)))
-    return out
+        sure = surenesses(chosen.names, sets, whole, c)
+        sure |= {n: stated(1.0 - chosen.events[n], whole, c) for n in chosen.with_events(c) - chosen.names}
+        for name, p in sure.items():
+            yield StatedName(p, name in case.names, whole)
 
 
 def cross_validated(cases: Sequence[Case], learner: Callable[[Sequence[Case]], Constants] = learn) -> dict[str, float]:
