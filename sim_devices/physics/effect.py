@@ -55,7 +55,8 @@ class Parameter:
     """One parameter of an effect. Bounds are in ``unit``; ``log`` says that its size, not its value, is uncertain.
 
     A ``unit`` may contain ``{in}`` and ``{out}``, the units of the signals before and after the base physics.
-    ``scale`` is a typical step for finite differences and for conditioning.
+    ``scale`` is a typical step for finite differences and for conditioning. ``away``: where it does nothing; a fit
+    leaves it there that does not notice, so that samples which no fit has seen are not told what no sample has shown.
     """
 
     name: str
@@ -64,6 +65,7 @@ class Parameter:
     hi: float = np.inf
     log: bool = False
     scale: float = 1.0
+    away: float | None = None
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ def _parts(settings: Settings) -> Parts:
     span = hi - lo or 1.0
     return Parts(
         (
-            Parameter("lower_limit", "{in}", lo - 0.5 * span, lo + 0.7 * span, scale=0.1 * span),
-            Parameter("upper_limit", "{in}", hi - 0.7 * span, hi + 0.5 * span, scale=0.1 * span),
+            Parameter("lower_limit", "{in}", lo - 0.5 * span, lo + 0.7 * span, scale=0.1 * span, away=lo - 0.4 * span),
+            Parameter("upper_limit", "{in}", hi - 0.7 * span, hi + 0.5 * span, scale=0.1 * span, away=hi + 0.4 * span),
             Parameter("corner", "{in}", 1e-4 * span, 0.5 * span, log=True, scale=0.05 * span),
         )
     )

@@ -50,6 +50,8 @@ class Free:
     linear: bool
     placed: int
     """-1 for base parameters, else the index of the placed effect."""
+    away: float | None = None
+    """Where it does nothing."""
 
 
 def middle(p: Parameter | Free) -> float:
@@ -65,4 +67,4 @@ def middle(p: Parameter | Free) -> float:
 def free_entry(p: Parameter, u_in: str, u_out: str, prefix: str, k: int) -> Free:
     """The entry of parameter ``p`` of placed effect ``k`` (-1: base), its unit in those of input and output."""
     unit = p.unit.replace("{in}", u_in).replace("{out}", u_out)
-    return Free(prefix + p.name, unit, p.lo, p.hi, p.log, p.scale, False, k)
+    return Free(prefix + p.name, unit, p.lo, p.hi, p.log, p.scale, False, k, p.away)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -20,8 +20,8 @@ from tools.mismatch.infer.store import Scored, Store
 
 MARGIN = 1.05
 """Residual rms of a rival over that of the named set, on held-out samples, within which it fits as well."""
-TESTED = 6
-"""Sets of names, best first, whose every name is tested."""
+TESTED, DEEPEST = 6, 30
+"""Sets of names, best first, whose every name is tested; and how many while none has passed."""
 CURVE = 12
 """Parameters that a free curve of a signal is charged for: the columns of a product of a curve and a mover."""
 LOUD = 1.5
@@ -57,16 +57,29 @@ class Answer:
     whole: bool
 
 
+def tested(store: Store) -> list[tuple[Scored, float]]:
+    """(set, the weakest test of its names), best first, down to the empty one. A name that is not borne out beside one
+    set may be in all of the first: then it is looked further."""
+    out: list[tuple[Scored, float]] = []
+    passed, c = 0, store.constants
+    for s in store.ranked()[:DEEPEST]:
+        out.append((s, store.least_z(s)))
+        passed += out[-1][1] > c.least_z and weighty(store.shares(s).values(), c)
+        if not s.names or (len(out) >= TESTED and passed):
+            break
+    return out
+
+
 def accepted(store: Store) -> list[Scored]:
     """Sets of which every name passes its test, best first; at least the empty one."""
     c = store.constants
-    out: list[Scored] = []
-    for s in store.ranked()[:TESTED]:
-        if store.least_z(s) > c.least_z:
-            out.append(s)
-        if not s.names:
-            break
+    out = [s for s, z in tested(store) if z > c.least_z and weighty(store.shares(s).values(), c)]
     return out if any(not s.names for s in out) else [*out, store.base]
+
+
+def weighty(shares: Iterable[tuple[float, float]], c: Constants) -> bool:
+    """Whether every name explains more than the form of the others may leave (``Store.shares``)."""
+    return all(not is_whole(explained, taken, c) for explained, taken in shares)
 
 
 def surenesses(

@@ -239,3 +239,13 @@ def weigh(problem: Problem, fitted: Fit) -> dict[str, Weighed]:
 def best_log_density(problem: Problem) -> Mapping[str, float]:
     """The mean log density per output that normal noise at the floor would have: no model predicts much better."""
     return {o: NORMAL - math.log(max(problem.sigma(o), 1e-300)) for o in problem.twin.outputs}
+
+
+def exact_log_density(problem: Problem) -> Mapping[str, float]:
+    """The log density per output that readings on a lattice would have whose every value is predicted."""
+    out: dict[str, float] = {}
+    for o in problem.twin.outputs:
+        floor = problem.floors[o]
+        least = max(LEAST * floor.rms, LATTICE * floor.step, 1e-300)
+        out[o] = _CONSTANT - math.log(least) if floor.step > 0.0 else -math.inf
+    return out

@@ -17,7 +17,6 @@ from scipy.optimize import minimize
 from tools.mismatch.infer.constants import START, Constants
 from tools.mismatch.infer.decide import (
     CURVE,
-    TESTED,
     candidate_signals,
     free_curve,
     is_whole,
@@ -25,6 +24,8 @@ from tools.mismatch.infer.decide import (
     log_odds,
     stated,
     surenesses,
+    tested,
+    weighty,
     worst_left,
 )
 from tools.mismatch.infer.run import Inferred
@@ -49,8 +50,9 @@ SETS = 60
 class SetTraits:
     """What a decision reads of one set of names.
 
-    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken``
-    are those of ``worst_left`` (None: not looked at); ``events`` the p-values of those that were found beside it.
+    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested), ``shares`` what every
+    name explains (``Store.shares``); ``rest`` and ``taken`` are those of ``worst_left`` (None: not looked at);
+    ``events`` the p-values of those that were found beside it.
     """
 
     names: frozenset[str]
@@ -60,6 +62,7 @@ class SetTraits:
     rest: float | None
     taken: float | None
     events: Mapping[str, float] = field(default_factory=dict[str, float])
+    shares: Sequence[tuple[float, float]] = ()
 
     def with_events(self, c: Constants) -> frozenset[str]:
         """The names that a report of this set has."""
@@ -73,8 +76,7 @@ class SetTraits:
 def traits_of(inferred: Inferred) -> dict[str, Any]:
     """What a decision reads of a search, as plain JSON."""
     store = inferred.found.store
-    ranked = store.ranked()[:TESTED]
-    tested = {s.key: store.least_z(s) if s.names else None for s in ranked}
+    weakest = {s.key: (z, list(store.shares(s).values())) for s, z in tested(store) if s.names}
     ranked = store.ranked()  # tests may have fitted sets anew
     leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
     events: dict[frozenset[tuple[str, ...]], dict[str, float]] = {}
@@ -89,7 +91,7 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
         "outputs": len(store.problem.twin.outputs),
         "sets": [
             {"names": sorted(s.names), "density": s.mean_density, "parameters": s.parameters,
-             "z": tested.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
+             "tested": weakest.get(s.key), "left": leaves.get(s.key), "events": events.get(s.key, {})}
             for s in [*kept, *([] if store.base in kept else [store.base])]
         ],
         "strange": None if strange is None else {
@@ -106,13 +108,14 @@ def _density_room(store: Store, s: Scored, output: str) -> float:
 
 def sets_of(traits: Traits) -> list[SetTraits]:
     """The sets of a search. What was tested of one set of names stands for its other places and forms, too."""
-    z: dict[frozenset[str], float] = {}
+    passed: dict[frozenset[str], tuple[float, list[tuple[float, float]]]] = {}
     left: dict[frozenset[str], tuple[float, float]] = {}
     events: dict[frozenset[str], Mapping[str, float]] = {}
     for s in traits["sets"]:
         names = frozenset(s["names"])
-        if s["z"] is not None:
-            z.setdefault(names, float(s["z"]))
+        if s["tested"] is not None:
+            z, shares = s["tested"]
+            passed.setdefault(names, (float(z), [(float(a), float(b)) for a, b in shares]))
         if s["left"] is not None:
             left.setdefault(names, (float(s["left"][0]), float(s["left"][1])))
             events.setdefault(names, {n: float(p) for n, p in s["events"].items()})
@@ -120,8 +123,9 @@ def sets_of(traits: Traits) -> list[SetTraits]:
     for s in traits["sets"]:
         names = frozenset(s["names"])
         rest, taken = left.get(names, (None, None))
-        of, beside = z.get(names), events.get(names, {})
-        out.append(SetTraits(names, float(s["density"]), float(s["parameters"]), of, rest, taken, beside))
+        z, shares = passed.get(names, (None, []))
+        beside = events.get(names, {})
+        out.append(SetTraits(names, float(s["density"]), float(s["parameters"]), z, rest, taken, beside, shares))
     return out
 
 
@@ -157,7 +161,7 @@ class Case:
         for s in self.ranked(c):
             if not s.names:
                 return [*out, s]
-            if s.z is not None and s.z > c.least_z:
+            if s.z is not None and s.z > c.least_z and weighty(s.shares, c):
                 out.append(s)
         return out
 

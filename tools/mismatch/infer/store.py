@@ -13,11 +13,19 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.revise import added, beyond_limits, size
-from tools.mismatch.engine.score import compare
+from tools.mismatch.engine.score import compare, winsorised
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.infer.constants import Constants
-from tools.mismatch.infer.density import LEAST, best_log_density, follower, gain_of_events, unpredicted, weigh
+from tools.mismatch.infer.density import (
+    LEAST,
+    best_log_density,
+    exact_log_density,
+    follower,
+    gain_of_events,
+    unpredicted,
+    weigh,
+)
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 
@@ -86,7 +94,9 @@ class Store:
         self.seen: dict[Part, Candidate] = {}
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
+        self._shares: dict[Key, dict[str, tuple[float, float]]] = {}
         self._best = best_log_density(problem)
+        self._exact = exact_log_density(problem)
         self.base = self.put(base)
 
     def put(self, fitted: Fit) -> Scored:
@@ -128,9 +138,14 @@ class Store:
         return sorted(best.values(), key=lambda s: (-self.score(s), sorted(s.names)))
 
     def room(self, s: Scored) -> dict[str, float]:
-        """Nats per output by which a larger set can be better at most: up to noise at its floor."""
+        """Nats per output by which a larger set can be better at most: up to noise at its floor, and where a set has
+        found readings on a lattice, up to all of them exactly there."""
         n = min(self.constants.samples, self.held) / len(s.density)
-        return {o: max(n * (self._best[o] - d), 0.0) for o, d in s.density.items()}
+        best = {
+            o: b if d < b else max(b, self._exact[o])
+            for (o, d), b in zip(s.density.items(), self._best.values(), strict=True)
+        }
+        return {o: max(n * (best[o] - d), 0.0) for o, d in s.density.items()}
 
     def without(self, s: Scored, drop: Callable[[Placed], bool]) -> Scored:
         """The set less the effects that ``drop`` says, fitted again unless the store has it."""
@@ -222,18 +237,47 @@ class Store:
         """
         if (s.key, name) not in self._tests:
             mine = [p for p in s.placed if p.effect.name == name]
-            if all(p.effect.stochastic for p in mine):
-                seen = [self.seen[part_of(p)] for p in mine if part_of(p) in self.seen]
-                z = max((z_of_p(c.p_value * len(self.seen)) for c in seen if c.tested), default=0.0)
+            if all(e.effect.stochastic for e in mine):
+                rest = self.without(s, lambda e: e.effect.name == name).fitted
+                with np.errstate(all="ignore"):
+                    ground = bend(self.problem, rest)
+                    found = [one_step(self.problem, rest, e, ground) for e in mine]
+                z = max((z_of_p(c.p_value * len(self.seen)) for c in found if c.tested), default=0.0)
             else:
                 small = self.without(s, lambda p: p.effect.name == name)
                 z = compare(self.problem, small.fitted, s.fitted).z
             self._tests[s.key, name] = z
         return self._tests[s.key, name]
 
+    def shares(self, s: Scored) -> dict[str, tuple[float, float]]:
+        """Per name (noise variances that it explains and nothing else of the set would, those that the set explains),
+        held out, on the output where it does most."""
+        p = self.problem
+
+        def left(fitted: Fit) -> dict[str, float]:
+            rest = unpredicted(p, fitted).residual
+            return {o: mean_square(p, rest[o], o) for o in p.twin.outputs}
+
+        if s.key not in self._shares:
+            with_all, base = left(s.fitted), left(self.base.fitted)
+            found: dict[str, tuple[float, float]] = {}
+            for name in s.names:
+                without = left(self.without(s, lambda e, n=name: e.effect.name == n).fitted)
+                found[name] = max(
+                    ((without[o] - with_all[o], base[o] - with_all[o]) for o in p.twin.outputs), key=lambda v: v[0]
+                )
+            self._shares[s.key] = found
+        return self._shares[s.key]
+
     def least_z(self, s: Scored) -> float:
         """The weakest of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+def mean_square(problem: Problem, r: Array, output: str) -> float:
+    """Of the held-out samples of ``r`` (m,), in noise variances, single outliers cut."""
+    s, rows = problem.sigma(output), problem.held_rows
+    return float(np.mean((winsorised(r[rows], s, problem.lively[rows]) / s) ** 2))
 
 
 EVENTS = 2
