@@ -13,7 +13,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.infer import diagnose
 from tools.mismatch.infer.constants import START, Constants, learned
-from tools.mismatch.infer.decide import is_whole, log_odds, stated, surenesses
+from tools.mismatch.infer.decide import TESTED, accepted, is_whole, log_odds, stated, surenesses
 from tools.mismatch.infer.density import DEGREES, NORMAL, student_log_density, student_scale
 from tools.mismatch.infer.run import infer
 from tools.mismatch.infer.store import Scored
@@ -129,3 +129,53 @@ def test_a_walk_is_no_account_of_what_follows_a_recorded_signal(follows: bool) -
     (walk,) = (s for s in store.sets.values() if s.names)
     assert walk.proper != follows
     assert store.ranked()[0].names == (frozenset() if follows else {"random_walk"})
+
+
+class _Ranked:
+    """A store whose sets have been tested: weakest test and what the weakest name explains, per set, best first."""
+
+    def __init__(self, sets: list[tuple[str, float, tuple[float, float]]]) -> None:
+        self.constants = replace(START, least_z=3.0, cut=0.5, cut_share=0.05)
+        self._sets = {_Named(names): (z, share) for names, z, share in sets}
+        self.base = list(self._sets)[-1]
+
+    def ranked(self) -> list[_Named]:
+        return list(self._sets)
+
+    def least_z(self, s: _Named) -> float:
+        return self._sets[s][0]
+
+    def shares(self, s: _Named) -> dict[str, tuple[float, float]]:
+        return {"weakest": self._sets[s][1]} if s.names else {}
+
+
+class _Named:
+    def __init__(self, names: str) -> None:
+        self.names = frozenset(names)
+
+
+def test_a_name_that_fails_in_the_best_sets_hides_no_smaller_one() -> None:
+    worse = [(f"aw{i}", -1.0, (9.0, 10.0)) for i in range(TESTED + 2)]
+    store = _Ranked([*worse, ("a", 9.0, (9.0, 10.0)), ("", math.inf, (0.0, 0.0))])
+    assert [sorted(s.names) for s in accepted(store)] == [["a"], []]  # pyright: ignore[reportArgumentType]
+
+
+def test_a_name_has_to_explain_more_than_the_form_of_the_others_leaves() -> None:
+    store = _Ranked(
+        [("ab", 9.0, (30.0, 900.0)), ("ac", 9.0, (90.0, 900.0)), ("a", 9.0, (800.0, 800.0)), ("", math.inf, (0, 0))]
+    )
+    assert [sorted(s.names) for s in accepted(store)] == [["a", "c"], ["a"], []]  # pyright: ignore[reportArgumentType]
+
+
+def test_a_limit_that_no_fitted_sample_reached_says_nothing_about_others() -> None:
+    """What is cut above alone gets no limit below."""
+    u = 40.0 * wave(np.random.default_rng(5), N)
+    limit = float(np.quantile(u, 0.95))
+    y = 0.12 * np.minimum(u, limit) + 0.01 * np.random.default_rng(5).standard_normal(N)
+    stack = {"gain_um_per_V": 0.12, "offset_um": 0.0}
+    r = recording("piezo_stack", {"command": u}, {"displacement": y}, stack)
+    store = infer(r, START, jobs=1, effects=[EFFECTS["saturation"]]).found.store
+    (clipped,) = (s for s in store.sets.values() if s.names == {"saturation"} and s.proper)
+    (lower, upper, _) = clipped.fitted.theta[clipped.fitted.model.slices(0)[0]]
+    assert upper == pytest.approx(limit, rel=0.02)
+    assert lower < u.min() - 0.2 * np.ptp(u)
