@@ -30,7 +30,7 @@ JsonOption = Annotated[
 ]
 
 
-DECIDING = (("mismatch", "diagnose"), ("mismatch", "apply"), ("mismatch", "simulate"), ("run",))
+DECIDING = (("mismatch", "diagnose"), ("mismatch", "apply"), ("mismatch", "simulate"), ("mismatch", "watch"), ("run",))
 """The commands that take ``--trust`` and ``--allow-outside``."""
 
 
