@@ -266,35 +266,50 @@ def _diagnose(
     if discarded:
         remarks.append(f"{discarded} It was discarded, and nothing is named.")
     posed = replace(posed, recording=recording, problem=problem, base=base, hold=hold)
-    return conclude(posed, selection, left, rule, remarks, jobs, withheld=withheld, held_out=held_out)
+    ended = run_through(posed, selection, held_out)
+    return conclude(posed, ended, left, rule, remarks, jobs, withheld=withheld)
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A search whose fits run through the whole record. ``official``: the held-out part in one free run, where the
+    decisions were made on shorter stretches."""
+
+    base: Fit
+    selection: Selection
+    official: Problem | None = None
+
+
+def run_through(posed: Posed, selection: Selection, held_out: float = 0.3) -> Ended:
+    """The fits as they are written down: the exported twin runs through, and what adds up over a whole run is fitted
+    in one."""
+    problem, base, twin = posed.problem, posed.base, posed.problem.twin
+    if not twin.restart or problem.settle:
+        return Ended(base, selection)
+    through = restarting(twin, False) if problem.split.own else twin
+    whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
+    course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
+    base = over_the_whole(problem, course, base)
+    selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
+    return Ended(base, selection, None if problem.split.own else course)
 
 
 def conclude(
     posed: Posed,
-    selection: Selection,
+    ended: Ended,
     left: dict[str, Leftover],
     rule: Rule,
     remarks: Sequence[str],
     jobs: int,
     *,
     withheld: Sequence[Withheld] = (),
-    held_out: float = 0.3,
     decision: Decision | None = None,
 ) -> Report:
     """The report of a finished search. ``decision``: the verdict where it was reached elsewhere; else ``judge``'s."""
-    problem, raw, base, twin = posed.problem, posed.raw, posed.base, posed.problem.twin
-    official = None
-    if twin.restart and not problem.settle:
-        # the exported twin runs through: what adds up over a whole run is fitted in one
-        through = restarting(twin, False) if problem.split.own else twin
-        whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
-        course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
-        official = None if problem.split.own else course
-        base = over_the_whole(problem, course, base)
-        selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
+    problem, raw, base, selection = posed.problem, posed.raw, ended.base, ended.selection
     report = assemble(
-        problem, raw, base, selection, left, posed.effects, rule, remarks, official, jobs, withheld, posed.hold,
-        decision,
+        problem, raw, base, selection, left, posed.effects, rule, remarks, ended.official, jobs, withheld,
+        posed.hold, decision,
     )  # fmt: skip
     if posed.recording.parts:
         # what is not named is not part of the model that recordings are compared under

@@ -142,6 +142,20 @@ class BaseShift:
 
 
 @dataclass(frozen=True)
+class Sealed:
+    """Rms of the residual per output on the end of the recording, which nothing read before everything was decided.
+    ``span``: its samples, stop excluded; None where nothing was sealed, and ``why``: "short", "own_split" (the
+    recording says what is fitted and tested) or "several_recordings" (each is left out in turn).
+    """
+
+    span: tuple[int, int] | None
+    why: str = ""
+    base_rms: Mapping[str, float] = field(default_factory=dict[str, float])
+    recalibrated_rms: Mapping[str, float] = field(default_factory=dict[str, float])
+    fitted_rms: Mapping[str, float] = field(default_factory=dict[str, float])
+
+
+@dataclass(frozen=True)
 class FitSummary:
     unit: Mapping[str, str]
     held_out: bool
@@ -157,6 +171,7 @@ class FitSummary:
     tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     file_unit: Mapping[str, str] = field(default_factory=dict[str, str])
     """Unit of an output in the data file, where it is not ``unit``: people are shown that one."""
+    sealed: Sealed | None = None
 
 
 @dataclass(frozen=True)

@@ -11,12 +11,12 @@ from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.diagnose import Posed, conclude, gross, pose
+from tools.mismatch.engine.diagnose import Posed, conclude, gross, pose, run_through
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.identifiability import experiment
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.parsimony import Rule
-from tools.mismatch.engine.report import Alternative, Equivalent, Report
+from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
 from tools.mismatch.engine.revise import size
 from tools.mismatch.engine.score import block_energy, compare, held_rms, misfits
 from tools.mismatch.engine.screen import Candidate
@@ -25,6 +25,7 @@ from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import Answer, decide, recalibrated
+from tools.mismatch.infer.sealed import score_sealed, seal
 from tools.mismatch.infer.search import Found, search
 from tools.mismatch.infer.store import Scored, Store, part_of
 from tools.mismatch.recording import Recording
@@ -35,10 +36,13 @@ Progress = Callable[[str, int, int], None]
 
 @dataclass(frozen=True)
 class Inferred:
-    """A recording made ready, and what the search found on it: everything that a decision needs."""
+    """A recording made ready, and what the search found on it: everything that a decision needs. ``whole``: with the
+    sealed end that neither knows of; ``unsealed``: why there is none."""
 
     posed: Posed
     found: Found
+    whole: Recording
+    unsealed: str
 
 
 def infer(
@@ -46,11 +50,11 @@ def infer(
     progress: Progress | None = None, effects: Iterable[Effect] | None = None,
 ) -> Inferred:  # fmt: skip
     """Prepare and search; no decision yet. The linear algebra uses one thread."""
+    kept, unsealed = seal(recording)
     with threadpool_limits(1):
-        posed = pose(recording, held_out, seed, jobs, progress, effects, Rule())
-        return Inferred(
-            posed, search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
-        )
+        posed = pose(kept, held_out, seed, jobs, progress, effects, Rule())
+        found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
+    return Inferred(posed, found, recording, unsealed)
 
 
 def diagnose(
@@ -79,10 +83,15 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
         tuple(() for _ in chosen.placed), inferred.found.first, answer.strange,
     )  # fmt: skip
     remarks = gross(posed.recording, posed.problem.twin, posed.raw)
-    report = conclude(posed, selection, dict(answer.left), Rule(), remarks, jobs, held_out=held_out, decision=decision)
+    ended = run_through(posed, selection, held_out)
+    report = conclude(posed, ended, dict(answer.left), Rule(), remarks, jobs, decision=decision)
+    sealed = Sealed(None, inferred.unsealed)
+    if not inferred.unsealed:
+        sealed = score_sealed(inferred.whole, posed, ended.base, ended.selection.fitted)
     physics = [replace(p, confidence=round(answer.sure.get(p.name, p.confidence), 4)) for p in report.physics]
     return replace(
         report,
+        fit=replace(report.fit, sealed=sealed),
         # the likeliest first; of equals the one that takes more
         physics=tuple(sorted(physics, key=lambda p: -effect_size(store, chosen, p.name))),
         alternatives=alternatives_of(store, answer) if chosen.placed else (),

@@ -51,7 +51,7 @@ def html_page(report: Report) -> str:
         between=_between(report),
         limits=_limits(report),
         experiments=next_experiments(report),
-        split=_split(report),
+        split=wording.data_parts(report),
         cautions=wording.cautions(report),
         number=number,
         chance=wording.chance,
@@ -186,11 +186,3 @@ def _limits(report: Report) -> dict[str, Any]:
         "outputs": [(o, units[o][1]) for o in outputs],
         "rows": [(words(n), [shown(o, n) for o in outputs]) for n in order],
     }
-
-
-def _split(report: Report) -> tuple[str, str]:
-    dt = wording.step_s(report)
-    f = report.fit
-    if dt is None:
-        return f"samples {list(f.fit_spans)}", f"samples {list(f.held_out_spans)}"
-    return wording.spans(f.fit_spans, dt), wording.spans(f.held_out_spans, dt)

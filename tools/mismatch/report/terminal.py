@@ -141,14 +141,6 @@ def _together(together: Together, fit: FitSummary) -> RenderableType:
     return _pairs(rows)
 
 
-def _split(report: Report) -> Table:
-    f = report.fit
-    dt = wording.step_s(report)
-    if dt is None:
-        return _pairs([("fitted on samples", str(list(f.fit_spans))), ("held out", str(list(f.held_out_spans)))])
-    return _pairs([("fitted on", wording.spans(f.fit_spans, dt)), ("held out", wording.spans(f.held_out_spans, dt))])
-
-
 def render(report: Report) -> RenderableType:
     """The whole report."""
     colour = _COLOUR[report.verdict]
@@ -188,7 +180,7 @@ def render(report: Report) -> RenderableType:
         rows = [(words(n), need) for n, need in report.cannot_show.items()]
         parts.append(_section("This recording cannot show at all (what would)", _pairs(rows)))
     parts.append(_section("Checks", _checks(report)))
-    parts.append(_section("Split", _split(report)))
+    parts.append(_section("Split", _pairs(wording.data_parts(report))))
     rows = [(f"{i + 1}.", f"{e.what}: {e.why}") for i, e in enumerate(next_experiments(report))]
     parts.append(_section("Record next", _pairs(rows)))
     parts.append(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 
 from tools.mismatch import units
 from tools.mismatch.engine.report import (
@@ -235,6 +236,35 @@ def step_s(report: Report) -> float | None:
     if p is None or p.t.size < 2:
         return None
     return float(min(p.t[i + 1] - p.t[i] for i in range(min(p.t.size - 1, 16))))
+
+
+UNSEALED = MappingProxyType(
+    {
+        "short": "the recording is too short to spare a part",
+        "own_split": "the recording says what is fitted and what is tested",
+        "several_recordings": "each recording is left out in turn instead",
+    }
+)
+
+
+def data_parts(report: Report) -> list[tuple[str, str]]:
+    """What of the recording was fitted, held out and sealed, and what the sealed part says."""
+    f, dt_s = report.fit, step_s(report)
+    say = lambda of: f"samples {list(of)}" if dt_s is None else spans(of, dt_s)  # noqa: E731
+    rows = [("fitted on", say(f.fit_spans)), ("held out", say(f.held_out_spans))]
+    if f.sealed is None:
+        return rows
+    if f.sealed.span is None:
+        return [*rows, ("sealed", f"nothing: {UNSEALED[f.sealed.why]}")]
+    rows.append(("sealed", f"{say([f.sealed.span])}: scored once, after everything was decided"))
+    for o, last in f.sealed.fitted_rms.items():
+        given, again = f.sealed.base_rms[o], f.sealed.recalibrated_rms[o]
+        factor, unit = shown_in(f, o, again)
+        said = f"{number(given * factor)} as given, {number(again * factor)} re-fitted"
+        if report.physics:
+            said += f", {number(last * factor)} with physics"
+        rows.append((f"  {o}", f"{said} ({unit} rms)"))
+    return rows
 
 
 def before_after(p: PhysicsFound, fit: FitSummary) -> str:

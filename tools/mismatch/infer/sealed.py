@@ -1,0 +1,72 @@
+"""The end of a recording, kept sealed: nothing that fits, chooses or estimates noise reads it. It is scored once, when
+everything is decided.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from tools.mismatch.engine.diagnose import Posed, ranges_of
+from tools.mismatch.engine.exported import without_events
+from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import Sealed
+from tools.mismatch.engine.residual import residuals
+from tools.mismatch.engine.score import held_rms
+from tools.mismatch.engine.split import Split, cut, shot
+from tools.mismatch.recording import Recording
+
+SHARE = 0.1
+"""Share of a recording that is sealed: its end, since a twin is for what comes next."""
+LEAST = 200
+"""Samples below which a sealed part would say nothing of the rms that is worth the samples: that is known to 5 %."""
+PIECES = 8
+"""Stretches of the sealed part, for a twin that starts every stretch afresh."""
+
+
+def seal(recording: Recording) -> tuple[Recording, str]:
+    """The recording without its sealed end; or all of it, and why nothing is sealed (``Sealed.why``)."""
+    if recording.parts:
+        return recording, "several_recordings"
+    if ranges_of(recording) is not None or recording.split.test is not None:
+        return recording, "own_split"
+    kept = recording.n - int(SHARE * recording.n)
+    if recording.n - kept < LEAST:
+        return recording, "short"
+    return shortened(recording, kept), ""
+
+
+def shortened(recording: Recording, samples: int) -> Recording:
+    """The first ``samples`` of a recording."""
+    return replace(
+        recording,
+        t=recording.t[:samples],
+        inputs={s: x[:samples] for s, x in recording.inputs.items()},
+        outputs={s: x[:samples] for s, x in recording.outputs.items()},
+        context={s: x[:samples] for s, x in recording.context.items()},
+        segments=recording.segments_of(0, samples),
+    )
+
+
+def score_sealed(whole: Recording, posed: Posed, base: Fit, fitted: Fit) -> Sealed:
+    """The score of the end of ``whole``, of which ``posed`` is the beginning: one run on from what was fitted, with
+    the effects that will be there again (no events).
+    """
+    problem, start = posed.problem, posed.problem.recording.n
+    full = replace(
+        problem.recording, t=whole.t, inputs=whole.inputs, outputs=whole.outputs, context=whole.context,
+        segments=whole.segments,
+    )  # fmt: skip
+    tail = ((start, whole.n),)
+    split = Split(whole.n, problem.split.fit, tail, cut(tail, 30), problem.split.fit_blocks)
+    if problem.twin.restart:
+        split = shot(split, problem.init, PIECES)
+    onward = replace(problem, recording=full, split=split, hints=())
+    return Sealed(tail[0], "", *(_rms(onward, f) for f in (posed.raw, base, without_events(problem, fitted))))
+
+
+def _rms(problem: Problem, fitted: Fit) -> dict[str, float]:
+    with np.errstate(all="ignore"):
+        return held_rms(problem, replace(fitted, residual=residuals(problem, fitted.model, fitted.theta)))
