@@ -119,6 +119,23 @@ class Model:
                 found |= {i for part in self._slices[k] for i in range(part.start, part.stop)}
         return found
 
+    def moved_by(self, i: int) -> tuple[str, ...]:
+        """The outputs that may change with nonlinear parameter ``i`` while the linear ones are solved again: its own
+        and all that share a linear parameter with one of them, in the twin's order.
+        """
+        k = self.parameters[i].placed
+        if not self.twin.apart or k < 0 or self.placed[k].site != "output":
+            return self.twin.outputs
+        found = set(self.placed[k].outputs)
+        shared = [
+            set(pl.outputs if pl.site == "output" else self.twin.outputs)
+            for j, pl in enumerate(self.placed)
+            if any(self.parameters[i].linear for part in self._slices[j] for i in range(part.start, part.stop))
+        ]
+        while more := [s for s in shared if s & found and s - found]:
+            found.update(*more)
+        return tuple(o for o in self.twin.outputs if o in found)
+
     def start(self, recording: Recording) -> Array:
         """Theta with the base as given, effects absent as far as that is expressible (weights zero, nonlinear
         parameters in the middle of their bounds)."""

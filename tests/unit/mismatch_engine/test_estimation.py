@@ -14,16 +14,19 @@ from tests.unit.mismatch_engine.cases import recording, stack, wave
 from tools.mismatch import notebook
 from tools.mismatch.engine.diagnose import diagnose, nominated, prepared
 from tools.mismatch.engine.exported import raw_values, without_events
-from tools.mismatch.engine.fit import fit, fit_base
+from tools.mismatch.engine.fit import fit, fit_base, moved_a_little, slopes
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.projected import Projected
 from tools.mismatch.engine.reduce import fitted_part, is_long
 from tools.mismatch.engine.score import fit_rms, held_rms
-from tools.mismatch.engine.screen import bend, one_step, places
+from tools.mismatch.engine.screen import Regression, bend, one_step, places
 from tools.mismatch.engine.split import own_split
+from tools.mismatch.engine.trust import to_search
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.opaque import opaque_twin
 
@@ -164,3 +167,48 @@ def test_parts_of_a_long_record_nominate_what_the_whole_decides_on() -> None:
     assert "saturation" in names
     assert "mains_interference" not in names
     assert [h.placed.effect.name for h in hints][:1] == ["saturation"], "the whole begins where the part ended"
+
+
+def test_slopes_on_the_outputs_that_move_are_those_of_all_outputs() -> None:
+    rng = np.random.default_rng(11)
+    force = np.column_stack([wave(rng, 1200) for _ in "xyz"])
+    volts = 2.5 + force - 0.1 * np.clip(force, -0.3, 0.3) + 2e-3 * rng.standard_normal(force.shape)
+    made = recording(
+        "accelerometer",
+        {f"specific_force_{a}": force[:, i] for i, a in enumerate("xyz")},
+        {f"voltage_{a}": volts[:, i] for i, a in enumerate("xyz")},
+        {"bias_V": 2.5, "scale_V_per_g": 1.0},
+    )
+    problem, _, base = prepared(made, 0.3, 0, False)
+    effects = [EFFECTS[n] for n in ("dead_zone", "channel_delay", "first_order_lag", "misalignment")]
+    tried = places(problem, effects, ())
+    one = [p for p in tried if p.effect.name in ("dead_zone", "misalignment") and p.target.endswith(("_x", "_y"))]
+    shared = next(p for p in tried if p.effect.name == "first_order_lag" and len(p.outputs) == 3)
+    model = Model(problem.twin, [prepare(Model(problem.twin), problem.fit_view, base.theta, p) for p in (*one, shared)])
+    theta = model.carry(base.model, base.theta, made)
+    projected = Projected(problem, model, problem.twin.outputs, 500)
+    residual, theta = projected.evaluate(theta)
+    alone = [len(model.moved_by(i)) for i in projected.free]
+    assert min(alone) == 1
+    assert max(alone) == 3
+    found = slopes(projected, theta, residual)
+    for c, i in enumerate(projected.free):
+        moved = moved_a_little(model, theta, i)
+        h = to_search(model.parameters[i], moved[i]) - to_search(model.parameters[i], theta[i])
+        true = (projected.evaluate(moved)[0] - residual) / h
+        assert found[:, c] == pytest.approx(true, rel=1e-6, abs=1e-6 * np.abs(true).max())
+        assert np.any(true != 0.0)
+
+
+def test_a_regression_in_blocks_is_that_of_the_whole() -> None:
+    rng = np.random.default_rng(4)
+    blocks = [rng.standard_normal((40, 6)) for _ in range(3)]
+    for i, block in enumerate(blocks):
+        block[:, [j for j in range(1, 6) if j != i + 1]] = 0.0
+    blocks[1][:, 5] = blocks[1][:, 2]  # one column twice
+    whole = np.concatenate(blocks)
+    y = rng.standard_normal((120, 2))
+    true = y - whole @ np.linalg.lstsq(whole, y, rcond=1e-9)[0]
+    found = Regression(blocks)
+    assert found.less(y) == pytest.approx(true, abs=1e-12)
+    assert found.less(y[:, 0]) == pytest.approx(true[:, 0], abs=1e-12)

@@ -85,16 +85,25 @@ def moved_a_little(model: Model, theta: Array, i: int) -> Array:
     return shifted
 
 
-def _slopes(projected: Projected, theta: Array, residual: Array) -> Array:
-    """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences."""
+def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
+    """Sensitivity (rows, free) of the projected residual to the searched parameters, by forward differences. What moves
+    some outputs alone is simulated on these.
+    """
     model = projected.model
     out = np.zeros((residual.size, len(projected.free)))
+    parts = {projected.outputs: (projected, np.arange(residual.size), residual)}
     for c, i in enumerate(projected.free):
         p = model.parameters[i]
         shifted = moved_a_little(model, theta, i)
         moved = to_search(p, shifted[i]) - to_search(p, theta[i])
-        if moved != 0.0:
-            out[:, c] = (projected.evaluate(shifted)[0] - residual) / moved
+        if moved == 0.0:
+            continue
+        outputs = tuple(o for o in model.moved_by(i) if o in projected.outputs)
+        if outputs not in parts:
+            part, at = projected.only(outputs)
+            parts[outputs] = (part, at, part.evaluate(theta)[0])
+        part, at, here = parts[outputs]
+        out[at, c] = (part.evaluate(shifted)[0] - here) / moved
     return out
 
 
@@ -112,7 +121,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
         return theta, cost
     parameters = [model.parameters[i] for i in free]
     damping = 1e-2
-    jacobian = _slopes(projected, theta, residual)
+    jacobian = slopes(projected, theta, residual)
     fresh = True
     for _ in range(iterations):
         if not np.all(np.isfinite(jacobian)):
@@ -150,7 +159,7 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
         elif fresh:
             break
         else:
-            jacobian = _slopes(projected, theta, residual)
+            jacobian = slopes(projected, theta, residual)
             fresh = True
             damping = min(damping, 1e-2)
     return theta, cost

@@ -4,6 +4,7 @@ projection: Golub and Pereyra, SIAM J. Numerical Analysis 10, 1973), outliers bo
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -39,22 +40,38 @@ class Projected:
         rows = spread(problem.fit_rows, most_rows, problem.seed)
         self.rows = rows
         self.samples = problem.index[rows]
-        design_free = model.parameters_of(outputs)
-        self.free = [i for i in model.nonlinear if i in design_free]
-        self.linear = np.array([j for j in model.linear if j in design_free], int)
-        self.position = {j: i for i, j in enumerate(self.linear.tolist())}
-        kept = [i for i, j in enumerate(model.linear) if j in design_free]
-        self.penalty = model.penalty[:, kept]
-        self.lo = np.array([model.parameters[j].lo for j in self.linear])
-        self.hi = np.array([model.parameters[j].hi for j in self.linear])
         self.measured = {o: problem.measured[o][rows] for o in self.outputs}
         self.usual = {o: 1.0 - model.excused(self.view, o)[rows] for o in self.outputs}
         self.weight = {o: self.usual[o] / problem.sigma(o) for o in self.outputs}
         prior = belief(problem, model)
-        believed = [i for i in range(model.n_base) if i in design_free and np.isfinite(prior.width[i])]
-        self.believed = np.array(believed, int)
         self.centre, self.width = prior.centre, prior.width
+        self._name_parameters()
         self.evaluations = 0
+
+    def _name_parameters(self) -> None:
+        """The parameters that move ``outputs``: those to be searched, solved and believed."""
+        model = self.model
+        moving = model.parameters_of(self.outputs)
+        self.free = [i for i in model.nonlinear if i in moving]
+        self.linear = np.array([j for j in model.linear if j in moving], int)
+        self.position = {j: i for i, j in enumerate(self.linear.tolist())}
+        kept = [i for i, j in enumerate(model.linear) if j in moving]
+        self.penalty = model.penalty[:, kept]
+        self.lo = np.array([model.parameters[j].lo for j in self.linear])
+        self.hi = np.array([model.parameters[j].hi for j in self.linear])
+        believed = [i for i in range(model.n_base) if i in moving and np.isfinite(self.width[i])]
+        self.believed = np.array(believed, int)
+
+    def only(self, outputs: Sequence[str]) -> tuple[Projected, NDArray[np.int64]]:
+        """The same residuals of ``outputs`` alone, which share no linear parameter with the others; and where they are
+        among all.
+        """
+        part = copy.copy(self)
+        part.outputs = tuple(o for o in self.outputs if o in outputs)
+        part._name_parameters()
+        m, of_all = self.rows.size, len(self.outputs) * self.rows.size
+        at = [np.arange(m) + m * i for i, o in enumerate(self.outputs) if o in part.outputs]
+        return part, np.concatenate([*at, of_all + np.flatnonzero(np.isin(self.believed, part.believed))])
 
     @property
     def usual_count(self) -> float:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,16 +82,16 @@ def bend(problem: Problem, current: Fit) -> Ground:
         h = 1e-3 * max(abs(theta[i]), abs(p.scale) if np.isfinite(p.scale) else 0.0, 1e-12)
         shifted = theta.copy()
         shifted[i] = theta[i] + h if theta[i] + h <= p.hi else theta[i] - h
-        there = model.simulate(problem.view, shifted)
-        for o in outputs:
+        for o, y in model.simulate(problem.view, shifted, model.moved_by(i)).items():
             now = problem.measured[o][rows] - current.residual[o][rows]
-            bends[o][:, c] = (there[o][rows] - now) / (shifted[i] - theta[i])
+            bends[o][:, c] = (y[rows] - now) / (shifted[i] - theta[i])
     energy: dict[str, float] = {}
     if problem.twin.apart:
         design = model.design(problem.view, theta, samples=samples)
         for o in outputs:
             s = problem.sigma(o)
-            left, _ = _without(current.residual[o][rows] / s, np.column_stack([design.columns[o], bends[o]]) / s)
+            known = Regression([np.column_stack([design.columns[o], bends[o]]) / s])
+            left = known.less(current.residual[o][rows] / s)
             energy[o] = float(left @ left)
     return Ground(rows, samples, bends, energy)
 
@@ -188,11 +188,11 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
             extra.append(((moved[o] - (here if without is None else without[o][rows])) / s)[:, None])
             extra += [((p[o][rows] - moved[o]) / s)[:, None] for p in pushed]
         new.append(np.column_stack(extra))
-    e, base, more = np.concatenate(target), np.concatenate(old), np.concatenate(new)
-    if not (np.all(np.isfinite(base)) and np.all(np.isfinite(more))):
+    e, more = np.concatenate(target), np.concatenate(new)
+    if not (all(np.all(np.isfinite(b)) for b in old) and np.all(np.isfinite(more))):
         return 0.0, 1.0
-    e0, base_q = _without(e, base)
-    more = more - base_q @ (base_q.T @ more)
+    known = Regression(old)
+    e0, more = known.less(e), known.less(more)
     size = np.linalg.norm(more, axis=0)
     more = more[:, size > 1e-9 * max(float(size.max(initial=0.0)), 1e-300)]
     # outputs that share nothing with the candidate keep what they have
@@ -202,12 +202,11 @@ def _step_gain(problem: Problem, current: Fit, model: Model, theta: Array, groun
         return 0.0, 1.0
     null, begin = before_, e0
     if without is not None:
-        begin = np.concatenate(target) - np.concatenate(shift)
-        begin = begin - base_q @ (base_q.T @ begin)
+        begin = known.less(e - np.concatenate(shift))
         null = min(before_, float(begin @ begin) + idle)
-    left, _ = _without(begin, more)
+    left = Regression([more]).less(begin)
     after = float(left @ left) + idle
-    dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - base.shape[1], 1)
+    dof = max(rows.size * len(problem.twin.outputs) - more.shape[1] - old[0].shape[1], 1)
     f = (null - after) / more.shape[1] / max(after / dof, 1e-300)
     # what another base does by itself is not the effect's
     share = 1 - after / (before_ if null - after > OWN_SHARE * null else null)
@@ -218,13 +217,35 @@ def _is_weight(model: Model, j: int) -> bool:
     return any(w.start <= j < w.stop for _, w in (model.slices(k) for k in range(len(model.placed))))
 
 
-def _without(e: Array, x: Array) -> tuple[Array, Array]:
-    """``e`` less its projection on the columns of ``x``, and an orthonormal basis of them."""
-    size = np.linalg.norm(x, axis=0)
-    x = x[:, size > 0] / size[size > 0]
-    if x.shape[1] == 0:
-        return e, x
-    values, vectors = np.linalg.eigh(x.T @ x)
-    keep = values > 1e-9 * values[-1]
-    q = x @ (vectors[:, keep] / np.sqrt(values[keep]))
-    return e - q @ (q.T @ e), q
+class Regression:
+    """Least squares on columns of which each block of rows (an output) sees few: zeros are not multiplied.
+
+    ``blocks``: (rows, columns) each, of the same size; the columns are those of all blocks on top of one another.
+    """
+
+    def __init__(self, blocks: Sequence[Array]) -> None:
+        self.blocks: list[tuple[NDArray[np.int64], Array]] = []
+        k = blocks[0].shape[1]
+        gram = np.zeros((k, k))
+        for block in blocks:
+            seen = np.flatnonzero(np.any(block != 0.0, axis=0))
+            x = block if seen.size == k else block[:, seen]
+            self.blocks.append((seen, x))
+            gram[np.ix_(seen, seen)] += x.T @ x
+        size = np.sqrt(np.diag(gram))
+        scale = np.where(size > 0, 1.0 / np.maximum(size, 1e-300), 0.0)
+        self.inverse = np.zeros((k, k))
+        if k:
+            values, vectors = np.linalg.eigh(gram * np.outer(scale, scale))
+            keep = values > max(1e-9 * values[-1], 1e-300)
+            root = scale[:, None] * vectors[:, keep] / np.sqrt(values[keep])
+            self.inverse = root @ root.T
+
+    def less(self, y: Array) -> Array:
+        """``y`` (rows of all blocks[, m]) less its projection on the columns."""
+        parts = np.split(y, len(self.blocks))
+        seen = np.zeros((self.inverse.shape[0], *y.shape[1:]))
+        for (at, x), part in zip(self.blocks, parts, strict=True):
+            seen[at] += x.T @ part
+        weights = self.inverse @ seen
+        return np.concatenate([part - x @ weights[at] for (at, x), part in zip(self.blocks, parts, strict=True)])
