@@ -40,7 +40,7 @@ lint: setup
 # of everything that is installed and of all extras: fails on a known vulnerability that has a repair; says so and goes on
 # where the database cannot be reached
 audit: setup
-	$(BIN)/python -m tools.supply.audit
+	$(BIN)/python -m tools.research.supply.audit
 
 # pins and hashes of the project and all extras again; make constraints UPGRADE="numpy uv" takes newer ones of these
 UPGRADE ?=
@@ -74,7 +74,7 @@ docs: setup
 
 # the pictures of the documents, of a running page; needs Chromium
 pictures: setup
-	$(BIN)/python -m tools.bench.pictures docs/pictures
+	$(BIN)/python -m tools.research.pictures docs/pictures
 
 # the built package in an empty environment, away from the sources
 wheel: setup

@@ -23,7 +23,7 @@ from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.cli.bench_option import bench_path
 from tools.closed_loop.simulate import SimulatedRun, simulate
-from tools.tremor.figures import tremor_figures
+from tools.reports.figures import tremor_figures
 
 WIRE_S = 10.0
 SIMULATED_S = (15.0, 60.0, 240.0)

@@ -165,6 +165,17 @@ def check_writable(*destinations: str | Path | None, folders: bool = False) -> N
             raise InputError(_cannot(destination, error)) from error
 
 
+def check_folder(folder: Path | None, option: str = "--out") -> None:
+    """Refuse, before any work, a folder for results that is a file or cannot be written: ``InputError``."""
+    if folder is None:
+        return
+    check_writable(folder, folders=True)
+    if folder.exists() and not folder.is_dir():
+        raise InputError(f"{option} {folder}: is a file; name a folder")
+    if folder.exists() and not os.access(folder, os.W_OK):
+        raise InputError(f"{option} {folder}: is not writable")
+
+
 def _cannot(path: object, error: OSError) -> str:
     advice = "free some space" if error.errno in (errno.ENOSPC, errno.EDQUOT) else "name a folder that you may write to"
     return f"{path}: cannot be written ({error.strerror or error}); {advice}"

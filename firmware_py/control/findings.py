@@ -5,7 +5,7 @@ before the outputs move again: the outputs ramp to neutral, hold there, and go o
 that what is known of the sensors or the outputs is wrong, or that a person wanted the end: the outputs stay in the
 safe state until a person acts.
 Models: ArduPilot's failsafe actions, IEC 61800-5-2 (a stop that holds against one that removes power), the fault
-protection of F Prime. ``docs/findings.md`` is this table, made by ``python -m tools.reports.findings_page``.
+protection of F Prime. ``docs/findings.md`` is this table, made by ``python -m tools.research.reports.findings_page``.
 """
 
 from __future__ import annotations

@@ -2,5 +2,5 @@
 
 What lives here: estimators behind one interface (``estimator``), their prefilters and designs, detectors of what is
 not tremor, the compiled ``stage``.
-What must not: sensors (``sensing``), actuators, figures of merit (``tools.tremor``).
+What must not: sensors (``sensing``), actuators, figures of merit (``tools.research.tremor``).
 """

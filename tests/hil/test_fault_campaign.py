@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.campaign import FaultRow, totals
-from tools.faults.catalogue import faults
-from tools.faults.pairs import join
-from tools.faults.phases import SELF_TEST
-from tools.faults.points import POINTS, write_bench
-from tools.faults.trial import observe_running, observe_start
+from tools.research.faults.campaign import FaultRow, totals
+from tools.research.faults.catalogue import faults
+from tools.research.faults.pairs import join
+from tools.research.faults.phases import SELF_TEST
+from tools.research.faults.points import POINTS, write_bench
+from tools.research.faults.trial import observe_running, observe_start
 
 NAMES = (
     "serial: silence",

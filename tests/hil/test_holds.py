@@ -27,9 +27,9 @@ from hal.errors import BenchError
 from hal.middleware.faults import FaultPlan
 from hal.types import I2cOp, I2cRead
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.fault import InWorld, Kill, OnBus, OnHost
-from tools.faults.points import POINTS, write_bench
-from tools.faults.trial import FarBench
+from tools.research.faults.fault import InWorld, Kill, OnBus, OnHost
+from tools.research.faults.points import POINTS, write_bench
+from tools.research.faults.trial import FarBench
 
 FIRST_S = 1.5
 NEUTRAL_V = 50.0

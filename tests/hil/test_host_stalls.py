@@ -18,9 +18,9 @@ from hal.bench import OpenBench
 from sim_devices.lateness import ALLOWED_NS, STALL_NS, Lateness, LatenessView
 from sim_devices.lockstep_world import LockstepWorld
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.fault import OnBus, OnHost
-from tools.faults.points import POINTS, write_bench
-from tools.faults.trial import FarBench
+from tools.research.faults.fault import OnBus, OnHost
+from tools.research.faults.points import POINTS, write_bench
+from tools.research.faults.trial import FarBench
 
 MS = 1_000_000
 STRIKE_S = 1.5

@@ -9,7 +9,7 @@ import os
 import pytest
 
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.long_run import LongRun, with_wires, without_wires
+from tools.research.faults.long_run import LongRun, with_wires, without_wires
 
 LONG_S = float(os.environ.get("MICRON_LONG_S", "1800"))
 SHIFT_S = float(os.environ.get("MICRON_SHIFT_S", "28800"))

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tools.mismatch.prove import corpus_page
-from tools.mismatch.prove.corpus import BLOCK, CORPORA, draw_case, first_block
-from tools.mismatch.prove.corpus_table import corpus_table
-from tools.mismatch.prove.exact import compare_paired, reliability, score_exactly, summarise
-from tools.mismatch.prove.harness import Run, run_corpus, sealed_draws
+from tools.research.prove import corpus_page
+from tools.research.prove.corpus import BLOCK, CORPORA, draw_case, first_block
+from tools.research.prove.corpus_table import corpus_table
+from tools.research.prove.exact import compare_paired, reliability, score_exactly, summarise
+from tools.research.prove.harness import Run, run_corpus, sealed_draws
 
 
 def _silent(path: Path) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def test_the_answer_is_not_beside_the_recording(tmp_path: Path) -> None:
 
 
 def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tools.mismatch.prove import harness
+    from tools.research.prove import harness
 
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc")
     result = run_corpus(Run("sealed", "old", 2, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)

@@ -9,14 +9,14 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.signal import lsim
 
-from tools.mismatch.prove import draw, guests, kernels, noise
-from tools.mismatch.prove.catalog import TABLE, TWINS
-from tools.mismatch.prove.disk import contract_unit, write
-from tools.mismatch.prove.plans import plans as drawn_plans
-from tools.mismatch.prove.plants import Scene, simulate
-from tools.mismatch.prove.proof import generate
 from tools.mismatch.recording_load import load
 from tools.mismatch.units import convert_difference
+from tools.research.prove import draw, guests, kernels, noise
+from tools.research.prove.catalog import TABLE, TWINS
+from tools.research.prove.disk import contract_unit, write
+from tools.research.prove.plans import plans as drawn_plans
+from tools.research.prove.plants import Scene, simulate
+from tools.research.prove.proof import generate
 
 
 def _case(twin: str, effects: tuple[str, ...], severity: float, seed: int = 3, kind: str = "single") -> draw.Case:

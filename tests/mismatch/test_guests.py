@@ -11,14 +11,14 @@ from hal import plugins
 from hal.trust import require_package
 from tools.errors import RecordingError
 from tools.mismatch import units
-from tools.mismatch.prove import draw, guests
-from tools.mismatch.prove.disk import contract_unit
-from tools.mismatch.prove.plans import plans
-from tools.mismatch.prove.proof import draw_one, generate
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
+from tools.research.prove import draw, guests
+from tools.research.prove.disk import contract_unit
+from tools.research.prove.plans import plans
+from tools.research.prove.proof import draw_one, generate
 
 
 @pytest.mark.parametrize("kind", [guests.FMU, guests.USER, guests.INSTRUMENT])

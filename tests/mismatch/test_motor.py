@@ -26,9 +26,9 @@ from tools.mismatch.export.module import python_module
 from tools.mismatch.export.run import whole_run, whole_view
 from tools.mismatch.export.write import runnable
 from tools.mismatch.placed import Placed
-from tools.mismatch.prove import foreign
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
+from tools.research.prove import foreign
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "motor"
 TRUTH = {

@@ -12,10 +12,10 @@ import pytest
 from rich.console import Console
 
 from tools.interrupt import begin_command, is_stopped
-from tools.mismatch.prove import draw, page, prove, seal
-from tools.mismatch.prove.nulls import clopper_pearson, document, kept, nulls
-from tools.mismatch.prove.score import coverage, score
-from tools.mismatch.prove.table import failures, show
+from tools.research.prove import draw, page, prove, seal
+from tools.research.prove.nulls import clopper_pearson, document, kept, nulls
+from tools.research.prove.score import coverage, score
+from tools.research.prove.table import failures, show
 
 QUIET = {"max_samples": 2500, "progress": lambda text: None}
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tools.reproduce import endoscope
-from tools.reproduce.endoscope_broad import broad
-from tools.reproduce.real_sensors import data_folder
+from tools.research.reproduce import endoscope
+from tools.research.reproduce.endoscope_broad import broad
+from tools.research.reproduce.real_sensors import data_folder
 
 
 def test_settling_times_are_the_printed_ones() -> None:

@@ -1,4 +1,4 @@
-"""Rows of ``micron reproduce`` keep the outcome that ``tools/reproduce/expected.json`` pins.
+"""Rows of ``micron reproduce`` keep the outcome that ``tools/research/reproduce/expected.json`` pins.
 
 A row that is met for the first time, or no longer, is a finding: look at it, then change the file and say why in the
 commit. The quick part runs with every ``make test``, whole tables with the slow tests.
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tools.reproduce import endoscope, real_sensors, sensing_static, sensing_variance
-from tools.reproduce.names import reproduce_table
-from tools.reproduce.recordings import data_folder
-from tools.reproduce.rows import Row, Table, expected_misses, keys, surprises
+from tools.research.reproduce import endoscope, real_sensors, sensing_static, sensing_variance
+from tools.research.reproduce.names import reproduce_table
+from tools.research.reproduce.recordings import data_folder
+from tools.research.reproduce.rows import Row, Table, expected_misses, keys, surprises
 
 TABLES = ("sensing", "real-sensors", "endoscope", "tremor")
 
@@ -26,7 +26,7 @@ def row(ours: float, quantity: str = "q") -> Row:
 @pytest.fixture
 def pinned(monkeypatch: pytest.MonkeyPatch) -> None:
     misses = {"t": {"s: q (2)"}}
-    monkeypatch.setattr("tools.reproduce.rows.expected_misses", misses.get)
+    monkeypatch.setattr("tools.research.reproduce.rows.expected_misses", misses.get)
 
 
 @pytest.mark.usefixtures("pinned")

@@ -11,12 +11,12 @@ from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.reproduce import broad, real_sensors
-from tools.reproduce.names import MODULES, expand
-from tools.reproduce.orientation_error import east_north_up, rms_errors_deg
-from tools.reproduce.page import markdown
-from tools.reproduce.rows import Row, Table, build
-from tools.reproduce.sensing_variance import placement_tables, table_2_4
+from tools.research.reproduce import broad, real_sensors
+from tools.research.reproduce.names import MODULES, expand
+from tools.research.reproduce.orientation_error import east_north_up, rms_errors_deg
+from tools.research.reproduce.page import markdown
+from tools.research.reproduce.rows import Row, Table, build
+from tools.research.reproduce.sensing_variance import placement_tables, table_2_4
 
 
 def row(published: float, ours: float, better: str, tolerance: float = 0.0) -> Row:

@@ -7,7 +7,7 @@ import pytest
 
 from firmware_py.actuation.config import StackConfig
 from tools.calibrate.piezo_prediction import simulate
-from tools.reproduce.stack_plants import Plant, hysterons, late, narx, preisach
+from tools.research.reproduce.stack_plants import Plant, hysterons, late, narx, preisach
 
 RATE_HZ = 200.0
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tools.tremor.ideal import GOAL, ideal_run
+from tools.research.tremor.ideal import GOAL, ideal_run
 
 BENCH = Path(__file__).parents[2] / "benches" / "micron.toml"
 

@@ -11,8 +11,8 @@ import pytest
 from firmware_py.app import run_in_process
 from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
-from tools.tremor.bench_variant import merged, write_variant
-from tools.tremor.ideal import SETTLE_S, ideal_changes, left_and_bound
+from tools.research.tremor.bench_variant import merged, write_variant
+from tools.research.tremor.ideal import SETTLE_S, ideal_changes, left_and_bound
 
 SECONDS = 20.0
 SAMPLE_TO_STROKE_S = 0.6e-3

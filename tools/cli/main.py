@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Annotated, Any
 
 import typer
@@ -21,97 +22,92 @@ from tools.interrupt import install_handler, was_interrupted
 
 # name -> where it is, and its line in the list
 COMMANDS = {
-    "run": ("run:run", "Run the instrument in closed loop and report what was left of the tremor."),
+    "run": ("tools.cli.run:run", "Run the instrument in closed loop and report what was left of the tremor."),
     "simulate": (
-        "simulate:simulate_command",
+        "tools.cli.simulate:simulate_command",
         "Simulate the closed loop without wires, tens of times faster than real time; the same figures as micron run.",
     ),
-    "bench": ("bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."),
+    "bench": ("tools.cli.bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."),
     "replay": (
-        "replay:replay",
+        "tools.cli.replay:replay",
         "Run the firmware over a recording and compare every estimate and command with the recorded one, bit for bit.",
     ),
     "doctor": (
-        "doctor:doctor",
+        "tools.cli.doctor:doctor",
         "What this machine offers, what the bench asks for, what is missing and how to get it.",
     ),
-    "hands": (
-        "hands:hands",
-        "Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.",
-    ),
-    "faults": ("faults:faults", "Break the emulated instrument in every way of the catalogue, and print what it did."),
-    "soak": (
-        "soak:soak",
-        "Run the closed loop for very long in virtual time: memory, what is left of the tremor, every counter by "
-        "eighths.",
-    ),
-    "reproduce": ("reproduce:reproduce", "Compute published figures again and print them beside ours."),
     "noise": (
-        "noise:noise",
+        "tools.cli.noise:noise",
         "Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.",
     ),
-    "placement": (
-        "placement:placement",
-        "Places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.",
-    ),
     "recover": (
-        "recordings:recover",
+        "tools.cli.recordings:recover",
         "Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).",
     ),
     "export": (
-        "recordings:export",
+        "tools.cli.recordings:export",
         "Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.",
     ),
     "scan": (
-        "diagnose:scan",
+        "tools.cli.diagnose:scan",
         "Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.",
     ),
     "read": (
-        "read:read",
+        "tools.cli.read:read",
         "One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.",
     ),
     "scope": (
-        "diagnose:scope",
+        "tools.cli.diagnose:scope",
         "The analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.",
     ),
     "latency": (
-        "diagnose:latency",
+        "tools.cli.diagnose:latency",
         "How late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.",
     ),
     "ramp": (
-        "diagnose:ramp",
+        "tools.cli.diagnose:ramp",
         "A staircase on the outputs, over their full range, with read-back. Exit 1 when a stair is off.",
     ),
     "capture": (
-        "diagnose:capture",
+        "tools.cli.diagnose:capture",
         "Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.",
     ),
     "emulate": (
-        "emulate:emulate",
+        "tools.cli.emulate:emulate",
         "Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.",
     ),
-    "can": ("diagnose:can", "CAN buses of a bench."),
-    "golden": ("diagnose:golden", "Golden transcripts."),
-    "log": ("diagnose:log", "The log of a running bench."),
-    "calibrate": ("calibrate:calibrate", "Identify sensors and stacks from calibration recordings."),
+    "can": ("tools.cli.diagnose:can", "CAN buses of a bench."),
+    "golden": ("tools.cli.diagnose:golden", "Golden transcripts."),
+    "log": ("tools.cli.diagnose:log", "The log of a running bench."),
+    "calibrate": ("tools.cli.calibrate:calibrate", "Identify sensors and stacks from calibration recordings."),
     "trust": (
-        "trust:trust",
+        "tools.cli.trust:trust",
         "Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.",
     ),
-    "endoscope": ("endoscope:endoscope", "Steer a field of view with a motion card (Erat 2018, chapter 6)."),
-    "imu": ("imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
-    "manipulator": ("manipulator:app", "The three-legged manipulator at the tip."),
-    "mismatch": ("mismatch:app", "Where simulation and recording differ, and which physics is missing."),
-    "data": ("data:data", "Public recordings: what there is, under which licence, and how to get it."),
-    "sensing": ("sensing:app", "Error budgets of the sensing stage on emulated sensors."),
-    "tremor": ("tremor:app", "Recorded hands: inspect them, train on them, evaluate estimators."),
+    "endoscope": ("tools.cli.endoscope:endoscope", "Steer a field of view with a motion card (Erat 2018, chapter 6)."),
+    "imu": ("tools.cli.imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
+    "mismatch": ("tools.cli.mismatch:app", "Where simulation and recording differ, and which physics is missing."),
+    "data": ("tools.cli.data:data", "Public recordings: what there is, under which licence, and how to get it."),
 }
+INSIDE: dict[str, dict[str, str]] = {}
+"""Commands of research inside a group of the product: group -> name -> where it is."""
+if find_spec("tools.research") is not None:  # a source tree; the wheel does not contain it
+    _research = import_module("tools.research.cli.commands")
+    COMMANDS |= _research.COMMANDS
+    INSIDE |= _research.INSIDE
+
+
+def _at(where: str) -> Any:
+    module, _, attribute = where.partition(":")
+    return getattr(import_module(module), attribute)
 
 
 def load(name: str) -> Any:
     """The command ``name`` with its modules, as typer makes it."""
-    module, _, attribute = COMMANDS[name][0].partition(":")
-    found = getattr(import_module(f"tools.cli.{module}"), attribute)
+    found = _at(COMMANDS[name][0])
+    for inner, where in INSIDE.get(name, {}).items():
+        if inner not in {command.name for command in found.registered_commands}:
+            found.command(inner)(_at(where))
     around = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):
         around.add_typer(found, name=name, cls=Helpful)

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,7 +15,7 @@ from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import Outputs, check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_folder, check_writable, write_json, write_text_atomic
 from tools.terminal import task_name
 
 if TYPE_CHECKING:
@@ -47,41 +45,6 @@ SeedOption = Annotated[int, typer.Option(min=0, help="Same recording and seed: s
 
 MOST_SHARED = 1_000_000
 """Samples above which one process works alone: every further one would hold a gigabyte of columns of its own."""
-
-
-@contextmanager
-def _clear_errors() -> Iterator[None]:
-    """As ``clear_errors``; a bad recording is bad input."""
-    from tools.errors import RecordingError
-
-    with clear_errors():
-        try:
-            yield
-        except RecordingError as error:
-            raise InputError(str(error)) from error
-
-
-def _check_targets(*files: str | Path | None) -> None:
-    """Refuse what cannot be written before any work is done."""
-    check_writable(*files)
-    for file in files:
-        if file is None or str(file) == "-":
-            continue
-        path = Path(file)
-        if path.is_dir():
-            raise InputError(f"{file}: is a folder; name a file in it")
-        if not os.access(path.absolute().parent, os.W_OK):
-            raise InputError(f"{file}: the folder {path.absolute().parent} is not writable")
-
-
-def _check_folder(folder: Path | None, option: str = "--out") -> None:
-    if folder is None:
-        return
-    check_writable(folder, folders=True)
-    if folder.exists() and not folder.is_dir():
-        raise InputError(f"{option} {folder}: is a file; name a folder")
-    if not os.access(folder if folder.exists() else folder.absolute().parent, os.W_OK):
-        raise InputError(f"{option} {folder}: is not writable")
 
 
 @app.command()
@@ -118,10 +81,10 @@ def diagnose(
 
     Example: micron mismatch diagnose recordings/stack --html stack.html --json stack.json
     """
-    with _clear_errors():
-        _check_targets(json_file, html)
-        _check_folder(out)
-        _check_engine(engine)
+    with clear_errors():
+        check_writable(json_file, html)
+        check_folder(out)
+        check_engine(engine)
         processes = jobs or os.cpu_count() or 1
         if together:
             if engine != "old" or dask is not None:
@@ -253,8 +216,8 @@ def new(
 
     Example: micron mismatch new rig/data.csv
     """
-    with _clear_errors():
-        _check_targets(json_file)
+    with clear_errors():
+        check_writable(json_file)
         for option, hertz in (("--rate", rate), ("--resample", resample)):
             if hertz is not None and not 0.0 < hertz < 1e9:
                 raise InputError(f"{option} {hertz:g}: must be a number of samples per second")
@@ -300,8 +263,8 @@ def physics(json_file: JsonOption = None) -> None:
 
     Example: micron mismatch physics --json -
     """
-    with _clear_errors():
-        _check_targets(json_file)
+    with clear_errors():
+        check_writable(json_file)
         from tools.mismatch.report.vocabulary import entries, print_vocabulary, to_json
 
         found = entries()
@@ -310,134 +273,9 @@ def physics(json_file: JsonOption = None) -> None:
         write_json(to_json(found), json_file)
 
 
-@app.command()
-def prove(
-    cases: Annotated[int, typer.Option(min=1, help="Recordings to draw.")] = 40,
-    seed: Annotated[int | None, typer.Option(min=0, help="A fresh one if left out; it is printed.")] = None,
-    json_file: JsonOption = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
-    keep: Annotated[
-        Path | None,
-        typer.Option(metavar="FOLDER", help="Recordings, sealed answers and reports; a stopped run goes on there."),
-    ] = None,
-    corpus: Annotated[
-        str | None, typer.Option(metavar="NAME", help="calibrate, develop or sealed: exact scores on its own seeds.")
-    ] = None,
-    engine: EngineOption = "old",
-    samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording of a corpus.")] = 8000,
-    minutes: Annotated[
-        float | None, typer.Option(min=0.0, help="With --corpus: begin no case after these; run again to go on.")
-    ] = None,
-    first: Annotated[int, typer.Option(min=0, help="With --corpus: the number of the first case.")] = 0,
-) -> None:
-    """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
-
-    Example: micron mismatch prove --cases 40 --seed 1
-    """
-    with _clear_errors():
-        _check_targets(json_file)
-        _check_folder(keep, "--keep")
-        if keep is not None:
-            keep.mkdir(exist_ok=True)
-        _check_engine(engine)
-        if corpus is not None:
-            if seed is not None:
-                raise InputError("--corpus has seeds of its own; leave --seed out")
-            _prove_corpus(corpus, engine, cases, first, samples, minutes, jobs, keep, json_file)
-            return
-        from functools import partial
-
-        from tools.mismatch.prove import prove as run_proof
-        from tools.mismatch.prove.runner import tool
-        from tools.mismatch.prove.table import show
-
-        err = console()
-        result = run_proof(
-            cases,
-            seed,
-            jobs or os.cpu_count() or 1,
-            keep,
-            max_samples=samples,
-            diagnose=partial(tool, engine=engine),
-            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
-        )
-        show(result, err if json_file == "-" else data_console())
-        write_json(result.to_json(), json_file)
-
-
-def _check_engine(engine: str) -> None:
+def check_engine(engine: str) -> None:
     if engine not in ("old", "new"):
         raise InputError(f"--engine {engine}: there is no such engine; use old or new")
-
-
-def _prove_corpus(
-    corpus: str,
-    engine: str,
-    cases: int,
-    first: int,
-    samples: int,
-    minutes: float | None,
-    jobs: int | None,
-    keep: Path | None,
-    json_file: str | None,
-) -> None:
-    from contextlib import ExitStack
-    from tempfile import TemporaryDirectory
-
-    from tools.mismatch.prove.corpus import NAMES, Name
-    from tools.mismatch.prove.corpus_table import corpus_table
-    from tools.mismatch.prove.harness import Engine, Run, run_corpus
-
-    if corpus not in NAMES:
-        raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
-    limit = float("inf") if minutes is None else minutes
-    run = Run(cast(Name, corpus), cast(Engine, engine), cases, samples, limit, jobs or os.cpu_count() or 1, first)
-    err = console()
-    with ExitStack() as stack:
-        folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))
-        result = run_corpus(run, folder, progress=lambda text: err.print(text, markup=False, soft_wrap=True))
-    (err if json_file == "-" else data_console()).print(corpus_table(result))
-    write_json(result.to_json(), json_file)
-
-
-@app.command()
-def calibrate(
-    keep: Annotated[Path, typer.Option("--keep", metavar="FOLDER", help="Cases and their fits; a run goes on there.")],
-    cases: Annotated[int, typer.Option(min=8, help="Cases of the calibrate corpus.")] = 120,
-    samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording.")] = 8000,
-    minutes: Annotated[float | None, typer.Option(min=0.0, help="Begin no case after these; run again.")] = None,
-    partial: Annotated[bool, typer.Option("--partial", help="Learn from the cases that are done so far.")] = False,
-    json_file: JsonOption = None,
-) -> None:
-    """Learn the constants of the new engine from the calibrate corpus and write them with their provenance.
-
-    Example: micron mismatch calibrate --keep calibration
-    """
-    with _clear_errors():
-        _check_targets(json_file)
-        _check_folder(keep, "--keep")
-        keep.mkdir(exist_ok=True)
-        from tools.mismatch.calibration import calibrate as run_calibration
-        from tools.mismatch.calibration import write_constants
-
-        err = console()
-        limit = float("inf") if minutes is None else minutes
-        body, left = run_calibration(
-            keep,
-            cases,
-            samples,
-            limit,
-            partial=partial,
-            progress=lambda text: err.print(text, markup=False, soft_wrap=True),
-        )
-        if body is None:
-            if not left:
-                raise InputError(f"--cases {cases}: too few of them can be searched to learn from; take more cases")
-            err.print(f"{left} of {cases} cases are still to be done; run the same command again", soft_wrap=True)
-            return
-        file = write_constants(body)
-        err.print(f"constants written: {file}", soft_wrap=True)
-        write_json(body, json_file)
 
 
 @app.command()
@@ -454,8 +292,8 @@ def cut(
 
     Example: micron mismatch cut rec --out whole
     """
-    with _clear_errors():
-        _check_folder(out)
+    with clear_errors():
+        check_folder(out)
         from tools.mismatch.cut import cut as cut_recording
 
         kept = cut_recording(recording, out, start, stop, every)
@@ -491,7 +329,7 @@ def apply(
 
     Example: micron mismatch apply rec rec.json --out twin.py
     """
-    with _clear_errors():
+    with clear_errors():
         if bench_out is not None and bench is None:
             raise InputError("--bench-out names a copy of a bench; name the bench with --bench")
         from tools.mismatch.export.write import check_format, write_twin
@@ -501,7 +339,7 @@ def apply(
             raise InputError(f"--bench takes a twin file; name one that ends in .toml with --out, not {out.name}")
         copy = bench_out or out.with_name("bench.toml")
         decide_on([recording], trust, allow_outside)
-        _check_targets(out, *([] if bench is None else [copy]))
+        check_writable(out, *([] if bench is None else [copy]))
         original = None
         if bench is not None:
             from hal.bench import load_bench
@@ -541,8 +379,8 @@ def simulate(
 
     Example: micron mismatch simulate twin.py rec --out simulated.csv
     """
-    with _clear_errors():
-        _check_targets(out, json_file)
+    with clear_errors():
+        check_writable(out, json_file)
         decide_on([twin, recording], trust, allow_outside)
         from tools.mismatch.export.run import Residual, residuals, simulate_file
         from tools.mismatch.export.write import columns

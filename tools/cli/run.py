@@ -26,11 +26,11 @@ from firmware_py.guardian.process import END_S, REPORT, STARTED, describe
 from firmware_py.inject import check_injections, parse_injection
 from firmware_py.machine.processors import format_processors
 from firmware_py.run_request import RunRequest
+from firmware_py.tremor.config import Method, all_methods
 from hal.bench import check_pace, load_bench
 from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
-from tools.cli.tremor_evaluate import estimator_name
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_writable, write_json
@@ -193,7 +193,7 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
         "voluntary": {"gain": None, "delay_ms": None},
     }
     if truth is not None and outcome["armed_ns"] is not None:
-        from tools.tremor.figures import tremor_figures
+        from tools.reports.figures import tremor_figures
 
         scored = tremor_figures(truth, from_ns=outcome["armed_ns"] + round(SETTLE_S * 1e9), to_ns=outcome["safe_ns"])
         if scored is not None:
@@ -317,3 +317,16 @@ def _shown(status: dict[str, Any], seconds: float, watch: TipWatch) -> Renderabl
     from tools.reports.run_live import live_line
 
     return Text(live_line(status, seconds, watch), no_wrap=True)
+
+
+def estimator_name(name: str) -> Method:
+    """Return ``name``. Raises ``InputError`` for a name that is no estimator of the instrument."""
+    known = all_methods()
+    if name in known:
+        return name
+    if name in ("nn", "cascade"):
+        raise InputError(
+            f"'{name}': the cascade network takes the tip's displacement, steady part and all, and this instrument "
+            "senses acceleration, which has none"
+        )
+    raise InputError(f"'{name}' is no estimator; there are: {', '.join(known)}")

@@ -13,7 +13,7 @@ from firmware_py.designs import design
 from hal.bench import BenchFile, OpenBench
 from hal.clock import Pace, VirtualClock
 from sim_devices.lockstep_world import LockstepWorld
-from tools.tremor.figures import TREMOR_BAND_HZ
+from tools.reports.figures import TREMOR_BAND_HZ
 
 LOOK_NS = 10_000_000
 """Time between two looks at the tip: 100 Hz shows a tremor of 12 Hz."""

@@ -16,7 +16,7 @@ from rich.table import Table
 from rich.text import Text
 
 from tools.output import Outputs, make_folder_of, write_bytes_atomic, write_json, write_text_atomic
-from tools.tremor.figures import AXES, TREMOR_BAND_HZ, band_pass
+from tools.reports.figures import AXES, TREMOR_BAND_HZ, band_pass
 
 Array = NDArray[np.float64]
 NOTHING_UM = 0.2

@@ -1,7 +1,8 @@
 """Faults on purpose, between a driver and its port: wrap any port, real or emulated, and count what was done.
 
 What lives here: a wrapper per kind of port, and the plan that says what happens when.
-What must not: the catalogue of faults and their judgement (``tools.faults``), faults behind the wire (``sim_devices``).
+What must not: the catalogue of faults and their judgement (``tools.research.faults``), faults behind the wire
+(``sim_devices``).
 """
 
 from hal.middleware.faults.can import FaultCan

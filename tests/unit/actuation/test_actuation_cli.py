@@ -18,11 +18,11 @@ from tools.calibrate.piezo import identify_stack
 from tools.calibrate.piezo_excitation import excitation_V
 from tools.calibrate.piezo_prediction import command, predict, simulate, tremor_profile_um
 from tools.cli.main import app
-from tools.manipulator import workspace
 from tools.mismatch.recording import Recording, Split, TwinText
-from tools.reproduce import actuation, names
-from tools.reproduce.actuation_lab import Controller, Tracking
-from tools.reproduce.rows import Row, Table
+from tools.research.manipulator import workspace
+from tools.research.reproduce import actuation, names
+from tools.research.reproduce.actuation_lab import Controller, Tracking
+from tools.research.reproduce.rows import Row, Table
 
 RATE_HZ = 1000.0
 TOML = """format = 1
@@ -156,7 +156,7 @@ def test_reproduce_prints_rows_and_refuses_a_name(tmp_path: Path, monkeypatch: p
     wrong = run("reproduce", "actuatoin")
     assert wrong.exit_code == 2
     assert "'actuatoin' is no table" in wrong.output
-    assert names.MODULES["actuation"] == "tools.reproduce.actuation"
+    assert names.MODULES["actuation"] == "tools.research.reproduce.actuation"
 
 
 def test_rows_put_each_way_beside_its_column(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ from firmware_py.actuation.config import ActuationConfig
 from tests.unit.actuation.truth import tip_from_strokes
 from tools.calibrate.manipulator import identify_manipulator, load_scan, manipulator_calibration
 from tools.errors import InputError
-from tools.manipulator.workspace import analyse
+from tools.research.manipulator.workspace import analyse
 
 BUILT = ActuationConfig(
     ball_circle_m=0.00507, shaft_m=0.0396, lever_gain=(8.15, 7.9, 8.02), rest_heights_m=(6e-6, -7e-6, 1e-6)

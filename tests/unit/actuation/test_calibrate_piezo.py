@@ -102,7 +102,7 @@ def test_poor_excitation_is_named() -> None:
 
 def test_a_real_micromanipulator_is_predicted_from_its_other_recording(shared_data: Path) -> None:
     """Public recording: the paper's own errors come out, prediction and simulated control are as good as they must."""
-    from tools.reproduce.actuation_real import real_stack
+    from tools.research.reproduce.actuation_real import real_stack
 
     *paper, line, goal, preisach, narx = real_stack()
     assert [row.published for row in paper] == [1.68, 0.58]

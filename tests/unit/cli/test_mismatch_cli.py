@@ -14,7 +14,7 @@ from tests.unit.mismatch_report.canned import all_verdicts, missing_physics
 from tests.unit.mismatch_report.contract_check import NAMES, faults
 from tests.unit.mismatch_report.systems import TWIN, recording
 from tools.cli.main import app
-from tools.mismatch.prove.proof import ProofResult
+from tools.research.prove.proof import ProofResult
 
 runner = CliRunner()
 
@@ -228,8 +228,8 @@ def test_prove_prints_its_table_and_writes_json(tmp_path: Path, monkeypatch: pyt
         progress("answers sealed, sha256 [abc]")
         return ProofResult(5, "abc", (), {}, 1.0, tmp_path)
 
-    monkeypatch.setattr("tools.mismatch.prove.prove", prove)
-    monkeypatch.setattr("tools.mismatch.prove.table.show", lambda result, console: console.print("the table"))
+    monkeypatch.setattr("tools.research.prove.prove", prove)
+    monkeypatch.setattr("tools.research.prove.table.show", lambda result, console: console.print("the table"))
     result = run("prove", "--cases", 12, "--seed", 5, "--jobs", 1, "--json", tmp_path / "p.json")
     assert result.exit_code == 0, result.stderr
     assert asked == {"cases": 12, "seed": 5, "jobs": 1, "folder": None}

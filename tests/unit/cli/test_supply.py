@@ -7,8 +7,8 @@ from email.message import Message
 from types import SimpleNamespace
 from typing import Any, cast
 
-from tools.supply.audit import CONSTRAINTS, audited, findings, verdict
-from tools.supply.licences import PYPROJECT, declared, page, parts
+from tools.research.supply.audit import CONSTRAINTS, audited, findings, verdict
+from tools.research.supply.licences import PYPROJECT, declared, page, parts
 
 
 def package(name: str, **fields: str) -> Any:

@@ -13,7 +13,7 @@ from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.closed_loop.simulate import COMMAND_DELAY_S, simulate, wires_of
 from tools.errors import InputError
-from tools.tremor.figures import tremor_figures
+from tools.reports.figures import tremor_figures
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"
 SECONDS = 5.0

@@ -20,7 +20,7 @@ from firmware_py.recording.reader import Recording
 from firmware_py.run_request import RunRequest
 from hal.contracts import Clock
 from hal.middleware.faults import FaultPlan, FaultSerial
-from tools.faults.carriers import SocketPort
+from tools.research.faults.carriers import SocketPort
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron-e727.toml"
 SECONDS = 0.6

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from tools.faults.catalogue import faults
-from tools.faults.phases import HOLD, LEARNING, RAMP, STEADY, Phase
-from tools.faults.points import POINTS, write_bench
-from tools.faults.trial import observe_running
+from tools.research.faults.catalogue import faults
+from tools.research.faults.phases import HOLD, LEARNING, RAMP, STEADY, Phase
+from tools.research.faults.points import POINTS, write_bench
+from tools.research.faults.trial import observe_running
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron-e727.toml"
 NAMES = (

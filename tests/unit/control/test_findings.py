@@ -22,7 +22,7 @@ from hal.errors import (
     ProtocolError,
     SafetyTrip,
 )
-from tools.reports.findings_page import markdown
+from tools.research.reports.findings_page import markdown
 
 ROOT = Path(__file__).parents[3]
 REPORTS = {"report": 1, "doubt": 1, "report_error": 3, "bad_for": 4}
@@ -137,4 +137,4 @@ def test_what_an_error_of_the_buttons_bus_means():
 
 def test_the_page_is_current():
     page = (ROOT / "docs" / "findings.md").read_text(encoding="utf-8")
-    assert page == markdown(), "python -m tools.reports.findings_page docs/findings.md"
+    assert page == markdown(), "python -m tools.research.reports.findings_page docs/findings.md"

@@ -8,11 +8,11 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import DEFAULT_BENCH
-from tools.faults import campaign
-from tools.faults.campaign import Trial, run_campaign
-from tools.faults.fault import Fault, InWorld
-from tools.faults.judge import Observation
 from tools.interrupt import begin_command, is_stopped
+from tools.research.faults import campaign
+from tools.research.faults.campaign import Trial, run_campaign
+from tools.research.faults.fault import Fault, InWorld
+from tools.research.faults.judge import Observation
 
 FAULTS = (Fault("one", InWorld("x", ""), "noticed"), Fault("two", InWorld("y", ""), "noticed"))
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from tools.faults import drift_bound as db
+from tools.research.faults import drift_bound as db
 
 
 def test_in_white_noise_it_is_the_sum_of_squares():

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from tests.conftest import DEFAULT_BENCH
-from tools.faults.campaign import FaultRow, moved_unseen, totals
-from tools.faults.fault import Fault, InWorld, Kill
-from tools.faults.judge import Observation, Seen, judge, neutral_ms, rough_demands
-from tools.faults.pairs import draw_pairs
-from tools.faults.phases import HOLD, LEARNING, PHASES, SELF_TEST, STEADY, accepted_answers
-from tools.faults.trial import command_wire_ns
+from tools.research.faults.campaign import FaultRow, moved_unseen, totals
+from tools.research.faults.fault import Fault, InWorld, Kill
+from tools.research.faults.judge import Observation, Seen, judge, neutral_ms, rough_demands
+from tools.research.faults.pairs import draw_pairs
+from tools.research.faults.phases import HOLD, LEARNING, PHASES, SELF_TEST, STEADY, accepted_answers
+from tools.research.faults.trial import command_wire_ns
 
 MS = 1_000_000
 

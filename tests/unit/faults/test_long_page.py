@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.faults.long_page import with_block
+from tools.research.faults.long_page import with_block
 
 
 def test_a_block_replaces_its_own_and_leaves_the_other(tmp_path: Path):

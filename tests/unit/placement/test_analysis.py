@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from tools.cli.main import app
-from tools.placement.analysis import DOWN_40, RC_RAD_S, Conditions, all_accelerometers, conventional
-from tools.placement.configurations import micron_000, micron_004
+from tools.research.placement.analysis import DOWN_40, RC_RAD_S, Conditions, all_accelerometers, conventional
+from tools.research.placement.configurations import micron_000, micron_004
 
 TIP = np.array([0.0, 0.0, 0.155])
 NOISE = 2.25e-3 * 9.80131

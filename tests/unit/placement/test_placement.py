@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from tools.errors import InputError
-from tools.placement import optimise as optimise_module
-from tools.placement.configurations import cube_004, micron_000, micron_004, micron_004_turned, proposed_004
-from tools.placement.optimise import cost_and_gradient, optimise, weakest_direction, weight_matrix
-from tools.placement.propositions import check_pairs
-from tools.placement.space import load_space, space_latt
-from tools.placement.variance import (
+from tools.research.placement import optimise as optimise_module
+from tools.research.placement.configurations import cube_004, micron_000, micron_004, micron_004_turned, proposed_004
+from tools.research.placement.optimise import cost_and_gradient, optimise, weakest_direction, weight_matrix
+from tools.research.placement.propositions import check_pairs
+from tools.research.placement.space import load_space, space_latt
+from tools.research.placement.variance import (
     angular_noise,
     motion_covariance,
     point_noise,

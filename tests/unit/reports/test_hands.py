@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from tools.reports.hand_limits import Swing, band_rms_um, known_tremor_um, strongest
-from tools.reports.hands import HandRow, markdown
-from tools.tremor.figures import BandFigures, TremorFigures
+from tools.reports.figures import BandFigures, TremorFigures
+from tools.research.reports.hand_limits import Swing, band_rms_um, known_tremor_um, strongest
+from tools.research.reports.hands import HandRow, markdown
 
 T_S = np.arange(4000) / 1000.0
 KEEP = (T_S > 1.0) & (T_S < 3.5)

@@ -13,11 +13,11 @@ from hal.bench import load_bench
 from tests.conftest import DEFAULT_BENCH
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.reports import hands_heldout
-from tools.reports.hand_limits import Swing
-from tools.reports.hands import HandRow
-from tools.reports.hands_heldout import Folder, Source, development_sums, find_recordings, heldout_page
-from tools.tremor.figures import BandFigures, TremorFigures
+from tools.reports.figures import BandFigures, TremorFigures
+from tools.research.reports import hands_heldout
+from tools.research.reports.hand_limits import Swing
+from tools.research.reports.hands import HandRow
+from tools.research.reports.hands_heldout import Folder, Source, development_sums, find_recordings, heldout_page
 
 
 def trembling(
@@ -97,7 +97,7 @@ def test_recordings_that_settings_were_chosen_on_are_left_out(folder: Path, monk
 
 def test_the_list_names_the_recordings_of_the_other_table(shared_data: Path) -> None:
     """Every file of ``micron hands`` is development data; its sums are those of the files."""
-    from tools.reports.hands import HANDS
+    from tools.research.reports.hands import HANDS
 
     listed = development_sums()
     for _, source in HANDS:

@@ -15,16 +15,16 @@ from tests.unit.mismatch_model.test_cascade import PRODUCT, circuit, matrices, u
 from tools.cli.main import app
 from tools.errors import InputError
 from tools.mismatch.engine.diagnose import opened
-from tools.mismatch.prove.disk import toml_text
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.make import make
-from tools.reproduce import measured, measured_rows
-from tools.reproduce.measured import chosen, score, sealed, write_part
-from tools.reproduce.measured_page import document
-from tools.reproduce.measured_rows import Scored, rows_of
-from tools.reproduce.measured_sets import SETS, Goal, MeasuredSet, Published
-from tools.reproduce.names import expand
+from tools.research.prove.disk import toml_text
+from tools.research.reproduce import measured, measured_rows
+from tools.research.reproduce.measured import chosen, score, sealed, write_part
+from tools.research.reproduce.measured_page import document
+from tools.research.reproduce.measured_rows import Scored, rows_of
+from tools.research.reproduce.measured_sets import SETS, Goal, MeasuredSet, Published
+from tools.research.reproduce.names import expand
 
 
 def scored(name: str, corrected: float | None, names: tuple[str, ...], **changes: Any) -> Scored:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from tools.errors import InputError
-from tools.results.artefact import from_markdown, load, read_page, to_markdown, write_result
-from tools.results.page import MISSED, main, page, read_all
+from tools.research.results.artefact import from_markdown, load, read_page, to_markdown, write_result
+from tools.research.results.page import MISSED, main, page, read_all
 
 ROOT = Path(__file__).parents[3]
 FOLDER = ROOT / "docs" / "results"
@@ -39,7 +39,7 @@ A note.
 def test_the_results_page_is_up_to_date():
     made = page(read_all(FOLDER))
     assert (ROOT / "docs" / "results.md").read_text(encoding="utf-8") == made, (
-        "python -m tools.results.page --out docs/results.md"
+        "python -m tools.research.results.page --out docs/results.md"
     )
 
 

@@ -19,7 +19,7 @@ from hal.errors import BenchError
 from tests.unit.allocations import allocations
 from tests.unit.pure_python import assert_kernel_is_python, without_compiler
 from tests.unit.sensing.rigid_body import AXES, POSITIONS, RATE_HZ, frames_of, hand_motion
-from tools.placement.configurations import micron_004
+from tools.research.placement.configurations import micron_004
 
 Array = np.ndarray
 DT_S = 1e-3

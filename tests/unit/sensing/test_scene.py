@@ -17,7 +17,7 @@ from sim_devices.plant.hand import SyntheticHand
 from sim_devices.plant.kernel import NOISES, SLOW_NOISES, TRUTH_COLUMNS, begin
 from sim_devices.plant.unit import build_unit, plant_arrays
 from tests.unit.pure_python import without_compiler
-from tools.reproduce import scene
+from tools.research.reproduce import scene
 
 
 def test_scene_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:

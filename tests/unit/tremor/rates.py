@@ -2,7 +2,7 @@
 
 ``python -m tests.unit.tremor.rates`` prints the table of docs/tremor.md. The limit is the best causal linear filter of
 the bank of that rate, fitted to the very record, at the very delay, with its noise; both are judged behind the filter
-that lifts 8 to 12 Hz, as in ``tools.tremor.bound``.
+that lifts 8 to 12 Hz, as in ``tools.research.tremor.bound``.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from firmware_py.tremor.config import Method, TremorConfig
 from firmware_py.tremor.estimator import Estimator
 from sim_devices.config import HandConfig
 from sim_devices.plant.hand import NODE_S, SyntheticHand
-from tools.tremor.bound import bank_features, lift
+from tools.research.tremor.bound import bank_features, lift
 
 Array = NDArray[np.float64]
 SKIP_S = 5.0

@@ -15,8 +15,8 @@ from firmware_py.tremor.activations import KINDS, activation, bessel_j0, bessel_
 from firmware_py.tremor.cascade import Cascade, CascadeNetwork, cascade_kernel
 from firmware_py.tremor.cascade_file import load_network, network_text
 from hal.errors import BenchError
-from tools.tremor.cascade_kernels import candidate_score, ndekf_pass, quickprop
-from tools.tremor.cascade_training import Paths, Training, train, windows
+from tools.research.tremor.cascade_kernels import candidate_score, ndekf_pass, quickprop
+from tools.research.tremor.cascade_training import Paths, Training, train, windows
 
 
 def network(units: int = 2, **changes: object) -> CascadeNetwork:

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from firmware_py.tremor.config import TremorConfig
 from tools.cli.main import app
-from tools.tremor.cases import emulated_hand
-from tools.tremor.evaluate import ORACLE, OTHERS, Result, evaluate, summarise
-from tools.tremor.manners import manners
-from tools.tremor.scores import Score
+from tools.research.tremor.cases import emulated_hand
+from tools.research.tremor.evaluate import ORACLE, OTHERS, Result, evaluate, summarise
+from tools.research.tremor.manners import manners
+from tools.research.tremor.scores import Score
 
 
 def result(case: str, method: str, lifted: float) -> Result:

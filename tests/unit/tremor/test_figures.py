@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tools.tremor.figures import tremor_figures
+from tools.reports.figures import tremor_figures
 
 RATE_HZ = 1000.0
 

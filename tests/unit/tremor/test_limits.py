@@ -10,11 +10,11 @@ import pytest
 from firmware_py.tremor.adaptive_design import design_adaptive
 from firmware_py.tremor.config import TremorConfig
 from tools.errors import InputError
-from tools.tremor.bound import lift, wiener_bounds
-from tools.tremor.cases import case_of, cases_from, emulated_hand
-from tools.tremor.published import band_passed, held, published_case, two_hundred_taps
-from tools.tremor.scores import score
-from tools.tremor.signal import TremorSignal
+from tools.research.tremor.bound import lift, wiener_bounds
+from tools.research.tremor.cases import case_of, cases_from, emulated_hand
+from tools.research.tremor.published import band_passed, held, published_case, two_hundred_taps
+from tools.research.tremor.scores import score
+from tools.research.tremor.signal import TremorSignal
 
 CONFIG = TremorConfig(sees="displacement", filter_cutoff_rad_s=float("inf"))
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from firmware_py.tremor.config import TremorConfig
-from tools.tremor.adapting import LEADS_S, adapting
-from tools.tremor.cases import emulated_hand, shorter
+from tools.research.tremor.adapting import LEADS_S, adapting
+from tools.research.tremor.cases import emulated_hand, shorter
 
 
 def test_a_hand_is_known_better_after_a_while_and_short_records_are_left_out() -> None:

@@ -12,8 +12,8 @@ from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from tools.cli.main import app
-from tools.tremor.bench_variant import write_variant
-from tools.tremor.budget import MADE, sources
+from tools.research.tremor.bench_variant import write_variant
+from tools.research.tremor.budget import MADE, sources
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"
 

@@ -12,9 +12,9 @@ from firmware_py.control.plan import load_plan
 from hal.bench import load_bench
 from sim_devices.config import EmulationConfig
 from sim_devices.plant.unit import build_unit
-from tools.tremor.bench_variant import merged, write_variant
-from tools.tremor.cases import emulated_hand
-from tools.tremor.ideal import POSITIONS_M, ideal_changes, residuals
+from tools.research.tremor.bench_variant import merged, write_variant
+from tools.research.tremor.cases import emulated_hand
+from tools.research.tremor.ideal import POSITIONS_M, ideal_changes, residuals
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron.toml"
 

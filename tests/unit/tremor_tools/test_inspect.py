@@ -10,10 +10,10 @@ import pytest
 from typer.testing import CliRunner
 
 from tools.cli.main import app
-from tools.tremor.inspect import Rule, inspect
-from tools.tremor.signal import TremorSignal
-from tools.tremor.signals import load_signals
-from tools.tremor.spectrum import line_spread_hz, periodogram
+from tools.research.tremor.inspect import Rule, inspect
+from tools.research.tremor.signal import TremorSignal
+from tools.research.tremor.signals import load_signals
+from tools.research.tremor.spectrum import line_spread_hz, periodogram
 
 RATE_HZ = 100.0
 

@@ -13,12 +13,12 @@ from firmware_py.tremor.cascade import Cascade
 from firmware_py.tremor.cascade_file import load_network
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.reproduce.tremor_hands import PUBLISHED_CROSS
-from tools.tremor.cascade_data import RATE_HZ, Making, learning_paths, subjects, voluntary
-from tools.tremor.report import filled, report, table
-from tools.tremor.report_detectors import detection, jerk_acceleration
-from tools.tremor.shaker import _held_out
-from tools.tremor.signal import TremorSignal
+from tools.research.reproduce.tremor_hands import PUBLISHED_CROSS
+from tools.research.tremor.cascade_data import RATE_HZ, Making, learning_paths, subjects, voluntary
+from tools.research.tremor.report import filled, report, table
+from tools.research.tremor.report_detectors import detection, jerk_acceleration
+from tools.research.tremor.shaker import _held_out
+from tools.research.tremor.signal import TremorSignal
 
 
 def test_paragraphs_are_filled_and_tables_left_alone() -> None:
@@ -119,8 +119,8 @@ def test_train_command_refuses(tmp_path: Path, extra: list[str]) -> None:
 
 
 def test_a_section_is_made_again_and_the_others_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tools.tremor import report as pages
-    from tools.tremor import report_inspect
+    from tools.research.tremor import report as pages
+    from tools.research.tremor import report_inspect
 
     monkeypatch.setattr(pages, "_signals", lambda data: [hand()])
     monkeypatch.setattr(report_inspect, "section", lambda signals, progress: ["## Two", "", "new"])

@@ -9,9 +9,9 @@ import pytest
 
 from hal.even_samples import stamp_share, steady_stamps
 from tools.errors import InputError
-from tools.tremor.clock import rate_from_known
-from tools.tremor.signals import load_signals
-from tools.tremor.spectrum import highest_line, periodogram
+from tools.research.tremor.clock import rate_from_known
+from tools.research.tremor.signals import load_signals
+from tools.research.tremor.spectrum import highest_line, periodogram
 
 
 def wave(t_s: np.ndarray) -> np.ndarray:

@@ -1,0 +1,72 @@
+"""``micron hands``: the closed loop on recorded tremor, as a table."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+
+from hal.bench import load_bench
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import JsonOption, clear_errors, console
+from tools.errors import InputError
+from tools.interrupt import keep_what_is_there, need_some
+from tools.output import check_writable, write_json
+from tools.research.results.artefact import write_result
+from tools.stamp import revision_and_day
+from tools.terminal import task_name
+
+
+def hands(
+    bench: BenchOption = None,
+    data: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder of the real recordings.")] = Path(
+        "../shared/data"
+    ),
+    heldout: Annotated[
+        Path | None, typer.Option(metavar="FOLDER", help="Score every recorded hand of this folder instead.")
+    ] = None,
+    seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Run the instrument in every recorded hand, with each estimator, in virtual time, beside the limits.
+
+    Example: micron hands --out docs/results/hands.json
+
+    Hands that no setting has seen, with the bench's estimator: micron hands --heldout recordings
+    """
+    from tools.research.reports.hands import HandRow, markdown, run_hands
+    from tools.research.reports.hands_heldout import find_recordings, heldout_page, run_heldout
+
+    with clear_errors():
+        check_writable(json_file, out)
+        file = load_bench(bench_path(bench))
+        folder = None if heldout is None else find_recordings(heldout, file)
+        if folder is None and not data.is_dir():
+            raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
+        rows: list[HandRow] = []
+        with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
+            task = progress.add_task("starting")
+
+            def show(text: str) -> None:
+                progress.update(task, description=text)
+
+            with keep_what_is_there():
+                if folder is None:
+                    found = run_hands(file, data, seconds, show)
+                else:
+                    found = run_heldout(file, folder, seconds, show)
+                for row in found:
+                    rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
+        need_some(rows)
+        stamp = revision_and_day()
+        page = markdown(rows, seconds, stamp) if folder is None else heldout_page(folder, rows, seconds, stamp)
+        if out is not None:
+            write_result(out, page)
+        if json_file != "-":
+            typer.echo(page)
+        write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)

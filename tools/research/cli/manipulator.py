@@ -1,0 +1,63 @@
+"""``micron manipulator workspace``: where the tip can go."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.table import Table
+
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.output import check_writable, write_json
+
+app = typer.Typer(help="The three-legged manipulator at the tip.")
+
+
+@app.callback()
+def _group() -> None:
+    """The three-legged manipulator at the tip."""
+
+
+@app.command("workspace")
+def workspace(
+    bench: BenchOption = None,
+    out: Annotated[Path, typer.Option("--out", metavar="PNG", help="Picture of the workspace.")] = Path(
+        "out/workspace.png"
+    ),
+    json_file: JsonOption = None,
+) -> None:
+    """Extents, largest sphere, singularity and conditioning of the bench's manipulator, beside the 50 um tremor.
+
+    Example: micron manipulator workspace --out out/workspace.png
+    """
+    from dataclasses import asdict
+
+    from firmware_py.control.plan import load_plan
+    from hal.bench import load_bench
+    from tools.research.manipulator.picture import save_workspace_picture
+    from tools.research.manipulator.workspace import analyse
+
+    with clear_errors():
+        check_writable(json_file)
+        config = load_plan(load_bench(bench_path(bench))).stages.actuation
+        found = analyse(config)
+        table = Table(title="Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", title_justify="left")
+        for heading in ("quantity", "required", "ours"):
+            table.add_column(heading, justify="left" if heading == "quantity" else "right")
+        x, y, z = found.extent_m * 1e6
+        table.add_row("extent x (um)", "> 1000", f"{x:.0f}")
+        table.add_row("extent y (um)", "> 1000", f"{y:.0f}")
+        table.add_row("extent z (um)", "> 100", f"{z:.1f}")
+        table.add_row("largest sphere, diameter (um)", ">= 100", f"{1e6 * found.sphere_m:.1f}")
+        table.add_row("the same around neutral (um)", "> 50 (tremor)", f"{1e6 * found.neutral_sphere_m:.1f}")
+        table.add_row("tilt in use, at the singularity (deg)", "", f"{found.tilt_deg:.2f}, {found.singular_deg:.1f}")
+        table.add_row("condition of the Jacobian, largest", "", f"{found.condition:.1f}")
+        table.add_row("determinant, smallest / at neutral", "> 0", f"{found.determinant:.3f}")
+        table.add_row("forward(inverse(tip)) - tip (nm)", "< 1", f"{1e9 * found.identity_m:.1e}")
+        table.add_row("Newton steps from level, most", "<= 3", str(found.newton))
+        data_console().print(table)
+        save_workspace_picture(config, found, out)
+        console().print(f"picture: {out}")
+        write_json({"format": 1, "picture": str(out), **asdict(found)}, json_file)

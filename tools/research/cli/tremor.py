@@ -1,0 +1,14 @@
+"""``micron tremor``: what recorded hands do, and what the estimators make of it."""
+
+from __future__ import annotations
+
+import typer
+
+from tools.research.cli import tremor_budget, tremor_evaluate, tremor_inspect, tremor_report, tremor_train
+
+app = typer.Typer(help="Recorded hands: inspect them, train on them, evaluate estimators.")
+app.command("inspect")(tremor_inspect.inspect)
+app.command("evaluate")(tremor_evaluate.evaluate)
+app.command("train")(tremor_train.train)
+app.command("report")(tremor_report.report)
+app.command("budget")(tremor_budget.budget)

@@ -1,0 +1,84 @@
+"""``micron tremor budget``: what each source of error costs at the tip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
+from rich.table import Table
+
+from firmware_py.endoscope.wiring import is_endoscope
+from hal.bench import load_bench
+from tools.cli.bench_option import BenchOption, bench_path
+from tools.cli.common import JsonOption, clear_errors, console, print_whole
+from tools.errors import InputError
+from tools.output import check_writable, write_json
+from tools.terminal import task_name
+
+
+def budget(
+    bench: BenchOption = None,
+    seconds: Annotated[float, typer.Option(min=8.0, max=600.0, help="Virtual seconds of each run.")] = 15.0,
+    ideal: Annotated[
+        bool, typer.Option("--ideal", help="Ideal sensors and manipulator, beside the bound, instead of the budget.")
+    ] = False,
+    json_file: JsonOption = None,
+) -> None:
+    """The closed loop in virtual time with one source of error taken away at a time; with --ideal, with all of them
+    away, beside the bound of the very hand.
+
+    Example: micron tremor budget --seconds 20
+
+    Example: micron tremor budget --ideal --seconds 15
+    """
+    from tools.research.tremor.budget import budget as runs
+
+    with clear_errors():
+        check_writable(json_file)
+        if is_endoscope(load_bench(bench_path(bench)).description):
+            raise InputError("a budget of tremor belongs to the instrument; an endoscope bench cancels none")
+        if ideal:
+            _ideal(bench_path(bench), seconds, json_file)
+            return
+        with _progress() as progress:
+            task = progress.add_task("starting")
+            rows = list(runs(bench_path(bench), seconds, lambda text: progress.update(task, description=text)))
+        if json_file != "-":
+            shown = Table(title="tip tremor in 8-12 Hz, um rms (vector)", title_justify="left")
+            shown.add_column("taken away")
+            for name in ("without the loop", "with it", "less (%)", "cost"):
+                shown.add_column(name, justify="right")
+            for row in rows:
+                figures = (row.uncompensated_rms_um, row.compensated_rms_um, row.reduction_percent, row.cost_um)
+                name = "nothing: all errors on" if row is rows[0] else row.source
+                shown.add_row(name, *(f"{v:.2f}" for v in figures))
+            print_whole(shown)
+        write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
+
+
+def _progress() -> Progress:
+    columns = (SpinnerColumn(), task_name(), TimeElapsedColumn())
+    return Progress(*columns, console=console(), transient=True)
+
+
+def _ideal(bench: Path, seconds: float, json_file: str | None) -> None:
+    from tools.research.tremor.ideal import GOAL, IdealRow, ideal_run
+
+    rows: list[IdealRow] = []
+    with _progress() as progress:
+        task = progress.add_task("starting")
+        for noise in (True, False):
+            progress.update(task, description=f"ideal instrument, accelerometer noise {'on' if noise else 'off'}")
+            rows.append(ideal_run(bench, seconds, noise))
+    if json_file != "-":
+        shown = Table(title="ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted", title_justify="left")
+        shown.add_column("sensors")
+        for name in ("loop", "estimator alone", "bound", f"loop / bound, goal {GOAL:g}", "less in 8-12 Hz (%)"):
+            shown.add_column(name, justify="right")
+        for row in rows:
+            figures = (row.loop_um, row.estimator_um, row.bound_um, row.ratio, row.reduction_percent)
+            shown.add_row(row.what, *(f"{v:.2f}" for v in figures))
+        print_whole(shown)
+    write_json({"format": 1, "seconds": seconds, "ideal": [row.as_dict() for row in rows]}, json_file)

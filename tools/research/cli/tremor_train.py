@@ -1,0 +1,110 @@
+"""``micron tremor train``: a cascade network from recorded hands."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import typer
+from rich.table import Table
+
+from tools.cli.common import JsonOption, clear_errors, console, data_console
+from tools.errors import InputError
+from tools.output import check_writable, write_json, write_text_atomic
+
+
+def train(
+    recordings: Annotated[
+        list[str], typer.Argument(metavar="RECORDING[#NAME]...", help="Gyroscope recordings of hands.")
+    ],
+    out: Annotated[Path, typer.Option(metavar="FILE", help="Weights (JSON), what the firmware loads.")] = Path(
+        "out/cascade.json"
+    ),
+    leave_out: Annotated[
+        list[str] | None, typer.Option(metavar="PERSON", help="Not trained on, tested on; may be repeated.")
+    ] = None,
+    target: Annotated[
+        Literal["voluntary", "error"], typer.Option(help="What the network gives: NN_vm or NN_err.")
+    ] = "voluntary",
+    window: Annotated[
+        int | None, typer.Option(min=2, max=400, help="Inputs; without it several windows are tried.")
+    ] = None,
+    spacing: Annotated[int, typer.Option(min=1, max=20, help="Samples of 4 ms between inputs.")] = 1,
+    units: Annotated[int, typer.Option(min=0, max=20, help="Hidden units at most.")] = 4,
+    centred: Annotated[
+        bool, typer.Option(help="Take the window's mean out: where the hand is does not matter.")
+    ] = True,
+    error_above_hz: Annotated[
+        float, typer.Option(min=0.1, max=5.0, help="What counts as error (Ang 2004, 5.3.3).")
+    ] = 2.0,
+    seed: Annotated[int, typer.Option(min=0)] = 1,
+    json_file: JsonOption = None,
+) -> None:
+    """Train on one file of each person, test on the others' files, write the weights.
+
+    Example: micron tremor train ../shared/data/tremor_mouse_lsm9ds1 --leave-out mouse23 --out out/cascade.json
+    """
+    from firmware_py.tremor.cascade_file import network_text
+    from tools.research.tremor.cascade_data import Making, subjects, voluntary
+    from tools.research.tremor.cascade_study import TEST_SEED, WINDOWS, mean_percent, score, search
+    from tools.research.tremor.cascade_training import Training
+    from tools.research.tremor.signals import load_signals
+
+    with clear_errors():
+        check_writable(json_file, out)
+        making = Making(error_above_hz=error_above_hz)
+        signals = [s for r in recordings for s in load_signals(r) if s.quantity == "angular rate"]
+        if not signals:
+            raise InputError(f"{', '.join(recordings)}: no gyroscope recording; training integrates angular rate once")
+        people = subjects(signals, making)
+        known = [p.name for p in people]
+        for name in leave_out or []:
+            if name not in known:
+                raise InputError(f"--leave-out {name}: no such person; there are: {', '.join(known)}")
+        learning = [p for p in people if p.name not in (leave_out or [])]
+        if not learning:
+            raise InputError("--leave-out leaves nobody to train on")
+        how = Training(units=units, target=target, centred=centred, seed=seed)
+        windows = WINDOWS if window is None else ((window, spacing),)
+        names = ", ".join(p.name for p in learning)
+        note = f"trained by micron tremor train on {names}; error above {error_above_hz:g} Hz"
+        with console().status("training"):
+            try:
+                trained = search([p.errors[0] for p in learning], making, replace(how), windows, 2, note)
+            except ValueError as error:
+                raise InputError(f"{error}; a smaller --window or --spacing fits") from error
+        wanted = voluntary(making, TEST_SEED)
+        network = trained.network
+        table = Table(
+            title=f"{network.window} inputs x {network.spacing}, hidden: {', '.join(network.kinds) or 'none'}"
+        )
+        for column in ("person", "trained on", "files tested", "less rms error (%)", "linear (%)"):
+            table.add_column(column, justify="left" if column == "person" else "right")
+        rows: list[dict[str, object]] = []
+        for person in people:
+            inside = person in learning
+            files = person.errors[1 if inside else 0 :]
+            if not files:
+                continue
+            ours, linear = (mean_percent([score(n, e, wanted) for e in files]) for n in (network, trained.linear))
+            rows.append({"person": person.name, "trained_on": inside, "percent": ours, "linear_percent": linear})
+            table.add_row(person.name, "yes" if inside else "no", str(len(files)), f"{ours:.1f}", f"{linear:.1f}")
+        write_text_atomic(out, network_text(network))
+        if json_file != "-":
+            data_console().print(table)
+        console().print(f"weights: {out}")
+        write_json(
+            {
+                "format": 1,
+                "weights": str(out),
+                "window": network.window,
+                "spacing": network.spacing,
+                "hidden": list(network.kinds),
+                "validation_error": list(trained.validation_error),
+                "training_error": list(trained.training_error),
+                "candidates_tried": trained.candidates_tried,
+                "rows": rows,
+            },
+            json_file,
+        )

@@ -1,0 +1,138 @@
+"""`micron mismatch calibrate`: search the calibrate corpus, keep what a decision reads of each search, and learn."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from firmware_py.recording.revision import git_revision
+from tools.mismatch.infer.constants import FILE, START
+from tools.mismatch.infer.learn import Case, cross_validated, learn, learn_sure, raw_surenesses, traits_of
+from tools.mismatch.infer.run import infer
+from tools.mismatch.recording_load import load
+from tools.output import write_text_atomic
+from tools.research.prove.corpus import CORPORA, answers_digest, digest_of, draw_case, generator_digest
+from tools.research.prove.exact import reliability
+from tools.research.prove.guests import installed
+from tools.research.prove.harness import SHARED
+from tools.research.prove.plans import SELDOM
+
+SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("density", "search", "store")))
+"""What the traits of a search depend on."""
+LEAST_CASES = 15
+"""Cases with fewer of which no constants are learned."""
+EVERY = 3
+"""One case in so many is kept for the map of "sure" alone."""
+
+
+def traits_file(folder: Path, samples: int) -> Path:
+    """Where the traits of searches with the present sources are kept."""
+    digest = f"{digest_of(*SEARCHING)[:12]}-{generator_digest()[:12]}"
+    return folder / f"traits-{samples}-{digest}.jsonl"
+
+
+def gather(
+    folder: Path, numbers: Sequence[int], samples: int, minutes: float, progress: Callable[[str], None]
+) -> tuple[dict[int, dict[str, Any]], int]:
+    """(traits by number of the case, how many of ``numbers`` are still to be done); a stopped run goes on.
+
+    Twins whose every run is a program (an FMU, the bench) are left out: one costs as much as ten others.
+    """
+    file, digest = traits_file(folder, samples), digest_of(*SEARCHING)
+    done: dict[int, dict[str, Any]] = {}
+    for line in file.read_text().splitlines() if file.exists() else ():
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            continue
+        done[int(row["number"])] = row
+    until = time.monotonic() + 60.0 * minutes
+    corpus = CORPORA["calibrate"]
+    with file.open("a") as rows:
+        for number in numbers:
+            if number in done or time.monotonic() > until:
+                continue
+            row: dict[str, Any] = {"number": number, "search": digest}
+            began = time.process_time()
+            drawn = draw_case(corpus, number, folder, samples)
+            if drawn is not None and drawn.answer["twin"] not in SELDOM:
+                with installed(drawn.recording):
+                    row["traits"] = traits_of(infer(load(drawn.recording), START))
+                row["answer"] = drawn.answer
+            row["cpu_s"] = round(time.process_time() - began, 2)
+            rows.write(json.dumps(row, default=float) + "\n")
+            rows.flush()
+            done[number] = row
+            progress(f"{len(done)} kept  case {number}  {row['cpu_s']:.1f} s of CPU")
+    return {n: done[n] for n in numbers if n in done}, sum(n not in done for n in numbers)
+
+
+def calibrate(
+    folder: Path,
+    cases: int,
+    samples: int,
+    minutes: float = float("inf"),
+    *,
+    partial: bool = False,
+    progress: Callable[[str], None] = print,
+) -> tuple[dict[str, Any] | None, int]:
+    """(what belongs into ``constants.json``, cases that are still to be done).
+
+    None instead of constants while cases are open, unless ``partial`` asks to learn from those that are done, and of
+    fewer than ``LEAST_CASES``.
+    """
+    rows, left = gather(folder, range(cases), samples, minutes, progress)
+    kept = {n: r for n, r in rows.items() if "traits" in r}
+    if (left and not partial) or len(kept) < LEAST_CASES:
+        return None, left
+    known = {n: case_of(n, r) for n, r in kept.items()}
+    main = [c for n, c in known.items() if n % EVERY]
+    apart = [c for n, c in known.items() if n % EVERY == 0]
+    constants = learn_sure(learn(main), apart)
+    corpus = CORPORA["calibrate"]
+    stated = [p for k in range(len(apart)) for p in _left_out(constants, apart, k)]
+    return {
+        "format": 1,
+        "constants": constants.to_json(),
+        "provenance": {
+            "learned": True,
+            "revision": git_revision(),
+            "generator": generator_digest(),
+            "search": sorted({str(r["search"]) for r in kept.values()}),
+            "seeds": [corpus.first, corpus.seed_of(cases - 1)],
+            "numbers": list(kept),
+            "cases": len(kept),
+            "without": sorted(SELDOM),
+            "max_samples": samples,
+            "corpus_sha256": answers_digest([r["answer"] for r in kept.values()]),
+            "searched_with": START.to_json(),
+            "date": time.strftime("%Y-%m-%d", time.gmtime()),
+        },
+        "cross_validated": {
+            **cross_validated(main),
+            "with_the_start": float(sum(c.right(START) for c in main)),
+            "true_set_was_searched": float(sum(any(s.names == c.names for s in c.sets) for c in main)),
+            "sure": {"cases": len(apart), **reliability(stated)},
+        },
+    }, left  # fmt: skip
+
+
+def _left_out(constants: Any, cases: list[Case], k: int) -> list[tuple[float, float]]:
+    """Names of one case with the map of "sure" that the others give."""
+    others = learn_sure(constants, cases[:k] + cases[k + 1 :])
+    return [(n.sure, float(n.right)) for n in raw_surenesses(others, [cases[k]])]
+
+
+def case_of(number: int, row: dict[str, Any]) -> Case:
+    """A row of traits with its answer."""
+    names = [e["name"] for e in row["answer"]["effects"] if e["name"] != "unknown"]
+    return Case.of(f"c{number:05d}", row["answer"]["kind"], names, row["traits"])
+
+
+def write_constants(body: dict[str, Any], file: Path = FILE) -> Path:
+    """Write the constants where the engine reads them."""
+    write_text_atomic(file, json.dumps(body, indent=1) + "\n")
+    return file

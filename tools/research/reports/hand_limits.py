@@ -1,0 +1,91 @@
+"""What no instrument of this kind could better in one hand: the manipulator's stroke, and causal estimation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from firmware_py.actuation.config import ActuationConfig
+from firmware_py.actuation.stage import Actuation
+from firmware_py.frame import CONFIDENCE, DESIRED_TIP, LAYOUT, TREMOR_AHEAD, TREMOR_CORE
+from firmware_py.tremor.adaptive_design import band
+from firmware_py.tremor.config import AdaptiveConfig
+from tools.reports.figures import TREMOR_BAND_HZ, band_pass
+from tools.research.tremor.cases import RATE_HZ
+from tools.research.tremor.ideal import bound_residual
+
+Array = NDArray[np.float64]
+
+
+SWING_S = 3.0
+
+
+@dataclass(frozen=True)
+class Swing:
+    """The strongest ``seconds`` of a hand in 8 to 12 Hz: their share of the power of all that was scored."""
+
+    start_s: float
+    """After the start of the run."""
+    seconds: float
+    share: float
+    rms_um: float
+    rest_um: float
+    """rms of all the rest; 0 where there is none."""
+
+
+def strongest(truth: Mapping[str, Array], from_ns: int, to_ns: int) -> Swing:
+    """Of the hand alone (the manipulator resting), between two instants of the run."""
+    t_ns = np.asarray(truth["t_ns"])
+    moved = np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"])
+    power = np.sum(band_pass(moved, RATE_HZ, TREMOR_BAND_HZ) ** 2, axis=1)
+    rows = np.flatnonzero((t_ns >= from_ns) & (t_ns < to_ns))
+    length = min(round(SWING_S * RATE_HZ), len(rows))
+    so_far = np.concatenate([[0.0], np.cumsum(power[rows])])
+    sums = so_far[length:] - so_far[:-length]
+    best = int(np.argmax(sums))
+    whole, inside, others = float(so_far[-1]), float(sums[best]), len(rows) - length
+    return Swing(
+        float(t_ns[rows[best]] - t_ns[0]) * 1e-9,
+        length / RATE_HZ,
+        inside / whole,
+        float(1e6 * np.sqrt(inside / length)),
+        float(1e6 * np.sqrt(max(whole - inside, 0.0) / others)) if others else 0.0,
+    )
+
+
+def band_rms_um(x: Array, keep: NDArray[np.bool_]) -> float:
+    """``x`` (n, 3) m in 8 to 12 Hz over the rows ``keep``, as a vector, um."""
+    return float(1e6 * np.sqrt(np.mean(np.sum(band_pass(x, RATE_HZ, TREMOR_BAND_HZ)[keep] ** 2, axis=1))))
+
+
+def known_tremor_um(truth: Mapping[str, Array], keep: NDArray[np.bool_], body: Array, config: ActuationConfig) -> float:
+    """um rms left in 8 to 12 Hz if the tremor were known: only the strokes and the way slow motion yields to it.
+
+    ``body`` (3, 3): axes of the body as columns, in the world.
+    """
+    moved = (np.asarray(truth["tip_rigid_m"]) - np.asarray(truth["intended_m"])) @ body
+    moved = moved - moved.mean(axis=0)
+    hz = np.asarray(np.fft.rfftfreq(len(moved), 1.0 / RATE_HZ), dtype=np.float64)
+    lines = np.fft.rfft(moved, axis=0)
+    a = AdaptiveConfig()
+    whole, core = (
+        np.asarray(np.fft.irfft(lines * band(hz, edges)[:, None], len(moved), axis=0))
+        for edges in ((*a.cancel_from_hz, *a.cancel_to_hz), a.core_hz)
+    )
+    frames = np.zeros((len(moved), LAYOUT.size))
+    frames[:, CONFIDENCE : CONFIDENCE + 3] = 1.0
+    frames[:, TREMOR_AHEAD : TREMOR_AHEAD + 3] = whole
+    frames[:, TREMOR_CORE : TREMOR_CORE + 3] = core
+    # clipped, because nothing is to be kept still above the band here
+    stage = Actuation(config.model_copy(update={"mounting": tuple(map(tuple, np.eye(3))), "overdrive": 0.0}))
+    for frame in frames:
+        stage.step(frame)
+    return band_rms_um(moved + frames[:, DESIRED_TIP : DESIRED_TIP + 3], keep)
+
+
+def causal_um(truth: Mapping[str, Array], keep: NDArray[np.bool_]) -> float:
+    """um rms left in 8 to 12 Hz by the best causal linear filter, fitted to this very hand; no stroke ends."""
+    return band_rms_um(bound_residual(truth, keep, noise=True), keep)

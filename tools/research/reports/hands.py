@@ -1,0 +1,206 @@
+"""The instrument in real hands: closed loop on recorded tremor, for three estimators, beside the limits, as a table.
+
+Recorded hands give the tremor; voluntary path and drift stay synthetic, all sensor and actuator errors are on. Runs are
+those without wires (``tools.closed_loop``), which leave the same tremor as runs over the wire.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from math import isfinite
+from pathlib import Path
+from textwrap import wrap
+from typing import Any
+
+import numpy as np
+
+from hal.bench import BenchFile
+from sim_devices.config import emulation_config
+from sim_devices.plant.hand_file import load_hand
+from sim_devices.plant.recorded_hand import make_hand
+from tools.closed_loop.simulate import SimulatedRun, simulate
+from tools.reports.figures import TremorFigures, tremor_figures
+from tools.research.reports.hand_limits import Swing, causal_um, known_tremor_um, strongest
+
+METHODS = ("adaptive", "kalman", "wflc_flc")
+SETTLE_S = 5.0
+GOAL_PERCENT = 70.0
+HANDS = (
+    ("physiological tremor of a stretched arm", "tremor_duke_adxl345/data.npz#arm_extended_no_tremor"),
+    ("wrist, imitated tremor", "tremor_duke_adxl345/data.npz#on_wrist_simulated_tremor1"),
+    ("shaker at 10.4 Hz", "tremor_duke_adxl345/data.npz#10.4low"),
+    ("hand on a mouse, essential tremor (23)", "tremor_mouse_lsm9ds1/imu_23.npz#20:80"),
+    ("hand on a mouse, participant 5", "tremor_mouse_lsm9ds1/imu_05.npz#20:80"),
+    # 7 of its 15 windows of 4 s with tremor; settings were chosen on 80 to 230 s
+    ("wrist gyroscope, Parkinson's disease", "tremor_paradigma_pd/data.npz#305:365"),
+)
+
+
+@dataclass(frozen=True)
+class HandRow:
+    """One hand, one estimator."""
+
+    hand: str
+    source: str
+    method: str
+    figures: TremorFigures
+    limited_percent: float
+    stroke_limit_um: float
+    """Left in 8 to 12 Hz if the tremor were known: what the strokes take."""
+    causal_limit_um: float
+    """Left there by the best causal linear filter fitted to this hand, without any stroke's end."""
+    swing: Swing
+    recorded_s: float = float("inf")
+    """Length of the recording: a run that is longer plays it again. ``inf``: a hand that is not recorded."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """JSON values."""
+        return {
+            "hand": self.hand,
+            "source": self.source,
+            "method": self.method,
+            "recorded_s": self.recorded_s if isfinite(self.recorded_s) else None,
+            "limited_percent": self.limited_percent,
+            "stroke_limit_um": self.stroke_limit_um,
+            "causal_limit_um": self.causal_limit_um,
+            "swing": asdict(self.swing),
+            **self.figures.to_json(),
+        }
+
+
+def run_hands(bench: BenchFile, data: Path, seconds: float, progress: Callable[[str], None]) -> Iterator[HandRow]:
+    """Every hand that is there, with every estimator."""
+    cases: list[tuple[str, str | None]] = [("synthetic hand, seed 1", None)]
+    cases += [(name, str(data / source)) for name, source in HANDS if (data / source.split("#")[0]).exists()]
+    for name, source in cases:
+        limits: tuple[float, float] | None = None
+        recorded_s = load_hand(source).seconds if source else float("inf")
+        for method in METHODS:
+            row = run_hand(bench, name, source, seconds, progress, method=method, limits=limits, recorded_s=recorded_s)
+            if row is None:
+                continue
+            limits = row.stroke_limit_um, row.causal_limit_um
+            yield row
+
+
+def run_hand(
+    bench: BenchFile,
+    name: str,
+    source: str | None,
+    seconds: float,
+    progress: Callable[[str], None],
+    *,
+    method: str | None = None,
+    limits: tuple[float, float] | None = None,
+    recorded_s: float = float("inf"),
+) -> HandRow | None:
+    """One hand, one estimator (the bench's own, if none is named); None for a run too short to be scored.
+
+    ``limits``: those of this hand, where they are known from another estimator's run.
+    """
+    progress(f"{name}, {method}" if method else name)
+    run = simulate(bench, seconds, hand_file=source, method=method)
+    from_ns = run.armed_ns + round(SETTLE_S * 1e9)
+    figures = tremor_figures(run.truth, from_ns=from_ns, to_ns=run.safe_ns)
+    if figures is None:
+        return None
+    if limits is None:
+        progress(f"{name}, limits")
+        limits = _limits(bench, source, run, from_ns)
+    limited = 100.0 * run.clipped / (1000.0 * seconds)
+    where = Path(source).name if source else "-"
+    swing = strongest(run.truth, from_ns, run.safe_ns)
+    used = run.configs.tremor.method
+    return HandRow(name, where, used, figures, limited, *limits, swing, recorded_s)
+
+
+def _limits(bench: BenchFile, source: str | None, run: SimulatedRun, from_ns: int) -> tuple[float, float]:
+    emulation = emulation_config(bench.description.model_dump())
+    body = make_hand(emulation.hand, emulation.seed, source).frame
+    t_ns = np.asarray(run.truth["t_ns"])
+    keep = (t_ns >= from_ns) & (t_ns < run.safe_ns - 500_000_000)  # zero-phase bands are not trusted at the end
+    return known_tremor_um(run.truth, keep, np.asarray(body), run.configs.actuation), causal_um(run.truth, keep)
+
+
+def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
+    """The page ``docs/results/hands.json``."""
+    lines = [
+        "# First results: the closed loop in real hands",
+        "",
+        f"Made by `micron hands --out docs/results/hands.json`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"time each, scored from {SETTLE_S:g} s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the",
+        "physical truth, manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p",
+        "in 8-12 Hz over the whole part that was chosen; the emulated instrument has all its sensor and actuator",
+        "errors on.",
+        "",
+        "| hand | estimator | without (um rms) | with (um rms) | less (%) | limits: stroke, causal (%) "
+        "| at a limit (% of ticks) | all bands, without -> with (um rms) |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        vector, whole = row.figures.vector, row.figures.whole_band
+        before = vector.uncompensated_rms_um
+        stroke, causal = (100.0 * (1.0 - left / before) for left in (row.stroke_limit_um, row.causal_limit_um))
+        cells = (
+            row.hand,
+            row.method,
+            f"{before:.2f}",
+            f"{vector.compensated_rms_um:.2f}",
+            f"{vector.reduction_percent:.1f}",
+            f"{stroke:.1f}, {causal:.1f}",
+            f"{row.limited_percent:.1f}",
+            f"{whole.uncompensated_rms_um:.1f} -> {whole.compensated_rms_um:.1f}",
+        )
+        lines.append(f"| {' | '.join(cells)} |")
+    best = {row.hand: row.figures.vector.reduction_percent for row in rows if row.method == METHODS[0]}
+    missed = [hand for hand, less in best.items() if less < GOAL_PERCENT]
+    short = [f"{hand} ({best[hand]:.1f} %)" for hand in missed]
+    lines += [
+        "",
+        f"Goal: {GOAL_PERCENT:g} % with the default estimator, `{METHODS[0]}`: reached in {len(best) - len(short)} of "
+        f"{len(best)} hands" + (f"; not in: {', '.join(short)}." if short else "."),
+        "",
+        "Limits: what the stroke alone would leave if the tremor were known beforehand, and what the best causal",
+        "linear filter leaves, fitted to this very hand and with sensor noise, if no stroke ended. Both at once leave",
+        "more.",
+        "",
+        *(line for row in rows if row.hand in missed and row.method == METHODS[0] for line in (*explain_miss(row), "")),
+        *_played_again(rows, seconds),
+        "Published for comparison: 69 % with WFLC alone in one dimension, sensing excluded (Ang 2004, section 5.2).",
+        "All bands: error against the intended path. It holds what the instrument does not try to cancel: drift, jerks",
+        "and everything below 2 Hz. At a limit: the wanted displacement was out of the manipulator's reach or the",
+        "amplifier's range. Motion below the tremor band yields its stroke to the band, so its error can stay large.",
+        "",
+    ]
+    return "\n".join(lines)
+
+
+def _played_again(rows: list[HandRow], seconds: float) -> list[str]:
+    """Which hands are shorter than a run, so that the estimator meets the same tremor more than once."""
+    short = {row.hand: row.recorded_s for row in rows if row.recorded_s < seconds}
+    if not short:
+        return []
+    named = ", ".join(f"{hand} ({length:.0f} s)" for hand, length in short.items())
+    text = f"Records shorter than the run are played again from their start: {named}. There the estimator meets tremor "
+    return [*wrap(text + "that it has met before in the same run.", 110), ""]
+
+
+def explain_miss(row: HandRow) -> list[str]:
+    """What the figures say of a hand that misses the goal; nothing that they do not."""
+    vector, swing = row.figures.vector, row.swing
+    said = [f"{row.hand[0].upper()}{row.hand[1:]}:"]
+    if swing.rms_um > 3.0 * swing.rest_um > 0.0:
+        said.append(
+            f"{100.0 * swing.share:.0f} % of the tremor's power is one swing from {swing.start_s:.0f} to "
+            f"{swing.start_s + swing.seconds:.0f} s after the start, {swing.rms_um:.0f} um rms against "
+            f"{swing.rest_um:.1f} um in all the rest: it decides the figure, and the estimator meets it unprepared "
+            "(the causal limit has seen it)."
+        )
+    elif swing.rest_um > 0.0:
+        share = f"{100.0 * swing.share:.0f} % of the tremor's power"
+        said.append(f"its strongest {swing.seconds:g} s hold {share}: no single swing.")
+    least = 100.0 * (1.0 - row.stroke_limit_um / vector.uncompensated_rms_um)
+    said.append(f"With the tremor known beforehand the stroke would allow {least:.1f} %;")
+    said.append(f"the manipulator is at a limit in {row.limited_percent:.1f} % of the ticks.")
+    return wrap(" ".join(said), 110)

@@ -1,0 +1,70 @@
+"""The BROAD trials as arrays (D. Laidig et al., Data 6 (7), 2021): every file that the set's ``meta.toml`` names."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.research.reproduce.orientation_error import Array, east_north_up, rms_errors_deg
+from tools.research.reproduce.recordings import data_folder, meta
+
+BROAD_HZ = 1.0 / 0.0035
+
+
+@dataclass(frozen=True)
+class Trial:
+    """``rate`` rad/s, ``force`` m/s^2, ``field`` uT (n, 3); ``truth`` (n, 4) east-north-up; ``published`` figures."""
+
+    name: str
+    rate: Array
+    force: Array
+    field: Array
+    truth: Array
+    counts: NDArray[np.bool_]
+    published: dict[str, Any]
+
+    @property
+    def disturbed(self) -> bool:
+        """Return whether the set's authors disturbed it (taps or magnets)."""
+        return "_disturbed_" in str(self.published["name"])
+
+    def errors_deg(self, attitude: Array) -> tuple[float, float, float]:
+        """Total, heading, inclination rms of quaternions (n, 4) whose world has x to magnetic north."""
+        return rms_errors_deg(east_north_up(attitude), self.truth, self.counts)
+
+
+def trials() -> list[Trial]:
+    """All trials that are there."""
+    found = []
+    for entry in meta("broad")["files"]:
+        found.append(read_trial(data_folder() / "broad" / entry["name"], entry))
+    return found
+
+
+def read_trial(path: Path, entry: dict[str, Any]) -> Trial:
+    """One file of the set; ``entry`` is what its meta.toml says of it."""
+    with np.load(path) as data:
+        rate, force, field, truth = (
+            np.ascontiguousarray(np.stack([data[f"{stem}_{axis}{unit}"] for axis in axes], axis=1).astype(np.float64))
+            for stem, axes, unit in (
+                ("gyro", "xyz", "_rad_s"),
+                ("acc", "xyz", "_m_s2"),
+                ("mag", "xyz", "_uT"),
+                ("opt_quat", "wxyz", ""),
+            )
+        )
+        return Trial(path.name[:2], rate, force, field, truth, data["movement"].astype(bool), entry)
+
+
+def vqf_errors_deg(trial: Trial) -> tuple[float, float, float] | None:
+    """The vqf package (its defaults) on the same samples; None when it is not installed (development extra)."""
+    try:
+        from vqf import VQF  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return None
+    found = np.asarray(VQF(1.0 / BROAD_HZ).updateBatch(trial.rate, trial.force, trial.field)["quat9D"])
+    return rms_errors_deg(found, trial.truth, trial.counts)

@@ -1,0 +1,260 @@
+"""``micron reproduce real-sensors``: published figures of public recordings beside ours.
+
+The recordings lie beside the project (``../shared/data``, or the folder that MICRON_DATA names); a set that is not
+there is left out with a note.
+"""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from math import floor, log10
+
+import numpy as np
+
+from tools.calibrate.ellipsoid import fit_ellipsoid
+from tools.calibrate.gyroscope import fit_gyroscope
+from tools.calibrate.logs import load_log
+from tools.calibrate.multi_position import fit_poses, identify_poses
+from tools.calibrate.still import quiet_level
+from tools.errors import InputError
+from tools.noise.allan import allan_curve
+from tools.research.reproduce import broad
+from tools.research.reproduce.recordings import data_folder, meta
+from tools.research.reproduce.rows import Row, Table, build
+
+ACCELEROMETER = ("acc_x_raw", "acc_y_raw", "acc_z_raw")
+GYROSCOPE = ("gyro_x_raw", "gyro_y_raw", "gyro_z_raw")
+
+
+def xsens() -> list[Row]:
+    """Accelerometer of an Xsens MTi from still poses."""
+    log = load_log(data_folder() / "imu_tk_xsens")
+    about = meta("imu_tk_xsens")
+    factory, own = about["reference_factory"], about["reference_own_fit"]["acc_scale_count_per_m_s2"]
+    result = identify_poses(log.matrix(ACCELEROMETER), log.need_rate(), 9.81744)
+    source, condition = "imu_tk, Xsens MTi (factory)", f"{result.poses} poses, |g| = 9.81744 m/s^2"
+    rows = [
+        Row(source, "residual of |a|", "m/s^2", condition, 0.0135, result.residual_m_s2, "lower", "recording"),
+        Row(
+            "imu_tk, Xsens MTi (own nine-parameter fit)",
+            "residual of |a|",
+            "m/s^2",
+            condition,
+            0.0010,
+            result.residual_m_s2,
+            "lower",
+            "recording",
+        ),
+    ]
+    for i, axis in enumerate("xyz"):
+        scale = factory["acc_scale_count_per_m_s2"][i]
+        rows += [
+            Row(
+                source,
+                f"scale {axis}",
+                "count/(m/s^2)",
+                condition,
+                float(scale),
+                1.0 / result.parameters[f"scale_{axis}"].value,
+                "equal",
+                "recording",
+                tolerance=0.5,
+                why=f"printed to three digits; nine parameters fitted by those who collected the set give {own[i]:g}",
+            ),
+            # the factory's own |a| scatters by 0.0135 m/s^2 over these poses: that much of an offset is within it
+            Row(
+                source,
+                f"offset {axis}",
+                "count",
+                condition,
+                float(factory["acc_offset_count"][i]),
+                result.parameters[f"bias_{axis}"].value,
+                "equal",
+                "recording",
+                tolerance=0.0135 * scale,
+                why="within the factory calibration's own scatter on these poses, 0.0135 m/s^2",
+            ),
+        ]
+    return rows
+
+
+def mpu6050() -> list[Row]:
+    """Accelerometer of an MPU-6050 from ten poses: those that we find, and the author's, three of them under 0.3 s."""
+    log = load_log(data_folder() / "mpu6050_tomisuarez" / "calibration.npz", 100.0)
+    about = meta("mpu6050_tomisuarez")
+    reference, intervals = about["reference_accelerometer"], about["reference_static_intervals"]
+    raw = log.matrix(ACCELEROMETER)
+    found = identify_poses(raw, 100.0, 9.80665)
+    bounds = list(zip(intervals["start_sample"], intervals["stop_sample"], strict=True))
+    mean = np.array([raw[a : b + 1].mean(axis=0) for a, b in bounds])
+    samples = np.array([b + 1 - a for a, b in bounds], dtype=np.float64)
+    noise = quiet_level(raw, 50) / np.sqrt(3.0 * np.median(samples))
+    result = fit_poses(mean, np.minimum(samples, 200.0), 9.80665, pose_noise=float(noise))
+    source, condition = "tomisuarez2/ImuCalibration, MPU-6050", "the author's own ten intervals"
+    published = reference["magnitude_calibrated_m_s2"][1]
+    rows = [
+        Row(source, "residual of |a|", "m/s^2", what, published, fit.residual_m_s2, "lower", "recording")
+        for what, fit in ((f"{found.poses} poses found", found), (condition, result))
+    ]
+    for i, axis in enumerate("xyz"):
+        scale, bias = result.parameters[f"scale_{axis}"], result.parameters[f"bias_{axis}"]
+        rows += [
+            Row(
+                source,
+                f"scale {axis}",
+                "m/s^2 per count",
+                condition,
+                reference["scale_m_s2_per_count"][i],
+                scale.value,
+                "equal",
+                "recording",
+                # 0.0042 m/s^2 of 9.80665: the scatter that the published calibration leaves
+                tolerance=reference["scale_m_s2_per_count"][i] * published / 9.80665,
+                why="within the published calibration's own scatter, 0.0042 m/s^2",
+            ),
+            Row(
+                source,
+                f"bias {axis} (to be taken off)",
+                "count",
+                condition,
+                -reference["bias_count"][i],
+                bias.value,
+                "equal",
+                "recording",
+                tolerance=published / reference["scale_m_s2_per_count"][i],
+                why="nine parameters from ten poses; ours hold the misalignments at a data sheet's 2 %",
+            ),
+        ]
+    return rows
+
+
+SATURATED = "in two turns the gyroscope is at its end; with them, as the author has it, the x scale rises (rows below)"
+
+
+def gyroscopes() -> list[Row]:
+    """Scale of two gyroscopes from still poses and the turns between them (Tedaldi sec. V).
+
+    The sources print no uncertainty, so only their digits are the tolerance; the reason says how far both are apart.
+    """
+    rows = []
+    counts = meta("imu_tk_xsens")["reference_factory"]["gyro_scale_count_per_rad_s"]
+    xsens_factory, half_count = [1.0 / v for v in counts], [0.5 / v**2 for v in counts]
+    mpu = meta("mpu6050_tomisuarez")["reference_gyroscope"]["scale_rad_s_per_count"]
+    printed = [1e-17] * 3
+    author = "tomisuarez2/ImuCalibration, MPU-6050"
+    cheap = "mpu6050_tomisuarez/calibration.npz"
+    for source, file, rate_hz, gravity, published, digits, keep in (
+        ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory, half_count, False),
+        (author, cheap, 100.0, 9.80665, mpu, printed, False),
+        (author, cheap, 100.0, 9.80665, mpu, printed, True),
+    ):
+        log = load_log(data_folder() / file, rate_hz)
+        force, turning = log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE)
+        fit = fit_gyroscope(force, turning, log.need_rate(), gravity, keep_saturated=keep)
+        condition = (
+            f"{fit.turns} turns between poses, {fit.saturated} saturated ones {'kept' if keep else 'left out'}; "
+            f"gravity after a turn off by {np.degrees(fit.residual_rad):.2f} deg rms"
+        )
+        for i, axis in enumerate("xyz"):
+            scale = fit.parameters[f"scale_{axis}"]
+            interval = f"our 95 % interval is +-{100.0 * (scale.high / scale.value - 1.0):.2f} %"
+            apart = 100.0 * (scale.value / published[i] - 1.0)
+            rows.append(
+                Row(
+                    source,
+                    f"scale of gyroscope {axis}",
+                    "rad/s per count",
+                    condition,
+                    published[i],
+                    scale.value,
+                    "equal",
+                    "recording",
+                    tolerance=digits[i],
+                    why=f"{apart:+.2f} % apart; {interval}" + (f"; {SATURATED}" if fit.saturated and not keep else ""),
+                )
+            )
+    return rows
+
+
+def allan_digit(value: float) -> float:
+    """Return the last printed digit of a value of that table: 0.01 stands for 0.0100, 5e-5 for 0.000050."""
+    return 10.0 ** max(floor(log10(value)) - 2, -6)
+
+
+def adis16405() -> list[Row]:
+    """Overlapping Allan variance of the x gyroscope of an ADIS16405."""
+    reference = meta("adis16405_static")["reference_allan_variance_gyro_x"]
+    log = load_log(data_folder() / "adis16405_static")
+    factors = np.round(np.array(reference["tau_s"]) * 100.0).astype(np.int64)
+    curve = allan_curve(log.matrix(("gyro_x_raw",))[:, 0] * 0.05, 100.0, factors)
+    rows = []
+    for tau, published, deviation in zip(reference["tau_s"], reference["avar_deg2_s2"], curve.deviation, strict=True):
+        rows.append(
+            Row(
+                "SMAC-Group avar, ADIS16405 imu1",
+                f"Allan variance of gyroscope x at {tau:g} s",
+                "deg^2/s^2",
+                "10 000 s at 100 Hz, overlapping",
+                published,
+                float(deviation) ** 2,
+                "equal",
+                "recording",
+                tolerance=0.5 * allan_digit(published),
+                why="printed to three significant digits, at most six decimals",
+            )
+        )
+    return rows
+
+
+def qmc5883l() -> list[Row]:
+    """Norm of the calibrated field of a QMC5883L."""
+    reference = meta("mag_qmc5883l_tomisuarez")["reference_calibration"]
+    rows = []
+    for name in ("filtered", "noisy"):
+        log = load_log(data_folder() / "mag_qmc5883l_tomisuarez" / f"{name}.npz", 50.0)
+        result = fit_ellipsoid(log.matrix(("mag_x_raw", "mag_y_raw", "mag_z_raw")))
+        mean, spread = reference[f"{name}_norm"]
+        rows.append(
+            Row(
+                "tomisuarez2/MagnetometerCalibration, QMC5883L",
+                f"spread of the norm over its mean, {name}",
+                "1",
+                f"{result.samples} samples, {result.outliers} rejected but counted here",
+                spread / mean,
+                result.norm_spread / result.norm_mean,
+                "lower",
+                "recording",
+            )
+        )
+    return rows
+
+
+SETS = {
+    "imu_tk_xsens": xsens,
+    "mpu6050_tomisuarez": mpu6050,
+    "adis16405_static": adis16405,
+    "mag_qmc5883l_tomisuarez": qmc5883l,
+    "broad": broad.rows,
+}
+
+
+def check() -> None:
+    """``InputError`` when none of the recordings is there."""
+    folder = data_folder()
+    if not any((folder / name).is_dir() for name in SETS):
+        raise InputError(
+            f"real-sensors compares public recordings, and none is in {folder}: put {', '.join(SETS)} there, "
+            "or name their folder in the environment variable MICRON_DATA"
+        )
+
+
+def table() -> Table:
+    """All sets that are there; ``InputError`` without any."""
+    check()
+    there = {name: section for name, section in SETS.items() if (data_folder() / name).is_dir()}
+    notes = [f"{data_folder() / name} is not there: left out" for name in SETS if name not in there]
+    if "broad" in there and find_spec("vqf") is None:
+        notes.append("the vqf package (development extra) is not installed: its rows are left out")
+    if all(name in there for name in ("imu_tk_xsens", "mpu6050_tomisuarez")):
+        there["gyroscopes"] = gyroscopes
+    return build("real-sensors", list(there.values()), notes)
