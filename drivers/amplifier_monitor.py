@@ -151,9 +151,10 @@ class AmplifierMonitor:
         shortest: list[tuple[float, float, float]] = []  # volts, least weight, further weight
         end_ns = window.latest_ns + window.longest_ns
         gone_late_ns = gone_early_ns = end_ns  # when the next command took over, at the latest and at the earliest
-        told_V = [told.volts[output] for told in self._guard.told]
+        commands = self._guard.told
+        told_V = [told.volts[output] for told in commands]
         tick_V = self._guard.limits[output].slew_V_per_s * 1e-3
-        for k, told in reversed(list(enumerate(self._guard.told))):
+        for k, told in reversed(list(enumerate(commands))):
             ticks_worth = max(1.0, abs(told_V[k] - told_V[k - 1]) / tick_V) if k else 1.0  # after a gap
             since_late_ns = told.sent_ns + round(self._settle_ns * ticks_worth)
             if told.offered_ns < end_ns:

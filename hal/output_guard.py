@@ -6,7 +6,6 @@ over the same memory (``GuardState.view``).
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -15,9 +14,12 @@ from hal.errors import ErrorKind, SafetyTrip
 from hal.output_guard_steps import (
     ARMED,
     CLIPPED,
+    KEPT,
+    N_SENT,
     NOT_FINITE,
     OFFERED_NS,
     RAMP_DONE,
+    RAMP_NEXT,
     RAMP_STEPS,
     SENT_NS,
     SLEW_LIMITED,
@@ -31,7 +33,8 @@ from hal.types import OutputLimit
 
 __all__ = ["RAMP_STEPS", "TOLD", "OutputGuard", "Told"]
 
-TOLD = 16
+TOLD = KEPT - 1
+"""Number of commands in ``OutputGuard.told``."""
 
 
 class Told(NamedTuple):
@@ -62,8 +65,6 @@ class OutputGuard:
         self.device = device
         self.limits = tuple(limits)
         self.state = new_state(self.limits, clock.now_ns(), ramp_steps, ramp_step_s, longest_gap_s)
-        self.told: deque[Told] = deque(maxlen=TOLD)
-        """Holds the commands that were sent from Python, the newest last, for comparison with the measured outputs."""
         self._clock = clock
 
     @property
@@ -93,6 +94,17 @@ class OutputGuard:
     @property
     def slew_limited(self) -> int:
         return self.state.words[SLEW_LIMITED]
+
+    @property
+    def told(self) -> list[Told]:
+        """Return the last ``TOLD`` commands, the newest last. A compiled loop may send more in the meantime; what it could
+        have overwritten is left out."""
+        state, n = self.state, len(self.limits)
+        newest = state.words[N_SENT]
+        kept_ns, kept_V = state.kept_ns.tolist(), state.kept_V.tolist()
+        oldest = max(0, state.words[N_SENT] - TOLD)
+        places = (k % KEPT for k in range(oldest, newest))
+        return [Told(*kept_ns[2 * p : 2 * p + 2], tuple(kept_V[n * p : n * p + n])) for p in places]
 
     def admit(self, values_V: Float64Array) -> int:
         """Fill ``next_V`` from the wish; returns the mask of channels that were clipped or slew limited.
@@ -131,8 +143,6 @@ class OutputGuard:
     def sent(self, ago_ns: int = 0) -> None:
         """The device was told ``next_V``, at least ``ago_ns`` ago."""
         note_sent(self.state, self._clock.now_ns() - ago_ns)
-        words = self.state.words
-        self.told.append(Told(words[OFFERED_NS], words[SENT_NS], tuple(self.state.last_V)))
 
     def start_from(self, values_V: Sequence[float]) -> None:
         """Believe that the device is at ``values_V``: after a readback, before a ramp."""
@@ -147,12 +157,13 @@ class OutputGuard:
 
     def brought_to_safe_state(self) -> None:
         """Somebody else has taken the device to its safe state and read that back."""
-        state, now_ns = self.state, self._clock.now_ns()
+        state, words, now_ns = self.state, self.state.words, self._clock.now_ns()
         for i, safe_V in enumerate(state.safe_V):
-            state.next_V[i] = state.last_V[i] = safe_V
-        state.words[OFFERED_NS] = now_ns
-        state.words[RAMP_DONE] = -1
-        self.told.append(Told(now_ns, now_ns, tuple(state.last_V)))
+            state.next_V[i] = safe_V
+        words[OFFERED_NS] = now_ns
+        words[RAMP_DONE] = words[RAMP_NEXT] = 0  # a step of a ramp, which counts as no command
+        note_sent(state, now_ns)
+        words[RAMP_DONE] = -1
 
     def at_safe_state(self) -> bool:
         return self.state.last_V == self.state.safe_V

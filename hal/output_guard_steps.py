@@ -20,11 +20,15 @@ from hal.types import OutputLimit
 RAMP_STEPS = 16
 """Number of ramp steps (1 ms each). It leaves 4 of the 20 ms until neutral for transfers that must be repeated."""
 
+KEPT = 17
+"""Number of sent commands that are kept. A reader beside the writer can rely on all but the oldest."""
+
 (
     ARMED, WRITES, CLIPPED, SLEW_LIMITED, SENT_NS, OFFERED_NS, RAMP_DONE, RAMP_NEXT, RAMP_START_NS, RAMP_LONGEST,
-    N_RAMP_STEPS, WORDS,
-) = range(12)  # fmt: skip
-"""Places in ``GuardState.words``. ``RAMP_DONE``: steps of the ramp that the device has been told, -1 without a ramp."""
+    N_RAMP_STEPS, N_SENT, WORDS,
+) = range(13)  # fmt: skip
+"""Places in ``GuardState.words``. ``RAMP_DONE``: steps of the ramp that the device has been told, -1 without a ramp.
+``N_SENT``: number of commands that were kept so far."""
 LONGEST_GAP_S, RAMP_STEP_NS, TIMES = range(3)
 """Places in ``GuardState.times``."""
 NOT_ARMED, NOT_FINITE = -1, -2
@@ -32,10 +36,15 @@ NOT_ARMED, NOT_FINITE = -1, -2
 
 
 class GuardState(NamedTuple):
-    """Holds all that a guard knows: ``words`` and ``times`` as named above, the others one value per channel, V."""
+    """Holds all that a guard knows: ``words`` and ``times`` as named above, the others one value per channel, V.
+
+    Command n is kept at place ``n % KEPT``: ``kept_ns`` (2 * KEPT,) when it was offered and sent, ``kept_V``
+    (channels * KEPT,) its volts."""
 
     words: Any
+    kept_ns: Any
     times: Any
+    kept_V: Any
     last_V: Any
     next_V: Any
     ramp_from_V: Any
@@ -46,8 +55,9 @@ class GuardState(NamedTuple):
 
     def view(self) -> GuardState:
         """Return numpy arrays over the same memory, for compiled code."""
-        words, *others = self
-        return GuardState(np.frombuffer(words, np.int64), *(np.frombuffer(part, np.float64) for part in others))
+        words, kept_ns, *others = self
+        volts = (np.frombuffer(part, np.float64) for part in others)
+        return GuardState(np.frombuffer(words, np.int64), np.frombuffer(kept_ns, np.int64), *volts)
 
 
 def new_state(
@@ -59,7 +69,8 @@ def new_state(
     words[RAMP_DONE], words[RAMP_LONGEST], words[N_RAMP_STEPS] = -1, 1, ramp_steps
     safe_V = [limit.safe_V for limit in limits]
     return GuardState(
-        words, array("d", [longest_gap_s, ramp_step_s * 1e9]), array("d", safe_V), array("d", safe_V),
+        words, array("q", bytes(16 * KEPT)), array("d", [longest_gap_s, ramp_step_s * 1e9]),
+        array("d", bytes(8 * KEPT * len(safe_V))), array("d", safe_V), array("d", safe_V),
         array("d", safe_V), array("d", [limit.lo_V for limit in limits]), array("d", [limit.hi_V for limit in limits]),
         array("d", [limit.slew_V_per_s for limit in limits]), array("d", safe_V),
     )  # fmt: skip
@@ -134,7 +145,7 @@ def next_ramp_step(state: GuardState, now_ns: int) -> bool:
 
 
 def note_sent(state: GuardState, sent_ns: int) -> None:
-    """Note that the device was told ``next_V`` at ``sent_ns``."""
+    """Note, and keep, that the device was told ``next_V`` at ``sent_ns``."""
     words = state.words
     for i in range(len(state.last_V)):
         state.last_V[i] = state.next_V[i]
@@ -143,3 +154,9 @@ def note_sent(state: GuardState, sent_ns: int) -> None:
         words[RAMP_DONE] = words[RAMP_NEXT]
     else:
         words[WRITES] += 1
+    n, place = len(state.last_V), words[N_SENT] % KEPT
+    state.kept_ns[2 * place] = words[OFFERED_NS]
+    state.kept_ns[2 * place + 1] = sent_ns
+    for i in range(n):
+        state.kept_V[n * place + i] = state.last_V[i]
+    words[N_SENT] += 1  # last: a reader beside the writer believes only what is counted
