@@ -17,4 +17,4 @@ def test_the_ideal_loop_is_near_the_bound() -> None:
     assert row.reduction_percent > 85.0
     assert row.ratio < 1.25
     if row.ratio >= GOAL:
-        pytest.xfail(f"{row.ratio:.2f} times the bound, {GOAL} is asked for: docs/tremor.md says why")
+        pytest.xfail(f"{row.ratio:.2f} times the bound, {GOAL} is asked for: docs/limits.md")

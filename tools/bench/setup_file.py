@@ -131,7 +131,7 @@ STILL_TIP = (
     "adaptive = { cancel_from_hz = [3.0, 6.0], cancel_to_hz = [14.0, 18.0], emphasis = 3.0, quiet = 220.0, "
     "shaken_hz = [600.0, 700.0] }"
 )
-"""The project's own benches have these where the output takes a command a tick (docs/tremor.md)."""
+"""The project's own benches have these where the output takes a command a tick (``AdaptiveConfig.cancel_from_hz``)."""
 
 
 def bench_text(draft: Draft, calibrations: list[str]) -> str:

@@ -23,8 +23,8 @@ _GUIDE = """# Your own data
 
 Made by `python -m tools.mismatch.own_data --out docs/own-data.md`; do not edit. The tests run the first part.
 
-A recording is a folder: your data file and a `recording.toml` that says what its columns are and which simulation it is
-to be compared with. Here, a motor axis: force in, position out, `data.csv` with a header row.
+A recording is a folder with your data file and a `recording.toml`, which describes its columns and names the simulation
+that it is compared with. The example is a motor axis: force in, position out, `data.csv` with a header row.
 
 ``` { .python title="what stands for your measurement here" }
 import numpy as np
@@ -64,18 +64,15 @@ micron mismatch simulate twin.py . --out simulated.csv
 ``` { .toml title="recording.toml" }
 {written}```
 
-It reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
-{endings}.
-What it could not know is printed and stands in the file as a comment; when nothing is unknown, `diagnose` runs on it at
-once.
-`--twin KIND` names the twin, `--rate HZ` the rate of a file without time.
+The command reads text tables (any delimiter, decimal comma, with or without a header, a row of units),
+{endings}. It prints what it could not know and
+writes it into the file as a comment. `--twin KIND` names the twin, `--rate HZ` the rate of a file without time stamps.
 
-Where the time is uneven or values are missing, it says in which line, and writes nothing. `--cut` then brings the
-columns to even steps at their usual rate and cuts them at gaps; `--resample HZ` does so at another rate (means over the
-new step, straight lines where that is not longer). The runs stand one behind the other in `recording.npz`, `segments`
-says where each begins, and one diagnosis holds for all of them.
+Where time steps are uneven or values are missing, the command names the line and writes nothing. `--cut` resamples the
+columns to even steps at their usual rate and cuts them at gaps; `--resample HZ` uses another rate. `recording.npz` then
+holds the runs one after another, `segments` names the sample at which each begins, and one diagnosis covers all runs.
 
-Put in what you believe, before you ask what is missing:
+Write the parameters that you believe before you ask what is missing:
 
 ``` { .toml title="in recording.toml" }
 mass = 2.1
@@ -85,20 +82,18 @@ hold = "zero"
 noise_rms = 0.02
 ```
 
-A computer that puts the force out holds it over each sample: `hold` says so. Without it, friction is found here, and
-the verdict is `unexplained` all the same.
-A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
+`hold = "zero"` says that a computer held the force over each sample. Without it the report names friction here, and the
+verdict is `unexplained`. A wrong `noise_rms` is the usual cause of a wrong verdict: leave it out if you do not know it.
 
 ## 2. Diagnose, correct, run again
 
-`micron mismatch diagnose` says where the two differ and which physics is missing
-([how to read it](mismatch.md#reading-a-report)).
-`apply` writes the corrected twin in the form that the ending asks for:
+`micron mismatch diagnose` reports where recording and twin differ and which physics is missing
+([how to read it](mismatch.md#reading-a-report)). `apply` writes the corrected twin in the format of the file's ending:
 
 {formats}
 
-A `.toml`, a `.py` and an `.fmu` are run again by `micron mismatch simulate`, or in Python by one call, in the units of
-the data file:
+`micron mismatch simulate` runs a `.toml`, a `.py` or an `.fmu` again. In Python one call does, in the units of the data
+file:
 
 ``` { .python title="run again" }
 from tools.mismatch.export.run import simulate_file
@@ -106,7 +101,7 @@ from tools.mismatch.export.run import simulate_file
 position_mm = simulate_file("twin.toml", ".")["position"]
 ```
 
-`twin.py` needs numpy alone and none of this package:
+`twin.py` needs only numpy, and nothing of this package:
 
 ``` { .python title="elsewhere" }
 import numpy as np
@@ -117,13 +112,13 @@ position_mm = simulate({"force": data["force_N"]})["position"]
 heavier = simulate({"force": data["force_N"]}, parameters={"mass": 3.0})["position"]
 ```
 
-`start` among its parameters is the state at the first sample of this recording; another recording begins elsewhere. An
-FMU knows its inputs at the ends of a communication step: set before each step what they are at its end.
+Its parameter `start` is the state at the first sample of this recording; set it for another recording. An FMU takes its
+inputs at the end of a communication step: set before each step the values at its end.
 
 ## 3. Does it hold on the next recording?
 
-Put `file = "twin.toml"` in place of the `[twin]` table of another recording and diagnose that. What is still missing is
-what the first one did not excite.
+Put `file = "twin.toml"` in place of the `[twin]` table of another recording and diagnose that. An effect that is still
+missing was not excited by the first recording.
 """
 
 

@@ -1,6 +1,6 @@
 """An emulated hand at other sampling rates than 1 kHz: what an estimator leaves beside the limit at that delay.
 
-``python -m tests.unit.tremor.rates`` prints the table of docs/tremor.md. The limit is the best causal linear filter of
+``python -m tests.unit.tremor.rates`` prints the table. The limit is the best causal linear filter of
 the bank of that rate, fitted to the very record, at the very delay, with its noise; both are judged behind the filter
 that lifts 8 to 12 Hz, as in ``tools.research.tremor.bound``.
 """

@@ -254,7 +254,7 @@ def _why_tilt(result: SceneResult, late: slice) -> str:
     moving = float(np.sqrt(np.sum(lean.var(axis=0))))
     return (
         f"{still:.3f} deg of it stand still, {moving:.3f} move: the first is cross-axis error of a form that the "
-        "model has not (docs/sensing.md)"
+        "model has not"
     )
 
 
