@@ -138,15 +138,23 @@ class Outputs:
             raise OutputError("not all results could be written; the others are there\n  " + "\n  ".join(self.failed))
 
 
+def check_names(*destinations: str | Path | None) -> None:
+    """Refuse a name that begins with ``-``: it is an option in the wrong place. Raises ``InputError``."""
+    for destination in destinations:
+        if destination is not None and str(destination).startswith("-"):
+            raise InputError(f"{destination}: looks like an option; name a file, or ./{destination} for that name")
+
+
 def check_writable(*destinations: str | Path | None, folders: bool = False) -> None:
     """Refuse, before any work, a result file that cannot be written: ``InputError``.
 
-    The folder must be there and take a file, and the name must not be a folder's (unless ``folders``). That the disk
-    becomes full during the work is not seen here.
+    The folder must be there and take a file, and the name must not be a folder's (unless ``folders``). A name that
+    begins with ``-`` is an option in the wrong place. That the disk becomes full during the work is not seen here.
     """
     for destination in destinations:
         if destination is None or str(destination) == "-":
             continue
+        check_names(destination)
         path = Path(destination)
         if not folders and path.is_dir():
             raise InputError(f"{destination}: this is a folder; name a file in it")

@@ -25,7 +25,7 @@ def test_this_server_was_started_as_the_help_of_bench_says(server: Server) -> No
 
 def test_log_follow_prints_what_the_page_says(server: Server) -> None:
     server.wait_running()
-    assert WITH_A_PAGE == ("bench", "log follow")
-    done = CliRunner().invoke(app, [*shlex.split(example("log follow")), "--url", server.base, "--seconds", "2"])
+    assert WITH_A_PAGE == ("bench", "log")
+    done = CliRunner().invoke(app, [*shlex.split(example("log")), "--url", server.base, "--seconds", "2"])
     assert done.exit_code == 0, done.output
     assert "devices open" in done.stdout

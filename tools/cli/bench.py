@@ -12,6 +12,7 @@ from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import clear_errors, console
 from tools.errors import InputError
+from tools.output import check_names
 from tools.prepare import prepare
 
 
@@ -45,6 +46,7 @@ def bench(
     from tools.bench.serve import LOOPBACK, bind, serve
 
     with clear_errors():
+        check_names(recordings)
         if host_name and listen is None:
             raise InputError("--host-name belongs to --listen; give both or neither")
         file = bench_path(bench).absolute()

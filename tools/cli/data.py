@@ -9,9 +9,9 @@ import typer
 
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_whole
 from tools.errors import InputError
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 
-data = typer.Typer(help="Public recordings: what there is, under which licence, and how to get it.")
+data = typer.Typer(help="List and fetch public recordings, each with its licence and checksum.")
 
 CacheOption = Annotated[
     Path | None, typer.Option("--cache", metavar="FOLDER", help="Default: MICRON_DATA, else the user's cache folder.")
@@ -25,6 +25,7 @@ def list_sets(cache: CacheOption = None, json_file: JsonOption = None) -> None:
     Example: micron data list
     """
     with clear_errors():
+        check_names(cache)
         check_writable(json_file)
         from rich.table import Table
 
@@ -77,6 +78,7 @@ def fetch_sets(
     Example: micron data fetch emps
     """
     with clear_errors():
+        check_names(cache)
         check_writable(json_file)
         if mirror and not mirror.startswith(("http://", "https://")):
             raise InputError(f"--mirror {mirror}: must begin with http:// or https://")

@@ -54,7 +54,8 @@ def scan(
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.
+    """List the machine's ports, the I2C addresses that answer and the CAN traffic; exit 4 when a declared I2C device
+    is silent.
 
     Example: micron scan --bench micron
     """
@@ -96,7 +97,7 @@ def scope(
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """The analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.
+    """Draw the analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.
 
     Example: micron scope --seconds 10
     """
@@ -148,7 +149,7 @@ def latency(
     firmware: Annotated[bool, typer.Option(help="Measure the firmware too, on the bench.")] = True,
     json_file: JsonOption = None,
 ) -> None:
-    """How late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.
+    """Measure how late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.
 
     With --hours the loops take turns of a minute, so that all have the same neighbours. The figures are those of
     cyclictest. Without a C compiler the loop in C is left out.
@@ -211,7 +212,7 @@ def ramp(
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """A staircase on the outputs, over their full range, with read-back. Exit 1 when a stair is off.
+    """Step the outputs over their full range and read each step back. Exit 1 when one is off.
 
     Example: micron ramp --arm --channel 1 --steps 21
     """
@@ -273,22 +274,18 @@ def ramp(
             raise typer.Exit(Exit.FAILED)
 
 
-can = typer.Typer(help="CAN buses of a bench.")
-
-
-@can.command("dump")
-def can_dump(
+def dump(
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=0.01, max=86_400.0, help="How long to listen.")] = 10.0,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Frames as they come, decoded where the id is known. Only listens.
+    """Print CAN frames as they come, decoded where the id is known; nothing is sent.
 
-    Example: micron can dump --seconds 5
+    Example: micron dump --seconds 5
     """
-    from tools.diagnose.can_dump import listen
+    from tools.diagnose.can_frames import listen
     from tools.diagnose.opened import opened_bench
 
     with clear_errors():
@@ -310,68 +307,67 @@ def can_dump(
 
 
 def capture(
-    out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="A new folder for the transcripts.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FOLDER", help="Record a transcript into this new folder.")
+    ] = None,
+    diff: Annotated[
+        Path | None, typer.Option("--diff", metavar="FOLDER", help="Replay the transcript in this folder instead.")
+    ] = None,
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=0.01, max=600.0, help="How long to scan.")] = 1.0,
+    seconds: Annotated[float, typer.Option(min=0.01, max=600.0, help="With --out: how long to scan.")] = 1.0,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.
+    """Record what goes over every bus while the drivers open the bench and scan, or replay such a transcript.
+
+    Nothing is armed. With --diff the transcript is replayed against today's drivers and against the emulated devices:
+    measured values differ between any two runs ("data"); questions and the form of answers must not ("protocol",
+    exit 1). The emulated bench is then that of the transcript unless --bench names another.
 
     Example: micron capture --bench micron --out golden
+
+    Compare: micron capture --diff golden
     """
+    with clear_errors():
+        check_writable(json_file)
+        if (out is None) == (diff is None):
+            raise InputError("name one folder: --out FOLDER records a transcript, --diff FOLDER replays one")
+        if out is not None:
+            _record_transcript(out, bench, seconds, virtual, json_file)
+        elif diff is not None:
+            _replay_transcript(diff, bench, json_file)
+
+
+def _record_transcript(out: Path, bench: Path | None, seconds: float, virtual: bool, json_file: str | None) -> None:
     from tools.diagnose.golden import capture as record
 
-    with clear_errors():
-        check_writable(json_file)
-        check_writable(out, folders=True)
-        if out.exists():
-            raise InputError(f"{out}: is there already; a golden transcript is not overwritten")
-        counts = record(bench_path(bench), out, seconds, pace=pace_of(virtual))
-        for bus, lines in counts.items():
-            console().print(f"{bus}: {lines} transfers")
-        write_json({"format": 1, "out": str(out), "transfers": counts}, json_file)
+    check_writable(out, folders=True)
+    if out.exists():
+        raise InputError(f"{out}: is there already; a golden transcript is not overwritten")
+    counts = record(bench_path(bench), out, seconds, pace=pace_of(virtual))
+    for bus, lines in counts.items():
+        console().print(f"{bus}: {lines} transfers")
+    write_json({"format": 1, "out": str(out), "transfers": counts}, json_file)
 
 
-golden = typer.Typer(help="Golden transcripts.")
-
-
-@golden.command("diff")
-def golden_diff(
-    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="What 'micron capture' wrote.")],
-    bench: BenchOption = None,
-    json_file: JsonOption = None,
-) -> None:
-    """Replay a transcript against today's drivers and against the emulated devices, and show where they part.
-
-    Measured values differ between any two runs ("data"); questions and the form of answers must not ("protocol",
-    exit 1). The emulated bench is that of the transcript unless --bench names another.
-
-    Example: micron golden diff golden --bench micron
-    """
+def _replay_transcript(folder: Path, bench: Path | None, json_file: str | None) -> None:
     from tools.diagnose.golden import diff
 
-    with clear_errors():
-        check_writable(json_file)
-        report = diff(folder, None if bench is None else bench_path(bench))
-        table = Table(title=f"{report.compared} transfers", title_justify="left")
-        for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
-            table.add_column(heading)
-        for d in report.differences:
-            table.add_row(d.bus, d.side, str(d.entry), d.kind, d.recorded, d.found)
-        if report.differences:
-            data_console().print(table)
-        console().print(f"{report.protocol} differences of protocol, {report.data} of data")
-        write_json({"format": 1, **report.as_dict()}, json_file)
-        if not report.same:
-            raise typer.Exit(Exit.FAILED)
+    report = diff(folder, None if bench is None else bench_path(bench))
+    table = Table(title=f"{report.compared} transfers", title_justify="left")
+    for heading in ("bus", "against", "entry", "kind", "recorded", "now"):
+        table.add_column(heading)
+    for d in report.differences:
+        table.add_row(d.bus, d.side, str(d.entry), d.kind, d.recorded, d.found)
+    if report.differences:
+        data_console().print(table)
+    console().print(f"{report.protocol} differences of protocol, {report.data} of data")
+    write_json({"format": 1, **report.as_dict()}, json_file)
+    if not report.same:
+        raise typer.Exit(Exit.FAILED)
 
 
-log = typer.Typer(help="The log of a running bench.")
-
-
-@log.command("follow")
-def log_follow(
+def log(
     url: Annotated[str, typer.Option(help="Address of the page, with its token if it is not on loopback.")] = (
         "http://127.0.0.1:8750"
     ),
@@ -380,7 +376,7 @@ def log_follow(
 ) -> None:
     """Print what a running 'micron bench' says, as it says it. Exit 4 when there is none.
 
-    Example: micron log follow --url http://127.0.0.1:8750
+    Example: micron log --url http://127.0.0.1:8750
     """
     from tools.diagnose.log_follow import follow
 

@@ -31,7 +31,7 @@ def doctor(
     ] = Path("/"),
     json_file: JsonOption = None,
 ) -> None:
-    """What this machine offers, what the bench asks for, what is missing and how to get it.
+    """Check what this machine offers and what the bench asks for, and say how to get what is missing.
 
     Example: micron doctor --bench micron
     """

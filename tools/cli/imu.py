@@ -17,11 +17,8 @@ from tools.imu.series import AXES, Series
 from tools.output import check_writable, write_json
 from tools.terminal import task_name
 
-imu = typer.Typer(help="Inertial sensors: offsets, stability, drift, noise, temperature.")
 
-
-@imu.command("evaluate")
-def evaluate(
+def imu(
     recording: Annotated[
         list[Path] | None, typer.Argument(metavar="[RECORDING]...", help="Motionless; more for other temperatures.")
     ] = None,
@@ -46,9 +43,12 @@ def evaluate(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Tables 5.4 to 5.8 of Erat 2018 for a sensor: from recordings, or measured now on a bench (auto-calibrated).
+    """Measure offsets, stability, drift, noise and temperature dependence of an inertial sensor, from recordings or on
+    a bench.
 
-    Example: micron imu evaluate --bench imus --virtual --seconds 60
+    The tables are those of Erat 2018 (5.4 to 5.8). On a bench the sensors calibrate themselves first.
+
+    Example: micron imu --bench imus --virtual --seconds 60
     """
     from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_turned
     from tools.imu.picture import save_imu_picture

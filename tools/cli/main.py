@@ -11,7 +11,7 @@ import os
 import sys
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer.core import TyperGroup
@@ -20,80 +20,133 @@ from firmware_py.exit_codes import Exit
 from hal.children import SUPERVISED, use_one_thread
 from tools.interrupt import install_handler, was_interrupted
 
-# name -> where it is, and its line in the list
+
+class Command(NamedTuple):
+    """A line of the list of commands."""
+
+    panel: str
+    where: str
+    """``module:attribute``; the module is imported when the command is called."""
+    line: str
+
+
 COMMANDS = {
-    "run": ("tools.cli.run:run", "Run the instrument in closed loop and report what was left of the tremor."),
-    "simulate": (
+    "run": Command(
+        "Run", "tools.cli.run:run", "Run the instrument in closed loop and report what was left of the tremor."
+    ),
+    "bench": Command(
+        "Run", "tools.cli.bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."
+    ),
+    "simulate": Command(
+        "Run",
         "tools.cli.simulate:simulate_command",
         "Simulate the closed loop without wires, tens of times faster than real time; the same figures as micron run.",
     ),
-    "bench": ("tools.cli.bench:bench", "Run the instrument and serve the bench page for it, until Ctrl-C."),
-    "replay": (
+    "replay": Command(
+        "Run",
         "tools.cli.replay:replay",
         "Run the firmware over a recording and compare every estimate and command with the recorded one, bit for bit.",
     ),
-    "doctor": (
-        "tools.cli.doctor:doctor",
-        "What this machine offers, what the bench asks for, what is missing and how to get it.",
-    ),
-    "noise": (
-        "tools.cli.noise:noise",
-        "Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.",
-    ),
-    "recover": (
-        "tools.cli.recordings:recover",
-        "Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).",
-    ),
-    "export": (
-        "tools.cli.recordings:export",
-        "Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.",
-    ),
-    "scan": (
-        "tools.cli.diagnose:scan",
-        "Ports of the machine, I2C addresses that answer, CAN traffic. Exit 4 when a declared I2C device is silent.",
-    ),
-    "read": (
-        "tools.cli.read:read",
-        "One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.",
-    ),
-    "scope": (
-        "tools.cli.diagnose:scope",
-        "The analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.",
-    ),
-    "latency": (
-        "tools.cli.diagnose:latency",
-        "How late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.",
-    ),
-    "ramp": (
-        "tools.cli.diagnose:ramp",
-        "A staircase on the outputs, over their full range, with read-back. Exit 1 when a stair is off.",
-    ),
-    "capture": (
-        "tools.cli.diagnose:capture",
-        "Golden transcript: what goes over every bus while the drivers open the bench and scan. Nothing is armed.",
-    ),
-    "emulate": (
+    "emulate": Command(
+        "Run",
         "tools.cli.emulate:emulate",
         "Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.",
     ),
-    "can": ("tools.cli.diagnose:can", "CAN buses of a bench."),
-    "golden": ("tools.cli.diagnose:golden", "Golden transcripts."),
-    "log": ("tools.cli.diagnose:log", "The log of a running bench."),
-    "calibrate": ("tools.cli.calibrate:calibrate", "Identify sensors and stacks from calibration recordings."),
-    "trust": (
+    "endoscope": Command(
+        "Run",
+        "tools.cli.endoscope:endoscope",
+        "Let a synthetic user steer the endoscope's field of view with the emulated motion card until all targets are "
+        "reached.",
+    ),
+    "trust": Command(
+        "Run",
         "tools.cli.trust:trust",
         "Let the programs run that a recording, a twin or a bench names; without PATH, list what was decided.",
     ),
-    "endoscope": ("tools.cli.endoscope:endoscope", "Steer a field of view with a motion card (Erat 2018, chapter 6)."),
-    "imu": ("tools.cli.imu:imu", "Inertial sensors: offsets, stability, drift, noise, temperature."),
-    "mismatch": ("tools.cli.mismatch:app", "Where simulation and recording differ, and which physics is missing."),
-    "data": ("tools.cli.data:data", "Public recordings: what there is, under which licence, and how to get it."),
+    "doctor": Command(
+        "Look",
+        "tools.cli.doctor:doctor",
+        "Check what this machine offers and what the bench asks for, and say how to get what is missing.",
+    ),
+    "scan": Command(
+        "Look",
+        "tools.cli.diagnose:scan",
+        "List the machine's ports, the I2C addresses that answer and the CAN traffic; exit 4 when a declared I2C "
+        "device is silent.",
+    ),
+    "read": Command(
+        "Look",
+        "tools.cli.read:read",
+        "Take one reading of every sensor whose driver is from an installed package; nothing is armed.",
+    ),
+    "scope": Command(
+        "Look",
+        "tools.cli.diagnose:scope",
+        "Draw the analog inputs as lines in the terminal; outputs are not armed. Exit 3 when scans were lost.",
+    ),
+    "dump": Command(
+        "Look",
+        "tools.cli.diagnose:dump",
+        "Print CAN frames as they come, decoded where the id is known; nothing is sent.",
+    ),
+    "log": Command(
+        "Look",
+        "tools.cli.diagnose:log",
+        "Print what a running 'micron bench' says, as it says it. Exit 4 when there is none.",
+    ),
+    "latency": Command(
+        "Look",
+        "tools.cli.diagnose:latency",
+        "Measure how late a 1 kHz loop is on this machine: in C, compiled, in Python, with a pty, as the firmware.",
+    ),
+    "ramp": Command(
+        "Look",
+        "tools.cli.diagnose:ramp",
+        "Step the outputs over their full range and read each step back. Exit 1 when one is off.",
+    ),
+    "capture": Command(
+        "Look",
+        "tools.cli.diagnose:capture",
+        "Record what goes over every bus while the drivers open the bench and scan, or replay such a transcript.",
+    ),
+    "export": Command(
+        "Look",
+        "tools.cli.recordings:export",
+        "Write a recording, or a span of it, as csv, npz, parquet, nc, mf4, mcap, or a folder for the mismatch engine.",
+    ),
+    "recover": Command(
+        "Look",
+        "tools.cli.recordings:recover",
+        "Make a finished recording of what is sound in FILE and say exactly what is missing (exit 3 if anything is).",
+    ),
+    "calibrate": Command(
+        "Calibrate", "tools.cli.calibrate:calibrate", "Identify sensors and stacks from calibration recordings."
+    ),
+    "imu": Command(
+        "Calibrate",
+        "tools.cli.imu:imu",
+        "Measure offsets, stability, drift, noise and temperature dependence of an inertial sensor, from recordings or "
+        "on a bench.",
+    ),
+    "noise": Command(
+        "Calibrate",
+        "tools.cli.noise:noise",
+        "Compute the overlapping Allan deviation of a recording and fit white noise, flicker, random walk and ramp.",
+    ),
+    "mismatch": Command(
+        "Mismatch",
+        "tools.cli.mismatch:app",
+        "Find where a simulation and a recording differ, and which physics the simulation lacks.",
+    ),
+    "data": Command(
+        "Mismatch", "tools.cli.data:data", "List and fetch public recordings, each with its licence and checksum."
+    ),
 }
 INSIDE: dict[str, dict[str, str]] = {}
 """Commands of research inside a group of the product: group -> name -> where it is."""
 if find_spec("tools.research") is not None:  # a source tree; the wheel does not contain it
     _research = import_module("tools.research.cli.commands")
-    COMMANDS |= _research.COMMANDS
+    COMMANDS |= {name: Command("Research", *row) for name, row in _research.COMMANDS.items()}
     INSIDE |= _research.INSIDE
 
 
@@ -104,10 +157,10 @@ def _at(where: str) -> Any:
 
 def load(name: str) -> Any:
     """The command ``name`` with its modules, as typer makes it."""
-    found = _at(COMMANDS[name][0])
+    found = _at(COMMANDS[name].where)
     for inner, where in INSIDE.get(name, {}).items():
         if inner not in {command.name for command in found.registered_commands}:
-            found.command(inner)(_at(where))
+            found.command(inner, rich_help_panel="Research")(_at(where))
     around = typer.Typer(rich_markup_mode="rich")
     if isinstance(found, typer.Typer):
         around.add_typer(found, name=name, cls=Helpful)
@@ -182,8 +235,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
     pretty_exceptions_enable=False,
 )
-for _name, (_, _says) in COMMANDS.items():
-    app.command(_name, help=_says)(lambda: None)
+for _name, _command in COMMANDS.items():
+    app.command(_name, help=_command.line, rich_help_panel=_command.panel)(lambda: None)
 
 
 def main() -> None:

@@ -15,7 +15,7 @@ from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import Outputs, check_folder, check_writable, write_json, write_text_atomic
+from tools.output import Outputs, check_folder, check_names, check_writable, write_json, write_text_atomic
 from tools.terminal import task_name
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 # what a command needs is imported inside it: `micron --help` shall not wait for the engine
 
-app = typer.Typer(help="Where simulation and recording differ, and which physics is missing.")
+app = typer.Typer(help="Find where a simulation and a recording differ, and which physics the simulation lacks.")
 app.command()(watch)
 
 RecordingArgument = Annotated[
@@ -217,6 +217,7 @@ def new(
     Example: micron mismatch new rig/data.csv
     """
     with clear_errors():
+        check_names(out)
         check_writable(json_file)
         for option, hertz in (("--rate", rate), ("--resample", resample)):
             if hertz is not None and not 0.0 < hertz < 1e9:
@@ -259,7 +260,7 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
 
 @app.command()
 def physics(json_file: JsonOption = None) -> None:
-    """The vocabulary: every effect with formula, parameters, source, and what excitation shows it.
+    """List every effect of the vocabulary with formula, parameters, source, and the excitation that shows it.
 
     Example: micron mismatch physics --json -
     """
@@ -330,6 +331,7 @@ def apply(
     Example: micron mismatch apply rec rec.json --out twin.py
     """
     with clear_errors():
+        check_names(out, bench_out)
         if bench_out is not None and bench is None:
             raise InputError("--bench-out names a copy of a bench; name the bench with --bench")
         from tools.mismatch.export.write import check_format, write_twin

@@ -12,7 +12,7 @@ from tools.cli.bench_option import bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 
 if TYPE_CHECKING:
     from tools.calibrate.logs import SensorLog
@@ -39,7 +39,7 @@ def noise(
     ),
     json_file: JsonOption = None,
 ) -> None:
-    """Overlapping Allan deviation, and white noise, flicker, random walk and ramp with 95 % intervals.
+    """Compute the overlapping Allan deviation of a recording and fit white noise, flicker, random walk and ramp.
 
     The JSON is what a bench names as [firmware] noise = "FILE": the attitude filters then use these figures.
 
@@ -55,6 +55,7 @@ def noise(
     from tools.noise.picture import save_allan_picture
 
     with clear_errors():
+        check_names(image)
         check_writable(json_file)
         log = load_log(recording, rate_hz)
         if bench is not None:

@@ -10,7 +10,7 @@ from tools.output import check_writable, write_json
 
 
 def read(bench: BenchOption = None, virtual: VirtualOption = False, json_file: JsonOption = None) -> None:
-    """One reading of every sensor whose driver is from an installed package (docs/adding). Nothing is armed.
+    """Take one reading of every sensor whose driver is from an installed package; nothing is armed.
 
     Example: micron read --bench lab.toml
     """

@@ -63,8 +63,8 @@ def export(
     Example: micron export out/run.mcap out/view.mcap
     """
     with clear_errors():
-        out = _target(to, out, raw)
         check_writable(json_file)
+        out = _target(to, out, raw)
         check_writable(out, folders=True)
         recording = Recording(file)
         with tempfile.TemporaryDirectory(prefix="micron-") as scratch:

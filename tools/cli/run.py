@@ -33,7 +33,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 from tools.prepare import prepare
 
 if TYPE_CHECKING:
@@ -102,6 +102,7 @@ def run(
     Example: micron run --virtual --seconds 20 --json -
     """
     with clear_errors():
+        check_names(image)
         check_writable(json_file, html, record)
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")

@@ -5,6 +5,7 @@ Needs the package ``playwright`` and Debian's Chromium; starts its own server on
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import subprocess
 import sys
@@ -44,7 +45,10 @@ def report(folder: Path) -> Path:
     return folder / "report.html"
 
 
-def main(arguments: list[str]) -> int:
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(prog="python -m tools.research.pictures", description=__doc__)
+    parser.add_argument("folder", type=Path, help="folder that takes the pictures")
+    folder: Path = parser.parse_args(arguments).folder
     people = plain_console(stderr=True)
     chromium = shutil.which("chromium")
     try:
@@ -55,7 +59,6 @@ def main(arguments: list[str]) -> int:
     if chromium is None:
         people.print("no Chromium: apt-get install chromium")
         return 1
-    folder = Path(arguments[0] if arguments else "docs/pictures")
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="micron-") as recordings, sync_playwright() as playwright:
         browser = playwright.chromium.launch(
@@ -80,4 +83,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

@@ -114,7 +114,7 @@ def test_calibrate_manipulator_refuses(tmp_path: Path) -> None:
 def test_workspace_prints_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(workspace, "analyse", partial(workspace.analyse, grid=5))
     picture, found = tmp_path / "workspace.png", tmp_path / "w.json"
-    done = run("manipulator", "workspace", "--out", str(picture), "--json", str(found))
+    done = run("manipulator", "--out", str(picture), "--json", str(found))
     assert done.exit_code == 0, done.output
     assert picture.read_bytes()[:4] == b"\x89PNG"
     result = json.loads(found.read_text())
@@ -126,7 +126,7 @@ def test_workspace_prints_and_draws(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_workspace_refuses_a_bench_that_is_none(tmp_path: Path) -> None:
     bench = tmp_path / "bench.toml"
     bench.write_text("format = 1\nname = 'x'\n[firmware.actuation]\nshaft_m = -1.0\n")
-    done = run("manipulator", "workspace", "--bench", str(bench), "--out", str(tmp_path / "w.png"))
+    done = run("manipulator", "--bench", str(bench), "--out", str(tmp_path / "w.png"))
     assert done.exit_code == 2
     assert "shaft_m" in done.output
     assert not (tmp_path / "w.png").exists()

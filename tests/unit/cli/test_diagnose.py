@@ -87,7 +87,7 @@ def test_a_staircase_starts_and_ends_at_neutral_and_touches_both_limits():
 
 def test_can_dump_decodes(tmp_path: Path):
     out = tmp_path / "can.json"
-    done = run("can", "dump", "--virtual", "--seconds", "5", "--count", "3", "--json", str(out))
+    done = run("dump", "--virtual", "--seconds", "5", "--count", "3", "--json", str(out))
     assert done.exit_code == 0
     frames = result_of(out)["frames"]
     assert [f["message"] for f in frames] == ["STOP_BUTTON"] * 3
@@ -103,7 +103,7 @@ def transcript(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_a_transcript_agrees_with_driver_and_emulator(transcript: Path, tmp_path: Path):
     out = tmp_path / "diff.json"
-    assert run("golden", "diff", str(transcript), "--json", str(out)).exit_code == 0
+    assert run("capture", "--diff", str(transcript), "--json", str(out)).exit_code == 0
     assert result_of(out)["protocol"] == 0
     assert result_of(out)["compared"] > 50
     assert run("capture", "--virtual", "--out", str(transcript)).exit_code == 2
@@ -129,17 +129,17 @@ def test_a_difference_is_found_on_the_side_where_it_is(
             text = text.replace(was, now, 1) if was in text else text.replace(" r", " w00 r", 1)
         (changed / file.name).write_text(text)
     out = tmp_path / "diff.json"
-    assert run("golden", "diff", str(changed), "--json", str(out)).exit_code == 1
+    assert run("capture", "--diff", str(changed), "--json", str(out)).exit_code == 1
     assert (bus, side) in {(d["bus"], d["side"]) for d in result_of(out)["differences"] if d["kind"] == "protocol"}
 
 
 def test_what_is_no_transcript_is_bad_input(tmp_path: Path):
-    assert run("golden", "diff", str(tmp_path)).exit_code == 2
+    assert run("capture", "--diff", str(tmp_path)).exit_code == 2
 
 
 def test_without_a_bench_page_there_is_no_log():
-    assert run("log", "follow", "--url", "http://127.0.0.1:1", "--seconds", "1").exit_code == 4
-    assert run("log", "follow", "--url", "nonsense").exit_code == 2
+    assert run("log", "--url", "http://127.0.0.1:1", "--seconds", "1").exit_code == 4
+    assert run("log", "--url", "nonsense").exit_code == 2
 
 
 def test_octaves_count_everything_once():

@@ -67,7 +67,7 @@ def test_a_bare_call_helps(words: list[str]):
         assert set(steps) <= set(COMMANDS)
 
 
-@pytest.mark.parametrize("words", [["nosuch"], ["can", "nosuch"]], ids=str)
+@pytest.mark.parametrize("words", [["nosuch"], ["data", "nosuch"]], ids=str)
 def test_a_command_that_is_not_there_is_bad_input(words: list[str]):
     result = CliRunner().invoke(app, words)
     assert result.exit_code == 2
@@ -77,7 +77,48 @@ def test_a_command_that_is_not_there_is_bad_input(words: list[str]):
 @pytest.mark.parametrize("name", COMMANDS)
 def test_the_list_says_what_the_help_says(name: str):
     own = micron.commands[name].help or ""
-    assert COMMANDS[name][1] == " ".join(own.split("\n\n")[0].split())
+    assert COMMANDS[name].line == " ".join(own.split("\n\n")[0].split())
+
+
+WRITTEN = (
+    "--bench-out", "--cache", "--html", "--json", "--keep", "--out", "--picture", "--png", "--record", "--recordings",
+    "--report", "--rows", "--series",
+)  # fmt: skip
+OUTPUTS = [
+    (name, flag) for name, (_, command) in ALL.items() for p in command.params for flag in p.opts if flag in WRITTEN
+]
+
+
+@pytest.mark.parametrize(("name", "flag"), OUTPUTS)
+def test_an_output_that_looks_like_an_option_is_refused(
+    name: str, flag: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``--out --help`` wrote a file of that name."""
+    monkeypatch.chdir(tmp_path)
+    path, command = ALL[name]
+    words = [flag, "--help"]
+    for needed in (p.opts[0] for p in command.params if p.required and flag not in p.opts):
+        words += [needed, "x.toml"] if needed.startswith("-") else ["x.toml"]
+    result = CliRunner().invoke(app, [*path, *words])
+    assert result.exit_code == 2, result.output
+    assert "looks like an option" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_wheel_has_about_twenty_commands_in_panels():
+    of_panel: dict[str, list[str]] = {}
+    for name, command in COMMANDS.items():
+        of_panel.setdefault(command.panel, []).append(name)
+    assert list(of_panel) == ["Run", "Look", "Calibrate", "Mismatch", "Research"]
+    assert len(COMMANDS) - len(of_panel["Research"]) <= 23
+    shown = CliRunner().invoke(app, ["--help"]).stdout
+    places = [shown.index(f"─ {panel} ─") for panel in of_panel]
+    assert places == sorted(places)
+
+
+@pytest.mark.parametrize("name", GROUPS)
+def test_no_group_of_one(name: str):
+    assert len(getattr(micron.commands[name], "commands", {})) > 1
 
 
 def test_the_readme_names_every_command():

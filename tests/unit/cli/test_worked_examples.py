@@ -25,11 +25,11 @@ from tools.cli.main import app
 ROOT = Path(__file__).parents[3]
 BENCHES, DOCS, CHIP = ROOT / "benches", ROOT / "docs", ROOT / "tests" / "examples" / "i2c_chip"
 ADDED = {
-    "can dump": "--virtual",
+    "dump": "--virtual",
     "capture": "--virtual",
     "faults": "--seeds 1 --jobs 1 --only 'clock steps by 2.5 ms'",
     "hands": "--seconds 8",
-    "imu evaluate": "--seconds 5",
+    "imu": "--seconds 5",
     "latency": "--hours 0.001 --policy other --no-firmware",
     "mismatch calibrate": "--samples 500 --minutes 0.001",
     "mismatch prove": "--cases 1 --jobs 1",
@@ -48,10 +48,10 @@ OF_HANDS = ("hands", "tremor evaluate", "tremor inspect", "tremor report", "trem
 # over two seconds each: `make test-all`
 SLOW = (
     "calibrate piezo",
-    "endoscope tables",
+    "endoscope-tables",
     "faults",
     "hands",
-    "imu evaluate",
+    "imu",
     "mismatch apply",
     "mismatch diagnose",
     "mismatch prove",
@@ -65,7 +65,7 @@ SLOW = (
     "tremor report",
     "tremor train",
 )
-WITH_A_PAGE = ("bench", "log follow")
+WITH_A_PAGE = ("bench", "log")
 WITH_A_SERVER = ("data fetch",)
 
 
@@ -135,7 +135,6 @@ MADE: dict[str, Callable[[], object]] = {
     "calibrate piezo": stacks,
     "calibrate positions": lambda: lab(["pivot", "--seconds", "14", "--out", "out/pivot"]),
     "calibrate sensors": lambda: lab(["tumble", "--positions", "24", "--seconds", "1", "--out", "out/tumble"]),
-    "golden diff": lambda: call("capture"),
     "mismatch apply": diagnosed,
     "mismatch simulate": lambda: (diagnosed(), call("mismatch apply")),
     "mismatch cut": lambda: recorded_stack("rec"),

@@ -247,19 +247,17 @@ def test_command(tmp_path: Path) -> None:
     np.savez(tmp_path / "rest.npz", **columns)
     runner = CliRunner()
     out, png = tmp_path / "out.json", tmp_path / "out.png"
-    arguments = ["imu", "evaluate", str(tmp_path / "rest.npz"), "--rate-hz", "100"]
+    arguments = ["imu", str(tmp_path / "rest.npz"), "--rate-hz", "100"]
     done = runner.invoke(app, [*arguments, "--json", str(out), "--picture", str(png)])
     assert done.exit_code == 0, done.output
     assert png.stat().st_size > 10_000
     found = json.loads(out.read_text())["sensors"][0]
     assert found["offset"]["gyroscope_dps"]["x"] == pytest.approx(1.5, abs=0.01)
-    assert runner.invoke(app, ["imu", "evaluate"]).exit_code == 2
-    assert (
-        runner.invoke(app, ["imu", "evaluate", "--fall", str(tmp_path / "rest.npz"), "--rate-hz", "100"]).exit_code == 2
-    )
+    assert runner.invoke(app, ["imu"]).exit_code == 2
+    assert runner.invoke(app, ["imu", "--fall", str(tmp_path / "rest.npz"), "--rate-hz", "100"]).exit_code == 2
 
 
-@pytest.mark.parametrize("command", [["imu", "evaluate", "--seconds", "5"], ["run", "--seconds", "1"]])
+@pytest.mark.parametrize("command", [["imu", "--seconds", "5"], ["run", "--seconds", "1"]])
 def test_clashing_addresses_are_refused_with_the_strap_that_frees_one(command: list[str], tmp_path: Path) -> None:
     path = tmp_path / "bench.toml"
     other = '[device.other]\ndriver = "mpu6050"\nbus = "i2c0"\naddress = 0x68\n'

@@ -11,8 +11,12 @@ COMMANDS = {
     ),
     "soak": (
         "tools.research.cli.soak:soak",
-        "Run the closed loop for very long in virtual time: memory, what is left of the tremor, every counter by "
-        "eighths.",
+        "Run the closed loop for hours in virtual time and report memory, tremor and every counter by eighths.",
+    ),
+    "endoscope-tables": (
+        "tools.research.cli.endoscope_tables:endoscope_tables",
+        "Measure the elapsed time for both mappings and four response times with a synthetic user (Erat 2018, Tables "
+        "6.1 and 6.2).",
     ),
     "reproduce": (
         "tools.research.cli.reproduce:reproduce",
@@ -20,11 +24,14 @@ COMMANDS = {
     ),
     "placement": (
         "tools.research.cli.placement:placement",
-        "Places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.",
+        "Find places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.",
     ),
-    "manipulator": ("tools.research.cli.manipulator:app", "The three-legged manipulator at the tip."),
-    "sensing": ("tools.research.cli.sensing:app", "Error budgets of the sensing stage on emulated sensors."),
-    "tremor": ("tools.research.cli.tremor:app", "Recorded hands: inspect them, train on them, evaluate estimators."),
+    "manipulator": (
+        "tools.research.cli.manipulator:manipulator",
+        "Compute extents, largest sphere, singularity and conditioning of the bench's manipulator.",
+    ),
+    "sensing": ("tools.research.cli.sensing:app", "Compute error budgets of the sensing stage on emulated sensors."),
+    "tremor": ("tools.research.cli.tremor:app", "Inspect recorded hands, train on them, and evaluate estimators."),
 }
 """Name -> where it is, and its line in the list."""
 

@@ -21,7 +21,7 @@ from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import is_stopped
-from tools.output import Outputs, check_writable, write_json
+from tools.output import Outputs, check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.stamp import revision_and_day
 from tools.terminal import task_name
@@ -68,6 +68,7 @@ def faults(
     from tools.research.faults.points import POINTS
 
     with clear_errors():
+        check_names(keep)
         check_writable(json_file, out)
         path = bench_path(bench)
         revision = git_revision() or "unknown"

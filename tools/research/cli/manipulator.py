@@ -1,4 +1,4 @@
-"""``micron manipulator workspace``: where the tip can go."""
+"""``micron manipulator``: where the tip can go."""
 
 from __future__ import annotations
 
@@ -10,27 +10,21 @@ from rich.table import Table
 
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import JsonOption, clear_errors, console, data_console
-from tools.output import check_writable, write_json
-
-app = typer.Typer(help="The three-legged manipulator at the tip.")
+from tools.output import check_names, check_writable, write_json
 
 
-@app.callback()
-def _group() -> None:
-    """The three-legged manipulator at the tip."""
-
-
-@app.command("workspace")
-def workspace(
+def manipulator(
     bench: BenchOption = None,
     out: Annotated[Path, typer.Option("--out", metavar="PNG", help="Picture of the workspace.")] = Path(
         "out/workspace.png"
     ),
     json_file: JsonOption = None,
 ) -> None:
-    """Extents, largest sphere, singularity and conditioning of the bench's manipulator, beside the 50 um tremor.
+    """Compute extents, largest sphere, singularity and conditioning of the bench's manipulator.
 
-    Example: micron manipulator workspace --out out/workspace.png
+    The table shows the tremor of 50 um beside them.
+
+    Example: micron manipulator --out out/workspace.png
     """
     from dataclasses import asdict
 
@@ -40,6 +34,7 @@ def workspace(
     from tools.research.manipulator.workspace import analyse
 
     with clear_errors():
+        check_names(out)
         check_writable(json_file)
         config = load_plan(load_bench(bench_path(bench))).stages.actuation
         found = analyse(config)

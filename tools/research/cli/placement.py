@@ -10,7 +10,7 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 
 
 def placement(
@@ -23,7 +23,7 @@ def placement(
     seed: Annotated[int, typer.Option(help="Seed of the coarse search.")] = 0,
     json_file: JsonOption = None,
 ) -> None:
-    """Places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.
+    """Find places of accelerometers with the least angular (or tip) noise, beside those of Latt 2011.
 
     Example: micron placement benches/space-latt.toml
     """
@@ -39,6 +39,7 @@ def placement(
     from tools.research.placement.variance import angular_noise, point_noise
 
     with clear_errors():
+        check_names(image)
         check_writable(json_file)
         space = load_space(space_file)
         try:

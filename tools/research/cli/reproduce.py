@@ -13,7 +13,7 @@ from rich.text import Text
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.stamp import revision_and_day
 
@@ -86,6 +86,7 @@ def reproduce(
         return there
 
     with clear_errors():
+        check_names(rows)
         check_writable(json_file, out)
         wanted = expand(names)
         options = {"only": tuple(sets or ()), "rows_file": rows} if sets or rows else {}

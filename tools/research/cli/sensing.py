@@ -10,9 +10,9 @@ from rich.table import Table
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
-from tools.output import check_writable, write_json
+from tools.output import check_names, check_writable, write_json
 
-app = typer.Typer(help="Error budgets of the sensing stage on emulated sensors.")
+app = typer.Typer(help="Compute error budgets of the sensing stage on emulated sensors.")
 
 
 @app.command("budget")
@@ -95,6 +95,7 @@ def variance(
         return "-" if values is None else ", ".join(f"{factor * v:.3g}" for v in np.asarray(values)[:3])
 
     with clear_errors():
+        check_names(image)
         check_writable(json_file)
         conditions = Conditions(
             _vector(tip_mm, "--tip-mm") * 1e-3,

@@ -32,7 +32,7 @@ def soak(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Run the closed loop for very long in virtual time: memory, what is left of the tremor, every counter by eighths.
+    """Run the closed loop for hours in virtual time and report memory, tremor and every counter by eighths.
 
     Exit status 1 when memory grew, the figures drifted, or something is not accounted for.
 

@@ -6,7 +6,7 @@ import typer
 
 from tools.research.cli import tremor_budget, tremor_evaluate, tremor_inspect, tremor_report, tremor_train
 
-app = typer.Typer(help="Recorded hands: inspect them, train on them, evaluate estimators.")
+app = typer.Typer(help="Inspect recorded hands, train on them, and evaluate estimators.")
 app.command("inspect")(tremor_inspect.inspect)
 app.command("evaluate")(tremor_evaluate.evaluate)
 app.command("train")(tremor_train.train)

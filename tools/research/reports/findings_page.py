@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import argparse
 import re
-import sys
 from pathlib import Path
 
 from firmware_py.control.findings import Finding
@@ -50,4 +50,6 @@ def markdown() -> str:
 
 
 if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(markdown(), encoding="utf-8")
+    parser = argparse.ArgumentParser(prog="python -m tools.research.reports.findings_page", description=__doc__)
+    parser.add_argument("page", type=Path, help="file to write")
+    parser.parse_args().page.write_text(markdown(), encoding="utf-8")

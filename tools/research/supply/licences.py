@@ -1,9 +1,9 @@
-"""Licences of everything that is installed, as a page: ``python -m tools.research.supply.licences [FILE]``."""
+"""Licences of everything that is installed, as a page: ``python -m tools.research.supply.licences FILE``."""
 
 from __future__ import annotations
 
+import argparse
 import re
-import sys
 import tomllib
 from collections.abc import Iterable, Mapping
 from email.message import Message
@@ -101,14 +101,7 @@ def _use(part: Part) -> str:
     return f"extra {part.extra}" if part.extra else "the program"
 
 
-def main(arguments: list[str]) -> int:
-    text = page(parts(distributions(), declared(PYPROJECT)))
-    if arguments:
-        Path(arguments[0]).write_text(text, encoding="utf-8")
-    else:
-        print(text)
-    return 0
-
-
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    parser = argparse.ArgumentParser(prog="python -m tools.research.supply.licences", description=__doc__)
+    parser.add_argument("page", type=Path, help="file to write")
+    parser.parse_args().page.write_text(page(parts(distributions(), declared(PYPROJECT))), encoding="utf-8")
