@@ -21,7 +21,6 @@ from hal.output_guard_steps import (
     RAMP_DONE,
     RAMP_NEXT,
     RAMP_STEPS,
-    SENT_NS,
     SLEW_LIMITED,
     WRITES,
     admit,
@@ -97,8 +96,10 @@ class OutputGuard:
 
     @property
     def told(self) -> list[Told]:
-        """Return the last ``TOLD`` commands, the newest last. A compiled loop may send more in the meantime; what it could
-        have overwritten is left out."""
+        """Return the last ``TOLD`` commands, the newest last.
+
+        A compiled loop may send more in the meantime; what it could have overwritten is left out.
+        """
         state, n = self.state, len(self.limits)
         newest = state.words[N_SENT]
         kept_ns, kept_V = state.kept_ns.tolist(), state.kept_V.tolist()
