@@ -23,7 +23,6 @@ import numpy as np
 from firmware_py.control.guarded import guarded
 from firmware_py.control.loop import InstrumentLoop
 from firmware_py.control.plan import load_plan
-from firmware_py.control.safety import RAMP_TICKS
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.control.wiring import Devices, open_devices
 from firmware_py.endoscope.wiring import is_endoscope
@@ -33,12 +32,12 @@ from firmware_py.inject import Injector, check_injections, parse_injection
 from firmware_py.live.link import LiveLink
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
+from firmware_py.run.outcome import describe_host, describe_scheduling
+from firmware_py.run.safety import RAMP_TICKS
 from firmware_py.run_request import (
     RunRequest,
     count_interrupts,
-    describe_host,
     describe_machine,
-    describe_scheduling,
     open_requested,
     scheduling,
     truth_of,

@@ -24,12 +24,12 @@ from drivers.daq.di4108 import Di4108
 from drivers.piezo.e727 import E727
 from firmware_py.compiled import memory as at
 from firmware_py.compiled.memory import Memory, Sinks, Timing
-from firmware_py.control.findings import Finding
 from firmware_py.control.loop import LATE_PART, InstrumentLoop
-from firmware_py.control.safety import State
 from firmware_py.control.wiring import Devices
 from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.recording.ring import RowsView
+from firmware_py.run.findings import Finding
+from firmware_py.run.safety import State
 from firmware_py.scheduler.task import TickInfo
 from firmware_py.scheduler.ticker import ScanTicker, Ticks, silent_at_ns
 from hal.clock import VirtualClock

@@ -7,7 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.control.plausibility import PlausibilityLimits
-from firmware_py.control.safety import SafetyLimits
+from firmware_py.run.safety import SafetyLimits
 
 
 class SelfTestLimits(BaseModel):

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.hmc2003 import Hmc2003
-from firmware_py.control.findings import Finding
 from firmware_py.control.fresh_field import fill_field
-from firmware_py.control.incidents import Incidents, LoopCounts
+from firmware_py.run.findings import Finding
+from firmware_py.run.incidents import Incidents, LoopCounts
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 

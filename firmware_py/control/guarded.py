@@ -9,7 +9,6 @@ from typing import Any
 
 from drivers.piezo.dac_output import DacOutput
 from drivers.specs import device_options
-from firmware_py.control.safety import SafetyLimits
 from firmware_py.control.wiring import Devices
 from firmware_py.guardian.amplifier import GuardedAmplifier
 from firmware_py.guardian.care import GuardianCare, start_failed
@@ -17,6 +16,7 @@ from firmware_py.guardian.gate import LEASE_MARGIN_MS
 from firmware_py.guardian.guardian import STEP_NS, Guardian, State
 from firmware_py.guardian.heart import Heart
 from firmware_py.guardian.process import GuardianProcess
+from firmware_py.run.safety import SafetyLimits
 from hal.bench import I2cSpec, OpenBench, Processes
 from hal.clock import VirtualClock
 

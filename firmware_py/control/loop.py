@@ -14,13 +14,10 @@ import numpy as np
 
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.field_input import FieldInput
-from firmware_py.control.findings import Finding, finding_of_button, finding_of_output
-from firmware_py.control.incidents import Incidents, LoopCounts, Recorder
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
 from firmware_py.control.plausibility import ScanCheck, turns_of_pairs
 from firmware_py.control.redundancy import Redundancy
-from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.scan_input import ScanInput
 from firmware_py.control.stages import Stages
 from firmware_py.control.status import LoopStatus
@@ -38,6 +35,9 @@ from firmware_py.frame import (
     FrameStatus,
 )
 from firmware_py.live.link import LiveLink
+from firmware_py.run.findings import Finding, finding_of_button, finding_of_output
+from firmware_py.run.incidents import Incidents, LoopCounts, Recorder
+from firmware_py.run.safety import State, Supervisor
 from firmware_py.scheduler.scheduler import Scheduler
 from firmware_py.scheduler.task import BackgroundSpec, TickInfo
 from firmware_py.scheduler.ticker import ScanTicker, Ticks

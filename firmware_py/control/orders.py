@@ -6,12 +6,12 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from firmware_py.control.findings import Finding
-from firmware_py.control.incidents import Incidents
 from firmware_py.control.manual import ManualDrive
-from firmware_py.control.safety import Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.live.link import LiveLink
+from firmware_py.run.findings import Finding
+from firmware_py.run.incidents import Incidents
+from firmware_py.run.safety import Supervisor
 from hal.contracts import Clock
 
 MAX_GAIN = 1.5

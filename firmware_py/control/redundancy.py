@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.incidents import Incidents
 from firmware_py.control.parity import Parity, Verdict
 from firmware_py.control.plausibility import ScanCheck
-from firmware_py.control.safety import Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.frame import PARITIES, PARITY, STATUS, FrameStatus
+from firmware_py.run.incidents import Incidents
+from firmware_py.run.safety import Supervisor
 
 UNBELIEVED = FrameStatus.INVALID | FrameStatus.STALE | FrameStatus.ALIGNING
 

@@ -11,11 +11,11 @@ from collections.abc import Callable
 import numpy as np
 
 from firmware_py.control.config import SafetyLimits
-from firmware_py.control.findings import Finding, finding_of_scans
-from firmware_py.control.host_gaps import HostGaps
-from firmware_py.control.incidents import Incidents, LoopCounts
-from firmware_py.control.safety import Supervisor
 from firmware_py.control.wiring import Devices
+from firmware_py.run.findings import Finding, finding_of_scans
+from firmware_py.run.host_gaps import HostGaps
+from firmware_py.run.incidents import Incidents, LoopCounts
+from firmware_py.run.safety import Supervisor
 from firmware_py.scheduler.ticker import Ticks
 from hal.contracts import Clock
 from hal.errors import HalError

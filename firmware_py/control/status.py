@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from firmware_py.control.holds import Holds
-from firmware_py.control.incidents import LoopCounts
 from firmware_py.control.manual import ManualDrive
-from firmware_py.control.safety import Supervisor
 from firmware_py.control.stages import Stages
 from firmware_py.frame import COMMAND, TIME, TREMOR_AMPLITUDE, TREMOR_FREQUENCY
+from firmware_py.run.holds import Holds
+from firmware_py.run.incidents import LoopCounts
+from firmware_py.run.safety import Supervisor
 from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.scheduler import Scheduler
 from hal.contracts import Clock

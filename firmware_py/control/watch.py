@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.control.config import FirmwareConfig
-from firmware_py.control.findings import Finding, finding_of_button, finding_of_output
-from firmware_py.control.incidents import Incidents
 from firmware_py.control.plausibility import ScanCheck
-from firmware_py.control.safety import State, Supervisor
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
+from firmware_py.run.findings import Finding, finding_of_button, finding_of_output
+from firmware_py.run.incidents import Incidents
+from firmware_py.run.safety import State, Supervisor
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 

@@ -16,11 +16,10 @@ from firmware_py.endoscope.targets import GameState
 from firmware_py.endoscope.wiring import open_sensors
 from firmware_py.recording.recorder import RecorderProcess, RecordingSummary
 from firmware_py.recording.revision import git_revision
+from firmware_py.run.outcome import describe_host, describe_scheduling
 from firmware_py.run_request import (
     RunRequest,
     count_interrupts,
-    describe_host,
-    describe_scheduling,
     open_requested,
     scheduling,
     truth_of,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from firmware_py.control.holds import OPERATOR
+from firmware_py.run.holds import OPERATOR
 from tests.conftest import DEFAULT_BENCH
 from tools.bench.firmware import Choice
 from tools.bench.session import Session

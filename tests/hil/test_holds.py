@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from firmware_py.app import run_in_process
-from firmware_py.control.findings import Finding
 from firmware_py.control.replay import replay_recording
-from firmware_py.control.safety import SafetyLimits
 from firmware_py.recording.reader import Recording
+from firmware_py.run.findings import Finding
+from firmware_py.run.safety import SafetyLimits
 from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, Port
 from hal.contracts import Clock

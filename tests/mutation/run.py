@@ -35,7 +35,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
             "tests/virtual_time/test_background.py",
         ),
     ),
-    "safety": (("firmware_py/control/safety.py",), ("tests/unit/control/test_safety.py",)),
+    "safety": (("firmware_py/run/safety.py",), ("tests/unit/control/test_safety.py",)),
     "guardian": (
         tuple(f"firmware_py/guardian/{name}.py" for name in ("amplifier", "care", "gate", "guardian", "heart")),
         ("tests/unit/guardian",),

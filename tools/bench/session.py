@@ -34,7 +34,7 @@ STATUS_S = 0.1
 DISK_S = 2.0
 STALE_S = 0.25
 OPERATOR = "the operator"
-"""What a hold of the firmware waits for when only a person is missing (``firmware_py.control.holds``)."""
+"""What a hold of the firmware waits for when only a person is missing (``firmware_py.run.holds``)."""
 DISK_LOW_BYTES = 2 << 30
 DISK_LOW_SHARE = 0.03
 

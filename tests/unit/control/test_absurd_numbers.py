@@ -18,7 +18,7 @@ from drivers.specs import check_devices
 from firmware_py.app import run_in_process
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.plan import load_plan
-from firmware_py.control.safety import SafetyLimits
+from firmware_py.run.safety import SafetyLimits
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from hal.errors import BenchError, HalError

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from firmware_py import app
-from firmware_py.run_request import RunRequest, describe_scheduling
+from firmware_py.run.outcome import describe_scheduling
+from firmware_py.run_request import RunRequest
 from firmware_py.scheduler.realtime import RealtimeReport, Setting
 from tests.conftest import DEFAULT_BENCH, copy_of_default_bench
 

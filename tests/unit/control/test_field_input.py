@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from firmware_py.control.field_input import FieldInput
-from firmware_py.control.incidents import LoopCounts
+from firmware_py.run.incidents import LoopCounts
 from firmware_py.scheduler.task import TickInfo
 
 OUTLIER_V = 0.01

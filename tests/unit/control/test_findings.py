@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from firmware_py.control import findings
-from firmware_py.control.findings import CauseClass, Finding, finding_of_button, finding_of_output, finding_of_scans
+from firmware_py.run import findings
+from firmware_py.run.findings import CauseClass, Finding, finding_of_button, finding_of_output, finding_of_scans
 from hal.errors import (
     BusError,
     Disconnected,

@@ -7,11 +7,11 @@ from typing import Any, cast
 
 import pytest
 
-from firmware_py.control.findings import CauseClass, Finding
-from firmware_py.control.holds import MINUTE_NS, OPERATOR
-from firmware_py.control.host_gaps import HostGaps
-from firmware_py.control.incidents import Incidents, LoopCounts
-from firmware_py.control.safety import SafetyLimits, State, Supervisor
+from firmware_py.run.findings import CauseClass, Finding
+from firmware_py.run.holds import MINUTE_NS, OPERATOR
+from firmware_py.run.host_gaps import HostGaps
+from firmware_py.run.incidents import Incidents, LoopCounts
+from firmware_py.run.safety import SafetyLimits, State, Supervisor
 from hal.clock import VirtualClock
 
 MS = 1_000_000

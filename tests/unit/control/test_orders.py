@@ -13,15 +13,15 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from firmware_py.control.findings import CauseClass, Finding
-from firmware_py.control.incidents import Incidents, LoopCounts
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import PageOrders
-from firmware_py.control.safety import State, Supervisor, Trip
 from firmware_py.control.stages import Stages
 from firmware_py.exit_codes import Exit, exit_code_of
 from firmware_py.live.link import MAX_ORDERS, LiveLink
 from firmware_py.live.memory import LiveMemory
+from firmware_py.run.findings import CauseClass, Finding
+from firmware_py.run.incidents import Incidents, LoopCounts
+from firmware_py.run.safety import State, Supervisor, Trip
 from firmware_py.scheduler.histogram import DurationHistogram
 from hal.clock import VirtualClock
 from hal.contracts import AnalogOutput

@@ -8,11 +8,11 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from firmware_py.control.incidents import Incidents, LoopCounts
 from firmware_py.control.parity import ALONE_TICKS, LEARN_TICKS, PATIENCE_TICKS
 from firmware_py.control.redundancy import Redundancy
-from firmware_py.control.safety import State, Supervisor
 from firmware_py.frame import LAYOUT, PARITIES, PARITY, STATUS, FrameStatus
+from firmware_py.run.incidents import Incidents, LoopCounts
+from firmware_py.run.safety import State, Supervisor
 from hal.clock import VirtualClock
 
 # eight directions in the plane of two parities, 22.5 degrees apart

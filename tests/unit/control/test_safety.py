@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from firmware_py.control.findings import CauseClass, Finding
-from firmware_py.control.safety import RAMP_TICKS, State, Supervisor, Trip
+from firmware_py.run.findings import CauseClass, Finding
+from firmware_py.run.safety import RAMP_TICKS, State, Supervisor, Trip
 from hal.contracts import Float64Array
 from hal.errors import I2cNack, SafetyTrip
 from hal.types import OutputLimit

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from firmware_py.control.config import FirmwareConfig
-from firmware_py.control.findings import CauseClass
-from firmware_py.control.incidents import Incidents, LoopCounts
-from firmware_py.control.safety import SafetyLimits, State, Supervisor
 from firmware_py.control.watch import Watch
 from firmware_py.frame import LAYOUT, STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.guardian.heart import Heart, Why
+from firmware_py.run.findings import CauseClass
+from firmware_py.run.incidents import Incidents, LoopCounts
+from firmware_py.run.safety import SafetyLimits, State, Supervisor
 from firmware_py.scheduler.task import TickInfo
 from hal.clock import VirtualClock
 from hal.errors import HalTimeout

@@ -6,13 +6,13 @@ import argparse
 import re
 from pathlib import Path
 
-from firmware_py.control.findings import Finding
-from firmware_py.control.safety import SafetyLimits
+from firmware_py.run.findings import Finding
+from firmware_py.run.safety import SafetyLimits
 
 HEAD = """# Findings: what holds, what latches
 
 Made by `python -m tools.research.reports.findings_page docs/findings.md` from the table in
-[`firmware_py/control/findings.py`](../firmware_py/control/findings.py), which the firmware itself obeys.
+[`firmware_py/run/findings.py`](../firmware_py/run/findings.py), which the firmware itself obeys.
 
 **Recoverable**: the outputs ramp to neutral within 20 ms and hold there. When scans have flowed and the self-test has
 passed for `hold_ms` without interruption, the amplifier is armed again (it reads neutral back) and compensation fades

@@ -8,9 +8,9 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.findings import CauseClass, Finding
-from firmware_py.control.holds import Holds
-from firmware_py.control.safety import SafetyLimits, State, Supervisor
+from firmware_py.run.findings import CauseClass, Finding
+from firmware_py.run.holds import Holds
+from firmware_py.run.safety import SafetyLimits, State, Supervisor
 from firmware_py.scheduler.histogram import DurationHistogram
 from hal.contracts import Clock
 from hal.errors import HalError

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from firmware_py.control.findings import Finding
-from firmware_py.control.safety import Hold, SafetyLimits, State, Supervisor
+from firmware_py.run.findings import Finding
+from firmware_py.run.safety import Hold, SafetyLimits, State, Supervisor
 
 MINUTE_NS = 60_000_000_000
 OPERATOR = "the operator"

@@ -15,7 +15,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
-from firmware_py.control.findings import CauseClass, Finding
+from firmware_py.run.findings import CauseClass, Finding
 from hal.contracts import AnalogOutput
 from hal.errors import HalError, I2cNack
 

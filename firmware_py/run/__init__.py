@@ -1,0 +1,6 @@
+"""Runs an instrument: the loop, what stops it, who is told, what is reported. The same for every instrument.
+
+What lives here: everything that two instruments have in common. An instrument is a table of tasks (``tasks.py``), a
+function that opens its devices, and a report (``instrument.py`` has the protocols).
+What must not: a sensor, an estimator, a device of one instrument (``firmware_py.control``, ``firmware_py.endoscope``).
+"""
