@@ -52,12 +52,6 @@ COMMANDS = {
         "tools.cli.emulate:emulate",
         "Serve every bus of a bench's emulated devices for any program, until Ctrl-C or until COMMAND ends.",
     ),
-    "endoscope": Command(
-        "Run",
-        "tools.cli.endoscope:endoscope",
-        "Let a synthetic user steer the endoscope's field of view with the emulated motion card until all targets are "
-        "reached.",
-    ),
     "trust": Command(
         "Run",
         "tools.cli.trust:trust",

@@ -302,7 +302,7 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
 
 def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None, json_file: str | None) -> None:
     """Report, JSON and exit code of an endoscope bench."""
-    from tools.endoscope.run_report import complete_run, print_run
+    from tools.reports.endoscope_report import complete_run, print_run
 
     result = complete_run(outcome, truth)
     print_run(result, console())
@@ -312,7 +312,7 @@ def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | Non
 
 def _shown(status: dict[str, Any], seconds: float, watch: TipWatch) -> RenderableType:
     if "view" in status:
-        from tools.endoscope.run_report import status_table
+        from tools.reports.endoscope_report import status_table
 
         return status_table(status, seconds)
     from tools.reports.run_live import live_line

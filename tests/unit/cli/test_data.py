@@ -18,8 +18,8 @@ from typer.testing import CliRunner, Result
 
 from tools.cli.main import app
 from tools.data import registry
-from tools.data.page import PAGE, page
 from tools.data.registry import public_sets
+from tools.research.reports.data_page import PAGE, page
 
 CONTENT = {"a.csv": b"t,x\n1,2\n", "b with blanks.mat": b"MATLAB" * 1000}
 LIST = """
@@ -174,4 +174,4 @@ def test_the_shipped_list_is_whole():
 def test_the_page_is_current(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(registry.public_sets, "__defaults__", (registry.LIST,))
     root = Path(__file__).parents[3]
-    assert (root / PAGE).read_text(encoding="utf-8") == page(), "run python -m tools.data.page --out docs/data.md"
+    assert (root / PAGE).read_text(encoding="utf-8") == page(), "its head names the command"

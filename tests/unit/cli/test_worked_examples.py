@@ -48,7 +48,7 @@ OF_HANDS = ("hands", "tremor evaluate", "tremor inspect", "tremor report", "trem
 # over two seconds each: `make test-all`
 SLOW = (
     "calibrate piezo",
-    "endoscope-tables",
+    "endoscope tables",
     "faults",
     "hands",
     "imu",

@@ -18,7 +18,7 @@ from firmware_py.run_request import RunRequest
 from hal.bench import OpenBench, load_bench
 from hal.errors import BenchError
 from tools.cli.main import app
-from tools.endoscope.run_report import complete_run, inclination_errors_deg
+from tools.reports.endoscope_report import complete_run, inclination_errors_deg
 
 TEXT = """
 format = 1

@@ -13,9 +13,9 @@ from firmware_py.endoscope.control import ControlConfig
 from firmware_py.endoscope.report import report_csv
 from firmware_py.endoscope.targets import GameConfig, TargetGame
 from tools.cli.main import app
-from tools.endoscope.play import play, play_on_bench, task_of
-from tools.endoscope.user import SyntheticUser, UserConfig
-from tools.research.reproduce.endoscope_experiment import run_cell
+from tools.research.endoscope.experiment import run_cell
+from tools.research.endoscope.play import play, play_on_bench, task_of
+from tools.research.endoscope.user import SyntheticUser, UserConfig
 
 BENCH = Path(benches.__file__).with_name("endoscope.toml")
 
@@ -100,15 +100,15 @@ def test_report_file() -> None:
 def test_command(tmp_path: Path) -> None:
     runner = CliRunner()
     report = tmp_path / "user.csv"
-    done = runner.invoke(app, ["endoscope", "--direct", "--targets", "1", "--report", str(report)])
+    done = runner.invoke(app, ["endoscope", "play", "--direct", "--targets", "1", "--report", str(report)])
     assert done.exit_code == 0, done.output
     assert report.exists()
-    wrong = runner.invoke(app, ["endoscope", "--direct", "--mapping", "force"])
+    wrong = runner.invoke(app, ["endoscope", "play", "--direct", "--mapping", "force"])
     assert wrong.exit_code == 2
     assert "position or speed" in wrong.output
-    late = runner.invoke(app, ["endoscope", "--direct", "--limit", "2"])
+    late = runner.invoke(app, ["endoscope", "play", "--direct", "--limit", "2"])
     assert late.exit_code == 1
     assert "gave up after 2 s" in late.output
-    other = runner.invoke(app, ["endoscope", "--bench", str(Path(benches.__file__).with_name("micron.toml"))])
+    other = runner.invoke(app, ["endoscope", "play", "--bench", str(Path(benches.__file__).with_name("micron.toml"))])
     assert other.exit_code == 2
     assert "no endoscope bench" in other.output

@@ -17,11 +17,11 @@ from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.reader import Recording
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.noise_file import noise_table
-from firmware_py.tremor.cascade_file import load_network
 from hal.bench import load_bench
 from hal.errors import BenchError
 from tests.conftest import DEFAULT_BENCH
 from tools.mismatch import recording_load as twins
+from tools.research.tremor.cascade_file import load_network
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "v1"
 

@@ -17,9 +17,9 @@ from tools.cli.main import app
 from tools.mismatch import key_tables as keys
 from tools.mismatch.export.write import FORMATS
 from tools.mismatch.keys import Key
-from tools.mismatch.own_data import page
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.vocabulary import KINDS
+from tools.research.reports.own_data_page import page
 
 PAGE = Path(__file__).parents[3] / "docs" / "own-data.md"
 
@@ -29,7 +29,7 @@ def blocks(kind: str) -> list[str]:
 
 
 def test_the_page_is_current() -> None:
-    assert PAGE.read_text(encoding="utf-8") == page(), "run python -m tools.mismatch.own_data --out docs/own-data.md"
+    assert PAGE.read_text(encoding="utf-8") == page(), "its head names the command"
 
 
 def test_every_key_and_every_kind_is_on_the_page() -> None:

@@ -12,7 +12,9 @@ import pytest
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.infer.constants import START, Constants
 from tools.mismatch.infer.decide import decide
-from tools.mismatch.infer.learn import (
+from tools.mismatch.infer.run import infer
+from tools.research.prove.calibration import calibrate, write_constants
+from tools.research.prove.learn import (
     CLIP,
     Case,
     SetTraits,
@@ -23,8 +25,6 @@ from tools.mismatch.infer.learn import (
     raw_surenesses,
     traits_of,
 )
-from tools.mismatch.infer.run import infer
-from tools.research.prove.calibration import calibrate, write_constants
 
 
 def _set(names: str, density: float, parameters: int = 2, z: float | None = 9.0, rest: float = 0.0) -> SetTraits:

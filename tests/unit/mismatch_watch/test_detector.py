@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
+from tests.unit.mismatch_watch.bounds import cusum_run_length, shiryaev_roberts_run_length, shortest_delay
 from tools.errors import InputError
-from tools.mismatch.watch.bounds import cusum_run_length, shiryaev_roberts_run_length, shortest_delay
 from tools.mismatch.watch.detector import State, begin, evidence, follow, interrupt
 from tools.mismatch.watch.reference import Reference, block_figures, learn, long_run_variance
 

@@ -10,8 +10,8 @@ from firmware_py.records import attributes
 from firmware_py.sensing.attitude_params import gyroscope_error_state
 from firmware_py.sensing.error_state import propagate_errors
 from firmware_py.sensing.error_state_records import ERROR_STATE, ERROR_STATE_STATE, ERRORS
-from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
 from firmware_py.sensing.triad import triad, triad_covariance
+from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 
 RATE_HZ = 200.0
 G = 9.81

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from firmware_py.records import attributes, new_record
 from firmware_py.sensing import fusion_filters
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
-from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
 from firmware_py.sensing.quaternion import from_matrix
 from tools.research.reproduce.broad_trials import read_trial
+from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 
 Array = NDArray[np.float64]
 RATE_HZ = 100.0

@@ -11,10 +11,10 @@ import pytest
 from scipy import special
 
 from firmware_py.records import attributes
-from firmware_py.tremor.activations import KINDS, activation, bessel_j0, bessel_j1, slope
-from firmware_py.tremor.cascade import Cascade, CascadeNetwork, cascade_kernel
-from firmware_py.tremor.cascade_file import load_network, network_text
 from hal.errors import BenchError
+from tools.research.tremor.activations import KINDS, activation, bessel_j0, bessel_j1, slope
+from tools.research.tremor.cascade import Cascade, CascadeNetwork, cascade_kernel
+from tools.research.tremor.cascade_file import load_network, network_text
 from tools.research.tremor.cascade_kernels import candidate_score, ndekf_pass, quickprop
 from tools.research.tremor.cascade_training import Paths, Training, train, windows
 

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from firmware_py.tremor.cascade import Cascade
-from firmware_py.tremor.cascade_file import load_network
 from tools.cli.main import app
 from tools.errors import InputError
 from tools.research.reproduce.tremor_hands import PUBLISHED_CROSS
+from tools.research.tremor.cascade import Cascade
 from tools.research.tremor.cascade_data import RATE_HZ, Making, learning_paths, subjects, voluntary
+from tools.research.tremor.cascade_file import load_network
 from tools.research.tremor.report import filled, report, table
 from tools.research.tremor.report_detectors import detection, jerk_acceleration
 from tools.research.tremor.shaker import _held_out

@@ -13,10 +13,9 @@ COMMANDS = {
         "tools.research.cli.soak:soak",
         "Run the closed loop for hours in virtual time and report memory, tremor and every counter by eighths.",
     ),
-    "endoscope-tables": (
-        "tools.research.cli.endoscope_tables:endoscope_tables",
-        "Measure the elapsed time for both mappings and four response times with a synthetic user (Erat 2018, Tables "
-        "6.1 and 6.2).",
+    "endoscope": (
+        "tools.research.cli.endoscope:endoscope",
+        "Let a synthetic user steer the endoscope's field of view with the motion card (Erat 2018, chapter 6).",
     ),
     "reproduce": (
         "tools.research.cli.reproduce:reproduce",

@@ -23,7 +23,7 @@ from tools.errors import InputError
 from tools.interrupt import is_stopped
 from tools.output import Outputs, check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
-from tools.stamp import revision_and_day
+from tools.research.stamp import revision_and_day
 from tools.terminal import task_name
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
 from tools.output import check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
-from tools.stamp import revision_and_day
+from tools.research.stamp import revision_and_day
 
 
 def reproduce(

@@ -31,9 +31,9 @@ def report(
 
     Example: micron tremor report --section evaluate --out docs/results/tremor-on-real-hands.json
     """
+    from tools.research.stamp import revision_and_day
     from tools.research.tremor.report import renewed
     from tools.research.tremor.report import report as make
-    from tools.stamp import revision_and_day
 
     with clear_errors():
         check_writable(out)

@@ -45,8 +45,8 @@ def train(
 
     Example: micron tremor train ../shared/data/tremor_mouse_lsm9ds1 --leave-out mouse23 --out out/cascade.json
     """
-    from firmware_py.tremor.cascade_file import network_text
     from tools.research.tremor.cascade_data import Making, subjects, voluntary
+    from tools.research.tremor.cascade_file import network_text
     from tools.research.tremor.cascade_study import TEST_SEED, WINDOWS, mean_percent, score, search
     from tools.research.tremor.cascade_training import Training
     from tools.research.tremor.signals import load_signals

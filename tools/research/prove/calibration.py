@@ -10,7 +10,6 @@ from typing import Any
 
 from firmware_py.recording.revision import git_revision
 from tools.mismatch.infer.constants import FILE, START
-from tools.mismatch.infer.learn import Case, cross_validated, learn, learn_sure, raw_surenesses, traits_of
 from tools.mismatch.infer.run import infer
 from tools.mismatch.recording_load import load
 from tools.output import write_text_atomic
@@ -18,6 +17,7 @@ from tools.research.prove.corpus import CORPORA, answers_digest, digest_of, draw
 from tools.research.prove.exact import reliability
 from tools.research.prove.guests import installed
 from tools.research.prove.harness import SHARED
+from tools.research.prove.learn import Case, cross_validated, learn, learn_sure, raw_surenesses, traits_of
 from tools.research.prove.plans import SELDOM
 
 SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("density", "search", "store")))

@@ -1,5 +1,5 @@
-"""Pages about the firmware: the closed loop in recorded hands beside its limits, and the table of findings.
+"""Pages of ``docs``: the closed loop in recorded hands, the table of findings, public recordings, data of one's own.
 
-What lives here: the runs over recorded hands and the pages made of them. What must not: the report of one run
-(``tools.reports``).
+What lives here: the runs over recorded hands and the pages made of them and of the product's tables.
+What must not: the report of one run (``tools.reports``).
 """

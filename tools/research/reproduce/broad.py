@@ -16,8 +16,8 @@ import numpy as np
 
 from firmware_py.records import Record
 from firmware_py.sensing.attitude_params import gyroscope_error_state
-from firmware_py.sensing.gyroscope_attitude import gyroscope_attitude
 from tools.research.reproduce.broad_trials import BROAD_HZ, Trial, trials, vqf_errors_deg
+from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
 from tools.research.reproduce.rows import Row
 
 GOAL, GOAL_MEAN, GOAL_DISTURBED = 1.1, 0.9, 0.7

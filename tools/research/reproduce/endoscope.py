@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.sensing.fusion import Fusion, FusionConfig, angles_deg
-from tools.endoscope.user import UserConfig
 from tools.imu.offsets import gyroscope_mean
 from tools.imu.series import Scales, load_series
+from tools.research.endoscope.experiment import RESPONSES_S, Mapping, run_cell
+from tools.research.endoscope.user import UserConfig
 from tools.research.reproduce.endoscope_broad import broad
-from tools.research.reproduce.endoscope_experiment import RESPONSES_S, Mapping, run_cell
 from tools.research.reproduce.endoscope_imu import imus
 from tools.research.reproduce.real_sensors import data_folder
 from tools.research.reproduce.rows import Row, Section, Table, build
@@ -273,7 +273,7 @@ SECTIONS: Sequence[Section] = (settling, beta_sweep, broad, imus, mapping_tables
 def table() -> Table:
     """All sections; recordings that are not there are left out with a note."""
     notes = [
-        "clicks and rotations of six people (Figures 6.7 to 6.11) are bars without numbers: micron endoscope-tables"
+        "clicks and rotations of six people (Figures 6.7 to 6.11) are bars without numbers: micron endoscope tables"
     ]
     if not data_folder().is_dir():
         notes.append(f"{data_folder()} is not there: no rows from recordings")

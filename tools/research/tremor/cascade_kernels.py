@@ -7,8 +7,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.tremor.activations import activation, slope
 from hal.compiled import kernel
+from tools.research.tremor.activations import activation, slope
 
 Array = NDArray[np.float64]
 

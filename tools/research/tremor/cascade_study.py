@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.tremor.cascade import Cascade, CascadeNetwork
+from tools.research.tremor.cascade import Cascade, CascadeNetwork
 from tools.research.tremor.cascade_data import RATE_HZ, Making, Subject, learning_paths, voluntary
 from tools.research.tremor.cascade_training import Trained, Training, train
 

@@ -15,8 +15,8 @@ from math import sqrt
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.tremor.activations import KINDS
-from firmware_py.tremor.cascade import CascadeNetwork, Target
+from tools.research.tremor.activations import KINDS
+from tools.research.tremor.cascade import CascadeNetwork, Target
 from tools.research.tremor.cascade_kernels import ndekf_pass, quickprop, unit_outputs
 
 Array = NDArray[np.float64]

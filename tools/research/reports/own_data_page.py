@@ -1,6 +1,6 @@
 """``docs/own-data.md``: from a csv to a diagnosis, then every key and every twin, from the tables that the loader uses.
 
-``python -m tools.mismatch.own_data --out docs/own-data.md`` writes the page; a test compares.
+``python -m tools.research.reports.own_data_page --out docs/own-data.md`` writes the page; a test compares.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from tools.mismatch.twins.vocabulary import CONTEXT_UNITS, KINDS
 
 _GUIDE = """# Your own data
 
-Made by `python -m tools.mismatch.own_data --out docs/own-data.md`; do not edit. The tests run the first part.
+Made by `python -m tools.research.reports.own_data_page --out docs/own-data.md`; do not edit. The tests run the
+first part.
 
 A recording is a folder with your data file and a `recording.toml`, which describes its columns and names the simulation
 that it is compared with. The example is a motor axis: force in, position out, `data.csv` with a header row.
@@ -185,7 +186,7 @@ def _signals(pattern: str) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description="write docs/own-data.md")
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE")
     parser.parse_args().out.write_text(page(), encoding="utf-8")
 

@@ -7,8 +7,8 @@ from typing import Literal
 
 from firmware_py.endoscope.control import ControlConfig
 from firmware_py.endoscope.targets import GameConfig
-from tools.endoscope.play import play
-from tools.endoscope.user import UserConfig
+from tools.research.endoscope.play import play
+from tools.research.endoscope.user import UserConfig
 
 RESPONSES_S = (0.25, 0.5, 1.0, 2.0)
 EXPERIMENTS = 5

@@ -1,4 +1,4 @@
-"""``micron endoscope``: the targeting experiment, played by a synthetic user."""
+"""``micron endoscope``: the targeting experiment, played by a synthetic user, and its tables."""
 
 from __future__ import annotations
 
@@ -6,12 +6,17 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.progress import track
 from rich.table import Table
 
 from tools.cli.bench_option import bench_path
-from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_json, write_text_atomic
+
+endoscope = typer.Typer(
+    help="Let a synthetic user steer the endoscope's field of view with the motion card (Erat 2018, chapter 6)."
+)
 
 MappingOption = Annotated[str, typer.Option("--mapping", help="position or speed.")]
 GainOption = Annotated[float, typer.Option(min=0.01, max=1000.0, help="Pixels per degree, or pixels/s per degree.")]
@@ -32,7 +37,8 @@ def default_bench() -> Path:
     return Path(benches.__file__).with_name("endoscope.toml")
 
 
-def endoscope(
+@endoscope.command("play")
+def play_command(
     user: Annotated[str, typer.Option(help="Name of the user in the report.")] = "synthetic",
     mapping: MappingOption = "position",
     gain: GainOption = 8.0,
@@ -54,13 +60,13 @@ def endoscope(
 
     The user turns the card and presses its button (Erat 2018, chapter 6), in virtual time.
 
-    Example: micron endoscope --mapping speed --response 1 --report out/user.csv
+    Example: micron endoscope play --mapping speed --response 1 --report out/user.csv
     """
     from firmware_py.endoscope.control import ControlConfig
     from firmware_py.endoscope.report import report_csv
     from firmware_py.endoscope.targets import GameConfig
-    from tools.endoscope.play import play, play_on_bench
-    from tools.endoscope.user import UserConfig
+    from tools.research.endoscope.play import play, play_on_bench
+    from tools.research.endoscope.user import UserConfig
 
     with clear_errors():
         check_writable(json_file, record, report)
@@ -111,3 +117,54 @@ def _show(user: str, result: dict[str, Any]) -> None:
         psi, theta = (f"{row[f'{a}_min_deg']:.1f} .. {row[f'{a}_max_deg']:.1f}" for a in ("psi", "theta"))
         table.add_row(str(row["target"]), f"{row['elapsed_s']:.1f}", str(row["clicks"]), psi, theta)
     console().print(table)
+
+
+@endoscope.command("tables")
+def tables(
+    gain: GainOption = 8.0,
+    experiments: Annotated[int, typer.Option(min=1, max=100, help="Per cell.")] = 5,
+    seed: SeedOption = 1,
+    json_file: JsonOption = None,
+) -> None:
+    """Measure the elapsed time for both mappings and four response times with a synthetic user (Erat 2018, Tables 6.1
+    and 6.2).
+
+    Example: micron endoscope tables --json out/mapping.json
+    """
+    from tools.research.endoscope.experiment import RESPONSES_S, run_cell
+    from tools.research.endoscope.user import UserConfig
+
+    with clear_errors():
+        check_writable(json_file)
+        person = UserConfig(seed=seed)
+        jobs = [(mapping, tau) for mapping in ("position", "speed") for tau in RESPONSES_S]
+        cells = [
+            run_cell(mapping_of(mapping), tau, person, gain=gain, experiments=experiments)
+            for mapping, tau in track(jobs, "playing", console=console(), transient=True)
+        ]
+        grid = Table(title=f"synthetic user, K = {gain:g}, {experiments} experiments a cell", title_justify="left")
+        for column in ("mapping", "tau (s)", "time (s)", "mean (s)", "clicks", "psi, theta (deg)"):
+            grid.add_column(column, justify="right")
+        for cell in cells:
+            times = " ".join(f"{v:.0f}" for v in cell.elapsed_s)
+            psi, theta = cell.rotation_deg
+            clicks = f"{sum(cell.clicks) / len(cell.clicks):.1f}"
+            grid.add_row(
+                cell.mapping, f"{cell.response_s:g}", times, f"{cell.mean_s:.1f}", clicks, f"{psi:.1f}, {theta:.1f}"
+            )
+        data_console().print(grid)
+        rows = [
+            {
+                "mapping": cell.mapping,
+                "response_s": cell.response_s,
+                "elapsed_s": list(cell.elapsed_s),
+                "mean_s": cell.mean_s,
+                "clicks": list(cell.clicks),
+                "rotation_deg": list(cell.rotation_deg),
+                "done": cell.done,
+            }
+            for cell in cells
+        ]
+        write_json({"format": 1, "gain": gain, "rows": rows}, json_file)
+        if not all(cell.done for cell in cells):
+            raise typer.Exit(Exit.FAILED)

@@ -17,8 +17,8 @@ from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.run_request import RunRequest, open_requested
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
-from tools.endoscope.user import SyntheticUser, Task, UserConfig
 from tools.errors import InputError
+from tools.research.endoscope.user import SyntheticUser, Task, UserConfig
 
 STEP_S = 0.01
 LIMIT_S = 600.0

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record, new_record
-from firmware_py.tremor.activations import KINDS, activation
 from hal.compiled import kernel
+from tools.research.tremor.activations import KINDS, activation
 
 Array = NDArray[np.float64]
 Target = Literal["voluntary", "error"]

@@ -9,9 +9,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from firmware_py.tremor.cascade import CascadeNetwork
 from hal.errors import BenchError
 from hal.validation import Positive, describe_validation_error
+from tools.research.tremor.cascade import CascadeNetwork
 
 
 class _File(BaseModel):

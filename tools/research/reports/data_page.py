@@ -1,6 +1,6 @@
 """``docs/data.md``: the public recordings, their licences and origins, from the list that ``micron data`` reads.
 
-``python -m tools.data.page --out docs/data.md`` writes the page; a test compares.
+``python -m tools.research.reports.data_page --out docs/data.md`` writes the page; a test compares.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ from tools.data.registry import PublicSet, public_sets
 PAGE = Path("docs/data.md")
 _HEAD = """# Public recordings
 
-Made by `python -m tools.data.page --out docs/data.md`; do not edit. These recordings are other people's: none is
-part of this project, and what they ask for (licence, citation) is yours to keep.
+Made by `python -m tools.research.reports.data_page --out docs/data.md`; do not edit. These recordings are other
+people's: none is part of this project, and what they ask for (licence, citation) is yours to keep.
 
 ```
 micron data list                # names, sizes, licences, what is here already
@@ -51,7 +51,7 @@ def _row(s: PublicSet) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tools.data.page", description="write docs/data.md")
+    parser = argparse.ArgumentParser(prog="python -m tools.research.reports.data_page", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE")
     parser.parse_args().out.write_text(page(), encoding="utf-8")
 
