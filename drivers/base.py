@@ -2,17 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Protocol
 
 from hal.contracts import Clock
-from hal.types import ChannelInfo
-
-
-class HasChannels(Protocol):
-    """Every driver says what it measures or moves."""
-
-    def channels(self) -> Sequence[ChannelInfo]: ...
 
 
 class DigitalOutput(Protocol):

@@ -25,10 +25,8 @@ LINE_BYTES = 55  # at most, with counts: '#:', seven times '-32768:', '2:', line
 LONGEST_LINE = 128  # scaled fields need more
 _NUMBER = re.compile(rb"-?\d{1,5}(\.\d{1,8})?")
 
-IMU_SERVICE = "bf470001-767b-467d-a4c0-e8e050c0d96e"
 IMU_CHARACTERISTIC = "bf470002-767b-467d-a4c0-e8e050c0d96e"
 BATTERY_CHARACTERISTIC = "00002a19-0000-1000-8000-00805f9b34fb"  # 0x2A19 of service 0x180F
-ADVERTISED_NAME = "CONTROL.CMR"
 
 
 @dataclass(frozen=True, slots=True)

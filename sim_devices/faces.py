@@ -62,16 +62,3 @@ class CanFace(TimedFace, Protocol):
 
     def receive(self, can_id: int, data: bytes, t_ns: int) -> None: ...
     def take(self) -> list[tuple[int, bytes]]: ...
-
-
-class HeldVoltages:
-    """Truth face of a set of analog inputs that stand still until somebody sets them, in V."""
-
-    def __init__(self, n: int) -> None:
-        self.volts_V = np.zeros(n)
-
-    def set_V(self, channel: int, volts: float) -> None:
-        self.volts_V[channel] = volts
-
-    def __call__(self, t_ns: int) -> Volts:
-        return self.volts_V

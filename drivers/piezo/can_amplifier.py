@@ -64,13 +64,11 @@ class CanAmplifier:
         self.state = DISARMED
         self.measured_V: Float64Array = np.full(CHANNELS, np.nan)
         self.status_ns = 0
-        self.node_heartbeat_ns = 0
         self.heartbeat = heartbeat or HostHeartbeat(bus, clock, database)
         self._bus = bus
         self._clock = clock
         self._setpoint_id = database.get_message_by_name("SETPOINT").frame_id
         self._command_id = database.get_message_by_name("COMMAND").frame_id
-        self._heartbeat_id = database.get_message_by_name("AMPLIFIER_HEARTBEAT").frame_id
         self._status = database.get_message_by_name("STATUS")
         self._counter = 0
         self._acknowledged = 0
@@ -201,8 +199,6 @@ class CanAmplifier:
             self.measured_V /= CODES_PER_V
             self.state = min(state, FAULT)
             self.status_ns = frame.t_ns
-        elif frame.can_id == self._heartbeat_id:
-            self.node_heartbeat_ns = frame.t_ns
 
     def _require_link(self) -> None:
         age_ns = self._clock.now_ns() - self.status_ns

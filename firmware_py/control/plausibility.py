@@ -351,11 +351,6 @@ class ScanCheck:
             return f"{self._labels[supply]} jumped; check the sensors' supply, its wire and the DAQ's line"
         return f"{self._labels[channel]} {WORDS[Implausible(finding)].format(n=self.limits.stuck_ticks)}"
 
-    @property
-    def ignores(self) -> bool:
-        """True if a channel is treated as healthy whatever it reads."""
-        return bool(self._ignored)
-
     def ignore(self, channel: int) -> None:
         """Treat ``channel`` as healthy from now on, whatever it reads."""
         self._ignored.append(channel)

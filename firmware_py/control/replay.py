@@ -13,7 +13,6 @@ from firmware_py.recording.reader import Recording
 from firmware_py.recording.replay import ReplayReport, replay
 
 _NAMES = LAYOUT.scalar_names()
-OUTPUT_COLUMNS = _NAMES[VOLTS:]
 """Columns that a replay must reproduce. It is given the other columns, the commands chosen by hand, and the status bits
 that the loop set."""
 LATER_COLUMNS = _NAMES[ACCELEROMETER_MORE : PARITY + len(PARITIES)]

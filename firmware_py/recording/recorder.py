@@ -56,10 +56,6 @@ class RecordingSummary:
     exit_code: int
     problem: str
 
-    @property
-    def complete(self) -> bool:
-        return self.exit_code == 0
-
 
 class RecorderProcess:
     """Handle of a running recorder. Start it before real-time settings are made: it must not inherit them."""

@@ -8,12 +8,12 @@ lives on the WFLC's frequency has none while the WFLC is not locked.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, inf, nan, pi, sqrt
+from math import exp, nan, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.records import Record, attributes, copy_record, new_record
+from firmware_py.records import Record, copy_record, new_record
 from firmware_py.tremor.adaptive import (
     adaptive_correct,
     adaptive_dtype,
@@ -315,14 +315,3 @@ class Estimator:
         now = out[rows, NOW]
         path = np.asarray(samples) - now if self.config.sees == "displacement" else np.full(now.shape, nan)
         return Estimate(now, out[rows, AHEAD], out[rows, FREQUENCY], out[rows, AMPLITUDE], out[rows, TRUST], path)
-
-
-def unfiltered(config: TremorConfig) -> TremorConfig:
-    """Return ``config`` for a displacement sensor without a filter."""
-    method = "adaptive" if config.method == "kalman" else config.method
-    return config.model_copy(update={"sees": "displacement", "filter_cutoff_rad_s": inf, "method": method})
-
-
-def peek(record: Record) -> Record:
-    """A state's or parameters' fields as attributes, for tests and figures."""
-    return attributes(record)[0]

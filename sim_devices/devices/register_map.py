@@ -28,7 +28,6 @@ class RegisterFace:
         self._reset_values, self._masks = reset_values, masks
         self._pointer = 0
         self._byte_ns = 0.0
-        self._transfer_start_ns: int | None = None
         self.load_reset_values()
 
     def load_reset_values(self) -> None:
@@ -63,11 +62,11 @@ class RegisterFace:
 
     def start(self, t_ns: int, byte_ns: float) -> None:
         """A transfer to this address begins; its bytes take ``byte_ns`` each."""
-        self._transfer_start_ns, self._byte_ns = t_ns, byte_ns
+        self._byte_ns = byte_ns
 
     def stop(self) -> None:
         """The bus is idle again."""
-        self._transfer_start_ns, self._byte_ns = None, 0.0
+        self._byte_ns = 0.0
 
     def write(self, data: bytes, t_ns: int) -> int:
         if self.nack_data:

@@ -88,12 +88,6 @@ class History:
         """The oldest row of which anything is known."""
         return min(self._fine.tail, self._low.tail * BLOCK)
 
-    def latest(self) -> Float32Array:
-        """The newest row; zeros before the first."""
-        if not self.head:
-            return np.zeros(self._n_columns, dtype=np.float32)
-        return self._fine.take(np.arange(self._n_columns), self.head - 1, self.head)[:, 0]
-
     @property
     def latest_t_s(self) -> float:
         """Time of the newest row; 0 before the first."""

@@ -1,4 +1,4 @@
-"""What a recording must contain for a stack's model, what one lacks, and a drive that has it all."""
+"""What a recording must contain for a stack's model, and what one lacks."""
 
 from __future__ import annotations
 
@@ -8,22 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-
-
-def excitation_V(rate_hz: float, seconds: float = 40.0, centre_V: float = 50.0, low_V: float = 0.0) -> Array:
-    """A drive that identifies all of the model: two full sweeps, full cycles at 20 Hz, then 10 Hz loops that
-    shrink from full range to 2 V four times, with a slow wander of their centre."""
-    t = np.arange(round(seconds * rate_hz)) / rate_hz
-    half = centre_V - low_V
-    sweep_s, fast_s = 0.1 * seconds, 0.04 * seconds
-    sweep = half * (1.0 - np.cos(4.0 * np.pi * t / sweep_s))
-    fast = half * (1.0 - np.cos(40.0 * np.pi * (t - sweep_s)))
-    rest = t - sweep_s - fast_s
-    size = half * np.exp(-np.log(half) * ((rest * 4.0 / (seconds - sweep_s - fast_s)) % 1.0))
-    loops = half + size * np.sin(2.0 * np.pi * 10.0 * rest)
-    loops += 0.9 * (half - size) * np.sin(2.0 * np.pi * 0.31 * rest)
-    drive = np.where(t < sweep_s, sweep, np.where(rest < 0.0, fast, loops))
-    return low_V + np.clip(drive, 0.0, 2.0 * half)
 
 
 def determined_from(drive: Array) -> int:

@@ -14,8 +14,8 @@ from typer.testing import CliRunner, Result
 from firmware_py.actuation.config import ActuationConfig, StackConfig
 from sim_devices.plant.lab import main as lab
 from tests.recording_text import stack_channels
+from tests.unit.actuation.excitation import excitation_V
 from tools.calibrate.piezo import identify_stack
-from tools.calibrate.piezo_excitation import excitation_V
 from tools.calibrate.piezo_prediction import command, predict, simulate, tremor_profile_um
 from tools.cli.main import app
 from tools.mismatch.recording import Recording, Split, TwinText

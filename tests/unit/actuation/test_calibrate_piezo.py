@@ -10,9 +10,9 @@ import pytest
 from scipy.signal import lfilter
 
 from firmware_py.actuation.config import ActuationConfig, StackConfig
+from tests.unit.actuation.excitation import excitation_V
 from tools.calibrate.piezo import identify_stack, piezo_calibration
 from tools.calibrate.piezo_dynamics import Dynamics, delayed
-from tools.calibrate.piezo_excitation import excitation_V
 from tools.calibrate.piezo_prediction import simulate
 from tools.errors import InputError
 from tools.mismatch.recording import Recording, Split, TwinText

@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from drivers.options import Adxl203Options
-from firmware_py.control.plausibility import PlausibilityLimits, ScanCheck
-from firmware_py.control.stages import StageConfigs
-from firmware_py.control.wiring import _axes  # pyright: ignore[reportPrivateUsage]
 from firmware_py.frame import COUNTS, INVALID, LAYOUT, STATUS
-from firmware_py.records import attributes
 from firmware_py.sensing import stage
 from firmware_py.sensing.config import SensingConfig
-from firmware_py.sensing.redundant_rate import redundant_params, redundant_rate_step, redundant_state
 from firmware_py.sensing.stage import Sensing
-from hal.errors import BenchError
-from tests.unit.pure_python import assert_kernel_is_python, without_compiler
+from tests.unit.pure_python import assert_kernel_is_python
 from tests.unit.sensing.rigid_body import Motion, frames_of, hand_motion, rc_filter
 
 PLACES = ((0.0101, -0.0101, 0.0), (-0.0101, 0.0101, 0.0), (0.0042, 0.0042, 0.116), (0.013, 0.0, 0.06))
@@ -96,60 +88,3 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     twins = rows.copy()
     run(rows, config)
     assert_kernel_is_python(monkeypatch, stage, "sense_kernel", Sensing(config), twins, rows, atol=1e-12)
-
-
-def test_the_rate_filter_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
-    rng = np.random.default_rng(2)
-    places = np.repeat(np.array(PLACES), 2, axis=0)
-    params = redundant_params(places, AXES, np.full(8, 1e-2))
-    state, twin = (redundant_state(np.array([1.0, -2.0, 0.5]), 0.1) for _ in range(2))
-    readings = 5.0 * rng.standard_normal((5, 8))
-    for y in readings:
-        redundant_rate_step(y, 1e-3, state, params)
-    without_compiler(monkeypatch)
-    for y in readings:
-        redundant_rate_step.py_func(y, 1e-3, attributes(twin), attributes(params))  # type: ignore[attr-defined]
-    for name in ("rate", "covariance", "motion"):
-        np.testing.assert_allclose(twin[name], state[name], rtol=1e-9, atol=1e-12)
-
-
-def test_a_recorded_configuration_of_eight_axes_is_the_same_again() -> None:
-    tables = {"sensing": EIGHT, "tremor": {}, "actuation": {}}
-    configs = StageConfigs.from_dict(tables, "bench")
-    assert StageConfigs.from_dict(configs.as_dict(), "recording") == configs
-    assert len(configs.sensing.bias_V) == len(configs.sensing.in_plane) == 8
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"channels": (0, 1, 2, 3, 4, 5, 6, 7, 8)}, "channels"),
-        ({"channels": (0, 1, 2, 3, 4)}, "6 to 8"),
-        ({"axes": EIGHT["axes"][:7]}, "axes has 7 values for 8"),
-        ({"positions_m": PLACES[:3]}, "3 places"),
-        ({"supply_channel": 6}, "different numbers"),
-        ({"bias_V": (2.5,) * 6}, "bias_V has 6"),
-    ],
-)
-def test_a_configuration_that_does_not_fit_is_refused(change: dict[str, Any], message: str) -> None:
-    with pytest.raises(BenchError, match=message):
-        SensingConfig.from_dict(EIGHT | change)
-
-
-def test_axes_of_further_packages_come_after_the_six() -> None:
-    six = {"acc1": ("x", "z"), "acc2": ("y", "z"), "acc3": ("x", "y")}
-    options: dict[str, Any] = {
-        name: Adxl203Options(channels=dict(zip(axes, (0, 1), strict=True)))  # pyright: ignore[reportArgumentType]
-        for name, axes in {**six, "acc4": ("z", "y")}.items()
-    }
-    options["mag"] = SimpleNamespace(channels=(0, 1, 2))
-    assert _axes(options)[6:] == (("acc4", "y"), ("acc4", "z"))
-
-
-def test_scans_without_a_supply_are_checked_too() -> None:
-    check = ScanCheck(PlausibilityLimits(), 10.0 / 65536.0, range(8), [f"axis {i}" for i in range(8)], sensors=8)
-    row = np.full(8, 16384, dtype=np.int16)
-    assert check.scan(row, 0) == ""
-    row = row + 7
-    row[7] += 2000
-    assert check.scan(row.astype(np.int16), 1).startswith("axis 7 jumped")

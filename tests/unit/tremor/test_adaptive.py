@@ -20,9 +20,10 @@ from firmware_py.tremor.adaptive_design import (
     target_taps,
 )
 from firmware_py.tremor.config import AdaptiveConfig, TremorConfig
-from firmware_py.tremor.estimator import Estimator, peek
+from firmware_py.tremor.estimator import Estimator
 from hal.errors import BenchError
 from tests.unit.tremor.compare import HELD_OUT, residuals
+from tests.unit.tremor.estimator_state import peek
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ, make_record, rc_filter, residual_percent
 
 

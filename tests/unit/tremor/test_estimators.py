@@ -8,10 +8,11 @@ import pytest
 from firmware_py.tremor.ar_kalman import chain_gain_and_lag, horizons
 from firmware_py.tremor.bmflc import comb_size
 from firmware_py.tremor.config import METHODS, Method, TremorConfig
-from firmware_py.tremor.estimator import ROWS, Estimator, peek, run_estimator, unfiltered
+from firmware_py.tremor.estimator import ROWS, Estimator, run_estimator
 from firmware_py.tremor.prefilter import prefilter_gain, prefilter_response, prefilter_sections
 from firmware_py.tremor.seen import seen_params, undo
 from tests.unit.allocations import allocations
+from tests.unit.tremor.estimator_state import peek, unfiltered
 from tests.unit.tremor.synthetic import CUTOFF_RAD_S, RATE_HZ
 from tests.unit.tremor.test_adaptive import tone_acceleration
 

@@ -13,10 +13,11 @@ from firmware_py.sensing.attitude_params import tip_lever
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.tremor.adaptive_design import design_adaptive
 from firmware_py.tremor.config import LeverConfig, TremorConfig
-from firmware_py.tremor.estimator import Estimator, peek
+from firmware_py.tremor.estimator import Estimator
 from firmware_py.tremor.stage import Tremor
 from hal.bench import load_bench
 from tests.conftest import DEFAULT_BENCH
+from tests.unit.tremor.estimator_state import peek
 from tests.unit.tremor.synthetic import RATE_HZ, rc_filter
 
 ARM_M = 0.1

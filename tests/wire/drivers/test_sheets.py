@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
 from drivers.adc.ads1115 import Ads1115
-from drivers.adxl203 import Adxl203
-from drivers.base import HasChannels
 from drivers.can_telemetry import CanTelemetry
 from drivers.daq.di4108 import Di4108
 from drivers.hmc2003 import Hmc2003
@@ -26,13 +26,16 @@ from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, Scripted
 # a bare voltage, any of NI's devices, dividers in front of an ADC, a part of another sheet
 NOT_PARTS = {"analog", "nidaqmx", "nidaqmx_ao", "amplifier_monitor", "ble_motion_card"}
 
+# the firmware reads the volts of an ADXL-203 through the DAQ; the part has no driver object
+PARTS = [name for name in names() if name != "adxl203"]
+
 
 class Strap:
     def write_digital(self, bits: int) -> None:
         pass
 
 
-def drivers() -> dict[str, HasChannels]:
+def drivers() -> dict[str, Any]:
     clock = VirtualClock()
     i2c, can, serial = ScriptedI2c([]), ScriptedCan(clock), ScriptedSerial(clock, [])
     daq = Di4108(serial, clock)
@@ -43,7 +46,6 @@ def drivers() -> dict[str, HasChannels]:
     return {
         "di4108": daq,
         "ads1115": adc,
-        "adxl203": Adxl203({"x": 0, "z": 1}),
         "hmc2003": Hmc2003(adc, Strap(), clock),
         "dac_amplifier": DacAmplifier(i2c, clock),
         "e727": E727(serial, clock),
@@ -60,7 +62,7 @@ def test_every_driver_of_the_bench_file_has_a_sheet():
     assert set(names()) == set(BUILT_IN) - NOT_PARTS
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", PARTS)
 def test_sheet_and_driver_agree(name: str):
     sheet = [c.info() for c in load_sheet(name).channels]
     driver = list(drivers()[name].channels())
@@ -69,7 +71,7 @@ def test_sheet_and_driver_agree(name: str):
         assert (said.lo, said.hi, said.epsilon) == pytest.approx((done.lo, done.hi, done.epsilon), rel=1e-9)
 
 
-@pytest.mark.parametrize("name", names())
+@pytest.mark.parametrize("name", PARTS)
 def test_two_instances_share_nothing(name: str):
     """No module-level state: what one instance is told, another does not know."""
     one, other = drivers()[name], drivers()[name]

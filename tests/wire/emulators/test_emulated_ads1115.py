@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from sim_devices.devices.ads1115 import Ads1115
-from sim_devices.faces import HeldVoltages
+from tests.wire.emulators.held import HeldVoltages
 
 WAKE_UP_NS = 25_000
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_devices.devices.di4108 import Di4108
-from sim_devices.faces import HeldVoltages
+from tests.wire.emulators.held import HeldVoltages
 
 MS = 1_000_000
 

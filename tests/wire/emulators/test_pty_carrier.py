@@ -9,8 +9,8 @@ import pytest
 import serial
 
 from sim_devices.devices.di4108 import Di4108
-from sim_devices.faces import HeldVoltages
 from sim_devices.transports.pty_carrier import PtyCarrier
+from tests.wire.emulators.held import HeldVoltages
 
 MS = 1_000_000
 

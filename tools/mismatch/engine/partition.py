@@ -24,8 +24,6 @@ from tools.mismatch.twins.dynamic import DynamicTwin
 from tools.mismatch.twins.linear import Hold, between_samples, discretise, run_output
 from tools.mismatch.twins.make import make
 
-Roots = NDArray[np.complex128]
-
 MOST_ORDER = 8
 """Poles of a twin that is split at most."""
 MOST_SPLITS = 800

@@ -107,12 +107,6 @@ def follow(reference: Reference, state: State, residual: Array) -> tuple[State, 
     return State(kept, samples, state.blocks + figures.shape[0], log_m, cusum, since, sums), alarms
 
 
-def evidence(reference: Reference, state: State) -> Array:
-    """How far each channel is on the way to an alarm (channels,), 0 to 1 on a logarithmic scale."""
-    total = np.logaddexp.reduce(state.log_m, axis=1) - math.log(MEMBERS)
-    return np.clip(total / math.log(reference.run_length), 0.0, 1.0)
-
-
 def _alarm(
     reference: Reference, i: int, cusum: Array, at_s: float, block: int, since: NDArray[np.int64], sums: Array
 ) -> Alarm:

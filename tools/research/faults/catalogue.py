@@ -15,7 +15,6 @@ ONE_BYTE = (
     "`read_back = true` at the amplifier every command is read back within its own transfer (0.21 ms more of the bus), "
     "and each wrong one is known: benches/micron-read-back.toml, below"
 )
-NO_NEED = "a tick allocates nothing"
 LOOKS = "each output is measured every 7.5 ms, a small difference twice before it is believed"
 RESUMES_S = 0.7
 """Watched for so long where outputs are expected to hold and to resume: the cause, 20 ms, 200 ms, a new alignment."""
