@@ -47,7 +47,7 @@ class Usual:
 
     def at(self, x_V: float) -> float:
         n, sx, sxx, sy, sxy = self._sums
-        slope = (sxy - sx * sy / n) / (sxx - sx * sx / n + n)  # as if known to 0 +- the difference over 1 V rms
+        slope = (sxy - sx * sy / n) / (sxx - sx * sx / n + n)  # prior of the slope: 0 +- the difference over 1 V rms
         return sy / n + slope * (x_V - sx / n)
 
     def learn(self, x_V: float, y_V: float) -> None:
@@ -58,11 +58,11 @@ class Usual:
 
 
 class AmplifierMonitor:
-    """``channels``: ADC inputs of outputs 1, 2, 3; output volts = ADC volts x ``ratio``.
+    """Compares the measured outputs of the amplifier with the commands that may have been in force.
 
-    ``settle_s``: how long the amplifier may take to follow a step of one tick. ``tolerance_V``: sum of the errors of
-    gain and offset of amplifier, divider and ADC. ``change_V``: by how much more or less than usual a reading may
-    differ.
+    ``channels`` are the ADC inputs of outputs 1, 2, 3; output volts = ADC volts x ``ratio``. The amplifier may take
+    ``settle_s`` to follow a step of one tick. ``tolerance_V`` is the sum of the errors of gain and offset of amplifier,
+    divider and ADC. A reading may differ from its usual difference by ``change_V``.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class AmplifierMonitor:
         nominal_ns = (adc.conversion_ns - WAKE_UP_NS) / (1.0 + RATE_TOLERANCE)
         self._longest_ns = round(nominal_ns * (1.0 + RATE_TOLERANCE))
         self._shortest_ns = round(nominal_ns * (1.0 - RATE_TOLERANCE))
-        self._output = self._turn = 0  # of the conversion under way; whose turn it was last
+        self._output = self._turn = 0  # output of the conversion under way; output that was converted last
         self._ordered_ns = self._started_ns = 0  # the conversion under way began in between
         self._suspected = [False] * len(self._channels)
 
@@ -143,31 +143,31 @@ class AmplifierMonitor:
         self._ordered_ns, self._started_ns = ordered_ns, self._clock.now_ns()
 
     def expected_V(self, output: int, window: Window) -> tuple[float, float] | None:
-        """Lowest and highest mean of the commands of ``output`` over a conversion; ``None``: not known any more.
+        """Return the lowest and highest mean, in V, of the commands of ``output`` over a conversion.
 
-        A command is in force from some time between its offer and its acknowledge, plus the settling time, until the
-        next one is.
+        Return ``None`` if the commands of that time are no longer kept. A command is in force from some time between
+        its offer and its acknowledge, plus the settling time, until the next one is.
         """
         shortest: list[tuple[float, float, float]] = []  # volts, least weight, further weight
         end_ns = window.latest_ns + window.longest_ns
         gone_late_ns = gone_early_ns = end_ns  # when the next command took over, at the latest and at the earliest
         commands = self._guard.told
-        told_V = [told.volts[output] for told in commands]
+        told_V = [command.volts[output] for command in commands]
         tick_V = self._guard.limits[output].slew_V_per_s * 1e-3
-        for k, told in reversed(list(enumerate(commands))):
+        for k, command in reversed(list(enumerate(commands))):
             ticks_worth = max(1.0, abs(told_V[k] - told_V[k - 1]) / tick_V) if k else 1.0  # after a gap
-            since_late_ns = told.sent_ns + round(self._settle_ns * ticks_worth)
-            if told.offered_ns < end_ns:
+            since_late_ns = command.sent_ns + round(self._settle_ns * ticks_worth)
+            if command.offered_ns < end_ns:
                 least_ns = min(gone_early_ns, window.earliest_ns + window.shortest_ns) - max(
                     since_late_ns, window.latest_ns
                 )
-                most_ns = min(gone_late_ns, end_ns) - max(told.offered_ns, window.earliest_ns)
+                most_ns = min(gone_late_ns, end_ns) - max(command.offered_ns, window.earliest_ns)
                 least = max(0, least_ns) / window.longest_ns
                 most = min(1.0, max(0, most_ns) / window.shortest_ns)
-                shortest.append((told.volts[output], least, most - least))
+                shortest.append((command.volts[output], least, most - least))
             if since_late_ns <= window.earliest_ns:  # all that came before had been replaced by this one
                 return _mean(sorted(shortest)), _mean(sorted(shortest, reverse=True))
-            gone_late_ns, gone_early_ns = since_late_ns, told.offered_ns
+            gone_late_ns, gone_early_ns = since_late_ns, command.offered_ns
         return None  # commands older than those that are kept
 
     def _judge(self, output: int, window: Window, measured_V: float) -> str:
@@ -182,10 +182,10 @@ class AmplifierMonitor:
         if not self._suspected[output] and beyond_V < GROSS * self._tolerance_V:
             self._suspected[output] = True
             return ""
-        told = f"{span[0]:.2f} V" if span[1] - span[0] < 0.005 else f"{span[0]:.2f} to {span[1]:.2f} V"
+        expected = f"{span[0]:.2f} V" if span[1] - span[0] < 0.005 else f"{span[0]:.2f} to {span[1]:.2f} V"
         return (
-            f"output {output + 1} is at {measured_V:.2f} V and was told {told}: the amplifier, its supply, a cable or "
-            f"a stack is broken (or {self.name} is); switch the amplifier off"
+            f"output {output + 1} is at {measured_V:.2f} V and was told {expected}: the amplifier, its supply, a cable "
+            f"or a stack is broken (or {self.name} is); switch the amplifier off"
         )
 
     def _is_odd(self, output: int, measured_V: float, span: tuple[float, float]) -> bool:
@@ -193,7 +193,7 @@ class AmplifierMonitor:
             return True
         usual, middle_V = self._usual[output], 0.5 * (span[0] + span[1])
         if usual.count >= LEARN:
-            # what is uncertain of the commands stays uncertain; only gain and offset are known better
+            # the uncertainty of the commands stays; only gain and offset are known better
             healthy_V = measured_V - usual.at(middle_V)
             if not span[0] - self._change_V <= healthy_V <= span[1] + self._change_V:
                 return True
@@ -202,7 +202,8 @@ class AmplifierMonitor:
 
 
 def _mean(commands: Sequence[tuple[float, float, float]]) -> float:
-    """Mean of volts with weights that sum to one: each its least, the rest to the first ones."""
+    """Return the mean of volts with weights that sum to one: each gets its least weight, the first ones get the
+    rest."""
     left = 1.0 - sum(least for _, least, _ in commands)
     mean_V = 0.0
     for volts, least, further in commands:

@@ -24,9 +24,9 @@ TOP_BITRATE = 1_000_000  # CAN with classic frames
 
 @dataclass(frozen=True)
 class BusUse:
-    """One kind of transaction on one bus: ``bits`` on the wire, ``per_s`` times a second.
+    """Describes one kind of transaction on one bus: ``bits`` on the wire, ``per_s`` times a second.
 
-    ``task``: the firmware's task that waits for it, empty where nobody does (CAN and serial frames are queued).
+    ``task`` is the firmware's task that waits for it. It is empty for queued transfers (CAN and serial frames).
     """
 
     bus: str
@@ -60,7 +60,7 @@ def bus_uses(description: BenchDescription, options: Mapping[str, Any], polling:
         for what, bits, per_s, task in find_driver(spec.driver).repeated(load):
             if per_s <= 0.0 or bits <= 0:
                 continue
-            if what == "HOST_HEARTBEAT":  # one per bus, whoever sends it
+            if what == "HOST_HEARTBEAT":  # a bus has one, and any of its drivers may send it
                 if spec.bus in with_heartbeat:
                     continue
                 with_heartbeat.add(spec.bus)
@@ -80,7 +80,7 @@ def bits_per_s(bus: SerialSpec | I2cSpec | CanSpec) -> int:
 
 
 def bus_shares(uses: Iterable[BusUse]) -> dict[str, float]:
-    """Part of its time that each bus is asked for."""
+    """Return the load of each bus, as a fraction of its time."""
     shares: dict[str, float] = defaultdict(float)
     for use in uses:
         shares[use.bus] += use.share
@@ -88,7 +88,7 @@ def bus_shares(uses: Iterable[BusUse]) -> dict[str, float]:
 
 
 def overloads(description: BenchDescription, uses: list[BusUse]) -> list[str]:
-    """A message for each bus that is set faster than its devices allow, or is asked for more than ``MOST``."""
+    """Return a message for each bus that is set faster than its devices allow or loaded above ``MOST``."""
     problems: list[str] = []
     for name, bus in description.bus.items():
         slowest = _slowest(description, name)
@@ -138,7 +138,7 @@ def _remedies(description: BenchDescription, name: str, here: list[BusUse]) -> I
 
 
 def _slowest(description: BenchDescription, bus: str) -> tuple[int, str] | None:
-    """Fastest clock that all devices of an I2C bus allow, and the device that allows no more."""
-    there = [(d.driver, name) for name, d in description.device.items() if d.bus == bus]
-    limits = [(find_driver(driver).max_bus_hz, name) for driver, name in there]
+    """Return the fastest clock (Hz) that all devices of an I2C bus allow, and the device that limits it."""
+    members = [(d.driver, name) for name, d in description.device.items() if d.bus == bus]
+    limits = [(find_driver(driver).max_bus_hz, name) for driver, name in members]
     return min(((hz, name) for hz, name in limits if hz is not None), default=None)

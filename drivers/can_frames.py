@@ -27,7 +27,7 @@ _CRC_TABLE = _crc_table()
 
 
 def crc8_j1850(data: bytes) -> int:
-    """CRC-8/SAE-J1850: polynomial 0x1D, start 0xFF, result inverted; "123456789" gives 0x4B."""
+    """Return the CRC-8/SAE-J1850: polynomial 0x1D, start 0xFF, result inverted; "123456789" gives 0x4B."""
     table = _CRC_TABLE
     crc = 0xFF
     for byte in data:

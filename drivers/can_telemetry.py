@@ -63,7 +63,7 @@ class CanTelemetry:
         return self.button_ns == 0 or self._clock.now_ns() - self.button_ns > BUTTON_LIMIT_NS
 
     def send_tremor(self, amplitude_um: Sequence[float], frequency_Hz: float) -> None:
-        """Tremor amplitude (3,) in um and frequency in Hz; values beyond the frame's range are sent as its end."""
+        """Send the tremor amplitude (3,) in um and the frequency in Hz, limited to the range of the frame."""
         x, y, z = amplitude_um
         self._send(
             self._tremor.frame_id,
@@ -78,7 +78,7 @@ class CanTelemetry:
         )
 
     def send_state(self, state: int, flags: int, lost_samples: int, skipped_ticks: int, worst_tick_us: float) -> None:
-        """Condition of the loop; counts stop at 65535."""
+        """Send the condition of the loop. Counts stop at 65535."""
         self._send(
             self._state.frame_id,
             self._state.encode(

@@ -53,9 +53,9 @@ class Hmc2003:
         self._fresh = np.full(3, np.nan)
 
     def poll(self) -> bool:
-        """One step of the round robin: collect what is ready, start the next axis. True on a new triple.
+        """Collect a finished conversion and start the next axis. Return True when all three axes are new.
 
-        One short I2C transfer; never waits. The triple is in ``volts``, ``field_T`` and ``t_ns``.
+        The call makes one short I2C transfer and never waits. The triple is in ``volts``, ``field_T`` and ``t_ns``.
         """
         if self._adc.pending is None:
             self._adc.start_conversion(self._adc_channels[self._axis])

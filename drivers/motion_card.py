@@ -103,7 +103,7 @@ class CardQueue:
 
 
 class QueuedCard:
-    """Base of the motion card drivers: the access to a card's queue that serial and BLE cards share."""
+    """Gives serial and BLE cards the access to their queue; it is the base of the motion card drivers."""
 
     def __init__(self, name: str, rate_hz: float, fields: Fields, *, spike_filter: bool) -> None:
         self.name = name
@@ -142,7 +142,7 @@ class QueuedCard:
 
 
 class MotionCard(QueuedCard):
-    """The scanner card's serial port. Call ``read`` at least at ``rate_hz``; it never waits."""
+    """Reads the scanner card's serial port. Call ``read`` at least at ``rate_hz``; it never waits."""
 
     def __init__(
         self,
@@ -162,7 +162,7 @@ class MotionCard(QueuedCard):
 
     @property
     def bad_frames(self) -> int:
-        """Lines that were none, since the first good one."""
+        """Return the number of malformed lines since the first good one."""
         return self.parser.bad_frames
 
     def probe(self, limit_s: float = 1.0) -> str:
@@ -185,7 +185,7 @@ class MotionCard(QueuedCard):
         return "motion card"
 
     def read(self, out: ImuSample) -> Status:
-        """The oldest reading not yet used; ``STALE`` (and the last one again) when there is none."""
+        """Return the oldest unread reading, or the last one with ``STALE`` when the queue is empty."""
         self._receive(0.0)
         return self._queue.take(out)
 
@@ -199,7 +199,7 @@ class MotionCard(QueuedCard):
 
 
 def card_channels(name: str) -> Sequence[ChannelInfo]:
-    """Channels of the card, over wire or air."""
+    """Return the channels of the card, for serial and BLE alike."""
     accel, gyro = ACCEL_RANGE_G * STANDARD_GRAVITY, GYRO_RANGE_DPS * RAD_PER_DEG
     channels = [ChannelInfo(f"{name}.accel_{a}", "m/s^2", -accel, accel, ACCEL_LSB_MPS2) for a in "xyz"]
     channels += [ChannelInfo(f"{name}.gyro_{a}", "rad/s", -gyro, gyro, GYRO_LSB_RAD_S) for a in "xyz"]

@@ -31,14 +31,14 @@ BATTERY_CHARACTERISTIC = "00002a19-0000-1000-8000-00805f9b34fb"  # 0x2A19 of ser
 
 @dataclass(frozen=True, slots=True)
 class CardReading:
-    """One message: accelerometer and gyro x, y, z and temperature as sent (counts, or g, deg/s, degC), status."""
+    """Holds one message: accelerometer and gyro x, y, z and temperature as sent (counts, or g, deg/s, degC), status."""
 
     values: tuple[float, float, float, float, float, float, float]
     status: int
 
 
 def decode_packet(packet: bytes) -> CardReading:
-    """The notification of the IMU characteristic. ``ValueError`` for another length or status."""
+    """Decode a notification of the IMU characteristic. Raises ``ValueError`` for another length or status."""
     if len(packet) != PACKET.size:
         raise ValueError(f"packet has {len(packet)} bytes instead of {PACKET.size}")
     *counts, status = PACKET.unpack(packet)
@@ -49,7 +49,7 @@ def decode_packet(packet: bytes) -> CardReading:
 
 
 def decode_battery(value: bytes) -> int:
-    """Battery level characteristic 0x2A19: percent. ``ValueError`` when it is none."""
+    """Return the battery level (characteristic 0x2A19) in percent. Raises ``ValueError`` for any other content."""
     if len(value) != 1 or value[0] > 100:
         raise ValueError(f"battery level {value.hex()!r} is not one byte of 0 .. 100")
     return value[0]
@@ -61,7 +61,7 @@ def line_bytes(fields: Fields) -> int:
 
 
 def decode_line(line: bytes, fields: Fields) -> CardReading:
-    """One line without its ``\\r\\n``: ``#:`` and eight numbers, each followed by ``:``. ``ValueError`` if not."""
+    """Decode one line without its ``\\r\\n``: ``#:`` and eight numbers, each followed by ``:``. Else ``ValueError``."""
     parts = line.split(b":")
     if len(parts) != 10 or parts[0] != b"#" or parts[9] != b"":
         raise ValueError("not '#:' and eight fields")
@@ -95,30 +95,30 @@ class LineParser:
         self._synchronised = False
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[CardReading]:
-        """All readings that are complete with ``data``, oldest first."""
+        """Return all readings that ``data`` completes, oldest first."""
         self._buffer += data
-        found: list[CardReading] = []
+        readings: list[CardReading] = []
         while (end := self._buffer.find(END)) >= 0:
             line = bytes(self._buffer[:end])
             del self._buffer[: end + len(END)]
-            self._take(line, found)
+            self._take(line, readings)
         if len(self._buffer) > LONGEST_LINE:
             self._drop_too_long()
-        return found
+        return readings
 
     def reset(self) -> None:
         """Forget what has arrived, keep the counts: after a reconnection."""
         self._buffer.clear()
         self._synchronised = False
 
-    def _take(self, line: bytes, found: list[CardReading]) -> None:
+    def _take(self, line: bytes, readings: list[CardReading]) -> None:
         start = line.rfind(START)
         if start > 0:
             # the end of the line before was lost, or something came in between
             self._bad(start)
             line = line[start:]
         try:
-            found.append(decode_line(line, self._fields))
+            readings.append(decode_line(line, self._fields))
             self.frames += 1
         except ValueError:
             self._bad(len(line))
@@ -187,7 +187,7 @@ class SpikeFilter:
 
 
 def to_si(fields: Fields, accel_lsb_mps2: float, gyro_lsb_rad_s: float) -> Callable[[CardReading], list[float]]:
-    """Readings to m/s^2 (3), rad/s (3), degC: counts of the card's MPU-6050 (T/340 + 36.53), or g, deg/s, degC."""
+    """Convert readings to m/s^2 (3), rad/s (3), degC from counts of the MPU-6050 (T/340 + 36.53) or g, deg/s, degC."""
     if fields == "raw":
         accel, gyro, slope, zero = accel_lsb_mps2, gyro_lsb_rad_s, 1.0 / 340.0, 36.53
     else:

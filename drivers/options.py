@@ -1,4 +1,4 @@
-"""Base classes of the checked entries of a bench file."""
+"""Defines the checked entries of a bench file for every driver."""
 
 from __future__ import annotations
 
@@ -56,7 +56,8 @@ def one_of(*allowed: float) -> AfterValidator:
 
 
 class Di4108Options(DaqOptions):
-    """DATAQ DI-4108. ``rate_hz`` per channel must divide 60 MHz/375 (protocol manual, ``srate``)."""
+    """Holds the keys of a DATAQ DI-4108. ``rate_hz`` per channel must divide 60 MHz/375 (protocol manual,
+    ``srate``)."""
 
     rate_hz: float = Field(gt=0, le=160_000)
     channels: tuple[Channel, ...] = Field(min_length=1, max_length=8)
@@ -64,7 +65,7 @@ class Di4108Options(DaqOptions):
 
 
 class NiDaqOptions(DaqOptions):
-    """National Instruments analog input through the ``nidaqmx`` package."""
+    """Holds the keys of a National Instruments analog input, used through the ``nidaqmx`` package."""
 
     device: str
     rate_hz: float = Field(gt=0)
@@ -73,13 +74,13 @@ class NiDaqOptions(DaqOptions):
 
 
 class Adxl203Options(Options):
-    """One ADXL-203: the DAQ channel of each of its axes, named in the instrument's body frame."""
+    """Holds the keys of one ADXL-203: the DAQ channel of each axis, named in the instrument's body frame."""
 
     channels: dict[Literal["x", "y", "z"], Channel] = Field(min_length=1, max_length=2)
 
 
 class AnalogOptions(Options):
-    """A plain analog quantity on one DAQ channel."""
+    """Holds the keys of a plain analog quantity on one DAQ channel."""
 
     channel: Channel
 
@@ -96,7 +97,7 @@ class Ads1115Options(Options):
 
 
 class Hmc2003Options(Options):
-    """HMC-2003 behind an ADC: the channels of x, y, z; the strap hangs on two digital outputs of the DAQ."""
+    """Holds the keys of an HMC-2003: the ADC channels of x, y, z. Two digital outputs of the DAQ drive its strap."""
 
     channels: tuple[Annotated[int, Field(ge=0, le=3)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
     strap_daq: str = "daq"
@@ -143,7 +144,7 @@ class E727Options(OutputOptions):
 
 
 class NiOutputOptions(OutputOptions):
-    """National Instruments analog outputs in front of the amplifier: output volts = card volts x ``gain``."""
+    """Holds the keys of National Instruments analog outputs: output volts = card volts x ``gain``."""
 
     device: str
     channels: tuple[Annotated[int, Field(ge=0, le=31)], ...] = Field(default=(0, 1, 2), min_length=3, max_length=3)
@@ -171,7 +172,8 @@ class CanTelemetryOptions(Options):
 
 
 class MotionCardOptions(Options):
-    """Motion card behind its scanner card. ``fields``: does the text carry counts or g, deg/s and degC?"""
+    """Holds the keys of a motion card behind its scanner card. ``fields`` says if the text carries counts or g, deg/s,
+    degC."""
 
     rate_hz: float = Field(default=100.0, gt=0, le=1000)
     fields: Literal["raw", "scaled"] = "raw"
@@ -179,7 +181,7 @@ class MotionCardOptions(Options):
 
 
 class BleMotionCardOptions(Options):
-    """Motion card over Bluetooth Low Energy (extra ``ble``): advertised name or address of the card."""
+    """Holds the keys of a motion card over Bluetooth Low Energy (extra ``ble``): its advertised name or address."""
 
     peripheral: str = "CONTROL.CMR"
     rate_hz: float = Field(default=100.0, gt=0, le=100)

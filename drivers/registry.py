@@ -1,4 +1,4 @@
-"""All drivers by the name that a bench file uses: one record each, imported when a bench names it.
+"""Finds drivers by the name that a bench file uses. Each is one record, imported when a bench names it.
 
 A driver is found in one of three places, in this order: ``BUILT_IN``; a folder ``drivers/NAME`` whose module ``driver``
 holds ``DRIVER``; an entry point of group ``micron.drivers`` of another package. The record is the same everywhere.

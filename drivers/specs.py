@@ -52,7 +52,7 @@ def check_devices(description: BenchDescription, where: str) -> dict[str, Any]:
 
 def _channel_claims(description: BenchDescription, options: dict[str, Any]) -> list[str]:
     problems: list[str] = []
-    taken: dict[tuple[str, int], str] = {}
+    claimed: dict[tuple[str, int], str] = {}
     for name, spec in description.device.items():
         parent = spec.daq or spec.adc
         claims = find_driver(spec.driver).inputs(options[name])
@@ -62,11 +62,11 @@ def _channel_claims(description: BenchDescription, options: dict[str, Any]) -> l
         for channel in claims:
             if channel not in offered:
                 problems.append(f"[device.{name}] channel {channel} is not scanned by '{parent}' ({list(offered)})")
-            if (parent, channel) in taken:
+            if (parent, channel) in claimed:
                 problems.append(
-                    f"[device.{name}] channel {channel} of '{parent}' is taken by '{taken[parent, channel]}'"
+                    f"[device.{name}] channel {channel} of '{parent}' is taken by '{claimed[parent, channel]}'"
                 )
-            taken.setdefault((parent, channel), name)
+            claimed.setdefault((parent, channel), name)
     return problems
 
 

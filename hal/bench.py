@@ -1,8 +1,8 @@
-"""The bench description: which buses and devices there are, and whether each is real or emulated.
+"""Reads a bench file: its buses, its devices, and which of them are emulated.
 
-Only a URI decides that (``serial:///dev/ttyACM0`` or ``sim://daq0``); no code above this module knows.
-The description is checked as a whole before anything is opened: unknown keys, duplicate addresses and
-channels, dangling references. What a driver's own keys may be is checked by ``drivers.specs``.
+A URI alone decides whether a bus is real or emulated (``serial:///dev/ttyACM0`` or ``sim://daq0``); no code above this
+module knows. The description is checked as a whole before anything is opened: unknown keys, duplicate addresses and
+channels, dangling references. ``drivers.specs`` checks the keys of each driver.
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ class _Strict(BaseModel):
 
 
 class ClockSpec(_Strict):
-    """The firmware's tick. Task rates are whole divisions of it."""
+    """Holds the rate of the firmware's tick. Task rates are whole divisions of it."""
 
     tick_hz: int = Field(default=1000, ge=10, le=10_000)
 
 
 class SerialSpec(_Strict):
-    """A serial port; USB CDC devices ignore ``baud``."""
+    """Describes a serial port. USB CDC devices ignore ``baud``."""
 
     kind: Literal["serial"]
     uri: str
@@ -51,7 +51,7 @@ class SerialSpec(_Strict):
 
 
 class I2cSpec(_Strict):
-    """An I2C bus; ``speed_hz`` is what the controller is set to, and what the bus-time check uses."""
+    """Describes an I2C bus. The controller is set to ``speed_hz``, and the bus-load check uses it."""
 
     kind: Literal["i2c"]
     uri: str
@@ -70,7 +70,7 @@ BusSpec = Annotated[SerialSpec | I2cSpec | CanSpec, Field(discriminator="kind")]
 
 
 class DeviceSpec(BaseModel):
-    """One device: which driver, on which bus or behind which other device; the rest is the driver's own."""
+    """Describes one device: its driver, its bus or the device that it hangs on. Other keys belong to the driver."""
 
     model_config = ConfigDict(extra="allow", frozen=True)
 
@@ -81,12 +81,12 @@ class DeviceSpec(BaseModel):
     address: int | None = Field(default=None, ge=0x08, le=0x77)
 
     def options(self) -> dict[str, Any]:
-        """The driver's own keys."""
+        """Return the driver's own keys."""
         return dict(self.__pydantic_extra__ or {})
 
 
 class BenchDescription(_Strict):
-    """A whole bench file. ``emulation`` and ``firmware`` are checked by those who read them."""
+    """Holds the content of a bench file. The readers of ``emulation`` and ``firmware`` check those tables."""
 
     format: Literal[1]
     name: str
@@ -100,21 +100,22 @@ class BenchDescription(_Strict):
         return [name for name, spec in self.bus.items() if spec.uri.startswith(SIM_SCHEME)]
 
     def devices_with(self, *drivers: str) -> dict[str, DeviceSpec]:
-        """All devices of the named drivers, in the order of the file."""
+        """Return the devices of the named drivers, in the order of the file."""
         return {name: spec for name, spec in self.device.items() if spec.driver in drivers}
 
 
 @dataclass(frozen=True)
 class BenchFile:
-    """A checked description together with where it came from and its text (kept in recordings)."""
+    """Holds a checked description with its path and its text, which recordings keep."""
 
     path: Path
     text: str
     description: BenchDescription
 
     def resolve(self, relative: str) -> Path:
-        """A path named in the bench file, relative to the file. ``NotTrusted`` when it lies outside the file's folder,
-        ``BenchError`` for one that no file can have.
+        """Return the path that the bench file names, relative to the file.
+
+        Raises ``NotTrusted`` when it lies outside the file's folder, ``BenchError`` for a path that no file can have.
         """
         return path_inside(self.path, relative)
 
@@ -134,13 +135,13 @@ def load_bench(path: Path) -> BenchFile:
 
 def named_packages(description: BenchDescription) -> list[str]:
     """Return ``module:object`` of the code that a bench names: its provider, and drivers and estimators of packages."""
-    found = [str(description.emulation["provider"])] if "provider" in description.emulation else []
+    targets = [str(description.emulation["provider"])] if "provider" in description.emulation else []
     drivers = {spec.driver for spec in description.device.values()}
     tremor: Any = description.firmware.get("tremor")
     methods = {str(cast(Any, tremor).get("method"))} if isinstance(tremor, dict) else set[str]()
     for group, names in ((plugins.DRIVERS, drivers), (plugins.DEVICES, drivers), (plugins.ESTIMATORS, methods)):
-        found += [entry.value for name, entry in plugins.offered(group).items() if name in names]
-    return found
+        targets += [entry.value for name, entry in plugins.offered(group).items() if name in names]
+    return targets
 
 
 def named_files(description: BenchDescription) -> list[str]:
@@ -293,12 +294,12 @@ EMULATED_CLOCKS: Mapping[Pace, Callable[[int], VirtualClock]] = {"paced": PacedC
 
 
 def default_pace(description: BenchDescription) -> Pace:
-    """``paced`` where every bus is emulated; devices that are real run in real time."""
+    """Return ``paced`` if every bus is emulated, else ``realtime``."""
     return "paced" if len(description.emulated_buses()) == len(description.bus) else "realtime"
 
 
 def check_pace(bench: BenchFile, pace: Pace | None) -> Pace:
-    """``pace``, or the default of this bench. Raises ``BenchError`` for emulated time with a real bus."""
+    """Return ``pace``, or the default of this bench. Raises ``BenchError`` for emulated time with a real bus."""
     default = default_pace(bench.description)
     if pace in ("paced", "virtual") and default == "realtime":
         emulated = bench.description.emulated_buses()
@@ -338,7 +339,7 @@ def open_bench(
     try:
         if emulated:
             table = description.model_dump()
-            table["folder"] = str(bench.path.parent)  # what the emulation names is relative to the bench file
+            table["folder"] = str(bench.path.parent)  # paths in [emulation] are relative to the bench file
             if seed is not None:
                 table["emulation"]["seed"] = seed
             if truth_s is not None:

@@ -14,7 +14,7 @@ SUPERVISED = "MICRON_SUPERVISED"
 
 
 def child_command(module: str, *arguments: str) -> list[str]:
-    """The command line that runs ``module`` of ours as a program.
+    """Return the command line that runs our ``module`` as a program.
 
     ``-P`` keeps the current folder off the import path: a ``random.py`` that lies there is not ours to run.
     """
@@ -22,8 +22,9 @@ def child_command(module: str, *arguments: str) -> list[str]:
 
 
 def child_environment() -> dict[str, str]:
-    """The environment for ``child_command``: our packages come first on the import path where they did so here, and
-    from a source tree."""
+    """Return the environment for ``child_command``.
+
+    Our packages come first on the import path if they do so in this process, or if it runs from a source tree."""
     environment = dict(os.environ)
     if str(ROOT) in sys.path[:1] or (ROOT / "pyproject.toml").exists():
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, (str(ROOT), environment.get("PYTHONPATH"))))

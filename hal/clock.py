@@ -1,4 +1,4 @@
-"""The clocks of a bench: the machine's monotonic clock, and emulated time, exact and either paced or unpaced."""
+"""Provides the clocks of a bench: the machine's monotonic clock, and exact emulated time, paced or unpaced."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ STALL_NS = 5_000_000
 
 
 class MonotonicClock:
-    """CLOCK_MONOTONIC: common to all processes of one machine."""
+    """Reads CLOCK_MONOTONIC, which all processes of one machine share."""
 
     def now_ns(self) -> int:
         return time.monotonic_ns()
@@ -116,7 +116,7 @@ class PacedClock(VirtualClock):
         self._begin_ns = self._now_ns
         self._begin_wall_ns = self._last_wall_ns = self._wall_ns()
         self._last_cpu_ns = self._cpu_ns()
-        self._ahead_ns = self._now_ns - self._begin_wall_ns  # of emulated time before wall time, when on pace
+        self._ahead_ns = self._now_ns - self._begin_wall_ns  # emulated time minus wall time while on pace
         self._look_ns = self._now_ns + PACE_NS
 
     def advance_to(self, t_ns: int) -> None:

@@ -54,11 +54,11 @@ def _when_imported(body: Sequence[ast.stmt]) -> Iterator[ast.stmt]:
 
 @cache
 def imported_sources(file: Path, root: Path = ROOT) -> frozenset[Path]:
-    """Our own files that ``file`` imports by absolute name when it is imported itself.
+    """Return the files of our own packages that ``file`` imports by absolute name when it is imported itself.
 
     An import within a function is not seen, and need not be: no kernel can use one.
     """
-    found: set[Path] = set()
+    sources: set[Path] = set()
     for node in _when_imported(ast.parse(file.read_bytes()).body):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
@@ -68,13 +68,13 @@ def imported_sources(file: Path, root: Path = ROOT) -> frozenset[Path]:
             continue
         for name in names:
             if name.split(".")[0] in PACKAGES:
-                found.update(_files_of(name, root))
-    return frozenset(found)
+                sources.update(_files_of(name, root))
+    return frozenset(sources)
 
 
 @cache
 def source_fingerprint(file: Path, root: Path = ROOT) -> str:
-    """Hex digest of ``file`` and of all that it reaches through imports of our own packages."""
+    """Return a hex digest of ``file`` and of every file that it imports, directly or not, from our own packages."""
     reached = {file}
     waiting = [file]
     while waiting:
@@ -124,7 +124,8 @@ def inlined_kernel(function: _Function) -> _Function:
 def thread_kernel(function: _Function) -> _Function:
     """Compile ``function`` as ``kernel`` does, and release the GIL while it runs: for loops that a thread enters once.
 
-    Not for calls of some microseconds: beside a busy Python thread, each would wait milliseconds for the GIL.
+    A call of some microseconds must not use it: beside a busy Python thread each call would wait milliseconds for the
+    GIL.
     """
     return _compiled(function, nogil=True)
 
@@ -135,9 +136,9 @@ def _compiled(function: _Function, nogil: bool, inline: str = "never") -> _Funct
     if "NUMBA_CACHE_DIR" in os.environ or not file.is_relative_to(ROOT):
         return cast(_Function, numba.njit(**options)(function))
     config = cast(Any, numba_config)
-    theirs = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
+    previous = config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES
     config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = str(cache_folder(file)), f"{__name__}.AnyClone"
     try:
         return cast(_Function, numba.njit(**options)(function))
     finally:
-        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = theirs
+        config.CACHE_DIR, config.CACHE_LOCATOR_CLASSES = previous

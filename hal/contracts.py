@@ -1,7 +1,7 @@
-"""Bus and device contracts: what a driver may assume, and no more.
+"""Defines the contracts of buses and devices: a driver may assume these and nothing else.
 
-One required method per bus, the rest derived (embedded-hal). Timeouts are per call, total, in seconds;
-``0`` polls. ``close()`` is idempotent. No method prints or retries. Every adapter, emulated or not, passes
+Each bus has one required method (embedded-hal). A timeout bounds one whole call, in seconds; ``0`` polls.
+``close()`` is idempotent. No method prints or retries. Every adapter, emulated or not, passes
 ``tests/contract``.
 """
 
@@ -20,10 +20,10 @@ Int16Array = NDArray[np.int16]
 
 
 class Clock(Protocol):
-    """The bench clock: monotonic integer nanoseconds, the same in every process of a bench."""
+    """Counts monotonic integer nanoseconds; every process of a bench sees the same time."""
 
     def now_ns(self) -> int:
-        """Time now."""
+        """Return the time now, in ns."""
         ...
 
     def sleep_until_ns(self, t_ns: int) -> int:
@@ -32,7 +32,7 @@ class Clock(Protocol):
 
 
 class SerialPort(Protocol):
-    """A byte stream, 8N1. Modem lines are not part of the contract (a pty has none)."""
+    """Carries bytes both ways, 8N1. Modem lines are not part of the contract (a pty has none)."""
 
     def read_into(self, buf: memoryview, timeout_s: float) -> int:
         """Read 1..len(buf) bytes as soon as any are there; 0 means that ``timeout_s`` passed.
@@ -54,12 +54,12 @@ class SerialPort(Protocol):
 
 
 class I2cBus(Protocol):
-    """An I2C master. Addresses are 7 bit, right-aligned."""
+    """Makes transfers as an I2C master. Addresses have 7 bits, right-aligned."""
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
-        """One START, a repeated START between the segments, one STOP.
+        """Send one START, a repeated START between the segments and one STOP.
 
-        Returns the bytes of all read segments, in order. Raises ``I2cNack`` (kind says address or data),
+        Return the bytes of all read segments, in order. Raises ``I2cNack`` (kind says address or data),
         ``BusError`` or ``Disconnected``.
         """
         ...
@@ -69,14 +69,14 @@ class I2cBus(Protocol):
 
 
 class CanBus(Protocol):
-    """A CAN controller with classic frames (up to 8 data bytes). It does not hear its own frames."""
+    """Sends and receives classic CAN frames (up to 8 data bytes). It does not receive its own frames."""
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
-        """Queue one frame; ``HalTimeout`` when the queue stays full."""
+        """Queue one frame. Raises ``HalTimeout`` when the queue stays full for ``timeout_s``."""
         ...
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """Next frame or ``None`` after ``timeout_s``; ``t_ns`` is on the bench clock."""
+        """Return the next frame, or ``None`` after ``timeout_s``. Its ``t_ns`` is on the bench clock."""
         ...
 
     def stats(self) -> CanStats: ...
@@ -85,21 +85,21 @@ class CanBus(Protocol):
 
 
 class GattClient(Protocol):
-    """A connection to one Bluetooth Low Energy peripheral. Characteristics are named by their 128-bit UUID."""
+    """Connects to one Bluetooth Low Energy peripheral. Characteristics are named by their 128-bit UUID."""
 
     def subscribe(self, characteristic: str, timeout_s: float) -> None:
-        """Switch notifications on; they queue from now on. ``DeviceNotFound`` without such a characteristic."""
+        """Switch notifications on; from now on they queue. Raises ``DeviceNotFound`` without such a characteristic."""
         ...
 
     def receive(self, timeout_s: float) -> tuple[str, bytes, int] | None:
-        """Oldest notification as characteristic, value and time of arrival (bench clock, ns), or ``None``.
+        """Return the oldest notification as characteristic, value and time of arrival (bench clock, ns), or ``None``.
 
         Raises ``Disconnected`` when the link is gone and nothing is left in the queue.
         """
         ...
 
     def read(self, characteristic: str, timeout_s: float) -> bytes:
-        """Ask for a value. Raises ``HalTimeout``."""
+        """Return the value of a characteristic. Raises ``HalTimeout``."""
         ...
 
     def info(self) -> PortInfo: ...
@@ -107,20 +107,21 @@ class GattClient(Protocol):
 
 
 class AnalogInputScan(Protocol):
-    """Hardware-timed scans of several channels."""
+    """Delivers hardware-timed scans of several channels."""
 
     def configure(self, config: ScanConfig) -> ScanInfo:
-        """Set the device up; the answer is what it really does. ``BenchError`` when it cannot."""
+        """Set the device up and return the settings that it really uses. Raises ``BenchError`` when it cannot."""
         ...
 
     def start(self) -> None: ...
 
     def read_scans(self, out: Int16Array, timeout_s: float) -> ScanBlock:
-        """Fill rows of ``out[max_scans, n_channels]`` with raw counts, oldest first; ``block.n`` says how many.
+        """Fill rows of ``out`` (max_scans, n_channels) with raw counts, oldest first; ``block.n`` is the number of
+        rows.
 
-        Waits for the first scan at most ``timeout_s``, then takes what is there. Never drops silently:
-        ``lost`` and ``Status.GAP`` say so, ``Overrun`` is raised when the device stopped by itself.
-        ``n == 0`` means timeout. Volts are ``counts * lsb_V``.
+        Waits for the first scan at most ``timeout_s``, then takes all scans that have arrived. Missing scans are
+        reported (``lost``, ``Status.GAP``); ``Overrun`` is raised when the device stopped by itself. ``n == 0`` means
+        timeout. Volts are ``counts * lsb_V``.
         """
         ...
 
@@ -129,7 +130,7 @@ class AnalogInputScan(Protocol):
 
 
 class AnalogOutput(Protocol):
-    """A group of analog outputs that move together and know their safe state. ``name`` is its bench entry."""
+    """Drives a group of analog outputs that move together and have a safe state. ``name`` is its bench entry."""
 
     name: str
     limits: tuple[OutputLimit, ...]
@@ -149,7 +150,7 @@ class AnalogOutput(Protocol):
         ...
 
     def write(self, values_V: Float64Array) -> int:
-        """Output one value per channel; returns a bit mask of the channels that were clipped or slew limited.
+        """Output ``values_V`` (n_channels,) in V. Return a bit mask of the channels that were clipped or slew limited.
 
         Raises ``SafetyTrip`` before ``arm()`` and on a value that is not finite. Never raises for clipping.
         """
@@ -160,9 +161,9 @@ class AnalogOutput(Protocol):
         ...
 
     def readback_V(self) -> Float64Array:
-        """Return the outputs that the device itself reports, in V."""
+        """Return the outputs that the device itself reports (n_channels,), in V."""
         ...
 
     def close(self) -> None:
-        """Go to the safe state if not there, then release the device."""
+        """Go to the safe state unless it is reached, then release the device."""
         ...

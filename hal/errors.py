@@ -1,4 +1,4 @@
-"""Errors of the hardware layer: a portable kind for code, a message and a cause for people.
+"""Defines the errors of the hardware layer: a portable kind for code, a message and a cause for people.
 
 Every message says what happened, where, and what to do. Sources: embedded-hal ``ErrorKind`` (portable
 kinds), nidaqmx (partial progress), ophyd-async (one tree of all failed connections).
@@ -11,7 +11,7 @@ from enum import Enum
 
 
 class ErrorKind(Enum):
-    """Kind of an error, independent of device and backend."""
+    """Names the kind of an error, independent of device and backend."""
 
     CONFIG = "config"
     NOT_FOUND = "not found"
@@ -31,7 +31,7 @@ class ErrorKind(Enum):
 
 
 class HalError(Exception):
-    """Base of all hardware errors.
+    """Is the base class of all hardware errors.
 
     ``device`` names the bench entry (``"daq"``, ``"i2c0"``), ``partial`` says how far a transfer got and
     ``lost`` how many samples are gone; the original exception is ``__cause__``.

@@ -33,7 +33,9 @@ def stamp_share(stamps_s: Array, values: Array) -> float:
 
 
 def steady_stamps(stamps_s: Array) -> Array:
-    """Time of each sample of an even clock from jittering host stamps: a straight line in every ``SMOOTH_S``."""
+    """Return the time (n,) in s of each sample of an even clock from jittering host stamps.
+
+    A straight line is fitted in every ``SMOOTH_S``."""
     from scipy.signal import savgol_filter  # pyright: ignore[reportMissingTypeStubs, reportUnknownVariableType]
 
     rate_hz = (len(stamps_s) - 1) / (stamps_s[-1] - stamps_s[0])

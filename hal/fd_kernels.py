@@ -1,4 +1,4 @@
-"""Compiled reading, writing, waiting and sleeping on file descriptors, without the interpreter (Linux, x86-64).
+"""Reads, writes, waits and sleeps on file descriptors in compiled code, without the interpreter (Linux, x86-64).
 
 A compiled loop calls these kernels instead of ``os.read`` and ``select``. Descriptors must be non-blocking. A call
 that a signal interrupts is repeated; every other failure is returned as a negative errno and never raised. Nothing is
@@ -58,7 +58,7 @@ def now_ns() -> int:
 
 @kernel
 def sleep_until_ns(t_ns: int) -> None:
-    """Sleep until ``t_ns``; not at all when that has passed."""
+    """Sleep until ``t_ns``. Return at once when that time has passed."""
     t = stack_index(2)  # pyright: ignore[reportCallIssue]
     t[0], t[1] = t_ns // SECOND_NS, t_ns % SECOND_NS
     while _clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, t.ctypes.data, 0) == EINTR:
@@ -120,13 +120,15 @@ def is_ready(word: int) -> bool:
 
 @kernel
 def write_fd(fd: int, data: NDArray[np.uint8], n: int, until_ns: int) -> int:
-    """Write ``data[:n]``, and wait for room until ``until_ns``, not at all if that is 0. Return how many bytes were
-    taken, fewer than ``n`` when the time is up, or a negative errno: some bytes may have been taken then."""
+    """Write ``data[:n]`` (bytes) and wait for room until ``until_ns``, or not at all if that is 0.
+
+    Return the number of bytes written, fewer than ``n`` when the time is up, or a negative errno: some bytes may have
+    been written then."""
     done = 0
     while done < n:
-        taken = _write(fd, data.ctypes.data + done, n - done)
-        if taken >= 0:
-            done += taken
+        written = _write(fd, data.ctypes.data + done, n - done)
+        if written >= 0:
+            done += written
             continue
         failed = _errno()
         if failed == EAGAIN:

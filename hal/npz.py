@@ -1,4 +1,4 @@
-"""Reading .npz files that somebody else wrote: no pickle, and no array that is larger than the file can hold.
+"""Reads .npz files of unknown origin: without pickle, and without an array that is larger than the file can hold.
 
 A header of a few bytes may claim an array of any size, and a few kilobytes of zeros may unpack to gigabytes: both are
 refused before anything is allocated.
@@ -94,7 +94,7 @@ def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 @contextmanager
 def open_npz(path: Path, most_bytes: int = MOST_BYTES) -> Generator[Npz]:
-    """The arrays of ``path``. Raises ``FileNotFoundError`` when it is not there, ``NpzError`` for all else."""
+    """Return the arrays of ``path``. Raises ``FileNotFoundError`` when it does not exist, ``NpzError`` for all else."""
     try:
         archive = zipfile.ZipFile(path)
     except FileNotFoundError:

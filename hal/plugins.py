@@ -1,7 +1,7 @@
-"""Registries of lazily loaded objects by name: ours, those of folders beside ours, and those of other packages.
+"""Finds lazily loaded objects by name: built-in ones, those of folders, and those of installed packages (plugins).
 
-A package declares ``[project.entry-points."micron.GROUP"]`` with ``name = "module:object"``; nothing here is edited.
-Our own names come first: a package cannot replace what is built in.
+A package declares ``[project.entry-points."micron.GROUP"]`` with ``name = "module:object"``; no file here changes.
+Built-in names come first, so a package cannot replace them.
 """
 
 from __future__ import annotations
@@ -26,21 +26,22 @@ _Kind = TypeVar("_Kind")
 
 
 def offered(group: str) -> Mapping[str, EntryPoint]:
-    """Entry points of ``group`` by name, not loaded. ``BenchError`` when two packages offer one name."""
-    found: dict[str, EntryPoint] = {}
+    """Return the entry points of ``group`` by name, not loaded. Raises ``BenchError`` when two packages offer a
+    name."""
+    entries: dict[str, EntryPoint] = {}
     for entry in entry_points(group=group):
-        other = found.setdefault(entry.name, entry)
+        other = entries.setdefault(entry.name, entry)
         if other.value != entry.value:
             raise BenchError(
                 f"'{entry.name}' of {group} is offered twice ({other.value}, {entry.value}): uninstall one package"
             )
-    return found
+    return entries
 
 
 def load(group: str, name: str, kind: type[_Kind]) -> _Kind | None:
-    """The object behind ``name``, which must be a ``kind``; ``None`` when nobody offers it.
+    """Return the object behind ``name``, which must be a ``kind``, or ``None`` when no package offers it.
 
-    ``BenchError`` says what is wrong with the package.
+    Raises ``BenchError`` with the cause when the package is broken.
     """
     entry = offered(group).get(name)
     return None if entry is None else _load(group, name, entry, kind)
@@ -84,9 +85,9 @@ class Registry(Generic[_Kind]):
 
     def _folders(self) -> dict[str, str]:
         package, module, attribute = self.folder.split(":")
-        found: dict[str, str] = {}
+        targets: dict[str, str] = {}
         for info in pkgutil.iter_modules(importlib.import_module(package).__path__):
             path = getattr(info.module_finder, "path", None)
             if info.ispkg and path is not None and (Path(path) / info.name / f"{module}.py").is_file():
-                found[info.name] = f"{package}.{info.name}.{module}:{attribute}"
-        return found
+                targets[info.name] = f"{package}.{info.name}.{module}:{attribute}"
+        return targets

@@ -1,4 +1,4 @@
-"""State and constants of ``hal.scan_time``, for its kernels as well; importing this module pulls in no compiler."""
+"""Holds the state and constants of ``hal.scan_time`` and its kernels. Importing this module loads no compiler."""
 
 from __future__ import annotations
 

@@ -20,12 +20,12 @@ from numpy.typing import NDArray
 
 
 def scratch(n: int) -> NDArray[np.float64]:
-    """(n,) uninitialised; ``n`` is a number or a global constant, known when the kernel is compiled."""
+    """Return an uninitialised array (n,). ``n`` is a number or a global constant, known when the kernel is compiled."""
     return np.empty(n)
 
 
 def scratch_matrix(rows: int, columns: int) -> NDArray[np.float64]:
-    """(rows, columns) uninitialised, C order; both known when the kernel is compiled."""
+    """Return an uninitialised array (rows, columns) in C order. Both are known when the kernel is compiled."""
     return np.empty((rows, columns))
 
 

@@ -1,4 +1,4 @@
-"""A TOML file of a stranger into a table, or one message: what is read is bounded, and every number in it is finite."""
+"""Reads a TOML file of unknown origin: its size and depth are bounded, and every number in it is finite."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ LARGEST_INTEGER = (1 << 63) - 1  # TOML 1.0: 64 bits, signed
 
 
 def read_text(path: Path, advice: str) -> str:
-    """The text of a regular file of at most ``LARGEST_BYTES``. ``BenchError`` with ``advice`` when it is none."""
+    """Return the text of a regular file of at most ``LARGEST_BYTES``. Otherwise raise ``BenchError`` with
+    ``advice``."""
     try:
         if not path.is_file():
             what = "it is no regular file" if path.exists() else "it is not there"
@@ -33,8 +34,9 @@ def read_text(path: Path, advice: str) -> str:
 
 
 def parse_toml(text: str, where: str) -> dict[str, Any]:
-    """The table of ``text``. ``BenchError`` for what is too deep or holds a number that is none; for what is no TOML
-    ``tomllib.TOMLDecodeError``, because the caller knows what the file should be."""
+    """Return the table of ``text``. Raises ``BenchError`` when it is nested too deeply or a number is not finite.
+
+    Raises ``tomllib.TOMLDecodeError`` when it is no TOML, because the caller knows what the file should be."""
     try:
         table = tomllib.loads(text)
         problems = [f"{where}: [{key}] {why}" for key, why in _no_numbers(table, ())]

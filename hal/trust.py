@@ -41,7 +41,7 @@ class NotTrusted(BenchError):
 
 @dataclass(frozen=True)
 class Decision:
-    """One line of the user's file. ``key`` is a digest (``run``) or a path (``name``), ``label`` is for people."""
+    """Holds a line of the user's file. ``key`` is a digest (``run``) or a path (``name``), ``label`` is for people."""
 
     act: Act
     key: str

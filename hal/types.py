@@ -1,4 +1,4 @@
-"""Values that cross the hardware boundary: samples, frames, transfers, and where their time comes from."""
+"""Defines the values that cross the hardware boundary: samples, frames, transfers, and the source of their time."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from enum import Enum, IntFlag
 
 
 class TimeSource(Enum):
-    """The clock that stamped a sample."""
+    """Names the clock that stamped a sample."""
 
     DEVICE_CLOCK = "device clock"
     KERNEL = "kernel"
@@ -16,7 +16,7 @@ class TimeSource(Enum):
 
 
 class Status(IntFlag):
-    """Condition of a sample; ordinary trouble travels here, not as an exception."""
+    """Flags the condition of a sample. Ordinary trouble is reported here and not as an exception."""
 
     OK = 0
     OVERRUN = 1
@@ -24,12 +24,12 @@ class Status(IntFlag):
     GAP = 4
     STALE = 8
     SHIFTED = 16
-    """Scans come at another time than their clock says: it stepped, or their way has become longer."""
+    """Scans arrive at another time than the device's clock says: it stepped, or the transport became slower."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChannelInfo:
-    """One measured quantity: ``lo``..``hi`` is the range and ``epsilon`` the resolution, all in ``unit``."""
+    """Describes one measured quantity: ``lo``..``hi`` is the range and ``epsilon`` the resolution, all in ``unit``."""
 
     name: str
     unit: str
@@ -40,7 +40,7 @@ class ChannelInfo:
 
 @dataclass(frozen=True, slots=True)
 class ScanConfig:
-    """A wish for hardware-timed scans: ``channels`` in scan order, full scale ``range_V`` per channel."""
+    """Asks for hardware-timed scans: ``channels`` in scan order, full scale ``range_V`` (V) per channel."""
 
     rate_hz: float
     channels: tuple[int, ...]
@@ -78,14 +78,14 @@ class ScanBlock:
 
 @dataclass(frozen=True, slots=True)
 class I2cWrite:
-    """One write segment of an I2C transfer."""
+    """Describes one write segment of an I2C transfer."""
 
     data: bytes
 
 
 @dataclass(frozen=True, slots=True)
 class I2cRead:
-    """One read segment of ``n`` bytes of an I2C transfer."""
+    """Describes one read segment of ``n`` bytes of an I2C transfer."""
 
     n: int
 
@@ -95,7 +95,7 @@ I2cOp = I2cWrite | I2cRead
 
 @dataclass(frozen=True, slots=True)
 class CanFrame:
-    """A CAN data frame. ``t_ns`` is bench time of reception (0 when not yet sent)."""
+    """Holds a CAN data frame. ``t_ns`` is the bench time of reception (0 when not yet sent)."""
 
     can_id: int
     data: bytes
@@ -106,7 +106,7 @@ class CanFrame:
 
 @dataclass(slots=True)
 class CanStats:
-    """Counters of a CAN adapter since it was opened."""
+    """Counts the frames of a CAN adapter since it was opened."""
 
     rx: int = 0
     tx: int = 0
@@ -116,7 +116,7 @@ class CanStats:
 
 @dataclass(frozen=True, slots=True)
 class OutputLimit:
-    """Limits of one analog output channel. ``safe_V`` is where it rests when nothing commands it."""
+    """Limits one analog output channel. The channel rests at ``safe_V`` when nothing commands it."""
 
     lo_V: float
     hi_V: float

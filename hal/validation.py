@@ -1,4 +1,4 @@
-"""Tables of configuration files: ranges that members share, and errors that name file and key."""
+"""Checks tables of configuration files: ranges that members share, and errors that name file and key."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NotNegative = Annotated[float, Field(ge=0.0, le=1e12)]
 
 
 def describe_validation_error(error: ValidationError, where: str) -> str:
-    """One line per wrong key: file, key, what is wrong with it."""
+    """Return one line per wrong key: file, key, and what is wrong with it."""
     lines: list[str] = []
     for item in error.errors():
         key = ".".join(str(part) for part in item["loc"] if part not in ("serial", "i2c", "can")) or "(top level)"

@@ -41,7 +41,7 @@ EXCHANGE_NS = 205_000
 
 
 class Ads1115:
-    """One converter. ``full_scale_V`` is that of the amplifier, ``rate_sps`` the conversion rate."""
+    """Drives one converter. ``full_scale_V`` belongs to its amplifier, ``rate_sps`` is the conversion rate."""
 
     def __init__(
         self,
@@ -85,10 +85,10 @@ class Ads1115:
         word = MUX_SINGLE_ENDED | self._config
         self._bus.transfer(self._address, [I2cWrite(bytes((POINTER_CONFIG, word >> 8, word & 0xFF)))])
         answer = self._bus.transfer(self._address, [I2cWrite(bytes((POINTER_CONFIG,))), I2cRead(2)])
-        found = int.from_bytes(answer, "big")
-        if found & ~OS_START != word:
+        read_back = int.from_bytes(answer, "big")
+        if read_back & ~OS_START != word:
             raise WrongDevice(
-                f"configuration 0x{word:04X} reads back as 0x{found:04X}: not an ADS1115", device=self.name
+                f"configuration 0x{word:04X} reads back as 0x{read_back:04X}: not an ADS1115", device=self.name
             )
         return f"ADS1115 at 0x{self._address:02X}, +-{self.full_scale_V} V"
 
@@ -100,11 +100,11 @@ class Ads1115:
         self._ready_ns = self._clock.now_ns() + self.conversion_ns
 
     def exchange(self, channel: int) -> float | None:
-        """Volts of the pending conversion, and in the same transfer the order to convert ``channel`` next.
+        """Return the volts of the pending conversion, and start to convert ``channel`` in the same transfer.
 
-        ``None`` while there is none or it may still run (then the bus stays untouched). The pointer is written, two
-        bytes are read after a repeated START, and the order follows after another one. After an error nothing is
-        pending: whether the order was heard is not known.
+        Return ``None`` without a transfer if no conversion is pending or it may still run. The transfer writes the
+        pointer, reads two bytes after a repeated START, and writes the configuration after another one. After an error
+        nothing is pending, because it is not known whether the converter accepted the configuration.
         """
         if self.pending is None or self._clock.now_ns() < self._ready_ns:
             return None

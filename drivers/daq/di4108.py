@@ -40,7 +40,8 @@ BUFFER_BYTES = 1 << 18  # the device's FIFO and all that a kernel keeps of a ser
 
 
 def scan_rate(rate_hz: float) -> tuple[int, int, float]:
-    """``(srate, dec, real rate in Hz)`` nearest to the wish; the smallest ``dec``, because 1 means no filter."""
+    """Return ``(srate, dec, real rate in Hz)`` nearest to the wanted rate, with the smallest ``dec``: 1 means no
+    filter."""
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise BenchError(f"rate_hz = {rate_hz} is not a positive number")
     best: tuple[float, int, int] | None = None
@@ -59,7 +60,7 @@ def scan_rate(rate_hz: float) -> tuple[int, int, float]:
 
 
 def packet_code(bytes_per_second: float) -> int:
-    """``ps`` argument: the largest packet (16 << n bytes) that still fills within a millisecond."""
+    """Return the ``ps`` argument: the largest packet (16 << n bytes) that still fills within a millisecond."""
     return max(0, min(7, int(math.log2(max(bytes_per_second / 1000.0, 16.0) / 16.0))))
 
 
@@ -161,7 +162,7 @@ class Di4108:
         self._timeline = ScanTimeline(1e9 / rate_hz, state=self._stream["timeline"][0])
 
     def channels(self) -> Sequence[ChannelInfo]:
-        """One voltage per configured input, in scan order."""
+        """Return one voltage channel per configured input, in scan order."""
         info = self._require_info()
         return [
             ChannelInfo(f"ai{c}", "V", -r, r, lsb)

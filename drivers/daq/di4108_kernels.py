@@ -75,7 +75,7 @@ def warm_up() -> None:
 
 @kernel
 def accept(stream: Record, buffer: NDArray[np.uint8], n: int, now_ns: int) -> int:
-    """Take note of ``n`` bytes that were read to ``buffer[end : end + n]`` at ``now_ns``. Return the verdict."""
+    """Count ``n`` bytes that were read to ``buffer[end : end + n]`` at ``now_ns``. Return the verdict."""
     s = stream[0]
     s.arrival_ns = now_ns
     s.end += n

@@ -11,7 +11,7 @@ from hal.types import ScanBlock, ScanConfig, ScanInfo, Status, TimeSource
 
 
 class ScanByScan(ABC):
-    """The ``AnalogInputScan`` of such a DAQ on a serial port; its driver says what the device sends and is sent.
+    """Implements ``AnalogInputScan`` for such a DAQ on a serial port. Its driver defines the bytes in both directions.
 
     ``modulo``: the sequence number that follows the last one is 0.
     """

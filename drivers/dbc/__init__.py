@@ -27,7 +27,7 @@ class DbcDatabase(Protocol):
 
 
 def load_database() -> DbcDatabase:
-    """A fresh database object (about 10 ms); decoded signals are numbers, choices stay numbers too."""
+    """Return a new database object (takes about 10 ms). Decoded signals and choices are numbers."""
     import_can()  # before cantools does it
     cantools = import_module("cantools.database")
     text = resources.files("drivers.dbc").joinpath("micron.dbc").read_text(encoding="ascii")

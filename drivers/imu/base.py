@@ -31,7 +31,8 @@ Int32Array = NDArray[np.int32]
 
 
 class PowerMode(Enum):
-    """``LOW_POWER`` duty-cycles or lowers the noise performance; what is left of the rates the driver says."""
+    """Names the power modes. ``LOW_POWER`` lowers the duty cycle or the noise performance; the driver names its
+    rates."""
 
     NORMAL = "normal"
     LOW_POWER = "low power"
@@ -56,7 +57,7 @@ class ImuSetup:
 
 @dataclass(slots=True)
 class ImuSample:
-    """One instant, filled in place. ``raw`` (7,) holds counts: accelerometer, gyro, temperature.
+    """Holds one sample and is filled in place. ``raw`` (7,) holds counts: accelerometer, gyro, temperature.
 
     ``seq`` counts the chip's samples; ``lost`` samples are known to be missing before this one. A sample with
     ``Status.STALE`` repeats the last one: its ``t_ns`` and ``seq`` too. ``field_T`` is NaN without magnetometer.
@@ -102,7 +103,7 @@ class ImuOffsets:
 
 @dataclass(frozen=True, slots=True)
 class AxisTest:
-    """One axis of a self-test: the reaction ``value`` must lie in ``lo``..``hi`` (``unit``)."""
+    """Holds one axis of a self-test: the reaction ``value`` must lie in ``lo``..``hi`` (``unit``)."""
 
     axis: str
     value: float
@@ -117,7 +118,7 @@ class AxisTest:
 
 @dataclass(frozen=True, slots=True)
 class SelfTestReport:
-    """All axes of a self-test with the data sheet's limits and its place in the data sheet."""
+    """Holds all axes of a self-test with the data sheet's limits and the section that states them."""
 
     axes: tuple[AxisTest, ...]
     source: str
@@ -141,7 +142,7 @@ class Imu(Protocol):
     @property
     def stale(self) -> int: ...
     def probe(self) -> str:
-        """Identity. Raises ``WrongDevice``, or ``I2cNack`` when nobody answers."""
+        """Return the identity. Raises ``WrongDevice``, or ``I2cNack`` when no device answers."""
         ...
 
     def reset(self, limit_s: float = 0.1) -> None:
@@ -186,7 +187,7 @@ class Imu(Protocol):
 
 
 def pick_range(value: float, codes: dict[float, int], what: str, name: str) -> int:
-    """The chip's code of a range. ``BenchError`` lists what there is."""
+    """Return the chip's code of a range. ``BenchError`` lists the ranges of the chip."""
     if value not in codes:
         raise BenchError(f"{what} = {value:g} is not one of {', '.join(f'{v:g}' for v in sorted(codes))}", device=name)
     return codes[value]
@@ -290,7 +291,8 @@ class FifoTimeline:
 def imu_channels(
     name: str, setup: ImuSetup, temperature: tuple[float, float, float], field_range_T: Sequence[float] = ()
 ) -> Sequence[ChannelInfo]:
-    """Channels of a sensor; ``temperature`` is lo, hi and step, ``field_range_T`` (x, y, z, step) or empty."""
+    """Return the channels of a sensor. ``temperature`` is lo, hi, step; ``field_range_T`` is (x, y, z, step) or
+    empty."""
     accel = setup.accel_range_g * STANDARD_GRAVITY
     gyro = setup.gyro_range_dps * RAD_PER_DEG
     channels = [ChannelInfo(f"{name}.accel_{a}", "m/s^2", -accel, accel, setup.accel_lsb_mps2) for a in AXES]

@@ -1,6 +1,6 @@
-"""Inertial sensors in a bench file: their options, their addresses, their bus time, and how one is made from that.
+"""Makes inertial sensors from a bench file, and defines their options, addresses and bus load.
 
-Bus time is counted as the drivers talk (``hal.wire_bits``).
+The bus load counts the transactions of the drivers (``hal.wire_bits``).
 """
 
 from __future__ import annotations
@@ -27,7 +27,8 @@ from hal.wire_bits import i2c_bits
 
 
 class ImuOptions(Options):
-    """Common to all. ``rate_hz``: how often it is read; ``drain_hz``: how often its FIFO is, in mode "fifo"."""
+    """Holds the keys of every chip. ``rate_hz`` is the rate of readings, ``drain_hz`` that of the FIFO in mode
+    "fifo"."""
 
     rate_hz: float = Field(default=100.0, gt=0)
     accel_range_g: Annotated[float, one_of(2, 4, 8, 16)] = 2.0
@@ -38,20 +39,22 @@ class ImuOptions(Options):
 
 
 class Mpu6050Options(ImuOptions):
-    """MPU-6050; AD0 gives address 0x68 or 0x69."""
+    """Holds the keys of an MPU-6050. AD0 selects address 0x68 or 0x69."""
 
     rate_hz: float = Field(default=100.0, ge=3.91, le=1000)
     gyro_range_dps: Annotated[float, one_of(250, 500, 1000, 2000)] = 250.0
 
 
 class Lsm6ds3Options(ImuOptions):
-    """LSM6DS3; SA0 gives address 0x6A or 0x6B. Its rates are 12.5, 26, 52, 104, 208, 416, 833 and 1660 Hz."""
+    """Holds the keys of an LSM6DS3. SA0 selects address 0x6A or 0x6B. Rates: 12.5, 26, 52, 104, 208, 416, 833, 1660
+    Hz."""
 
     rate_hz: float = Field(default=104.0, gt=0, le=1660)
 
 
 class Bmx055Options(ImuOptions):
-    """BMX055: ``address`` is the accelerometer's, gyro and magnetometer have their own. ``mag_rate_hz`` 0: off."""
+    """Holds the keys of a BMX055. ``address`` is the accelerometer's. ``mag_rate_hz`` = 0 leaves the magnetometer
+    off."""
 
     rate_hz: float = Field(default=100.0, gt=0, le=2000)
     gyro_address: int = 0x68
@@ -69,7 +72,7 @@ LOWEST_ADDRESS = {"mpu6050": 0x68, "lsm6ds3": 0x6A, "bmx055": 0x18}  # the other
 
 
 def make_imu(spec: DeviceSpec, options: ImuOptions, bus: I2cBus, clock: Clock, name: str) -> Imu:
-    """The driver of a bench entry, nothing sent yet. ``open_imu`` also sets it up."""
+    """Return the driver of a bench entry. It sends nothing; ``open_imu`` also sets the chip up."""
     address = spec.address or LOWEST_ADDRESS[spec.driver]
     match options:
         case Mpu6050Options():
@@ -135,18 +138,18 @@ def address_problems(description: BenchDescription, options: dict[str, Any]) -> 
 
 
 def _claims(option: ImuOptions, address: int, name: str) -> list[tuple[int, str, str]]:
-    """Address, who, and what frees it, for every die."""
+    """Return for every die its address, its name and the key that changes the address."""
     if isinstance(option, Bmx055Options):
         check_addresses(address, option.gyro_address, option.mag_address, name)
         gyro, mag = option.gyro_address ^ 1, option.mag_address ^ 1
         sdo2 = f"tie SDO2 of '{name}' {_level(gyro)} (gyro_address = 0x{gyro:02x}, mag_address = 0x{mag:02x})"
-        found = [
+        claims = [
             (address, f"the accelerometer of '{name}' (BMX055)", _strap("SDO1", name, address)),
             (option.gyro_address, f"the gyro of '{name}' (BMX055)", sdo2),
         ]
         if option.mag_rate_hz:
-            found.append((option.mag_address, f"the magnetometer of '{name}' (BMX055)", sdo2))
-        return found
+            claims.append((option.mag_address, f"the magnetometer of '{name}' (BMX055)", sdo2))
+        return claims
     part, pin = ("MPU6050", "AD0") if isinstance(option, Mpu6050Options) else ("LSM6DS3", "SA0")
     lowest = LOWEST_ADDRESS["mpu6050" if part == "MPU6050" else "lsm6ds3"]
     if address not in (lowest, lowest + 1):

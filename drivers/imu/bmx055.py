@@ -1,4 +1,4 @@
-"""BMX055: three dies (accelerometer 12 bit, gyro 16 bit, magnetometer) at three addresses of one I2C bus.
+"""Drives the BMX055: three dies (accelerometer 12 bit, gyro 16 bit, magnetometer) at three addresses of one I2C bus.
 
 Source: Bosch BST-BMX055-DS000 rev 1.1. Data registers are updated axis after axis, FIFO frames hold one instant
 ("FIFO operating modes"): so samples always come out of the FIFOs, which also count what was not read. The gyro
@@ -53,7 +53,7 @@ MAG_RANGE_T = (1300e-6, 1300e-6, 2500e-6, 0.3e-6)  # x, y, z and the step
 
 
 class Bmx055:
-    """One part. ``mag_rate_hz`` 0 leaves the magnetometer suspended, and its address untouched.
+    """Drives one part. ``mag_rate_hz`` = 0 leaves the magnetometer suspended and sends nothing to its address.
 
     ``overruns`` of either FIFO are counted; ``lost`` and ``stale`` count since ``start``.
     """
@@ -102,7 +102,7 @@ class Bmx055:
         return self._timeline.lost
 
     def probe(self) -> str:
-        """Identity of all dies; the magnetometer must be switched on for that."""
+        """Return the identity of all dies. This switches the magnetometer on."""
         self._accel.identify(m.ACC_CHIPID, "BMX055")
         self._gyro.identify(m.GYR_CHIPID, "BMX055")
         where = f"0x{self._accel.address:02X}, 0x{self._gyro.address:02X}"
@@ -166,7 +166,7 @@ class Bmx055:
         self._mode = mode
 
     def read(self, out: ImuSample) -> Status:
-        """The newest frame of either FIFO; older ones that were not read in time are ``lost``."""
+        """Return the newest frame of both FIFOs. Older frames that were not read in time count as ``lost``."""
         require_mode(self._mode, "data ready", self.name)
         t_ns = self._clock.now_ns()
         block = self._pending
@@ -208,7 +208,8 @@ class Bmx055:
 
     @property
     def field_T(self) -> tuple[float, float, float]:
-        """The newest field of the magnetometer in T, NaN before the first and without it."""
+        """Return the newest field of the magnetometer (3,) in T; NaN before the first reading and without
+        magnetometer."""
         x, y, z = self._field_T
         return float(x), float(y), float(z)
 
@@ -320,7 +321,7 @@ class Bmx055:
         self._gyro.write(m.GYR_FIFO_CONFIG_1, join((m.GYR_FIFO_MODE, m.STREAM)))
 
     def _drain(self, out: ImuBlock, arrival_ns: int) -> int:
-        """All frames of both FIFOs into ``out.raw``, one row per frame of the leading die, and its head."""
+        """Write all frames of both FIFOs into ``out.raw``, one row per frame of the leading die, and fill its head."""
         head = self._accel_head()
         out.temperature_C = signed(head[0], 8) * 0.5 + 23.0
         accel_status, gyro_status = head[6], self._gyro_head()[0] if self._gyro_on else 0

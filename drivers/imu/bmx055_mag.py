@@ -16,8 +16,8 @@ MICRO = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class MagTrim:
-    """Factory values of one die; ``blank`` when it has none (then nominal steps are used: 0.3125 uT in x and y,
-    a half of that in z)."""
+    """Holds the factory values of one die. A ``blank`` die uses nominal steps: 0.3125 uT in x and y, half of that in
+    z."""
 
     x1: int
     y1: int
@@ -42,7 +42,7 @@ class MagTrim:
         return MagTrim(x1, y1, x2, y2, z1, z2, z3, z4, xy1, xy2, xyz1 & 0x7FFF)
 
     def field_T(self, x: int, y: int, z: int, rhall: int) -> tuple[float, float, float]:
-        """Field in T; NaN for an axis that overflowed, and for all without a Hall resistance."""
+        """Return the field (3,) in T: NaN for an axis that overflowed, and for all axes without a Hall resistance."""
         if self.blank:
             values = 0.3125 * x, 0.3125 * y, 0.15625 * z
         elif rhall == 0:
@@ -64,6 +64,6 @@ class MagTrim:
 
 
 def counts(data: bytes) -> tuple[bool, int, int, int, int]:
-    """The eight data bytes as: new, x (13 bit), y (13 bit), z (15 bit), Hall resistance (14 bit)."""
+    """Return from the eight data bytes: new, x (13 bit), y (13 bit), z (15 bit), Hall resistance (14 bit)."""
     x, y, z, rhall = struct.unpack("<hhhH", data)
     return bool(rhall & 1), x >> 3, y >> 3, z >> 1, rhall >> 2

@@ -51,7 +51,7 @@ SELF_TEST_SAMPLES = 5
 
 
 class Lsm6ds3(CountingImu):
-    """One chip. ``setup`` says what it does, ``lost`` and ``stale`` count since ``start``."""
+    """Drives one chip. ``setup`` holds its settings; ``lost`` and ``stale`` count since ``start``."""
 
     def __init__(self, bus: I2cBus, clock: Clock, address: int = 0x6A, *, name: str = "imu") -> None:
         if address not in ADDRESSES:
@@ -108,7 +108,7 @@ class Lsm6ds3(CountingImu):
         self._mode = mode
 
     def read(self, out: ImuSample) -> Status:
-        """Not new as long as either sensor has nothing new: gyro and accelerometer come as a pair."""
+        """Read gyro and accelerometer as a pair. The sample is new only when both sensors have new values."""
         require_mode(self._mode, "data ready", self.name)
         t_ns = self._clock.now_ns()
         data = self._burst()
@@ -214,7 +214,7 @@ class Lsm6ds3(CountingImu):
         return SelfTestReport(tuple(tests), "DocID026899, mechanical characteristics LA_ST, G_ST; AN4650, self-test")
 
     def power(self, mode: PowerMode) -> None:
-        """``LOW_POWER``: both sensors without high-performance mode, which saves up to 208 Hz. ``SLEEP``: off.
+        """Set the power mode. ``LOW_POWER`` leaves the high-performance mode, for up to 208 Hz; ``SLEEP`` switches off.
 
         Without gyro its rates are NaN. ``start`` wakes up."""
         accel, gyro = self._settings
@@ -241,7 +241,7 @@ class Lsm6ds3(CountingImu):
 
 
 def celsius(raw: int) -> float:
-    """Section "Temperature sensor characteristics": 16 counts per degC, 25 degC at zero."""
+    """Return degC ("Temperature sensor characteristics": 16 counts per degC, 25 degC at zero)."""
     return raw / 16.0 + 25.0
 
 

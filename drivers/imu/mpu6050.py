@@ -51,7 +51,7 @@ SELF_TEST_SAMPLES = 20
 
 
 class Mpu6050(CountingImu):
-    """One chip. ``setup`` says what it does, ``lost`` and ``stale`` count since ``start``."""
+    """Drives one chip. ``setup`` holds its settings; ``lost`` and ``stale`` count since ``start``."""
 
     def __init__(self, bus: I2cBus, clock: Clock, address: int = 0x68, *, name: str = "imu") -> None:
         if address not in ADDRESSES:
@@ -125,8 +125,8 @@ class Mpu6050(CountingImu):
         return status
 
     def read_fifo(self, out: ImuBlock) -> int:
-        """After an overflow the frames no longer begin where they should: the FIFO is emptied, ``out`` stays
-        empty and says how many are gone."""
+        """Read all frames of the FIFO. After an overflow the frames are misaligned: the FIFO is emptied, and ``out``
+        holds no sample and the number of lost ones."""
         require_mode(self._mode, "fifo", self.name)
         arrival_ns = self._clock.now_ns()
         overflow = self._chip.read(m.INT_STATUS) & m.FIFO_OFLOW_INT.mask
@@ -154,7 +154,7 @@ class Mpu6050(CountingImu):
         return n
 
     def read_offsets(self) -> ImuOffsets:
-        """Gyro: what the registers hold. Accelerometer: their difference to the factory's trim."""
+        """Return the gyro's offset registers, and the difference of the accelerometer's to the factory's trim."""
         factory = self._trim()
         accel = [
             (w - f) / OFFSET_LSB_PER_G * STANDARD_GRAVITY for w, f in zip(self._accel_words(), factory, strict=True)
@@ -217,7 +217,8 @@ class Mpu6050(CountingImu):
         return SelfTestReport(tuple(tests), "RM-MPU-6000A 4.1; PS-MPU-6000A 6.1, 6.2")
 
     def power(self, mode: PowerMode) -> None:
-        """``LOW_POWER``: accelerometer only, 40 Hz (4.29). Without gyro its rates are NaN. ``start`` wakes up."""
+        """Set the power mode. ``LOW_POWER`` runs the accelerometer only, at 40 Hz (4.29); rates are NaN then. ``start``
+        wakes up."""
         gyro = mode is PowerMode.NORMAL or mode is PowerMode.SLEEP
         cycle = mode is PowerMode.LOW_POWER
         self._chip.write(
@@ -268,7 +269,7 @@ class Mpu6050(CountingImu):
 
 
 def celsius(raw: int) -> float:
-    """RM 4.18, p. 30: 340 counts per degC, 36.53 degC at zero."""
+    """Return degC (RM 4.18, p. 30: 340 counts per degC, 36.53 degC at zero)."""
     return raw / 340.0 + 36.53
 
 

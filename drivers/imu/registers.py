@@ -19,7 +19,8 @@ Access = Literal["r", "w", "rw"]
 
 @dataclass(frozen=True, slots=True)
 class Register:
-    """One byte of a chip. ``reset`` is its value after reset, ``None`` where the data sheet leaves it open."""
+    """Describes one byte of a chip. ``reset`` is its value after reset, ``None`` where the data sheet leaves it
+    open."""
 
     name: str
     address: int
@@ -56,12 +57,12 @@ class Field:
         return (byte & self.mask) >> self.low
 
     def replace(self, byte: int, value: int) -> int:
-        """``byte`` with this field set to ``value``, other bits kept."""
+        """Return ``byte`` with this field set to ``value`` and its other bits kept."""
         return byte & ~self.mask | self.place(value)
 
 
 def join(*parts: tuple[Field, int]) -> int:
-    """One register value out of several fields; fields that are not named are zero."""
+    """Return one register value from several fields. Fields that are not named are zero."""
     value = 0
     for field, part in parts:
         value |= field.place(part)
@@ -85,7 +86,7 @@ class RegisterFile:
         return self._bus.transfer(self.address, [I2cWrite(bytes((first.address,))), I2cRead(n)])
 
     def burst(self, first: Register, n: int) -> Callable[[], bytes]:
-        """``read_block`` prepared once, for the loop."""
+        """Return a prepared ``read_block`` for the loop."""
         transfer, address = self._bus.transfer, self.address
         ops = (I2cWrite(bytes((first.address,))), I2cRead(n))
         return lambda: transfer(address, ops)
@@ -99,11 +100,11 @@ class RegisterFile:
     def write_checked(self, register: Register, *values: int) -> None:
         """``write``, then read back. ``ProtocolError`` when something else comes back."""
         self.write(register, *values)
-        found = self.read_block(register, len(values))
-        if found != bytes(values):
+        read_back = self.read_block(register, len(values))
+        if read_back != bytes(values):
             raise ProtocolError(
                 f"{register.name} (0x{register.address:02X}) was written {bytes(values).hex()} and reads back "
-                f"{found.hex()}; check supply, wiring and that nobody else drives this address",
+                f"{read_back.hex()}; check supply, wiring and that nobody else drives this address",
                 device=self.name,
             )
 
@@ -116,20 +117,20 @@ class RegisterFile:
     def update_checked(self, field: Field, value: int) -> None:
         """``update``, then read the field back: reserved bits of the register may read as they like."""
         self.update(field, value)
-        found = field.take(self.read(field.register))
-        if found != value:
+        read_back = field.take(self.read(field.register))
+        if read_back != value:
             raise ProtocolError(
                 f"a field of {field.register.name} (0x{field.register.address:02X}) was set to {value} and reads "
-                f"back {found}; check supply, wiring and that nobody else drives this address",
+                f"back {read_back}; check supply, wiring and that nobody else drives this address",
                 device=self.name,
             )
 
     def identify(self, register: Register, part: str) -> None:
         """Compare an identity register with its fixed value. Raises ``WrongDevice``."""
-        found = self.read(register)
-        if found != register.reset:
+        read_back = self.read(register)
+        if read_back != register.reset:
             raise WrongDevice(
-                f"{register.name} at address 0x{self.address:02X} reads 0x{found:02X}, {part} says "
+                f"{register.name} at address 0x{self.address:02X} reads 0x{read_back:02X}, {part} says "
                 f"0x{register.reset:02X} ({register.source}); another part is strapped to this address",
                 device=self.name,
             )
@@ -156,5 +157,5 @@ class RegisterFile:
 
 
 def signed(value: int, bits: int) -> int:
-    """Two's complement of ``bits`` bits."""
+    """Return ``value`` read as two's complement of ``bits`` bits."""
     return value - (1 << bits) if value & 1 << (bits - 1) else value

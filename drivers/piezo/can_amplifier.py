@@ -43,7 +43,7 @@ _STATUS = struct.Struct("<HHHBB")
 
 
 class CanAmplifier:
-    """AnalogOutput of three stacks, in V at the stack."""
+    """Implements ``AnalogOutput`` for three stacks, in V at the stack."""
 
     def __init__(
         self,
@@ -114,8 +114,8 @@ class CanAmplifier:
             self._hold_one_tick()
         limit_ns = self._clock.now_ns() + STATUS_LIMIT_NS
         neutral_V = np.array([limit.safe_V for limit in self.limits])
-        told = self._counter
-        while not self._accepted_since(told) or np.abs(self.measured_V - neutral_V).max() > 1.0:
+        counter = self._counter
+        while not self._accepted_since(counter) or np.abs(self.measured_V - neutral_V).max() > 1.0:
             self.guard.require(
                 self._clock.now_ns() < limit_ns and self.state == ARMED,
                 f"commanded {neutral_V.tolist()} V, the node measures {self.measured_V.round(2).tolist()} V and is "
@@ -134,7 +134,8 @@ class CanAmplifier:
         return self.guard.last_V
 
     def write(self, values_V: Float64Array) -> int:
-        """See ``AnalogOutput.write``. Also raises when the node has left the armed state or fallen silent."""
+        """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Raises also when the node is not armed or is
+        silent."""
         self.poll()
         if self.guard.armed:
             self._require_link()
@@ -165,7 +166,8 @@ class CanAmplifier:
         return False
 
     def readback_V(self) -> Float64Array:
-        """Voltages measured by the node, from the next status frame; the setpoint is held meanwhile."""
+        """Return the voltages (3,) in V that the node measured, from its next status frame. It holds the set point
+        meanwhile."""
         if not self.guard.armed:
             self._fresh_status(STATUS_LIMIT_NS * 1e-9)
             return self.measured_V.copy()

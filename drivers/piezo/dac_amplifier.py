@@ -1,4 +1,4 @@
-"""Three-channel piezo amplifier behind an AD5696R: 16-bit quad I2C DAC, internal 2.5 V reference, gain pin high.
+"""Drives a three-channel piezo amplifier behind an AD5696R: 16-bit quad I2C DAC, 2.5 V reference, gain pin high.
 
 Source: Analog Devices AD5696R data sheet rev. B: "Input shift register" (Tables 7 and 8), "Write operation",
 "Multiple DAC readback sequence", "Load DAC", "Internal reference setup". V_DAC = 2.5 V * 2 * code / 65536.
@@ -34,7 +34,7 @@ WIRE_BITS = {
 
 
 class DacAmplifier(DacOutput):
-    """AD5696R: all outputs of a command move at once."""
+    """Drives an AD5696R. All outputs of a command move at once."""
 
     PART = "AD5696R"
     ADDRESSES = (0x0C, 0x0D, 0x0E, 0x0F)
@@ -59,10 +59,10 @@ class DacAmplifier(DacOutput):
             self.transfer([I2cWrite(bytes(command))])
         for pattern in PATTERNS:
             self.transfer([I2cWrite(bytes((WRITE_INPUT | SPARE, pattern >> 8, pattern & 0xFF)))])
-            found = int.from_bytes(self.transfer([I2cWrite(bytes((SPARE,))), I2cRead(2)]), "big")
-            if found != pattern:
+            read_back = int.from_bytes(self.transfer([I2cWrite(bytes((SPARE,))), I2cRead(2)]), "big")
+            if read_back != pattern:
                 raise WrongDevice(
-                    f"wrote 0x{pattern:04X} to DAC D, read back 0x{found:04X}: not an AD5696R", device=self.name
+                    f"wrote 0x{pattern:04X} to DAC D, read back 0x{read_back:04X}: not an AD5696R", device=self.name
                 )
 
     def segments(self, a: int, b: int, c: int) -> tuple[I2cOp, ...]:

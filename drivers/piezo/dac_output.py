@@ -1,6 +1,6 @@
-"""Analog outputs behind an I2C DAC with an amplifier: what all such parts have in common.
+"""Implements analog outputs behind any I2C DAC with an amplifier.
 
-A part is a subclass that says which bytes go over the bus. The DAC has no watchdog: the safe state is the firmware's
+A part is a subclass that defines the bytes on the bus. The DAC has no watchdog: the safe state is the firmware's
 duty, and a guardian may hold the same part through an object of its own.
 """
 
@@ -34,7 +34,7 @@ class OutputGate(Protocol):
 
 
 class DacOutput:
-    """AnalogOutput of three stacks, in V at the stack. ``arm`` -> ``write`` ... -> ``safe_step``.
+    """Implements ``AnalogOutput`` for three stacks, in V at the stack: ``arm``, then ``write``, at last ``safe_step``.
 
     A subclass sets the constants of its part and defines ``identify``, ``segments``, ``codes_of`` and ``verify``.
     """
@@ -140,7 +140,7 @@ class DacOutput:
         return self.guard.last_V
 
     def write(self, values_V: Float64Array) -> int:
-        """``ProtocolError`` with ``read_back``: the DAC holds something else than it was told just now."""
+        """Write ``values_V`` (3,). With ``read_back``, raises ``ProtocolError`` when the DAC holds another command."""
         mask = self.guard.admit(values_V)
         self._send(self.READ_CODES if self._read_back else ())
         return mask
@@ -152,9 +152,9 @@ class DacOutput:
         done = self.guard.ramp()
         self._send()
         if done:
-            found = self.read_codes()
+            codes = self.read_codes()
             wanted = [self._code(limit.safe_V) for limit in self.limits]
-            self.guard.require(found == wanted, f"neutral codes {wanted} read back as {found}")
+            self.guard.require(codes == wanted, f"neutral codes {wanted} read back as {codes}")
         return done
 
     def lose_position(self) -> None:
@@ -169,7 +169,7 @@ class DacOutput:
         return ""
 
     def readback_V(self) -> Float64Array:
-        """Contents of the input registers, which equal the outputs after each update command."""
+        """Return the input registers as volts (3,). They equal the outputs after each update command."""
         return np.array(self.read_codes(), dtype=np.float64) * self.lsb_V
 
     def close(self) -> None:
@@ -209,8 +209,8 @@ class DacOutput:
         if read_back:
             self._compare(answer, (a, b, c))
 
-    def _compare(self, answer: bytes, told: tuple[int, int, int]) -> None:
-        for i, (code, wanted) in enumerate(zip(self.codes_of(answer), told, strict=True)):
+    def _compare(self, answer: bytes, commanded: tuple[int, int, int]) -> None:
+        for i, (code, wanted) in enumerate(zip(self.codes_of(answer), commanded, strict=True)):
             if code != wanted:
                 self._position_known = False  # the ramp begins where the outputs are
                 raise ProtocolError(

@@ -1,4 +1,4 @@
-"""PI E-727.3SDA digital piezo controller, three axes, over a serial line (GCS 2.0).
+"""Drives the PI E-727.3SDA digital piezo controller, three axes, over a serial line (GCS 2.0).
 
 Source: PI manual E727T0005 (commands SVO, SVA, MOV, VOL?, TMN?, TMX?, ERR?).
 
@@ -36,10 +36,10 @@ ERROR_BYTES = len("ERR?\n")
 
 
 class E727:
-    """AnalogOutput of three stacks, in V at the stack.
+    """Implements ``AnalogOutput`` for three stacks, in V at the stack.
 
-    ``mode`` "open loop": SVA with volts. "servo": MOV with micrometres, ``um_per_V`` converting, so that the
-    rest of the firmware still thinks in volts.
+    ``mode`` "open loop" sends SVA with volts. "servo" sends MOV with micrometres; ``um_per_V`` converts, so the
+    firmware still computes in volts.
     """
 
     def __init__(
@@ -104,10 +104,10 @@ class E727:
             wait_s(self._clock, TICK_S)
         self.link.settle()
         self.link.command(self._command().decode().rstrip())
-        told = [v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)]
+        reported_V = [v / self.per_V for v in self.link.values(f"{self._verb}?", CHANNELS)]
         neutral = [limit.safe_V for limit in self.limits]
-        good = all(abs(a - b) < 0.01 for a, b in zip(told, neutral, strict=True))
-        self.guard.require(good, f"neutral is {neutral} V, the controller answers {told}")
+        good = all(abs(a - b) < 0.01 for a, b in zip(reported_V, neutral, strict=True))
+        self.guard.require(good, f"neutral is {neutral} V, the controller answers {reported_V}")
         self.guard.armed = True
 
     @property
@@ -134,8 +134,8 @@ class E727:
         return self.guard.last_V
 
     def write(self, values_V: Float64Array) -> int:
-        """See ``AnalogOutput.write``: between two commands only the newest values count, the others are
-        ``superseded``. Raises what the controller reports, some commands later."""
+        """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Between two command times only the newest values
+        count, the others are ``superseded``. Raises errors of the controller some commands later."""
         self.link.take_error()
         now_ns = self._clock.now_ns()
         if now_ns < self.words[DUE_NS]:
@@ -150,7 +150,7 @@ class E727:
         return mask
 
     def safe_step(self) -> bool:
-        """One tick of the ramp; steps between two command times are not sent, the last one always is. The first tick
+        """Make one step of the ramp. Steps between two command times are not sent, except the last one. The first tick
         may have to ask where the outputs are, 8 ms at 115200 baud: the ramp began before that."""
         if not self._position_known:
             asked_ns = self._clock.now_ns()
@@ -168,7 +168,7 @@ class E727:
         return done
 
     def readback_V(self) -> Float64Array:
-        """Piezo voltages of output channels 1 to 3, measured by the controller (``VOL?``)."""
+        """Return the piezo voltages (3,) in V that the controller measures (``VOL?``)."""
         self.link.settle()
         return np.array(self.link.values("VOL? 1 2 3", CHANNELS))
 

@@ -111,7 +111,7 @@ def is_link_well(out: OutputMemory, fd: int, now_ns: int) -> bool:
 
 @kernel
 def write(out: OutputMemory, fd: int, values_V: NDArray[np.float64], now_ns: int) -> tuple[int, int]:
-    """Do what ``E727.write`` does. Return the result and the guard's mask."""
+    """Write ``values_V`` (3,) as ``E727.write`` does. Return the result and the guard's mask."""
     if not is_link_well(out, fd, now_ns):
         return HANDED_OVER, 0
     mask = guard_admit(out.guard, values_V, now_ns)
@@ -136,9 +136,9 @@ def step_ramp(out: OutputMemory, fd: int, now_ns: int) -> bool:
         out.words[DUE_NS] = following_due(out.words[DUE_NS], now_ns, out.words[PERIOD_NS])
         if out.link.sizes[UNSENT] > 0:
             size = out.link.sizes[UNSENT]
-            taken = write_fd(fd, out.link.unsent, size, 0)
-            if taken > 0:
-                link_keep(out.link, out.link.unsent, taken, size)
+            written = write_fd(fd, out.link.unsent, size, 0)
+            if written > 0:
+                link_keep(out.link, out.link.unsent, written, size)
             if out.link.sizes[UNSENT] > 0:
                 return False
         if not send(out, fd, now_ns):

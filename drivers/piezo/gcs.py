@@ -1,4 +1,4 @@
-"""GCS 2.0 on a serial line: commands, queries and the deferred error query. Knows no axis and no volt.
+"""Speaks GCS 2.0 on a serial line: commands, queries and the deferred error query. It knows no axis and no volt.
 
 Source: PI manual E727T0005 (GCS syntax; command "ERR?"), reply ends from PI's own client: every line but the last
 ends with SP LF, the last with LF.
@@ -99,7 +99,7 @@ def keep_unsent(memory: LinkMemory, data: Any, begin: int, end: int) -> None:
 
 
 class GcsLink:
-    """One controller on one port. ``memory`` holds what the port did not take at once, and the answer so far."""
+    """Talks to one controller on one port. ``memory`` holds unsent bytes and the incomplete answer."""
 
     def __init__(self, port: SerialPort, clock: Clock, name: str, timeout_s: float = 0.5) -> None:
         self.name = name

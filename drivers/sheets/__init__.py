@@ -1,4 +1,4 @@
-"""Data sheets of the drivers: what a part measures or moves, in which unit and range, and how long it may take.
+"""Holds the data sheets of the drivers: quantity, unit, range and time of every part.
 
 One TOML file per driver. People and reports read them; a test holds them against what the drivers say.
 What lives here: facts of a part. What must not: what a bench makes of it (channels, wiring: the bench file).

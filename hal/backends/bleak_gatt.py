@@ -23,7 +23,7 @@ T = TypeVar("T")
 
 
 def load() -> Any:
-    """The package. ``DeviceNotFound`` says how to get it."""
+    """Return the package. ``DeviceNotFound`` says how to install it."""
     try:
         return importlib.import_module("bleak")
     except ImportError as error:

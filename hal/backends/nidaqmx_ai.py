@@ -21,7 +21,7 @@ MAX_SCANS = 256
 
 
 class NidaqmxScan:
-    """Inputs ``ai0`` ... of ``device`` ("Dev1"), single-ended, and switch outputs on port 0, lines 0 and 1."""
+    """Scans inputs ``ai0`` ... of ``device`` ("Dev1"), single-ended, and drives port 0, lines 0 and 1."""
 
     def __init__(self, device: str, clock: Clock, *, name: str = "daq") -> None:
         self.name = name

@@ -24,7 +24,7 @@ TOLERANCE_V = 0.02  # at the converter
 
 
 class NidaqmxOutput:
-    """Outputs ``ao0`` ... of ``device``; all values are volts behind the amplifier (``gain``)."""
+    """Drives outputs ``ao0`` ... of ``device``. All values are volts behind the amplifier (``gain``)."""
 
     def __init__(
         self,
@@ -72,11 +72,11 @@ class NidaqmxOutput:
         self._known = False
         while not self.safe_step():
             self._clock.sleep_until_ns(self._clock.now_ns() + TICK_NS)
-        found = self.readback_V() / self._gain
+        measured_V = self.readback_V() / self._gain
         wanted = np.array([limit.safe_V for limit in self.limits]) / self._gain
         self.guard.require(
-            bool(np.abs(found - wanted).max() <= TOLERANCE_V),
-            f"neutral is {wanted.tolist()} V at the converter, read back {found.round(3).tolist()} V",
+            bool(np.abs(measured_V - wanted).max() <= TOLERANCE_V),
+            f"neutral is {wanted.tolist()} V at the converter, read back {measured_V.round(3).tolist()} V",
         )
         self.guard.armed = True
 

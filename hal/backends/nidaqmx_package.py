@@ -1,4 +1,4 @@
-"""The nidaqmx package, if it is there, and its errors in our words."""
+"""Loads the nidaqmx package, if it is installed, and translates its errors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ UNKNOWN_DEVICE = -200220
 
 
 def load() -> Any:
-    """The package. ``DeviceNotFound`` says how to get it."""
+    """Return the package. ``DeviceNotFound`` says how to install it."""
     try:
         for part in ("constants", "errors", "stream_readers", "stream_writers"):
             importlib.import_module(f"nidaqmx.{part}")
@@ -27,7 +27,7 @@ def load() -> Any:
 
 
 def new_task(nidaqmx: Any, name: str) -> Any:
-    """An empty task. ``DeviceNotFound`` when NI's driver is missing."""
+    """Return an empty task. Raises ``DeviceNotFound`` when NI's driver is missing."""
     try:
         return nidaqmx.Task()
     except nidaqmx.errors.DaqNotFoundError as error:
@@ -38,7 +38,7 @@ def new_task(nidaqmx: Any, name: str) -> Any:
 
 
 def translated(error: Any, name: str, lost: int = 0) -> HalError:
-    """Our error for a ``DaqError``."""
+    """Return the ``HalError`` that stands for a ``DaqError``."""
     code = int(error.error_code)
     text = str(error).strip().splitlines()[0]
     if code == NOT_YET_AVAILABLE:

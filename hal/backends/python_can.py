@@ -28,17 +28,17 @@ MARK_SEPARATOR = "#"
 
 
 def open_virtual(name: str, clock: Clock) -> PythonCan:
-    """Frames between buses of the same name inside this process."""
+    """Open a bus that carries frames between buses of the same name inside this process."""
     return _open(f"virtual-can://{name}", clock, interface="virtual", channel=name)
 
 
 def open_socketcan(name: str, clock: Clock) -> PythonCan:
-    """A Linux CAN interface; its bitrate is set by ``ip link``, not here."""
+    """Open a Linux CAN interface. ``ip link`` sets its bitrate."""
     return _open(f"socketcan://{name}", clock, interface="socketcan", channel=name)
 
 
 def open_slcan(path: str, bitrate: int, clock: Clock, wait_s: float = 0.0) -> PythonCan:
-    """A serial adapter (LAWICEL protocol). ``wait_s``: boards that reset when opened need about 2 s."""
+    """Open a serial CAN adapter (LAWICEL protocol). Boards that reset when opened need ``wait_s`` of about 2 s."""
     return _open(
         f"slcan://{path}",
         clock,
@@ -51,7 +51,7 @@ def open_slcan(path: str, bitrate: int, clock: Clock, wait_s: float = 0.0) -> Py
 
 
 def open_udp_multicast(group: str, port: int, clock: Clock) -> PythonCan:
-    """Frames between processes of this machine. One bench, one port."""
+    """Open a bus that carries frames between processes of this machine. Each bench needs a port of its own."""
     bus = _open(
         f"udp-multicast://{group}:{port}",
         clock,
@@ -80,7 +80,7 @@ def _open(uri: str, clock: Clock, *, marked: bool = False, **options: Any) -> Py
 
 
 class PythonCan:
-    """One open python-can bus. Classic data frames only: remote, error and FD frames are counted, not given."""
+    """Holds one open python-can bus. It delivers classic data frames; remote, error and FD frames are only counted."""
 
     def __init__(self, bus: Any, can: Any, uri: str, clock: Clock, marked: bool) -> None:
         self._bus = bus
@@ -180,7 +180,7 @@ class PythonCan:
         with contextlib.closing(socket.socket(fileno=os.dup(self._bus.fileno()))) as same:
             try:
                 same.setsockopt(socket.SOL_SOCKET, SO_RCVBUFFORCE, RECEIVE_BYTES)
-            except OSError:  # not root: as much as the system grants
+            except OSError:  # without root the system grants less
                 same.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BYTES)
             if same.family == socket.AF_INET:
                 with contextlib.suppress(OSError):

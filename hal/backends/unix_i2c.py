@@ -1,4 +1,4 @@
-"""I2cBus through a Unix stream socket: how the process of the emulated world offers its I2C devices.
+"""Carries I2C transfers over a Unix stream socket to the process of the emulated world.
 
 Request: u8 address, u8 number of segments, i64 LE monotonic time of the request in ns, then per segment u8 kind (0
 write, 1 read), u16 LE length and, for a write, the data. Reply: u8 status (0 ok, 1 address NACK, 2 data NACK, 3 bus
@@ -23,10 +23,10 @@ _REPLY = struct.Struct("<BH")
 
 
 class UnixI2c:
-    """Client of one emulated bus. ``timeout_s`` bounds one transfer.
+    """Makes transfers on one emulated bus. ``timeout_s`` bounds one transfer.
 
-    A transfer without an answer is a ``HalTimeout``, a server that has gone is ``Disconnected``. Either spoils the
-    connection, because half an answer may still be under way: the next transfer connects anew.
+    A transfer without an answer raises ``HalTimeout``, a server that is gone raises ``Disconnected``. Both close the
+    connection, because half an answer may still be under way: the next transfer connects again.
     """
 
     def __init__(self, path: str, speed_hz: int = 400_000, timeout_s: float = 0.5) -> None:

@@ -1,6 +1,6 @@
-"""One CAN bus, several drivers: each gets a view that receives only its own frames.
+"""Shares one CAN bus between several drivers: each gets a view that receives only its own frames.
 
-Cooperative: whoever receives sorts what arrives into all views, nobody needs a thread.
+The driver that receives sorts arriving frames into all views, so no thread is needed.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ QUEUE_FRAMES = 1024
 
 
 class SharedCan:
-    """Owner of the bus. ``unclaimed`` counts frames that no view wants."""
+    """Owns the bus. ``unclaimed`` counts frames that no view receives."""
 
     def __init__(self, bus: CanBus) -> None:
         self.unclaimed = 0
@@ -24,7 +24,7 @@ class SharedCan:
         self._views: dict[int, CanView] = {}
 
     def view(self, can_ids: Iterable[int]) -> CanView:
-        """A CanBus that receives exactly these ids. Raises ``BenchError`` when one is already claimed."""
+        """Return a CanBus that receives exactly these ids. Raises ``BenchError`` when one is already claimed."""
         wanted = frozenset(can_ids)
         for can_id in wanted:
             if can_id in self._views:
@@ -34,7 +34,7 @@ class SharedCan:
         return view
 
     def pump(self, timeout_s: float) -> bool:
-        """Receive one frame and hand it over. False when none came."""
+        """Receive one frame and hand it to its view. Return False when none came within ``timeout_s``."""
         frame = self._bus.recv(timeout_s)
         if frame is None:
             return False
@@ -50,7 +50,7 @@ class SharedCan:
 
 
 class CanView:
-    """CanBus contract for one driver. Closing a view closes nothing: the bus belongs to its owner."""
+    """Implements the ``CanBus`` contract for one driver. ``close`` does nothing: the bus belongs to its owner."""
 
     def __init__(self, owner: SharedCan, bus: CanBus) -> None:
         self._owner = owner
@@ -61,7 +61,7 @@ class CanView:
         self._dropped = 0
 
     def accept(self, frame: CanFrame) -> None:
-        """Called by the owner. A full queue gives up its oldest frame, and counts it."""
+        """Queue ``frame``; the owner calls this. A full queue drops its oldest frame and counts it."""
         if len(self._queue) == QUEUE_FRAMES:
             self._queue.popleft()
             self._dropped += 1
@@ -72,7 +72,7 @@ class CanView:
         self._tx += 1
 
     def recv(self, timeout_s: float) -> CanFrame | None:
-        """One wait of at most ``timeout_s`` on the bus; frames of other views do not end it early for long."""
+        """Wait for a frame of this view. Each frame of another view restarts the wait of ``timeout_s``."""
         while not self._queue and self._owner.pump(timeout_s):
             pass
         if not self._queue:

@@ -21,7 +21,7 @@ from hal.types import CanFrame, CanStats, I2cOp, I2cWrite, PortInfo
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line: time since the start, verb (w, r, x, t) and the words after it."""
+    """Holds one line: time since the start, verb (w, r, x, t) and the words after it."""
 
     t_ns: int
     verb: str

@@ -14,7 +14,7 @@ BABBLE_ID = 0x001
 
 
 class FaultCan:
-    """CanBus with faults. A corrupted frame arrives: its checksum, if it has one, has to find it."""
+    """Injects faults into a CanBus. A corrupted frame arrives; only its own checksum can reveal it."""
 
     def __init__(self, bus: CanBus, clock: Clock, plan: FaultPlan) -> None:
         self._bus = bus

@@ -48,7 +48,7 @@ class FaultI2c:
         return bytes(result)
 
     def _damaged(self, ops: Sequence[I2cOp]) -> list[I2cOp]:
-        """One bit of one written data byte is wrong; the first byte of a write is a register and is left alone."""
+        """Flip one bit of one written data byte. The first byte of a write is a register and stays as it is."""
         damaged = list(ops)
         places = [(i, op) for i, op in enumerate(ops) if isinstance(op, I2cWrite) and len(op.data) > 1]
         if places:

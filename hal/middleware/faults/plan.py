@@ -1,4 +1,4 @@
-"""Fault plans of a port: which faults are injected and when, and counts of those that were.
+"""Plans the faults of a port: which are injected and when. It counts those that were injected.
 
 Faults are deterministic: the same seed, plan and traffic give the same faults. Loss and corruption apply to received
 data; silence applies to both directions; a delay blocks the caller, as a slow link does.

@@ -1,4 +1,4 @@
-"""A serial port whose incoming bytes suffer."""
+"""Injects faults into the incoming bytes of a serial port."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from hal.types import PortInfo
 
 
 class FaultSerial:
-    """SerialPort with faults; ``counts`` says what happened."""
+    """Injects faults into a SerialPort. ``counts`` says which were injected."""
 
     def __init__(self, port: SerialPort, clock: Clock, plan: FaultPlan) -> None:
         self._port = port
