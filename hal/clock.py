@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Literal
 
 Pace = Literal["paced", "virtual", "realtime"]
-"""How bench time passes. ``paced`` and ``virtual`` are emulated time and give the same bits; a paced second takes a
-second of wall-clock time where the host can keep up. ``realtime`` is the wall clock itself."""
+"""The way in which bench time passes. ``paced`` and ``virtual`` are emulated time and give the same bits; a paced
+second takes a second of wall-clock time where the host can keep up. ``realtime`` is the wall clock itself."""
 
 PACE_NS = 2_000_000
 """Emulated time between two looks at the wall clock. A page that draws 60 times a second sees no steps."""

@@ -30,7 +30,7 @@ _BROKEN = (
     SyntaxError, TokenError, TypeError, AttributeError, OverflowError, UnicodeError, RecursionError, MemoryError,
     ValueError,
 )  # fmt: skip
-"""All that the standard library and numpy raise for a damaged archive."""
+"""Exceptions that the standard library and numpy raise for a damaged archive."""
 
 
 class NpzError(ValueError):

@@ -1,4 +1,4 @@
-"""Configuration of the ``[emulation]`` table of a bench: one unit of the instrument, its hand and its room.
+"""Defines the ``[emulation]`` table of a bench: one unit of the instrument, its hand and its room.
 
 Every value has a default, so ``provider``, ``unit`` and ``seed`` alone describe a complete instrument. Spreads are
 standard deviations from which the seed draws one physical unit: the same seed is the same unit everywhere
@@ -25,7 +25,7 @@ class _Table(BaseModel):
 
 
 class HandConfig(_Table):
-    """The surgeon. Sources and reasons: docstring of ``sim_devices.plant.hand``."""
+    """Describes the surgeon's hand. ``sim_devices.plant.hand`` has the sources and reasons."""
 
     performs: Literal["work", "poses"] = "work"
     """"poses": turns the instrument through the 14 resting poses of a calibration by hand, over and over."""
@@ -48,11 +48,12 @@ class HandConfig(_Table):
     """Typical peak to peak per axis at the tip (Ang 2004 sec. 6.1.1); rms = p-p / (2 sqrt 2)."""
     tremor_frequency_hz: Positive = 9.6
     tremor_frequency_spread_hz: NotNegative = 0.4
-    """Between people (seeds); the person's mean stays within 8.5 to 11.5 Hz unless the mean itself does not."""
+    """Spread of the mean frequency between people (seeds); the mean stays within 8.5 to 11.5 Hz unless the mean itself
+    does not."""
     frequency_wander_hz: NotNegative = 0.4
     """Standard deviation of the slow wander of one person's frequency."""
     frequency_wander_s: Positive = 2.0
-    """Its correlation time (1/e)."""
+    """Correlation time (1/e) of the frequency."""
     envelope_s: Positive = 0.6
     """Correlation time (1/e) of the complex Gaussian envelope: a line of 0.78 Hz between half-power points."""
     amplitude_depth: NotNegative = 0.3
@@ -64,7 +65,7 @@ class HandConfig(_Table):
     """Part of the lateral tip tremor that comes from turning about the grip."""
     grip_to_tip_mm: Positive = 90.0
     roll_tremor_mrad: NotNegative = 0.3
-    """rms of the tremor about the instrument's axis."""
+    """Tremor about the instrument's axis, rms."""
 
     drift_rms_um: NotNegative = 30.0
     drift_s: Positive = 6.0
@@ -90,7 +91,8 @@ class HandConfig(_Table):
 
 
 class InstrumentConfig(_Table):
-    """Geometry in the body frame {B}: base of the back suite, z toward the tip (Ang 2004 (2.54), errata no. 23).
+    """Holds the geometry in the body frame {B}: base of the back suite, z toward the tip (Ang 2004 (2.54), errata no.
+    23).
 
     Only the differences d1 = 20.2, d2 = 14.3, d3 = 116.0 mm are published. Here the back suite is centred on the
     axis: {1} and {2} then fit the 26 mm box and {3} the handle.
@@ -104,7 +106,8 @@ class InstrumentConfig(_Table):
 
 
 class SensorConfig(_Table):
-    """ADXL-203, TMP36, HMC-2003 and the DAQ's analog side; sizes from their data sheets (ADXL-203 rev. D, table 1)."""
+    """Holds the errors of ADXL-203, TMP36, HMC-2003 and the DAQ's analog side, with sizes from their data sheets
+    (ADXL-203 rev. D, table 1)."""
 
     noise_ug_per_rtHz: NotNegative = 110.0
     """ADXL-203, white before the RC (errata no. 25)."""
@@ -137,7 +140,7 @@ class SensorConfig(_Table):
     temperature_offset_K: NotNegative = 0.7
 
     magnetometer_noise_uG: NotNegative = 40.0
-    """rms per sample, HMC-2003 1 kHz bandwidth (its resolution)."""
+    """Noise per sample of the HMC-2003 at 1 kHz bandwidth, rms (its resolution)."""
     magnetometer_offset_V: NotNegative = 0.01
     """Bridge and amplifier offset: does not change sign with the strap."""
     magnetometer_scale_spread: NotNegative = 0.01
@@ -147,13 +150,13 @@ class SensorConfig(_Table):
     piezo_coupling_G_per_A: NotNegative = 0.1
 
     daq_noise_uV: NotNegative = 150.0
-    """rms per sample at the +-5 V range, before quantisation."""
+    """Noise per sample at the +-5 V range, rms, before quantisation."""
     daq_offset_uV: NotNegative = 300.0
     daq_gain_spread: NotNegative = 2e-4
 
 
 class StackConfig(_Table):
-    """P-885.50-like stack: generalised Maxwell slip with viscous slip (``sim_devices.plant.stack``)."""
+    """Describes a stack like the P-885.50: generalised Maxwell slip with viscous slip (``sim_devices.plant.stack``)."""
 
     stroke_um_at_100_V: Positive = 15.0
     """Quasi-static, 0 to 100 V and back."""
@@ -179,7 +182,7 @@ class StackConfig(_Table):
 
 
 class AmplifierConfig(_Table):
-    """The piezo amplifier. ``gain``, limits and ``neutral_V`` follow the output's entry under [device]."""
+    """Describes the piezo amplifier. ``gain``, limits and ``neutral_V`` follow the output's entry under [device]."""
 
     gain: Positive = 20.0
     """Output volts per volt of the DAC in front of it."""
@@ -190,7 +193,7 @@ class AmplifierConfig(_Table):
     output_ohm: Positive = 10.0
     stack_farad: Positive = 1.5e-6
     neutral_V: float = 50.0
-    """Where it rests when nobody commands."""
+    """Output without a command, in V."""
 
     @model_validator(mode="after")
     def _within(self) -> AmplifierConfig:
@@ -200,7 +203,7 @@ class AmplifierConfig(_Table):
 
 
 class ManipulatorConfig(_Table):
-    """Ang 2004 ch. 6, errata nos. 58 to 71: values that are not published are ours.
+    """Describes the manipulator (Ang 2004 ch. 6, errata nos. 58 to 71). Values that are not published are ours.
 
     With R = r = 5 mm and 120 um of ball travel, > 1000 um of total travel in x and y needs a shaft of at least
     36.1 mm; 40 mm gives 1280 x 1108 x 120 um.
@@ -214,7 +217,7 @@ class ManipulatorConfig(_Table):
     mount_spread_deg: NotNegative = 0.5
     """Turn of the manipulator frame against the body about z."""
     tilt_spread_deg: NotNegative = 0.3
-    """And about x and y."""
+    """Rotation of the mounting about x and y."""
     length_spread: NotNegative = 0.01
     """Relative, of circle and shaft."""
     rest_spread_um: NotNegative = 20.0
@@ -236,7 +239,7 @@ class EnvironmentConfig(_Table):
 
 
 class ImuConfig(_Table):
-    """``[emulation.imu.DEVICE]``: how the IMU of that name is mounted, and how good a specimen it is."""
+    """Holds ``[emulation.imu.DEVICE]``: the mounting of the IMU of that name and the size of its errors."""
 
     position_mm: Vector = (0.0, 0.0, 0.0)
     """Position in the body frame; on the instrument it is measured from the base of the back suite."""
@@ -248,7 +251,7 @@ class ImuConfig(_Table):
 
 
 class DaqConfig(_Table):
-    """``[emulation.daq]``."""
+    """Holds ``[emulation.daq]``."""
 
     fifo_samples: Annotated[int, Field(ge=64)] = 1024
     """Number of samples that a DI-4108 keeps for a host that does not read: 128 ms of eight channels at 1 kHz.
@@ -257,7 +260,8 @@ class DaqConfig(_Table):
 
 
 class MoreAxis(_Table):
-    """``[[emulation.more_axes]]``: an accelerometer axis beyond the six, in place of supply or temperature."""
+    """Holds an entry of ``[[emulation.more_axes]]``: an accelerometer axis beyond the six, in place of supply or
+    temperature."""
 
     input: Literal[6, 7]
     """Input of the DAQ."""
@@ -268,7 +272,7 @@ class MoreAxis(_Table):
 
 
 class EndoscopeConfig(_Table):
-    """``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
+    """Holds ``[emulation.endoscope]``: a loose body instead of the instrument (``sim_devices.plant.scanner``)."""
 
     scenario: Literal["rest", "turntable", "fall", "poses", "hand", "led"] = "hand"
     """Motion of the body. With "led", a caller moves it (``Scanner.lead``)."""
@@ -301,7 +305,7 @@ class EndoscopeConfig(_Table):
 
 
 class ServeConfig(_Table):
-    """Where a world in a process of its own serves its buses, besides ptys and sockets (``micron emulate``)."""
+    """Says where a world in a process of its own serves its buses, besides ptys and sockets (``micron emulate``)."""
 
     tcp_port: Annotated[int, Field(ge=0, le=65_000)] | None = None
     """TCP port of the first serial bus; the next ones follow. 0 takes free ports, ``None`` serves none."""
@@ -310,7 +314,7 @@ class ServeConfig(_Table):
 
 
 class EmulationConfig(_Table):
-    """The whole ``[emulation]`` table."""
+    """Holds the whole ``[emulation]`` table."""
 
     provider: str = "sim_devices.register:provider"
     unit: Annotated[int, Field(ge=0)] = 1

@@ -1,4 +1,4 @@
-"""Orders to a running emulated world: read and set what its parts sense, inject faults, pause time.
+"""Obeys orders to a running emulated world: read and set what its parts sense, inject faults, pause time.
 
 One JSON object is one order, and so is its answer: ``{"ok": true, "t_s": ...}`` with what was asked for, or
 ``{"ok": false, "error": "..."}``. ``t_s`` is the age of the world in s. The orders are:
@@ -72,8 +72,8 @@ class WorldControl:
             known = [name for name in self._orders if name in order]
             if len(known) != 1:
                 raise ValueError(f"an order has one of {', '.join(self._orders)}")
-            said = self._orders[known[0]](order)
-            return json.dumps({"ok": True, "t_s": (self._now_ns() - self._world.epoch_ns) * 1e-9, **said}).encode()
+            answer = self._orders[known[0]](order)
+            return json.dumps({"ok": True, "t_s": (self._now_ns() - self._world.epoch_ns) * 1e-9, **answer}).encode()
         except KeyError as error:
             return json.dumps({"ok": False, "error": f"the order lacks {error}"}).encode()
         except (ValueError, TypeError, AttributeError, RecursionError, UnknownFault, UnknownChannel) as error:

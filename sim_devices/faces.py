@@ -25,7 +25,7 @@ class TimedFace(Protocol):
 
 
 class ByteFace(TimedFace, Protocol):
-    """A device behind a serial line."""
+    """Is the wire side of a device behind a serial line."""
 
     unread: int
     """Bytes that were handed over but that the host has not read yet; the carrier keeps it up to date."""
@@ -35,7 +35,7 @@ class ByteFace(TimedFace, Protocol):
 
 
 class I2cFace(TimedFace, Protocol):
-    """A device on an I2C bus; every call happens at the end of what it describes.
+    """Is the wire side of a device on an I2C bus. Each call happens at the end of the event that it describes.
 
     A device may also have ``start(t_ns, byte_ns)`` and ``stop()``: the line calls them around each transfer to it.
     """

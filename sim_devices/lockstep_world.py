@@ -82,7 +82,7 @@ class LockstepWorld:
         return 0.0
 
     def stalls(self) -> tuple[int, float]:
-        """No stalls, of no length."""
+        """Return no stalls: emulated time has none."""
         return 0, 0.0
 
     def stop(self) -> None:
@@ -94,7 +94,7 @@ class LockstepWorld:
             self._truth = self.world.truth(self._clock.now_ns())
 
     def truth(self) -> Truth:
-        """Physical truth; see the provider interface for columns. After ``stop``."""
+        """Return the physical truth (columns: see the provider interface). Call it after ``stop``."""
         self.stop()
         assert self._truth is not None
         return self._truth

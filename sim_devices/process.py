@@ -48,7 +48,8 @@ POLL_NS = 1_000_000
 CATCH_UP_NS = 8_000_000
 PARENT_CHECK_NS = 100_000_000
 LINGER_NS = 1_000_000_000
-"""After the death of the firmware the world goes on for so long, and while a guardian is connected to an I2C bus."""
+"""Time for which the world continues after the death of the firmware. It also continues while a guardian is
+connected."""
 LONGEST_LINGER_NS = 60_000_000_000
 """A client that does not go away keeps the world for so long at most."""
 COUNT_DOWN_NS = 50_000  # a sleeping process wakes so much too late on a virtual machine, and what is due meanwhile
@@ -173,7 +174,7 @@ class WorldProcess:
         return {name: line.port for name, line in self._tcp.items()}
 
     def endpoints(self) -> dict[str, str]:
-        """URI of each bus for the ordinary adapters of hal."""
+        """Return the URI of each bus for the adapters of hal."""
         uris = {name: f"serial://{pty.path}" for name, pty in self._ptys.items()}
         uris |= {name: f"slcan://{pty.path}" for name, pty in self._slcan.items()}
         uris |= {name: f"unix-i2c://{server.path}" for name, server in self._i2c.items()}
@@ -188,7 +189,7 @@ class WorldProcess:
             ready = self._wait()
             for fileno in ready:
                 self._take_transfer(fileno)
-            self._turn()  # what was due before a request came happens before it
+            self._turn()  # events that were due before the request happen before it
             for fileno in ready:
                 self._on_readable(fileno)
             if self._now_ns >= check_ns:
@@ -268,7 +269,8 @@ class WorldProcess:
             time.sleep(0.0001)  # let the host drain what it was late for through no fault of its own
 
     def _take_transfer(self, fileno: int) -> None:
-        """A request to an I2C bus; it tells when it was made, which the world may still have before it."""
+        """Handle a request to an I2C bus. It carries the time at which it was made, which may lie ahead of the world's
+        time."""
         for server in self._i2c.values():
             if fileno in server.filenos():
                 server.on_readable(fileno, self._now_ns, self._clock.now_ns(), self._clock.behind_ns)

@@ -73,7 +73,7 @@ class ProcessWorld:
         return self._process.pid
 
     def endpoint(self, bus: str) -> str:
-        """URI of ``bus`` for the ordinary adapters."""
+        """Return the URI of ``bus`` for the adapters of hal."""
         return self._endpoints[bus]
 
     def alive(self) -> bool:
@@ -91,7 +91,8 @@ class ProcessWorld:
         shutil.rmtree(self._sockets, ignore_errors=True)
 
     def truth(self) -> Truth:
-        """Physical truth. After ``stop``. Raises ``Disconnected`` when the process was killed before it could write."""
+        """Return the physical truth. Call it after ``stop``. Raises ``Disconnected`` when the process was killed before
+        it could write."""
         path = self._dir / "truth.npz"
         if not path.exists():
             raise Disconnected(f"the emulated world was killed and left no truth; its log: {self._tail()}")
@@ -109,7 +110,8 @@ class ProcessWorld:
         return self._lateness.stalls, self._lateness.longest_ms
 
     def statistics(self) -> dict[str, float]:
-        """After ``stop``: ``worst_late_us`` (how late the world ran at worst), ``turns`` of its loop, ``cpu_s``."""
+        """Return, after ``stop``, ``worst_late_us`` (largest lateness of the world), ``turns`` of its loop and
+        ``cpu_s``."""
         path = self._dir / "world.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 

@@ -25,7 +25,7 @@ class UnknownChannel(ValueError):
 
 
 class Stimuli:
-    """All channels of a world. ``units`` has the unit of each channel, by its name."""
+    """Holds all channels of a world. ``units`` maps the name of each channel to its unit."""
 
     def __init__(self) -> None:
         self.units: dict[str, str] = {}
@@ -83,10 +83,10 @@ class Stimuli:
             self._look[name] = lambda t_ns, i=i: float(source(t_ns)[i])
 
         def volts(t_ns: int) -> Volts:
-            found = source(t_ns)
+            sensed = source(t_ns)
             if not self._put:
-                return found
-            return np.array([self._put[n](t_ns) if n in self._put else v for n, v in zip(names, found, strict=True)])
+                return sensed
+            return np.array([self._put[n](t_ns) if n in self._put else v for n, v in zip(names, sensed, strict=True)])
 
         return volts
 

@@ -30,7 +30,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class PlacedEffect:
-    """One effect with its parameters ``q`` (searched) and ``weights``, as it was fitted."""
+    """Holds one fitted effect with its parameters ``q`` (searched) and ``weights``."""
 
     effect: Effect
     site: str
@@ -145,8 +145,8 @@ def _effect(where: str, entry: Any) -> PlacedEffect:
     try:
         settings = {str(k): tuple(float(x) for x in v) for k, v in dict(entry.get("settings", {})).items()}
         family_forms = [e for e in (family, *family.variants) if e.kind != "feedback"]
-        said = [e for e in family_forms if e.equation == entry.get("equation")]
-        forms = [(e, e.parts(settings)) for e in said or family_forms]
+        same_form = [e for e in family_forms if e.equation == entry.get("equation")]
+        forms = [(e, e.parts(settings)) for e in same_form or family_forms]
     except (KeyError, IndexError, TypeError, ValueError) as error:
         raise BenchError(f"{where}: settings do not fit {family.name} ({error!r})") from error
     for effect, parts in forms:

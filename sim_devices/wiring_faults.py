@@ -1,4 +1,4 @@
-"""Faults between the plant and its devices: sensors, their wires and supply, amplifier channels.
+"""Injects faults between the plant and its devices: sensors, their wires and supply, amplifier channels.
 
 Volts pass through here on their way to the DAQ, demands on their way to the amplifier. While no fault is injected,
 they pass unchanged.
@@ -49,7 +49,7 @@ class _Active:
 
 @dataclass
 class WiringFaults:
-    """Active faults by input of the DAQ and by channel of the amplifier."""
+    """Holds the active faults by input of the DAQ and by channel of the amplifier."""
 
     seed: int = 1
     _sensors: dict[int, _Active] = field(default_factory=dict[int, _Active])

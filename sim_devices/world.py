@@ -1,4 +1,4 @@
-"""The emulated world: one plant, the devices that sense and move it, and the buses they hang on.
+"""Builds the emulated world: one plant, the devices that sense and move it, and their buses.
 
 Built from a bench description: every bus whose URI is ``sim://`` gets the devices that the description puts on it.
 The world itself knows no clock and no transport. Somebody moves it with ``advance_to``; inside, everything
@@ -60,7 +60,7 @@ class EmulatedBuses:
 
 
 class World:
-    """Plant and devices. ``devices`` are the wire faces by device name, for tests and fault injection."""
+    """Holds plant and devices. ``devices`` maps device names to wire faces, for tests and fault injection."""
 
     def __init__(self, description: Mapping[str, Any], plant: Plant, *, epoch_ns: int = 0) -> None:
         self.plant = plant
@@ -94,9 +94,9 @@ class World:
             due_ns: int | None = None
             first: TimedFace | None = None
             for face in self._timed:
-                mine = face.next_event_ns()
-                if mine is not None and (due_ns is None or mine < due_ns):
-                    due_ns, first = mine, face
+                face_ns = face.next_event_ns()
+                if face_ns is not None and (due_ns is None or face_ns < due_ns):
+                    due_ns, first = face_ns, face
             if first is None or due_ns is None or due_ns > t_ns:
                 return due_ns
             first.advance_to(due_ns)
@@ -114,7 +114,7 @@ class World:
         self._timed.append(face)
 
     def truth(self, t_ns: int) -> Truth:
-        """Physical truth up to ``t_ns``; ``t_ns`` column on the bench clock."""
+        """Return the physical truth up to ``t_ns``, with a column ``t_ns`` on the bench clock."""
         self.plant.advance_to(t_ns - self.epoch_ns)
         truth = dict(self.plant.truth())
         truth["t_ns"] = np.asarray(truth["t_ns"], dtype=np.int64) + self.epoch_ns
@@ -158,8 +158,8 @@ class World:
         return self._adc_volts
 
     def stack_monitor(self, channels: Sequence[int], ratio: float) -> VoltageSource:
-        """Inputs of an ADC whose ``channels`` hang behind dividers by ``ratio`` on the terminals of the three
-        stacks."""
+        """Return the inputs of an ADC whose ``channels`` hang behind dividers by ``ratio`` on the terminals of the
+        three stacks."""
         volts = np.zeros(4)
 
         def at(t_ns: int) -> Volts:
@@ -236,16 +236,16 @@ class World:
     def _add(self, name: str, device: Mapping[str, Any], kind: str) -> bool:
         """Add the emulated device ``name``; False if there is none for its driver. A driver on a DAQ then shows the
         plant's volts."""
-        found = find_device(device["driver"])
-        if found is None:
+        device_record = find_device(device["driver"])
+        if device_record is None:
             return False
-        if found.build is not None:
-            found.build(self, name, device)
+        if device_record.build is not None:
+            device_record.build(self, name, device)
             return True
-        assert found.make is not None
+        assert device_record.make is not None
         motion = self.motion if kind == "daq" else self.stimuli.motion(name, self.motion, Mount())
         senses = motion, self.analog_V, self.switch_strap, self.amplify
-        made = found.make(Surroundings(name, device, self.seed, self.epoch_ns, *senses))
+        made = device_record.make(Surroundings(name, device, self.seed, self.epoch_ns, *senses))
         if kind == "daq":
             self._added_V.update(made)
             return True

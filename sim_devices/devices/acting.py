@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class ActingFace:
-    """``due_ns``: when it acts by itself next. ``frozen`` is a hook for faults: nothing happens any more."""
+    """Acts by itself at ``due_ns``. ``frozen`` is a fault hook: the device then stops acting."""
 
     frozen = False
     due_ns: int | None = None

@@ -1,4 +1,4 @@
-"""Analog Devices AD5696R: quad 16-bit DAC on I2C with a 2.5 V reference.
+"""Emulates the Analog Devices AD5696R: quad 16-bit DAC on I2C with a 2.5 V reference.
 
 Source: AD5696R/AD5695R/AD5694R data sheet, rev. B: Serial Interface, Table 7 (commands), Table 8 (address bits),
 Write Operation, Read Operation, Multiple DAC Readback Sequence, Power-Down Operation, LDAC Mask Register,
@@ -25,7 +25,7 @@ SELECTED = tuple(tuple(c for c in range(CHANNELS) if bits >> c & 1) for bits in 
 
 
 class Ad5696r:
-    """One AD5696R. ``gain`` is 2 with the GAIN pin at VDD (0..5 V); ``midscale`` is the RSTSEL strap.
+    """Emulates one AD5696R. ``gain`` is 2 with the GAIN pin at VDD (0..5 V); ``midscale`` is the RSTSEL strap.
 
     ``on_output(channel, volts, t_ns)`` is called whenever an output changes.
     """
@@ -59,7 +59,7 @@ class Ad5696r:
         self._pointer = 0
 
     def brown_out(self, t_ns: int) -> None:
-        """Fault hook: the supply dips, the part starts anew with its power-up outputs."""
+        """Restart the part with its power-up outputs, as after a dip of the supply (fault hook)."""
         self._reset()
         for channel in range(CHANNELS):
             self._drive(channel, t_ns)
@@ -68,13 +68,13 @@ class Ad5696r:
         return not self.nack_address
 
     def advance_to(self, t_ns: int) -> None:
-        """Nothing happens by itself."""
+        """Do nothing: the part does not act by itself."""
 
     def next_event_ns(self) -> int | None:
         return None
 
     def write(self, data: bytes, t_ns: int) -> int:
-        """24-bit words: command and address nibble, high byte, low byte."""
+        """Accept 24-bit words: command and address nibble, high byte, low byte."""
         n = len(data)
         if self.nack_data:
             return 0

@@ -1,4 +1,4 @@
-"""Texas Instruments ADS1115: 16-bit delta-sigma ADC on I2C, four inputs, comparator.
+"""Emulates the Texas Instruments ADS1115: 16-bit delta-sigma ADC on I2C, four inputs, comparator.
 
 Source: ADS111x data sheet SBAS444: Operating Modes, Data Rate and Conversion Time, Comparator, Conversion Ready
 Pin, Reset and Power-Up (general call 06h), Register Map (pointer, conversion, config, Lo_thresh, Hi_thresh).
@@ -33,7 +33,7 @@ OS_BIT, MODE_BIT = 0x8000, 0x0100
 
 
 class Ads1115:
-    """One ADS1115. ``rate_error`` = 0.05 makes conversions 5 % faster than the nominal data rate."""
+    """Emulates one ADS1115. ``rate_error`` = 0.05 makes conversions 5 % faster than the nominal data rate."""
 
     def __init__(self, inputs: VoltageSource, *, rate_error: float = 0.0, looks: int = 1) -> None:
         if not -0.1 <= rate_error <= 0.1:
@@ -85,7 +85,7 @@ class Ads1115:
         return (value.to_bytes(2, "big") * (n // 2 + 1))[:n]
 
     def general_call(self, data: bytes, t_ns: int) -> bool:
-        """Address 0: 06h resets and powers down (Reset and Power-Up)."""
+        """Answer a call to address 0: 06h resets and powers down (Reset and Power-Up)."""
         if data[:1] == bytes((RESET_COMMAND,)):
             self._reset()
         return not self.nack_address
@@ -149,7 +149,8 @@ class Ads1115:
             self._begin(t_ns, 0)
 
     def _compare(self, code: int) -> None:
-        """Comparator with queue, window mode and latch; Hi < 0 <= Lo MSBs make it a conversion-ready signal."""
+        """Update the comparator with queue, window mode and latch; Hi < 0 <= Lo MSBs make it a conversion-ready
+        signal."""
         config = self.registers[CONFIG]
         queue = config & 0x3
         if queue == 3:

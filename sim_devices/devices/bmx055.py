@@ -1,4 +1,5 @@
-"""Bosch BMX055, accelerometer die (12 bit) and gyroscope die (16 bit); its magnetometer is in ``bmx055_magnetometer``.
+"""Emulates the Bosch BMX055, accelerometer die (12 bit) and gyroscope die (16 bit); its magnetometer is in
+``bmx055_magnetometer``.
 
 Source: BMX055 data sheet BST-BMX055-DS000 rev. 1.3, sections 4 to 6 (accelerometer, "A") and 7 to 9 (gyroscope,
 "G"); bit places of the gyroscope's offset registers also from the BMG160 data sheet. Three dies share one package and
@@ -64,7 +65,7 @@ G_OFFSET_DPS = 0.061  # per LSB of the 12-bit offset
 
 
 class Bmx055Accelerometer(Die):
-    """Address 0x18 or 0x19 (SDO1). In suspend only after a command: it wakes up measuring at +-2 g, 1 kHz."""
+    """Emulates the accelerometer die at address 0x18 or 0x19 (SDO1). It wakes up measuring at +-2 g, 1 kHz."""
 
     def __init__(self, imu: Imu, *, start_ns: int = 0) -> None:
         facts = DieFacts(1_800_000, 50_000, 32, b"\0\0", (A_OFFSET_X, 0x3C))
@@ -134,7 +135,8 @@ class Bmx055Accelerometer(Die):
 
 
 class Bmx055Gyroscope(Die):
-    """Address 0x68 or 0x69 (SDO2), the same two as the MPU-6050's. Wakes up measuring at 2000 dps, 2 kHz."""
+    """Emulates the gyroscope die at address 0x68 or 0x69 (SDO2), like the MPU-6050. It wakes up measuring at 2000 dps,
+    2 kHz."""
 
     def __init__(self, imu: Imu, *, start_ns: int = 0) -> None:
         facts = DieFacts(30_000_000, 300_000, 100, b"\x00\x80", (G_OFC1, 0x3B))

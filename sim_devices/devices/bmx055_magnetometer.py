@@ -1,4 +1,4 @@
-"""Bosch BMX055, magnetometer die (that of the BMM150).
+"""Emulates the Bosch BMX055, magnetometer die (that of the BMM150).
 
 Source: BMX055 data sheet BST-BMX055-DS000 rev. 1.3, sections 10 to 12 (power modes, register 0x4A to 0x52, data
 formats, repetitions); trim registers 0x5D to 0x71 and the compensation that they are for: BMM150 sensor API (the data
@@ -77,7 +77,7 @@ class Trim:
 
 
 class Bmx055Magnetometer(RegisterFace):
-    """The magnetometer die. It powers up in suspend."""
+    """Emulates the magnetometer die. It powers up in suspend."""
 
     def __init__(self, imu: Imu, *, trim: Trim | None = None, seed: int = 1) -> None:
         if imu.magnetometer is None:
@@ -200,5 +200,5 @@ class Bmx055Magnetometer(RegisterFace):
         self._outputs.push(t_ns, b"".join(word.to_bytes(2, "little") for word in packed))
 
     def _noise(self) -> NDArray[np.float64]:
-        """(3,) standard normal; less in a better unit, none in an ideal one."""
+        """Return noise (3,) of unit variance, less for a better unit and none for an ideal one."""
         return self._rng.standard_normal(3) * self._imu.noise

@@ -68,7 +68,7 @@ _CRC_TABLE = _crc_table()
 
 
 class CanPiezoNode:
-    """One node. ``on_output(channel, volts, t_ns)`` is called for each output that changes."""
+    """Emulates one node. ``on_output(channel, volts, t_ns)`` is called for each output that changes."""
 
     def __init__(self, *, on_output: Callable[[int, float, int], None] | None = None, start_ns: int = 0) -> None:
         self.state = NodeState.DISARMED
@@ -90,7 +90,7 @@ class CanPiezoNode:
 
     @property
     def output_V(self) -> list[float]:
-        """Demand to the amplifier, in V."""
+        """Return the demand to the amplifier, in V."""
         return [code * UNIT_V for code in self.codes]
 
     # ------------------------------------------------------------------ wire face

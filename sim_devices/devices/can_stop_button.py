@@ -15,7 +15,7 @@ RELEASED_PERIOD_NS = 500_000_000
 
 
 class CanStopButton:
-    """One button. ``start_ns`` is the bench time of its first heartbeat."""
+    """Emulates one button. ``start_ns`` is the bench time of its first heartbeat."""
 
     def __init__(self, *, start_ns: int = 0) -> None:
         self.pressed = False

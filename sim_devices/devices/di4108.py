@@ -1,4 +1,4 @@
-"""DATAQ DI-4108: 8 x 16 bit data acquisition over USB CDC, command and stream protocol.
+"""Emulates the DATAQ DI-4108: 8 x 16 bit data acquisition over USB CDC, command and stream protocol.
 
 Source: DATAQ "Data Acquisition Instrument Command Protocol", revised 1 August 2019, 72 pages (page numbers in
 the comments). Wire face: ``receive`` command bytes, ``advance_to`` the scan clock, ``take`` what the host reads.
@@ -60,7 +60,7 @@ class Di4108Settings:
 
 
 class Di4108:
-    """One DI-4108. ``clock_error_ppb`` > 0 makes its crystal, hence its scan clock, run fast."""
+    """Emulates one DI-4108. ``clock_error_ppb`` > 0 makes its crystal, hence its scan clock, run fast."""
 
     def __init__(
         self,
@@ -101,7 +101,7 @@ class Di4108:
     # ------------------------------------------------------------------ wire face
 
     def receive(self, data: bytes, t_ns: int) -> None:
-        """Bytes from the host. LF and NUL are skipped (page 16: CR alone ends a command)."""
+        """Take bytes from the host. LF and NUL are skipped (page 16: CR alone ends a command)."""
         if self.frozen:
             return
         self.advance_to(t_ns)
@@ -145,7 +145,7 @@ class Di4108:
         return (len(self._out) + len(self._partial) + self.unread) // 2
 
     def set_clock_error_ppb(self, ppb: int, t_ns: int) -> None:
-        """Fault hook: from the last conversion on the crystal runs fast by ``ppb``."""
+        """Let the crystal run fast by ``ppb`` from the last conversion on (fault hook)."""
         self.advance_to(t_ns)
         self._clock_error_ppb = ppb
         self._start_ns += self._conversion * self._num // self._den
@@ -154,13 +154,13 @@ class Di4108:
         self._next_ns = self._start_ns + self._num // self._den
 
     def step_clock(self, dt_ns: int, t_ns: int) -> None:
-        """Fault hook: the next conversion, and all that follow, come ``dt_ns`` later (earlier where negative)."""
+        """Shift the next conversion and all that follow by ``dt_ns`` (fault hook)."""
         self.advance_to(t_ns)
         self._start_ns += dt_ns
         self._next_ns = max(t_ns + 1, self._next_ns + dt_ns)
 
     def force_overflow(self) -> None:
-        """Fault hook: as if the host had not read for too long."""
+        """Overflow the buffer, as if the host had not read for too long (fault hook)."""
         if self.scanning:
             self._overflow()
 
@@ -217,7 +217,7 @@ class Di4108:
             self._emit(codes.tobytes())
 
     def _filtered(self) -> Volts:
-        """Page 51: last point, average, maximum or minimum per channel."""
+        """Return the last point, average, maximum or minimum per channel (page 51)."""
         s, m = self._samples, self._modes
         return np.select([m == 1, m == 2, m == 3], [s.mean(0), s.max(0), s.min(0)], s[-1])
 
@@ -230,7 +230,7 @@ class Di4108:
         return self._codes
 
     def _digital_code(self, word: int, t_ns: int) -> int:
-        """Digital, rate and counter words (pages 60, 66)."""
+        """Return the digital, rate and counter words (pages 60, 66)."""
         function = word & 0xF
         if function == DIGITAL:
             levels = self._din()
@@ -348,20 +348,21 @@ class Di4108:
         return f"ps {16 << self.settings.packet_code}"
 
     def _eol(self, line: str, rest: str) -> str:
-        """Page 38: it has an effect in ASCII mode only. The vendor's own examples send it before ``encode 1``."""
+        """Obey ``eol`` (page 38): it acts in ASCII mode only. The vendor's examples send it before ``encode 1``."""
         code = _integer(rest, 0, 2)
         self.settings.eol = (b"\r", b"\n", b"\r\n")[code]
         return line
 
     def _slist(self, line: str, rest: str) -> str:
-        """Page 39: position 0 starts a new list; positions in sequence; each channel once."""
+        """Obey ``slist`` (page 39): position 0 starts a new list; positions are in sequence; each channel occurs
+        once."""
         first, second = rest.split(" ")
         words = self.settings.words
         position, word = _integer(first, 0, 10), _integer(second, 0, 0xFFFF)
         kept = [] if position == 0 else words
         function = word & 0xF
-        taken = any(w & 0xF == function for i, w in enumerate(kept) if i != position and w != IGNORE)
-        if position > len(kept) or (word != IGNORE and (taken or not _legal_word(word))):
+        is_duplicate = any(w & 0xF == function for i, w in enumerate(kept) if i != position and w != IGNORE)
+        if position > len(kept) or (word != IGNORE and (is_duplicate or not _legal_word(word))):
             return NOT_FOUND
         self.settings.words = [*kept[:position], word, *kept[position + 1 :]]
         return line
@@ -391,7 +392,7 @@ def _integer(text: str, lo: int, hi: int) -> int:
 
 
 def _legal_word(word: int) -> bool:
-    """Page 44: function in bits 3..0, range code in bits 11..8, all others 0."""
+    """Return True for a legal word (page 44): function in bits 3..0, range code in bits 11..8, all others 0."""
     function, code = word & 0xF, word >> 8 & 0xF
     if word & 0xF0F0 or function > COUNTER:
         return False

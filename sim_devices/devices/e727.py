@@ -1,4 +1,4 @@
-"""PI E-727.3SDA digital piezo controller: three axes, four output channels, GCS 2.0 over RS-232.
+"""Emulates the PI E-727.3SDA digital piezo controller: three axes, four output channels, GCS 2.0 over RS-232.
 
 Sources: PI E-727 manual E727T0005 (28 June 2019); GCS framing and error numbers as collected in
 ``ecosystem.md`` section 6b from PI's client and captures of real devices. Wire face: bytes at 115200 baud 8N1
@@ -50,7 +50,7 @@ class GcsError(Exception):
 
 
 class E727:
-    """One controller. ``measure_um(axis, t_ns)`` is its position sensor, ``on_output`` its amplifier."""
+    """Emulates one controller. ``measure_um(axis, t_ns)`` is its position sensor, ``on_output`` its amplifier."""
 
     def __init__(
         self,
@@ -284,7 +284,7 @@ class E727:
             self.servo[axis] = bool(value)
 
     def _move(self, pairs: list[tuple[int, float]]) -> None:
-        """All axes start together, and only if every target is legal."""
+        """Start all axes together, and only if every target is legal."""
         if any(not self.servo[axis] for axis, _ in pairs):
             raise GcsError(SERVO_OFF)
         if any(not TRAVEL_UM[0] <= target <= TRAVEL_UM[1] for _, target in pairs):
@@ -342,7 +342,8 @@ class E727:
         return ["The following commands are valid:", *(f"{n} {MEANINGS[n]}" for n in names), "end of help"]
 
     def _parameter_help(self, args: list[str]) -> list[str]:
-        """Fields of a line: level for writing, number of items, type, group and name (GCS manual PZ281E, HPA?)."""
+        """Return the fields of a line: level for writing, number of items, type, group and name (GCS manual PZ281E,
+        HPA?)."""
         lines = [
             f"0x{number:X}=\t{level}\t{len(AXES)}\t{kind}\tAxis\t{name}"
             for number, (_, level, kind, name) in PARAMETERS.items()

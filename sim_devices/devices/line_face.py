@@ -13,23 +13,23 @@ from sim_devices.registry import Surroundings
 
 
 class LineFace(ActingFace):
-    """Wire face of one device."""
+    """Implements the wire face of one device."""
 
     def __init__(self, around: Surroundings) -> None:
         self.around = around
         self.unread = 0
-        self._heard, self._said = b"", bytearray()
+        self._heard, self._outgoing = b"", bytearray()
 
     # ------------------------------------------------------------------ for the device to override
 
     def hear(self, words: list[str], t_ns: int) -> None:
-        """One line of the host, its words; never empty."""
+        """Obey one line of the host, given as its words (at least one)."""
 
     # ------------------------------------------------------------------
 
     def say(self, text: str) -> None:
-        """One line for the host."""
-        self._said += text.encode() + b"\n"
+        """Queue one line for the host."""
+        self._outgoing += text.encode() + b"\n"
 
     def receive(self, data: bytes, t_ns: int) -> None:
         if self.frozen:
@@ -41,6 +41,6 @@ class LineFace(ActingFace):
                 self.hear(words, t_ns)
 
     def take(self, max_bytes: int) -> bytes:
-        said = bytes(self._said[:max_bytes])
-        del self._said[:max_bytes]
-        return said
+        sent = bytes(self._outgoing[:max_bytes])
+        del self._outgoing[:max_bytes]
+        return sent

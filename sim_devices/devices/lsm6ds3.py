@@ -1,4 +1,4 @@
-"""ST LSM6DS3: three-axis accelerometer and gyroscope, temperature, 4096-word FIFO.
+"""Emulates the ST LSM6DS3: three-axis accelerometer and gyroscope, temperature, 4096-word FIFO.
 
 Source: LSM6DS3 data sheet DocID026899 rev. 10 ("DS", section numbers in comments) and application note AN4650 rev. 5
 ("AN"). Wire face: I2C register transactions. Truth face: an ``Imu`` (sensing elements on a moving body); observables
@@ -71,7 +71,7 @@ _WRITABLE = dict.fromkeys(
 
 
 class Lsm6ds3(RegisterFace):
-    """One LSM6DS3. The SA0 strap is the address that the bus puts it at. ``rate_error``: its clock runs fast."""
+    """Emulates one LSM6DS3. The SA0 strap follows from its address on the bus. ``rate_error``: its clock runs fast."""
 
     def __init__(self, imu: Imu, *, rate_error: float = 0.0) -> None:
         if not -0.1 <= rate_error <= 0.1:
@@ -255,7 +255,7 @@ class Lsm6ds3(RegisterFace):
         self._outputs[group].push(t_ns, block)
 
     def _write_fifo(self) -> None:
-        """One set: gyroscope x y z, then accelerometer x y z, each by its own decimation (DS 9.5)."""
+        """Write one set: gyroscope x y z, then accelerometer x y z, each by its own decimation (DS 9.5)."""
         decimation = self.registers[FIFO_CTRL3]
         pattern = 0
         for group, factor in ((GYRO, DECIMATION[decimation >> 3 & 7]), (ACCEL, DECIMATION[decimation & 7])):

@@ -1,4 +1,5 @@
-"""The endoscope's motion tracking card (MTC) behind its scanner card: an MPU-6050, a button, a battery, ASCII lines.
+"""Emulates the endoscope's motion tracking card (MTC) behind its scanner card: an MPU-6050, a button, a battery, ASCII
+lines.
 
 Source: Erat 2018, section 4.2 (card and packet), 6.2 (button, status), 6.3 with Fig. 6.5 (mechanical spike), with
 errata nos. 112, 113, 121. A line is ``#:ax:ay:az:wx:wy:wz:temperature:status:`` CR LF, sent by the scanner card at
@@ -46,7 +47,8 @@ HOUR_NS = 3_600_000_000_000
 
 
 class MotionCard:
-    """Card and scanner card. ``baud`` paces the line, ``rate_hz`` is the card's sampling rate (100 Hz in Erat 2018)."""
+    """Emulates card and scanner card. ``baud`` paces the line, ``rate_hz`` is the card's sampling rate (100 Hz in Erat
+    2018)."""
 
     def __init__(
         self,
@@ -139,7 +141,7 @@ class MotionCard:
     # ------------------------------------------------------------------ wire face
 
     def receive(self, data: bytes, t_ns: int) -> None:
-        """The scanner card listens to the radio only."""
+        """Ignore the host: the scanner card receives by radio only."""
 
     def take(self, max_bytes: int) -> bytes:
         data = bytes(self._out[:max_bytes])
@@ -209,7 +211,7 @@ class MotionCard:
         return f"#:{':'.join(fields)}:{self.status}:\r\n".encode("ascii")
 
     def _shaken(self, t_ns: int) -> BodyMotion:
-        """The body's motion and the ringing of the case after each edge of the button."""
+        """Return the body's motion with the ringing of the case after each edge of the button."""
         motion = self._motion(t_ns)
         while self._edges and t_ns - self._edges[0] >= SPIKE_NS:
             self._edges.popleft()

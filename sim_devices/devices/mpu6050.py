@@ -1,4 +1,4 @@
-"""InvenSense MPU-6050: three-axis gyroscope and accelerometer, temperature, 1024-byte FIFO.
+"""Emulates the InvenSense MPU-6050: three-axis gyroscope and accelerometer, temperature, 1024-byte FIFO.
 
 Source: MPU-6000/6050 Product Specification rev. 3.4 ("PS") and Register Map and Descriptions rev. 4.2 ("RM", section
 numbers in comments); offset registers: InvenSense application note "MPU Hardware Offset Registers" rev. 1.0 but for
@@ -83,7 +83,7 @@ def _factory_trim() -> tuple[list[int], list[float]]:
 
 
 class Mpu6050(RegisterFace):
-    """One MPU-6050. The AD0 strap is the address that the bus puts it at.
+    """Emulates one MPU-6050. The AD0 strap follows from its address on the bus.
 
     ``rate_error`` = 0.01 makes its clock 1 % fast. ``factory_offsets`` is what the accelerometer offset registers hold
     at power-up: the factory's own correction, which moves with them when they are written.

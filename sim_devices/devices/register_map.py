@@ -47,7 +47,7 @@ class RegisterFace:
         self.registers[register] = self.registers[register] & ~mask & 0xFF | value & mask
 
     def next_register(self, register: int) -> int:
-        """Auto-increment."""
+        """Return the register that auto-increment selects next."""
         return register + 1 & 0xFF
 
     def advance_to(self, t_ns: int) -> None: ...
@@ -89,12 +89,13 @@ class RegisterFace:
         return bytes(out)
 
     def general_call(self, data: bytes, t_ns: int) -> bool:
-        """None of these parts listens to address 0."""
+        """Refuse address 0: none of these parts answers it."""
         return False
 
 
 class SampleClock:
-    """Instants of an oscillator: ``due_ns`` is the next, ``None`` while it stands. No rounding adds up."""
+    """Counts the instants of an oscillator without accumulated rounding. ``due_ns`` is the next one, ``None`` while it
+    stands."""
 
     def __init__(self) -> None:
         self.due_ns: int | None = None
@@ -151,5 +152,5 @@ def signed_limited(value: float, bits: int = 16) -> int:
 
 
 def signed_byte(value: int) -> int:
-    """Two's complement byte to integer."""
+    """Return the integer of a two's complement byte."""
     return value - 0x100 if value & 0x80 else value

@@ -19,7 +19,8 @@ RESET = 0x06  # general call
 
 
 class WordFace(ActingFace):
-    """Wire face of one chip. ``power_up`` are its registers, ``read_only`` those that the host cannot change.
+    """Implements the wire face of one chip. ``power_up`` holds its registers, ``read_only`` those that the host cannot
+    write.
 
     ``nack_address`` and ``nack_data`` are hooks for faults.
     """

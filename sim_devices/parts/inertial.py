@@ -1,4 +1,4 @@
-"""Emulated inertial sensors and the motion card as they hang on the world."""
+"""Connects emulated inertial sensors and the motion card to the world."""
 
 from __future__ import annotations
 

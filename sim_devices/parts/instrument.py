@@ -1,4 +1,4 @@
-"""The instrument's emulated parts as they hang on the world: what they sense, and what they drive."""
+"""Connects the instrument's emulated parts to the world: the inputs that they sense and the outputs that they drive."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ Array = NDArray[np.float64]
 
 
 class PlantBlocks:
-    """One instrument, one hand, one run, given out in blocks of ``ms`` milliseconds (a multiple of ``BLOCK_MS``).
+    """Computes one run of one instrument in one hand, in blocks of ``ms`` milliseconds (a multiple of ``BLOCK_MS``).
 
     ``plant``, ``state``: one-row structured arrays; ``nodes``, ``parts``, ``noise``, ``slow``: the present block's, as
     ``advance`` wants them. ``truth`` (n + 1, TRUTH_COLUMNS) has a row for each of ``total_ms`` milliseconds.
@@ -51,7 +51,7 @@ class PlantBlocks:
             self._rng.standard_normal(out=self.slow[block])
 
     def truth_columns(self, rows: int) -> dict[str, NDArray]:
-        """The first ``rows`` rows of the truth, by the names of ``Instrument.truth``."""
+        """Return the first ``rows`` rows of the truth by the names and units of ``Instrument.truth``."""
         columns: dict[str, NDArray] = {"t_ns": np.arange(rows, dtype=np.int64) * 1_000_000}
         for name, at, n in TRUTH:
             columns[name] = self.truth[:rows, at] if n == 1 else self.truth[:rows, at : at + n]

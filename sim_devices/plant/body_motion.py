@@ -20,7 +20,7 @@ def _zeros() -> Array:
 
 @dataclass(frozen=True)
 class BodyMotion:
-    """State of a body at an instant; vectors in the body frame unless said otherwise.
+    """Holds the state of a body at an instant. Vectors are in the body frame unless their name says otherwise.
 
     ``attitude`` (3, 3) maps body to world. ``specific_force_m_s2`` (3,) is felt at ``origin_m`` (3,), body frame:
     +g on an axis that points up at rest (errata no. 2). ``field_world_uT`` (3,) in the world frame.
@@ -39,7 +39,7 @@ MotionSource = Callable[[int], BodyMotion]  # bench time in ns -> motion at that
 
 
 def rotation(angles_deg: tuple[float, float, float]) -> Array:
-    """(3, 3) = Rz(yaw) Ry(pitch) Rx(roll) for ``angles_deg`` = (roll, pitch, yaw): child to parent."""
+    """Return the matrix (3, 3) Rz(yaw) Ry(pitch) Rx(roll) for ``angles_deg`` = (roll, pitch, yaw): child to parent."""
     (sx, cx), (sy, cy), (sz, cz) = ((math.sin(math.radians(a)), math.cos(math.radians(a))) for a in angles_deg)
     return np.array(
         [
@@ -82,5 +82,5 @@ class Mount:
         return felt, turned
 
     def field_uT(self, motion: BodyMotion) -> Array:
-        """Magnetic field (3,) along the sensor's axes."""
+        """Return the magnetic field (3,) in uT along the sensor's axes."""
         return (motion.field_world_uT @ motion.attitude) @ self.turn

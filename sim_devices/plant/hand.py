@@ -68,16 +68,17 @@ class Hand(Protocol):
         ...
 
     def start(self, pose: Array, parts: Array) -> None:
-        """``pose`` (18,) and ``parts`` (6,): intended and tremor part of the tip path, at t = 0."""
+        """Fill ``pose`` (18,) and ``parts`` (6,), the intended and tremor part of the tip path, at t = 0."""
         ...
 
     def fill(self, pose: Array, parts: Array) -> None:
-        """The next n nodes: ``pose`` (n, 18), ``parts`` (n, 6)."""
+        """Fill the next n nodes: ``pose`` (n, 18), ``parts`` (n, 6)."""
         ...
 
 
 def holding_frame(config: HandConfig) -> Array:
-    """(3, 3) attitude of an instrument held like a pen: its axis points down, tilted and turned as configured."""
+    """Return the attitude (3, 3) of an instrument held like a pen: its axis points down, tilted and turned as
+    configured."""
     azimuth, pitch, roll = (math.radians(v) for v in (config.azimuth_deg, 180.0 - config.tilt_deg, config.roll_deg))
     return _rz(azimuth) @ _ry(pitch) @ _rz(roll)
 
@@ -96,7 +97,7 @@ def pose_angles() -> Array:
 
 
 def tremor_matrix(config: HandConfig, frame: Array) -> Array:
-    """(6, 6) from unit sources to tip displacement (world, m) and body angles (rad).
+    """Return the matrix (6, 6) from unit sources to tip displacement (world, m) and body angles (rad).
 
     Turning by (ax, ay) about a grip that lies L behind the tip moves the tip by (ay L, -ax L); the angles are the
     share of the lateral motion that is made this way, plus the independent roll and a tenth of wobble.
@@ -162,7 +163,7 @@ class SyntheticHand:
         hand_nodes(self._p, self._s, noise, self._reaches, self._jerks, pose, parts)
 
     def _plan(self, seconds: float) -> None:
-        """Reaches and jerks for at least ``seconds``; a longer plan begins with the shorter one."""
+        """Plan reaches and jerks for at least ``seconds``. A longer plan begins with the shorter one."""
         config = self._config
         count = int(seconds / config.reach_s[0]) + 2
         draw = stream(self._seed, "hand.reaches").random((count, 8))

@@ -51,7 +51,7 @@ class NoHandError(HandFileError):
 
 @dataclass(frozen=True)
 class HandRecording:
-    """One recorded motion on a uniform time base: arrays (n, 3) in SI, absent quantities ``None``.
+    """Holds one recorded motion on a uniform time base: arrays (n, 3) in SI, absent quantities ``None``.
 
     ``axes`` says which of the three columns were recorded; the others are zero. ``notes`` says what was mended.
     """
@@ -203,8 +203,8 @@ def _choose(path: Path, columns: dict[str, Array], name: str) -> dict[str, Array
 
 
 def _signals(path: Path, columns: dict[str, Array], units: dict[str, str]) -> dict[str, Array]:
-    """(n, 3) per quantity, SI; columns fill x, y, z by their name (_x, _y, _z), else in their order."""
-    found: dict[str, list[tuple[str, Array]]] = {}
+    """Return (n, 3) per quantity, in SI. Columns fill x, y, z by their name (_x, _y, _z), else in their order."""
+    by_quantity: dict[str, list[tuple[str, Array]]] = {}
     for column, values in columns.items():
         unit = units.get(column, "") if units else _unit_of(column)
         if unit not in _UNITS:
@@ -216,17 +216,17 @@ def _signals(path: Path, columns: dict[str, Array], units: dict[str, str]) -> di
         bad = np.flatnonzero(~np.isfinite(values))
         if bad.size:
             raise HandFileError(f"{path}: column '{column}' is not a number at sample {bad[0]}")
-        found.setdefault(quantity, []).append((column, values * factor))
+        by_quantity.setdefault(quantity, []).append((column, values * factor))
     missing = [c for c in units if c not in columns and units[c] in _UNITS]
-    if missing and not found:
+    if missing and not by_quantity:
         raise HandFileError(f"{path}: column '{missing[0]}' is missing")
-    if not found:
+    if not by_quantity:
         raise NoHandError(
             f"{path}: no column is an acceleration, a displacement or an angular rate; "
             f"columns: {', '.join(columns)}; names end in a unit (_g, _m_s2, _um, _deg_s) or meta.toml tells it"
         )
     signals = {}
-    for quantity, list_of in found.items():
+    for quantity, list_of in by_quantity.items():
         if len(list_of) > 3:
             raise HandFileError(f"{path}: {len(list_of)} columns of {quantity}, a hand has at most three")
         signal = np.zeros((len(list_of[0][1]), 3))

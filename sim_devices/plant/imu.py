@@ -50,7 +50,7 @@ class TriadSpec:
     per_m_s2: float = 0.0
     """Sensitivity to specific force, unit per m/s^2."""
     drift: float = 0.0
-    """rms of the slow wander at constant temperature."""
+    """Slow wander at constant temperature, rms."""
     drift_s: float = 100.0
 
 
@@ -216,7 +216,7 @@ class Imu:
             self.magnetometer = Triad(triad_unit(spec.magnetometer, units, errors, noise), self._field, hiss)
         self._load_kernels()
         self.self_test_gain = 1.0 + 0.05 * units.standard_normal(6).clip(-2.0, 2.0) * errors
-        """How this chip's self-test responses differ from the factory's, accelerometer then gyroscope."""
+        """Differences of this chip's self-test responses from the factory's, accelerometer then gyroscope."""
 
     def _load_kernels(self) -> None:
         """Compile or load now, not when the first sample is due in real time."""

@@ -37,7 +37,7 @@ _CHUNK_ROWS = 256 * BLOCK_MS
 
 
 class Instrument:
-    """One instrument, one hand, one run.
+    """Simulates one instrument in one hand for one run.
 
     ``unit`` (default ``seed``) draws the physical instrument, ``seed`` its noise; ``hand`` must be fresh.
     ``quiet`` leaves all sensor, DAQ and room noise out (a twin for arrays); ``twins`` move in place of the stacks (in
@@ -125,13 +125,14 @@ class Instrument:
 
     @property
     def analog_V(self) -> Array:
-        """(8,) at the DAQ inputs now: a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36. Changes as time goes on."""
+        """Return the volts (8,) at the DAQ inputs now: a1x, a1z, a2y, a2z, a3x, a3y, supply / 2, TMP36. Changes as time
+        goes on."""
         self._now()
         return self._daq_V if self._more is None else self._more.volts(self._daq_V, self.motion(), self._t_ns)
 
     @property
     def magnetometer_V(self) -> Array:
-        """(3,) HMC-2003 outputs now. Changes as time goes on."""
+        """Return the HMC-2003 outputs (3,) in V now. They change as time goes on."""
         self._now()
         return self._magnetometer_V
 
@@ -148,11 +149,11 @@ class Instrument:
         outputs_later(self._plant, self._state, 0.0)
 
     def sag_supply(self, part: float) -> None:
-        """Fault hook: the sensors' supply is ``part`` of what it was when the unit was built, from the next step on."""
+        """Scale the sensors' supply to ``part`` of its original value from the next step on (fault hook)."""
         self._plant[0]["supply_V"] = self._supply_V * part
 
     def hush(self) -> None:
-        """No noise from now on; the hand goes on as before."""
+        """Switch all noise off from now on. The hand continues."""
         self._quiet = True
         self._noise[:] = 0.0
         self._slow[:] = 0.0
@@ -174,14 +175,16 @@ class Instrument:
         return self._state[0]["clipped"].copy()
 
     def truth_row(self) -> dict[str, Array]:
-        """Truth at the last step, by the names of ``truth``; intended and tremor are those of the last millisecond."""
+        """Return the truth at the last step by the names and units of ``truth``; intended and tremor are those of the
+        last millisecond."""
         row = np.zeros(TRUTH_COLUMNS)
         part = self._parts[(self._in_block // STEPS_PER_MS) - 1] if self._in_block >= STEPS_PER_MS else self._part
         truth_row(self._plant[0], self._state[0], part, row)
         return {name: row[at : at + n] for name, at, n in TRUTH}
 
     def truth(self) -> dict[str, NDArray]:
-        """Columns, one row per millisecond: ``t_ns`` (n,) int64, ``tip_m`` (n, 3) and so on (kernel.TRUTH)."""
+        """Return columns with one row per millisecond: ``t_ns`` (n,) int64, ``tip_m`` (n, 3) and so on
+        (kernel.TRUTH)."""
         rows = np.concatenate([*self._chunks, self._chunk[: self._row]])
         numbers = self._forgotten + np.arange(len(rows), dtype=np.int64)
         columns: dict[str, NDArray] = {"t_ns": numbers * 1_000_000}

@@ -1,4 +1,4 @@
-"""The plant's one compiled kernel: hand, body, amplifier, stacks, manipulator, sensors, in steps of 1/8 ms."""
+"""Steps the plant in one compiled kernel: hand, body, amplifier, stacks, manipulator, sensors, in steps of 1/8 ms."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ STATE = np.dtype(
 
 @kernel
 def copy(a, b):
-    """b <- a. A slice assignment would compile half of numba's string library, for its error message."""
+    """Copy ``a`` to ``b``. A slice assignment would compile half of numba's string library, for its error message."""
     for i in range(b.shape[0]):
         b[i] = a[i]
 
@@ -173,7 +173,7 @@ def outputs(p, s, later_s):
 
 @kernel
 def outputs_later(plant, state, later_s):
-    """``outputs`` from Python: an array goes over the border a hundred times faster than a record of it."""
+    """Call ``outputs`` from Python. An array crosses into compiled code a hundred times faster than a record of it."""
     outputs(plant[0], state[0], later_s)
 
 
@@ -203,7 +203,7 @@ def truth_row(p, s, part, row):
 
 @kernel
 def begin(plant, state, node, part, truth):
-    """The world's first instant: everything at rest, filters settled; writes the first truth row."""
+    """Set the first instant of the world, at rest with settled filters, and write the first truth row."""
     p, s = plant[0], state[0]
     room(p, s, np.zeros(SLOW_NOISES))
     copy(node, s["pose"])

@@ -1,4 +1,4 @@
-"""The lab's measuring instruments: calibration recordings of the same physical unit as the bench.
+"""Makes calibration recordings of the same physical unit as the bench, with the lab's measuring instruments.
 
 ``python -m sim_devices.plant.lab piezo --out FOLDER [--axis N] [--profile sawtooth|sine|tremor|loops|steps|set]
 [--twin FILE]``
@@ -52,7 +52,8 @@ class LabError(BenchError):
 
 @kernel
 def drive_stack(params, state, volts, temperature_C, steps_per_sample, stroke, terminal_V):
-    """One stack under held demands ``volts`` (n,): ``stroke`` (n,) m and ``terminal_V`` (n,) at each sample's time.
+    """Drive one stack with held demands ``volts`` (n,). Return ``stroke`` (n,) m and ``terminal_V`` (n,) at each
+    sample's time.
 
     Sample i is taken when its demand is given, so the answer to demand i shows from sample i + 1 on.
     """
@@ -70,7 +71,7 @@ def sample_rate_hz(profile: str) -> float:
 
 
 def drive_profile(profile: str, rate_hz: float, seconds: float, amplitude_V: float, seed: int) -> Array:
-    """Demand in volts about 50 V at ``sample_rate_hz``: triangle (``sawtooth``), sine of growing amplitude,
+    """Return the demand (n,) in V about 50 V at ``sample_rate_hz``: triangle (``sawtooth``), sine of growing amplitude,
     tremor, loops or small steps."""
     t = np.arange(round(seconds * sample_rate_hz(profile))) / sample_rate_hz(profile)
     if profile == "steps":
@@ -118,7 +119,8 @@ def measure_piezo(
     amplitude_V: float,
     twin: FileTwin | None = None,
 ) -> tuple[dict[str, Array], str]:
-    """Columns of the recording and its ``recording.toml``. ``twin``: a corrected piezo twin in place of the stack."""
+    """Return the columns (n,) of the recording and its ``recording.toml``. A corrected piezo ``twin`` may replace the
+    stack."""
     if axis not in (0, 1, 2):
         raise LabError(f"axis {axis}: the stacks are 0, 1 and 2")
     if not 0.0 < rate_hz <= 200.0:
@@ -184,7 +186,7 @@ unit = "degC"
 
 
 def tumble_attitudes(positions: int) -> tuple[Array, Array]:
-    """Stage angles (n, 2) rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity.
+    """Return stage angles (n, 2) in rad, about z then y, and attitudes (n, 3, 3): evenly spread directions of gravity.
 
     The order jumps about, so that a drift during the recording does not look like one of the axes.
     """
@@ -257,7 +259,7 @@ def _mean_noise_V(config: EmulationConfig, samples: int) -> Array:
 
 
 def load_config(bench: Path | None, unit: int | None) -> EmulationConfig:
-    """The ``[emulation]`` table of a bench file, or the defaults; ``unit`` overrides."""
+    """Return the ``[emulation]`` table of a bench file, or the defaults. ``unit`` overrides its unit."""
     table: dict[str, object] = {}
     if bench is not None:
         try:

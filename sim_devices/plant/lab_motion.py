@@ -1,4 +1,4 @@
-"""Recordings of the whole instrument in the lab at 1 kHz: at rest on a table, or swung about its tip in a dimple.
+"""Makes recordings of the whole instrument at 1 kHz: at rest on a table, or swung about its tip in a dimple.
 
 ``rest`` is what a noise model is made from. ``pivot`` shows where the sensors sit: the tip stays, so every acceleration
 is the turn's; swings of up to 35 degrees about all axes with several frequencies below 2.5 Hz, as an arm makes them.
@@ -59,7 +59,7 @@ def pivot_path(seconds: float, seed: int) -> Array:
 
 @kernel
 def sense_at(p, s, node, noise, slow):
-    """A millisecond of the sensors: hand node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
+    """Compute a millisecond of the sensors from hand node (18,), noise (NOISES,), slow (SLOW_NOISES,)."""
     copy(node, s["pose"])
     s["step"] += STEPS_PER_MS
     room(p, s, slow)
@@ -83,7 +83,7 @@ def record(plant, state, nodes, noise, slow, first, held, analog, magnet):
 
 
 def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[dict[str, Array], str]:
-    """Columns at 1 kHz and their descriptor; ``kind`` is ``rest`` or ``pivot``."""
+    """Return columns (n,) at 1 kHz and their descriptor. ``kind`` is ``rest`` or ``pivot``."""
     shortest = 10.0 if kind == "pivot" else 1.0
     if not shortest <= seconds <= 3600.0:
         raise BenchError(f"{seconds:g} s: give {shortest:g} to 3600 s")

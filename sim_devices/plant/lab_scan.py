@@ -27,7 +27,7 @@ SETTLE_S = 0.05
 
 
 def scan_grid(per_axis: int) -> Array:
-    """(n, 3) volts: a grid through all corners of 5 to 95 V, back and forth so that steps are small."""
+    """Return volts (n, 3): a grid through all corners of 5 to 95 V, back and forth so that steps are small."""
     levels = np.linspace(5.0, 95.0, per_axis)
     points: list[tuple[float, float, float]] = []
     for i, (a, b) in enumerate(itertools.product(levels, levels)):
@@ -37,7 +37,7 @@ def scan_grid(per_axis: int) -> Array:
 
 
 def measure_scan(config: EmulationConfig, per_axis: int, rng: np.random.Generator) -> tuple[dict[str, Array], str]:
-    """Columns of the scan and its descriptor. Strokes and tip are counted from rest at neutral."""
+    """Return the columns (n,) of the scan and its descriptor. Strokes and tip (m) count from rest at neutral."""
     unit = build_unit(config, config.unit)
     temperature_C = start_temperature_C(config)
     channels = [drive_channel(stack, config.amplifier, STEP_S, temperature_C) for stack in unit.stacks]

@@ -1,4 +1,5 @@
-"""The three-legged manipulator: ball heights to tip displacement (Ang 2004 ch. 6, errata nos. 58 to 70).
+"""Computes the tip displacement of the three-legged manipulator from its ball heights (Ang 2004 ch. 6, errata nos. 58
+to 70).
 
 Balls sit on a circle of radius r in the planes y = 0, y = -sqrt3 x, y = +sqrt3 x and move up and down, so the heights
 give the pose in closed form (errata nos. 68, 69): no iteration, exact to rounding.
@@ -19,8 +20,8 @@ from sim_devices.plant.streams import stream
 
 @dataclass(frozen=True)
 class ManipulatorUnit:
-    """One manipulator: ``lever`` (3,) gains, ``rest_m`` (3,) ball heights at neutral, ``mount`` (3, 3) its frame to
-    the body's."""
+    """Holds one manipulator: ``lever`` (3,) gains, ``rest_m`` (3,) ball heights at neutral, ``mount`` (3, 3) its frame
+    to the body's."""
 
     circle_m: float
     shaft_m: float
@@ -43,7 +44,7 @@ def manipulator_unit(config: ManipulatorConfig, seed: int) -> ManipulatorUnit:
 
 
 def rotation(turn_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(3, 3) of a rotation vector (Rodrigues)."""
+    """Return the matrix (3, 3) of a rotation vector (3,) in rad (Rodrigues)."""
     x, y, z = turn_rad
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     angle = float(np.linalg.norm(turn_rad))

@@ -36,7 +36,7 @@ class MoreAxes:
         self._before_V, self._rc_V = np.zeros(len(axes)), np.zeros(len(axes))
 
     def volts(self, volts: Array, motion: BodyMotion, t_ns: int) -> Array:
-        """``volts`` of the six and the supply, copied; times may not go back."""
+        """Return a copy of ``volts`` (n,) with the further axes. Times may not go back."""
         out = volts.copy()
         if t_ns > self._t_ns:
             self._look(2.0 * float(volts[SUPPLY_INPUT]), motion, t_ns)
@@ -60,7 +60,7 @@ class MoreAxes:
 
 
 def _felt(motion: BodyMotion, place_m: Array) -> Array:
-    """(3,) specific force at ``place_m``: f + alpha x r + omega x (omega x r), body frame (Ang 2004 (2.3), erratum
-    2)."""
+    """Return the specific force (3,) in m/s^2 at ``place_m``: f + alpha x r + omega x (omega x r), body frame (Ang 2004
+    (2.3), erratum 2)."""
     r, w = place_m - motion.origin_m, motion.rate_rad_s
     return motion.specific_force_m_s2 + np.cross(motion.angular_acceleration_rad_s2, r) + np.cross(w, np.cross(w, r))

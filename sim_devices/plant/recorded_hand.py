@@ -34,7 +34,7 @@ _FADE_S = 0.5
 
 
 class RecordedHand:
-    """A recorded tremor in a synthetic voluntary motion.
+    """Plays a recorded tremor within a synthetic voluntary motion.
 
     ``scale`` ``None``: the mean over the moving axes of the tip's rms in 8 to 12 Hz becomes that of
     ``config.tremor_pp_um`` (one factor for all axes and frequencies). A number multiplies the motion as recorded.
@@ -53,7 +53,7 @@ class RecordedHand:
             scale = config.tremor_pp_um * 1e-6 / (2.0 * math.sqrt(2.0)) / found_m
         self.scale = float(scale)
         self.tremor_rms_m = found_m * self.scale
-        """rms in 8 to 12 Hz at the tip, mean over the moving axes."""
+        """Tremor in 8 to 12 Hz at the tip, rms, mean over the moving axes."""
         body = body * self.scale
         body[:, :3] = body[:, :3] @ self.frame.T
         self._table, self._span_s = _nodes(frequency_hz, body, recording)
@@ -86,7 +86,8 @@ def make_hand(
 
 
 def _spectrum(config: HandConfig, recording: HandRecording) -> tuple[Array, NDArray[np.complex128]]:
-    """Frequencies (m,) and Fourier coefficients (m, 6): tip displacement (body axes, m) and body angles (rad)."""
+    """Return frequencies (m,) in Hz and Fourier coefficients (m, 6): tip displacement (body axes, m) and body angles
+    (rad)."""
     count = round(recording.seconds * recording.rate_hz)
     frequency_hz: Array = np.asarray(np.fft.rfftfreq(count, 1.0 / recording.rate_hz), dtype=np.float64)
     low, high = config.recorded_band_hz
@@ -119,7 +120,7 @@ def _transform(signal: Array, rate_hz: float) -> NDArray[np.complex128]:
 
 
 def _band(frequency_hz: Array, low_hz: float, high_hz: float) -> Array:
-    """1 within the band, raised-cosine edges a tenth wide to either side."""
+    """Return a window that is 1 within the band, with raised-cosine edges a tenth wide on either side."""
     rise = np.clip((frequency_hz / low_hz - 0.9) / 0.2, 0.0, 1.0)
     fall = np.clip((1.1 - frequency_hz / high_hz) / 0.2, 0.0, 1.0)
     return 0.25 * (1.0 - np.cos(math.pi * rise)) * (1.0 - np.cos(math.pi * fall))
@@ -134,7 +135,7 @@ def _band_rms_m(frequency_hz: Array, body: NDArray[np.complex128], recording: Ha
 
 
 def _nodes(frequency_hz: Array, body: NDArray[np.complex128], recording: HandRecording) -> tuple[Array, float]:
-    """(N + 1, 18) nodes over one period, the last equal to the first, and their distance in seconds."""
+    """Return nodes (N + 1, 18) over one period, the last equal to the first, and their distance in seconds."""
     count = round(recording.seconds * recording.rate_hz)
     nodes = max(count, math.ceil(recording.seconds * _NODES_HZ))
     iw = 2j * math.pi * frequency_hz[:, None]

@@ -1,4 +1,4 @@
-"""Kinematics of the rigid instrument: pose, body rates, specific force and fields at its sensors.
+"""Computes the kinematics of the rigid instrument: pose, body rates, specific force and fields at its sensors.
 
 Conventions of the errata, section 5: C_WB maps body to world, quaternions scalar first, an accelerometer at rest reads
 +g on an axis that points up (errata no. 2: f = C_WB^T (a - g)).
@@ -13,7 +13,7 @@ from hal.compiled import kernel
 
 @kernel
 def attitude(frame, angles, c):
-    """``c`` (3, 3) = frame Rz(angles[2]) Ry(angles[1]) Rx(angles[0])."""
+    """Fill ``c`` (3, 3) with frame Rz(angles[2]) Ry(angles[1]) Rx(angles[0])."""
     sx, cx = math.sin(angles[0]), math.cos(angles[0])
     sy, cy = math.sin(angles[1]), math.cos(angles[1])
     sz, cz = math.sin(angles[2]), math.cos(angles[2])
@@ -29,7 +29,8 @@ def attitude(frame, angles, c):
 
 @kernel
 def body_rates(angles, rates, accelerations, omega, alpha):
-    """Body rate ``omega``, rad/s, and its derivative ``alpha``, from ``attitude``'s angles and their derivatives."""
+    """Fill the body rate ``omega`` (3,) in rad/s and its derivative ``alpha`` (3,) from ``attitude``'s angles and their
+    derivatives."""
     sx, cx = math.sin(angles[0]), math.cos(angles[0])
     sy, cy = math.sin(angles[1]), math.cos(angles[1])
     x1, y1, z1 = rates[0], rates[1], rates[2]
@@ -60,7 +61,8 @@ def specific_force(c, acceleration, gravity, arm, omega, alpha, f):
 
 @kernel
 def quaternion(c, q):
-    """``q`` (4,) scalar first, q0 >= 0, of ``c``: the largest component first, so it is exact for every attitude."""
+    """Fill ``q`` (4,), scalar first, q0 >= 0, from ``c`` (3, 3). The largest component comes first, so it is exact
+    everywhere."""
     trace = c[0, 0] + c[1, 1] + c[2, 2]
     if trace >= c[0, 0] and trace >= c[1, 1] and trace >= c[2, 2]:
         q[0] = 1.0 + trace

@@ -1,4 +1,4 @@
-"""The body of the endoscope bench: it rests, turns on a table, falls, is led through poses or is held.
+"""Moves the body of the endoscope bench: it rests, turns on a table, falls, is led through poses or is held.
 
 The scenarios are functions of time, so the motion does not depend on how often it is sampled. The exception is "led",
 where a caller sets the rotation of the body from time to time. World frame: z up, x to magnetic north. The specific
@@ -33,7 +33,7 @@ _LEVEL = np.eye(3)
 
 
 class Scanner:
-    """The plant of an endoscope bench; implements what ``sim_devices.world`` needs of a plant."""
+    """Simulates the plant of an endoscope bench, with the interface that ``sim_devices.world`` needs."""
 
     def __init__(self, config: EmulationConfig) -> None:
         self._config = config.endoscope or EndoscopeConfig()
@@ -85,7 +85,7 @@ class Scanner:
         }
 
     def truth(self) -> dict[str, NDArray]:
-        """Columns, one row per 10 ms: ``t_ns``, ``quaternion`` (n, 4), ``rate_rad_s`` (n, 3),
+        """Return columns with one row per 10 ms: ``t_ns``, ``quaternion`` (n, 4), ``rate_rad_s`` (n, 3),
         ``specific_force_m_s2`` (n, 3), ``temperature_C`` (n,)."""
         t_ns = np.arange(0, self.now_ns + 1, TRUTH_STEP_NS, dtype=np.int64)
         q, rate, force, warm = np.zeros((len(t_ns), 4)), np.zeros((len(t_ns), 3)), np.zeros((len(t_ns), 3)), t_ns * 0.0
@@ -132,7 +132,8 @@ class Scanner:
         return self._level, np.zeros(3), np.zeros(3), np.zeros(3)
 
     def _turntable(self, t_s: float) -> Pose:
-        """About the world's z: constant angular acceleration up to the rate, the body ``radius_m`` from the axis."""
+        """Turn about the world's z: constant angular acceleration up to the rate, the body ``radius_m`` from the
+        axis."""
         c = self._config
         full, since_s = math.radians(c.rate_dps), max(0.0, t_s - c.start_s)
         if since_s < c.ramp_s:
@@ -183,7 +184,7 @@ class Scanner:
         return turned, rates + accelerations * since_s, accelerations, np.zeros(3)
 
     def _hand(self, t_s: float) -> Pose:
-        """Slow voluntary sweeps and tremor: sums of sines, the same for the same seed."""
+        """Return slow voluntary sweeps and tremor: sums of sines that depend on the seed alone."""
         total = np.zeros((4, 3))
         for axis, omega, phase, radians, metres in self._waves:
             s, c = math.sin(omega * t_s + phase), math.cos(omega * t_s + phase)
@@ -195,7 +196,7 @@ class Scanner:
 
 
 def _waves(config: EndoscopeConfig, seed: int) -> list[tuple[int, float, float, float, float]]:
-    """(axis, rad/s, phase, angle rad, displacement m): four slow ones and two of tremor for each axis."""
+    """Return waves (axis, rad/s, phase, angle rad, displacement m): four slow ones and two of tremor for each axis."""
     rng = stream(seed, "scanner.hand")
     waves: list[tuple[int, float, float, float, float]] = []
     for axis in range(3):

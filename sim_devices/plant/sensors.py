@@ -1,4 +1,4 @@
-"""One set of sensors: what the seed drew, and what they put out.
+"""Computes the outputs of one set of sensors, whose errors the seed draws.
 
 ADXL-203 (data sheet: ratiometric, 1 V/g and 2.5 V at 5 V, 110 ug/rtHz, internal 32 kOhm against 0.33 uF), TMP36
 (0.5 V + 10 mV/degC), supply through a 2:1 divider, HMC-2003 (1 V/gauss, 2.5 V at zero field), DAQ inputs. Cross-axis
@@ -134,14 +134,15 @@ def sensor_unit(config: SensorConfig, instrument: InstrumentConfig, seed: int, s
 
 
 def field_gauss(config: EnvironmentConfig) -> Array:
-    """(3,) earth field in the world frame, gauss: x north, z up."""
+    """Return the earth field (3,) in gauss in the world frame: x north, z up."""
     dip = math.radians(config.dip_deg)
     return config.field_uT * 1e-2 * np.array([math.cos(dip), 0.0, -math.sin(dip)])
 
 
 @kernel
 def accelerometer_V(a, f, supply_V, temperature_C):
-    """Output before the RC, V, for the specific force ``f`` (3,) in m/s^2 at the sensor, body axes."""
+    """Return the output before the RC filter, in V, for the specific force ``f`` (3,) in m/s^2 at the sensor, body
+    axes."""
     g = 9.80665
     along = (a["axis"][0] * f[0] + a["axis"][1] * f[1] + a["axis"][2] * f[2]) / g
     other, across = f[a["in_plane"]] / g, f[a["out_of_plane"]] / g

@@ -1,4 +1,4 @@
-"""Smooth stationary noise with exact derivatives: white noise through three equal real poles.
+"""Makes smooth stationary noise with exact derivatives: white noise through three equal real poles.
 
     p''' = -L^3 p - 3 L^2 p' - 3 L p'' + L^3 u
 
@@ -24,7 +24,7 @@ CORRELATION_POLE = 2.904
 
 @dataclass(frozen=True)
 class SmoothNoise:
-    """One process of unit variance, made discrete for one step.
+    """Holds one process of unit variance, made discrete for one step.
 
     ``transition`` (3, 3) and ``drive`` (3,) move (p, p', p''): x <- transition x + drive u, u ~ N(0, 1).
     ``integral`` (3,) and ``integral_drive`` give the integral of p over the step. ``stationary`` (3, 3) is a factor

@@ -1,4 +1,4 @@
-"""A piezo stack and its amplifier channel.
+"""Simulates a piezo stack and its amplifier channel.
 
 Stack: generalised Maxwell slip in the voltage domain. The effective drive is y = u - sum w_k s_k, where each s_k is a
 spring in series with a slider: s_k' = u' while |s_k| is below its threshold, and above it the excess relaxes with a
@@ -75,7 +75,7 @@ DRIVE_STATE = np.dtype(
 
 @dataclass(frozen=True)
 class StackUnit:
-    """One physical stack: what the seed drew. Arrays (SLIPS,) over the slip elements."""
+    """Holds the parameters of one physical stack, which the seed draws. Arrays (SLIPS,) run over the slip elements."""
 
     stroke_m: float
     threshold_V: Array
@@ -90,7 +90,7 @@ class StackUnit:
 
 
 def stack_unit(config: StackConfig, seed: int, axis: int) -> StackUnit:
-    """The stack of ``axis`` (0, 1, 2)."""
+    """Return the stack of ``axis`` (0, 1, 2)."""
     rng = stream(seed, f"stack.{axis}")
     draw = rng.standard_normal(4)
     width_V = config.slip_limit_V / SLIPS
@@ -116,7 +116,8 @@ def stack_unit(config: StackConfig, seed: int, axis: int) -> StackUnit:
 
 @kernel
 def effective_drive(p, s, change_V, stack_V):
-    """y, V: moves the slip elements by ``change_V`` to the voltage ``stack_V`` within one step."""
+    """Return the effective drive y in V and move the slip elements by ``change_V`` to the voltage ``stack_V`` within
+    one step."""
     y = stack_V
     scale = 1.0 - p["slip_bias"] * (stack_V - 50.0) / 50.0
     slip, threshold, weight = s["slip_V"], p["threshold_V"], p["weight"]
@@ -137,7 +138,7 @@ def effective_drive(p, s, change_V, stack_V):
 
 @kernel
 def drive_step(p, s, demand_V, temperature_C):
-    """One step of amplifier and stack at a demand held over the step; the stroke is ``s["mode"][0]``, m."""
+    """Make one step of amplifier and stack at a demand (V) held over the step. The stroke is ``s["mode"][0]``, in m."""
     target = min(max(demand_V, p["low_V"]), p["high_V"])
     move = (target - s["amplifier_V"]) * p["lag"]
     slew = p["slew_step_V"]

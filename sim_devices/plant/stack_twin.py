@@ -51,7 +51,7 @@ class StackTwins:
             del times[:keep], volts[:keep]
 
     def strokes_m(self, t_ns: NDArray[np.int64], temperature_C: Array) -> Array:
-        """(n, 3) beyond neutral at each millisecond ``t_ns`` (n,) of the truth."""
+        """Return the strokes (n, 3) in m from neutral at each millisecond ``t_ns`` (n,) of the truth."""
         out = np.empty((t_ns.size, len(self._twins)))
         for i, twin in enumerate(self._twins):
             at = np.searchsorted(self._times_ns[i], t_ns, side="right") - 1
@@ -61,8 +61,8 @@ class StackTwins:
 
 
 def _stroke_m(twin: FileTwin, volts: Array, temperature_C: Array, begin_s: float) -> Array:
-    found = twin.run(MS_S, {"command": volts, "temperature": np.ascontiguousarray(temperature_C)}, begin_s)
-    return 1e-6 * found["displacement"]
+    response = twin.run(MS_S, {"command": volts, "temperature": np.ascontiguousarray(temperature_C)}, begin_s)
+    return 1e-6 * response["displacement"]
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""Named random streams: one seed, one physical unit, whatever else is drawn beside it."""
+"""Makes named random streams: one seed gives one physical unit, whatever else is drawn."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import numpy as np
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
-    """Generator for one purpose. Streams of different names are independent; adding one changes no other."""
+    """Return the generator for one purpose. Streams of different names are independent; adding one changes no other."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])

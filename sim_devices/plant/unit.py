@@ -21,7 +21,7 @@ _BOARD_S = 60.0
 
 @dataclass(frozen=True)
 class Unit:
-    """One instrument: what the seed drew."""
+    """Holds the parameters of one instrument, which the seed draws."""
 
     stacks: tuple[StackUnit, StackUnit, StackUnit]
     manipulator: ManipulatorUnit

@@ -25,7 +25,8 @@ def frame_ns(n_data: int, bitrate: int, *, extended: bool = False) -> int:
 
 
 class CanHub:
-    """Nodes and the host on one bus. A timed face: ``next_event_ns`` is the end of the frame on the wire."""
+    """Connects nodes and the host on one bus. It is a timed face: ``next_event_ns`` is the end of the frame on the
+    wire."""
 
     def __init__(self, bitrate: int) -> None:
         self.host: Callable[[int, bytes, int], None] | None = None

@@ -1,4 +1,5 @@
-"""A Unix stream socket on which other programs control an emulated world: one JSON object a line, one answer a line.
+"""Serves a Unix stream socket on which other programs control an emulated world: one JSON order and one answer per
+line.
 
 Orders are described in ``sim_devices.control`` and docs/emulate.md.
 """

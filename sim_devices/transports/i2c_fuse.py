@@ -46,7 +46,7 @@ class _IoVector(ctypes.Structure):
 
 
 class FuseI2cFile:
-    """The file system and its one file. ``serve`` returns when it is unmounted."""
+    """Serves a file system with one file. ``serve`` returns when it is unmounted."""
 
     def __init__(self, transfer: Transfer, folder: Path) -> None:
         self._transfer = transfer
@@ -139,7 +139,8 @@ class FuseI2cFile:
             raise OSError(errno.ENOTTY, "")
 
     def _read_write(self, pid: int, argument: int) -> None:
-        """struct i2c_rdwr_ioctl_data: pointer to messages of (u16 address, u16 flags, u16 length, pointer)."""
+        """Handle I2C_RDWR (struct i2c_rdwr_ioctl_data): pointer to messages of (u16 address, u16 flags, u16 length,
+        pointer)."""
         messages_at, n = struct.unpack_from("<QI", _peek(pid, argument, 16))
         if not 1 <= n <= MAX_MESSAGES:
             raise OSError(errno.EINVAL, "")
@@ -158,7 +159,7 @@ class FuseI2cFile:
         self._done = n
 
     def _smbus(self, address: int, pid: int, argument: int) -> None:
-        """struct i2c_smbus_ioctl_data: u8 read, u8 command, u32 size, pointer to a 34-byte union."""
+        """Handle I2C_SMBUS (struct i2c_smbus_ioctl_data): u8 read, u8 command, u32 size, pointer to a 34-byte union."""
         reads, command, size, at = struct.unpack("<BB2xIQ", _peek(pid, argument, 16))
         register = bytes((command,))
         if size == QUICK:
@@ -190,8 +191,8 @@ class FuseI2cFile:
 
 
 def _move(call: Callable[..., int], pid: int, address: int, buffer: ctypes.Array[ctypes.c_char], n: int) -> None:
-    here, there = _IoVector(ctypes.addressof(buffer), n), _IoVector(address, n)
-    if n and call(pid, ctypes.byref(here), 1, ctypes.byref(there), 1, 0) != n:
+    local, remote = _IoVector(ctypes.addressof(buffer), n), _IoVector(address, n)
+    if n and call(pid, ctypes.byref(local), 1, ctypes.byref(remote), 1, 0) != n:
         raise OSError(errno.EFAULT, "")
 
 

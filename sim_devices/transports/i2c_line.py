@@ -28,16 +28,17 @@ Transfer = Generator[int, None, TransferResult]
 
 
 class I2cLine:
-    """One bus with the devices on it. ``stuck`` is a fault hook: SDA held low, every transfer is a bus error."""
+    """Connects one bus with the devices on it. ``stuck`` is a fault hook: SDA held low, every transfer is a bus
+    error."""
 
     def __init__(self, speed_hz: int) -> None:
         self.faces: dict[int, I2cFace] = {}
         self.stuck = False
         self.transfers = 0
         self.busy_ns = 0
-        self.taken = False
+        self.is_busy = False
         self.busy_until_ns = 0
-        """Bench time in ns at which the current segment ends; ``taken`` is True while a transfer is in progress."""
+        """Bench time in ns at which the current segment ends; ``is_busy`` is True while a transfer is in progress."""
         self._bit_ns = 1e9 / speed_hz
 
     def attach(self, address: int, face: I2cFace) -> None:

@@ -38,7 +38,7 @@ class _Port:
         self._closed = True
 
     def unplug(self) -> None:
-        """Fault hook: the adapter is gone for good."""
+        """Remove the adapter for good (fault hook)."""
         self.unplugged = True
 
     def _refuse(self) -> NoReturn:
@@ -48,7 +48,8 @@ class _Port:
 
 
 class LockstepSerialPort(_Port):
-    """``hal`` SerialPort on a byte face. ``latency_ns`` passes between a device's packet and the waiting host."""
+    """Implements ``hal`` SerialPort on a byte face. ``latency_ns`` passes between a device's packet and the waiting
+    host."""
 
     def __init__(
         self,
@@ -104,7 +105,7 @@ class LockstepSerialPort(_Port):
 
 
 class LockstepI2cBus(_Port):
-    """``hal`` I2cBus on an ``I2cLine``; a transfer burns its bus time.
+    """Implements ``hal`` I2cBus on an ``I2cLine``. A transfer takes its bus time.
 
     The adapter drives the wire by itself: a transfer that has begun goes on when the host that waits for it stalls.
     Another master waits for its STOP.
@@ -119,9 +120,9 @@ class LockstepI2cBus(_Port):
             self._refuse()
         check_address(address, self._name)
         clock, line = self._clock, self._line
-        while line.taken:
+        while line.is_busy:
             clock.advance_to(line.busy_until_ns)
-        line.taken = True
+        line.is_busy = True
         steps = line.transfer(address, ops, clock.now_ns())
         results: list[TransferResult] = []
 
@@ -129,7 +130,7 @@ class LockstepI2cBus(_Port):
             try:
                 at_ns = next(steps)
             except StopIteration as done:
-                line.taken = False
+                line.is_busy = False
                 results.append(done.value)
             else:
                 line.busy_until_ns = at_ns
@@ -160,7 +161,7 @@ def i2c_error(status: I2cStatus, address: int, device: str) -> BusError:
 
 
 class LockstepCanBus(_Port):
-    """``hal`` CanBus: the host's controller on a ``CanHub``."""
+    """Implements ``hal`` CanBus: the host's controller on a ``CanHub``."""
 
     def __init__(self, name: str, hub: CanHub, clock: VirtualClock, on_activity: Callable[[], None]) -> None:
         super().__init__(name, clock, on_activity, "emulated CAN bus in virtual time")

@@ -23,7 +23,7 @@ READ_BYTES = 4096
 
 
 class PtyCarrier:
-    """One pty. ``path`` is what the host opens; ``fileno`` is for a selector and -1 when unplugged."""
+    """Carries bytes over one pty. The host opens ``path``; ``fileno`` is for a selector and -1 when unplugged."""
 
     def __init__(self, face: ByteFace) -> None:
         self._face = face

@@ -25,7 +25,7 @@ ADDRESS = "127.0.0.1"
 
 
 class TcpLine:
-    """A byte face with a TCP port in front: put it between a device and its pty carrier. ``port`` 0 is any free port.
+    """Puts a TCP port in front of a byte face, between a device and its pty carrier. ``port`` 0 is any free port.
 
     Raises ``BenchError`` when the port is taken.
     """
