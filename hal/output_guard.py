@@ -108,7 +108,7 @@ class OutputGuard:
         return [Told(*kept_ns[2 * p : 2 * p + 2], tuple(kept_V[n * p : n * p + n])) for p in places]
 
     def admit(self, values_V: Float64Array) -> int:
-        """Fill ``next_V`` from the wish; returns the mask of channels that were clipped or slew limited.
+        """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.
 
         Raises ``SafetyTrip`` when not armed, on a wrong number of values and on a value that is not finite.
         """

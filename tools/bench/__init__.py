@@ -1,4 +1,4 @@
-"""The bench page: a server of its own process that looks at a running firmware and passes orders on to it.
+"""Serves the bench page from a process of its own, which reads a running firmware and passes orders on to it.
 
 What lives here: session with the firmware, viewers, recordings, jobs, the page's files in ``static``; ``open_run``.
 What must not: anything that the loop could wait for.

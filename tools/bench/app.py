@@ -1,4 +1,4 @@
-"""The routes: a static page, one websocket, a few requests that change something."""
+"""Defines the routes: a static page, one websocket, and the requests that change something."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def catalogue() -> list[dict[str, Any]]:
 
 
 def core_routes(session: Session, access: Access) -> list[BaseRoute]:
-    """Page, websocket, firmware and recordings."""
+    """Return the routes of page, websocket, firmware and recordings."""
     viewers: set[Viewer] = set()
 
     async def page(_: Request) -> Response:
@@ -92,7 +92,7 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
 
 
 def make_app(session: Session, access: Access, more_routes: list[BaseRoute] | None = None) -> Guard:
-    """The application; the firmware starts and ends with it."""
+    """Return the application. The firmware starts and ends with it."""
 
     @contextlib.asynccontextmanager
     async def lifespan(_: Starlette) -> AsyncIterator[None]:

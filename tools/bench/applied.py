@@ -1,4 +1,5 @@
-"""What was laid over the bench file from the page: calibrations and a corrected twin, in a copy; one way back."""
+"""Keeps the calibrations and the corrected twin that the page applied, in a copy of the bench file; one step goes
+back."""
 
 from __future__ import annotations
 
@@ -16,7 +17,8 @@ TWIN = "corrected twin"
 
 
 class Applied:
-    """``original``: the bench file to go back to, None while nothing is applied. ``what``: in the order applied."""
+    """Holds what is applied, in order, and ``original``, the bench file to go back to (None while nothing is
+    applied)."""
 
     def __init__(self, session: Session) -> None:
         self._session = session

@@ -1,4 +1,4 @@
-"""A bench file with another calibration, or a corrected twin in it: a copy, the original stays as it is."""
+"""Makes a copy of a bench file with another calibration or a corrected twin. The original stays as it is."""
 
 from __future__ import annotations
 
@@ -51,12 +51,12 @@ def with_twin(bench: BenchFile, twin: Path, out: Path) -> Path:
 
 
 def _table_span(text: str) -> tuple[int, int]:
-    """Where the keys of ``[emulation]`` stand, from the end of its own line to the next table."""
-    found = _EMULATION.search(text)
-    if found is None:
+    """Return the span of the keys of ``[emulation]``, from the end of its own line to the next table."""
+    match = _EMULATION.search(text)
+    if match is None:
         raise BenchError("[emulation] must be a table of its own line to take a twin")
-    after = re.search(r"^\[", text[found.end() :], re.MULTILINE)
-    return found.end(), len(text) if after is None else found.end() + after.start()
+    after = re.search(r"^\[", text[match.end() :], re.MULTILINE)
+    return match.end(), len(text) if after is None else match.end() + after.start()
 
 
 def _calibrations(bench: BenchFile) -> list[str]:
@@ -67,7 +67,7 @@ def _calibrations(bench: BenchFile) -> list[str]:
 
 
 def _calibrated(bench: BenchFile, wanted: list[str]) -> str:
-    """The bench's text with these calibration files."""
+    """Return the bench's text with these calibration files."""
     firmware = bench.description.firmware
     if not wanted:
         return bench.text
@@ -76,7 +76,7 @@ def _calibrated(bench: BenchFile, wanted: list[str]) -> str:
     if "calibration" in firmware:
         text = _LIST.sub(lambda _: line, text, count=1)
     elif _TABLE.search(text):
-        text = _TABLE.sub(lambda found: f"{found.group()}\n{line}", text, count=1)
+        text = _TABLE.sub(lambda match: f"{match.group()}\n{line}", text, count=1)
     else:
         text = f"{text.rstrip()}\n\n[firmware]\n{line}\n"
     assert tomllib.loads(text)["firmware"]["calibration"] == wanted

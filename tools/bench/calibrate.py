@@ -29,7 +29,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 class Calibration:
-    """What was found and not yet applied."""
+    """Holds an identified calibration that is not yet applied."""
 
     def __init__(self, session: Session, jobs: Jobs, applied: Applied) -> None:
         self._session = session
@@ -91,13 +91,13 @@ class Calibration:
         t, value = t[good], value[good]
         if len(t) < 30:
             return {"t": t.tolist(), "temperature": value.tolist(), "text": "watching: a verdict needs ten seconds"}
-        found = await asyncio.to_thread(warm_up, t, value, TEMPERATURE_TOLERANCE_K)
-        last = "steady" if found.steady else "still warming up"
+        warm = await asyncio.to_thread(warm_up, t, value, TEMPERATURE_TOLERANCE_K)
+        last = "steady" if warm.steady else "still warming up"
         return {
             "t": t.tolist(),
             "temperature": value.tolist(),
-            "steady": found.steady,
-            "text": f"{last}: {found.remaining:+.2f} K to come, {found.tolerance:g} K allowed",
+            "steady": warm.steady,
+            "text": f"{last}: {warm.remaining:+.2f} K to come, {warm.tolerance:g} K allowed",
         }
 
     async def apply(self, request: Request) -> Any:

@@ -26,7 +26,7 @@ TILT_RAD = math.pi / 180.0
 
 
 def open_card(bench: OpenBench) -> MotionCard:
-    """The first motion card of the bench, probed."""
+    """Open and probe the first motion card of the bench."""
     description = bench.file.description
     name, spec = next(iter(description.devices_with("motion_card").items()))
     options: MotionCardOptions = check_devices(description, str(bench.file.path))[name]
@@ -37,7 +37,7 @@ def open_card(bench: OpenBench) -> MotionCard:
 
 
 class Tilt:
-    """Roll and pitch, degrees."""
+    """Estimates roll and pitch, in degrees."""
 
     def __init__(self) -> None:
         self.angles: tuple[float, float] | None = None

@@ -34,8 +34,8 @@ MOST_NOTES_BYTES = 1 << 20
 
 
 def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
-    """Recordings in ``folder``, newest first; the one being written is marked."""
-    found: list[dict[str, Any]] = []
+    """Return the recordings in ``folder``, newest first. The one that is being written is marked."""
+    recordings: list[dict[str, Any]] = []
     files = sorted(
         (p for p in folder.glob(f"*{SUFFIX}") if is_own_file(p)), key=lambda p: p.stat().st_mtime, reverse=True
     )
@@ -45,7 +45,7 @@ def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
         if is_own_file(sidecar):
             table = _notes(sidecar)
         status = path.stat()
-        found.append(
+        recordings.append(
             {
                 "name": path.stem,
                 "bytes": status.st_size,
@@ -57,11 +57,11 @@ def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
                 "problem": table.get("problem", ""),
             }
         )
-    return found
+    return recordings
 
 
 def _notes(sidecar: Path) -> dict[str, Any]:
-    """What was noted beside a recording; a stranger's file may hold anything."""
+    """Return the notes beside a recording. A file of unknown origin may hold anything."""
     try:
         if sidecar.stat().st_size > MOST_NOTES_BYTES:
             raise ValueError("too long")
@@ -107,8 +107,8 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
             values = data[:-1].astype(np.float32)
         low[:, first:stop] = np.fmin(low[:, first:stop], np.fmin.reduceat(values, starts, axis=1))
         high[:, first:stop] = np.fmax(high[:, first:stop], np.fmax.reduceat(values, starts, axis=1))
-        begun = (row + starts) % k == 0
-        t_s[first:stop][begun] = data[-1, starts[begun]]
+        is_first = (row + starts) % k == 0
+        t_s[first:stop][is_first] = data[-1, starts[is_first]]
         row += n
         if status is not None:
             holds.follow(block.data[index[-1]], block.data[status])
@@ -147,8 +147,8 @@ def collect_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
     async def recordings(_: Request) -> Any:
         now = recorder.name if recorder.active else ""
         formats = [[ending, known.readers] for ending, known in FORMATS.items()]
-        found = await asyncio.to_thread(listing, recorder.folder, now)  # reads the notes of up to 500 files
-        return {"folder": str(recorder.folder), "recordings": found, "formats": formats}
+        recordings = await asyncio.to_thread(listing, recorder.folder, now)  # reads the notes of up to 500 files
+        return {"folder": str(recorder.folder), "recordings": recordings, "formats": formats}
 
     async def start(request: Request) -> Any:
         table = await body(request)

@@ -1,4 +1,4 @@
-"""Data files dropped into the Mismatch view: kept aside, described by a person, written as a recording folder."""
+"""Handles data files dropped into the Mismatch view: a person describes them, then they become a recording folder."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ async def run_module(*arguments: str) -> str:
         env=child_environment(),
     )
     try:
-        out, said = await asyncio.wait_for(process.communicate(), READ_S)
+        out, stderr = await asyncio.wait_for(process.communicate(), READ_S)
     except BaseException as error:
         process.kill()
         await process.wait()
@@ -65,21 +65,21 @@ async def run_module(*arguments: str) -> str:
             raise InputError(f"the file was not read within {READ_S:.0f} s; cut it into parts") from None
         raise
     if process.returncode:
-        lines = said.decode(errors="replace").strip().splitlines()
+        lines = stderr.decode(errors="replace").strip().splitlines()
         raise InputError(lines[-1] if lines else f"the file could not be read (status {process.returncode})")
     return out.decode()
 
 
-def parameter_value(name: str, said: str) -> Any:
+def parameter_value(name: str, text_value: str) -> Any:
     """Return the value that a person typed: a number, a list, a table, true, or a word. ``InputError`` otherwise."""
     try:
-        table = tomllib.loads(f"value = {said}")
+        table = tomllib.loads(f"value = {text_value}")
         if list(table) == ["value"]:
             return table["value"]
     except tomllib.TOMLDecodeError:
-        if _WORD.fullmatch(said):
-            return said
-    raise InputError(f"parameter {name}: {said!r} is no number, list or word; write numbers as 2.1")
+        if _WORD.fullmatch(text_value):
+            return text_value
+    raise InputError(f"parameter {name}: {text_value!r} is no number, list or word; write numbers as 2.1")
 
 
 def files_of(session: Session, kind: str) -> dict[str, Path]:
@@ -108,18 +108,18 @@ def description(table: dict[str, Any], data: str) -> dict[str, Any]:
             raise InputError(f"other parameters: {line.strip()!r} is not a new name = value; write one a line")
         typed[key.strip()] = said
     parameters = {key: parameter_value(key, said.strip()) for key, said in typed.items()}
-    found: dict[str, Any] = {"format": 1, "title": text(table, "title", longest=200) or data, "data": data}
+    descriptor: dict[str, Any] = {"format": 1, "title": text(table, "title", longest=200) or data, "data": data}
     if clock := text(table, "time_column", longest=200):
-        found["time_column"] = clock
+        descriptor["time_column"] = clock
     rate = table.get("rate_hz")
     if rate is not None:
         if isinstance(rate, bool) or not isinstance(rate, int | float) or not 0 < rate < 1e9:
             raise InputError("the rate must be a number of samples per second")
-        found["rate_hz"] = float(rate)
+        descriptor["rate_hz"] = float(rate)
     elif not clock:
         raise InputError("say which column is the time, or give the rate")
-    found["twin"] = {"kind": kind, "parameters": parameters}
-    found["channels"] = []
+    descriptor["twin"] = {"kind": kind, "parameters": parameters}
+    descriptor["channels"] = []
     for channel in channels:
         one: dict[str, Any] = {k: text(channel, k, longest=200) for k in ("column", "role", "signal", "unit")}
         if not one["unit"]:
@@ -127,8 +127,8 @@ def description(table: dict[str, Any], data: str) -> dict[str, Any]:
         noise = channel.get("noise_rms")
         if isinstance(noise, int | float) and not isinstance(noise, bool):
             one["noise_rms"] = float(noise)
-        found["channels"].append(one)
-    return found
+        descriptor["channels"].append(one)
+    return descriptor
 
 
 def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:

@@ -27,7 +27,7 @@ STOP_S = 15.0
 
 @dataclass(frozen=True)
 class Choice:
-    """What to run."""
+    """Holds the choices of a run."""
 
     bench: Path
     hand_file: str | None = None
@@ -104,10 +104,12 @@ class Firmware:
             with contextlib.suppress(ValueError):
                 on_line(json.loads(line))
         await process.wait()
-        told = (await errors).decode(errors="replace").strip()
+        stderr = (await errors).decode(errors="replace").strip()
         outcome_file = self.runtime_dir / "outcome.json"
         outcome = json.loads(outcome_file.read_text(encoding="utf-8")) if outcome_file.exists() else None
-        last = told.splitlines()[-1].removeprefix("micron: ") if told else f"it ended with code {process.returncode}"
+        last = (
+            stderr.splitlines()[-1].removeprefix("micron: ") if stderr else f"it ended with code {process.returncode}"
+        )
         on_end(outcome, "" if outcome is not None else last)
 
     def order(self, order: str, **values: Any) -> bool:
@@ -120,7 +122,7 @@ class Firmware:
         return True
 
     def metadata(self) -> dict[str, Any]:
-        """For recordings of this run; empty before the devices are open."""
+        """Return the metadata for recordings of this run. It is empty before the devices are open."""
         path = self.runtime_dir / "metadata.json"
         return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
 
@@ -139,7 +141,7 @@ class Firmware:
         await reader
 
     def close(self) -> None:
-        """After ``stop``: give memory and folder back."""
+        """Release memory and folder. Call it after ``stop``."""
         import shutil
 
         self.memory.close()

@@ -1,4 +1,4 @@
-"""Who may ask and who may change something: an ASGI layer in front of everything.
+"""Decides which requests may read and which may change something, as an ASGI layer in front of everything.
 
 * The Host must be one that the server listens on (a foreign name that resolves to this machine is refused).
 * A request with an Origin must come from the page itself.
@@ -37,18 +37,19 @@ POLICY = (
 
 @dataclass(frozen=True)
 class Access:
-    """``hosts``: what the Host header may say, with port. ``open_reading``: looking needs no token (loopback)."""
+    """Holds the rules: ``hosts`` lists allowed Host headers with port; with ``open_reading``, reading needs no token
+    (loopback)."""
 
     token: str
     hosts: frozenset[str]
     open_reading: bool
 
     def knows(self, token: str | None) -> bool:
-        """Whether that is the token; takes the same time for every wrong one."""
+        """Return True for the right token. Every wrong one takes the same time."""
         return token is not None and hmac.compare_digest(token.encode(), self.token.encode())
 
     def same_origin(self, origin: str | None) -> bool:
-        """Whether a page of this server asks; programs that are not browsers send no Origin."""
+        """Return True if a page of this server asks. Programs that are not browsers send no Origin."""
         return origin is None or origin.partition("://")[2] in self.hosts
 
 
@@ -61,7 +62,7 @@ class _TooSlow(Exception):
 
 
 class Guard:
-    """The layer."""
+    """Checks every request before the application sees it."""
 
     def __init__(self, app: ASGIApp, access: Access) -> None:
         self._app = app
@@ -151,7 +152,7 @@ async def _refuse(status: int, why: str, scope: Scope, receive: Receive, send: S
 
 
 async def _whole_body(receive: Receive) -> bytes:
-    """The body, at most ``MAX_BODY_BYTES``. ``_TooLarge`` and ``_TooSlow`` where a limit is passed."""
+    """Return the body, at most ``MAX_BODY_BYTES``. Raises ``_TooLarge`` or ``_TooSlow`` beyond a limit."""
     parts: list[bytes] = []
     size = 0
     try:

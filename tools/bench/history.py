@@ -1,4 +1,4 @@
-"""The last minutes of every column, and smallest and largest value per pixel of any part of them.
+"""Keeps the last minutes of every column, and returns the smallest and largest value per pixel of any part of them.
 
 Rows are numbered from the start of the run. Bucket ``b`` of ``k`` rows holds rows ``b k`` to ``(b + 1) k - 1``: the
 grid does not move with the window, so what is drawn does not shimmer, and no row is ever left out.
@@ -21,7 +21,8 @@ BLOCK = 16
 
 
 class Buckets(NamedTuple):
-    """Buckets ``first`` to ``first + n - 1``: time of the first row of each [n] s, extremes [channels, n]."""
+    """Holds buckets ``first`` to ``first + n - 1``: the time of their first rows (n,) in s and extremes (channels,
+    n)."""
 
     first: int
     per_bucket: int
@@ -37,7 +38,7 @@ def rows_per_bucket(rows: float, pixels: int) -> int:
 
 
 class _Ring:
-    """``depth`` columns-by-entries, numbered for ever; the oldest are overwritten."""
+    """Keeps the newest ``depth`` entries of every column. Their numbers never repeat; the oldest are overwritten."""
 
     def __init__(self, n_columns: int, depth: int) -> None:
         self.depth = depth
@@ -45,7 +46,7 @@ class _Ring:
         self._data = np.zeros((n_columns, depth), dtype=np.float32)
 
     def append(self, values: Float32Array) -> None:
-        """``values`` [columns, n], n at most ``depth``."""
+        """Append ``values`` (columns, n), n at most ``depth``."""
         n = values.shape[1]
         start = self.head % self.depth
         fits = min(n, self.depth - start)
@@ -58,7 +59,7 @@ class _Ring:
         return max(0, self.head - self.depth)
 
     def take(self, channels: NDArray[np.intp], first: int, stop: int) -> Float32Array:
-        """Entries ``first`` to ``stop - 1`` of ``channels``, contiguous."""
+        """Return entries ``first`` to ``stop - 1`` of ``channels`` as a contiguous array (channels, entries)."""
         a, n = first % self.depth, stop - first
         fits = min(n, self.depth - a)
         part = self._data[channels, a : a + fits]
@@ -80,7 +81,7 @@ class History:
 
     @property
     def head(self) -> int:
-        """Rows that were ever added."""
+        """Return the number of rows that were ever added."""
         return self._fine.head
 
     @property
@@ -94,7 +95,7 @@ class History:
         return float(self._fine_t[(self.head - 1) % self._fine.depth]) if self.head else 0.0
 
     def append(self, rows: Float64Array) -> None:
-        """Add ``rows`` [n, columns]; more than the fine level holds is added in parts."""
+        """Add ``rows`` (n, columns). More rows than the fine level holds are added in parts."""
         step = self._fine.depth // 2
         for start in range(0, len(rows), step):
             self._append(rows[start : start + step])

@@ -20,7 +20,7 @@ NEAR_S = 2.0
 
 @dataclass
 class HoldSpan:
-    """One hold, from ``from_s`` until ``to_s`` (None: it lasts). ``cause`` is empty until somebody has said it."""
+    """Holds one hold, from ``from_s`` until ``to_s`` (None while it lasts). ``cause`` is empty until it is known."""
 
     from_s: float
     to_s: float | None = None
@@ -33,7 +33,7 @@ class HoldSpans:
     def __init__(self) -> None:
         self.spans: deque[HoldSpan] = deque(maxlen=MOST_SPANS)
         self._cause = ""
-        self._told: list[tuple[float, str]] = []
+        self._causes: list[tuple[float, str]] = []
 
     @property
     def current(self) -> HoldSpan | None:
@@ -68,11 +68,11 @@ class HoldSpans:
     def name_by_outcome(self, holds: Iterable[Mapping[str, Any]]) -> None:
         """Take causes from the ``holds`` of a run's outcome, for spans whose cause no status told: a hold that is over
         before its rows are read. Its rows may come afterwards."""
-        self._told = [(float(hold["t_s"]), str(hold["cause"])) for hold in holds]
+        self._causes = [(float(hold["t_s"]), str(hold["cause"])) for hold in holds]
         self._name_by_time()
 
     def _name_by_time(self) -> None:
-        for t_s, cause in self._told:
+        for t_s, cause in self._causes:
             _name_nearest(self.spans, t_s, cause)
 
     def as_list(self) -> list[dict[str, Any]]:

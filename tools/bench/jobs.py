@@ -87,7 +87,7 @@ class Job:
                 os.killpg(self._process.pid, signal.SIGTERM)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page."""
+        """Return the JSON values that the page shows."""
         return {
             "kind": self.kind,
             "title": self.title,
@@ -102,7 +102,7 @@ class Job:
 
 
 class Jobs:
-    """The newest job of each kind; only one runs at a time, since each takes a processor."""
+    """Keeps the newest job of each kind. One job runs at a time, because each takes a processor."""
 
     def __init__(self) -> None:
         self._root = Path(tempfile.mkdtemp(prefix="micron-jobs-"))
@@ -110,7 +110,7 @@ class Jobs:
         self._number = 0
 
     def new_folder(self) -> Path:
-        """For the files of the next job."""
+        """Return a new folder for the files of the next job."""
         self._number += 1
         folder = self._root / str(self._number)
         folder.mkdir()
@@ -132,7 +132,7 @@ class Jobs:
                 raise InputError(f"'{job.title}' is still running; wait for it or cancel it")
 
     def get(self, kind: str) -> Job:
-        """The newest of that kind. ``InputError`` when there is none."""
+        """Return the newest job of that kind. Raises ``InputError`` when there is none."""
         if kind not in self._jobs:
             raise InputError(f"no {kind} was run yet")
         return self._jobs[kind]
@@ -141,7 +141,7 @@ class Jobs:
         return self._jobs[kind].as_dict() if kind in self._jobs else {"kind": kind, "state": "none"}
 
     def file(self, kind: str, name: str) -> Path:
-        """A file that the job left. ``InputError`` when it did not."""
+        """Return a file that the job wrote. Raises ``InputError`` when it wrote none."""
         folder = self.get(kind).folder
         path = folder / Path(name).name
         if not path.is_file():

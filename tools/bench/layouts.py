@@ -45,7 +45,7 @@ def checked_name(name: str) -> str:
 
 
 class Layouts:
-    """The layouts in ``folder``, one file each; the folder is made with the first one."""
+    """Keeps layouts in ``folder``, one file each. The first layout makes the folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

@@ -1,4 +1,4 @@
-"""How much one client may hold of the server before it has asked for anything.
+"""Limits the connections and half-sent requests that one client may hold.
 
 A connection costs a place from its first byte on, and half a request is no request: uvicorn waits for the rest for
 ever and counts it against everybody. Here a head has ``HEAD_S``, and only so many connections may be without a request

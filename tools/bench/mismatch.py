@@ -1,4 +1,4 @@
-"""Requests of the Mismatch view: a recording, its twin, the engine in a process of its own, report, corrected twin."""
+"""Answers requests of the Mismatch view: it runs the engine in a process of its own and serves report and twin."""
 
 from __future__ import annotations
 
@@ -90,13 +90,13 @@ def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[Base
         return jobs.start("difference", "both benches in virtual time", steps, work).as_dict()
 
     async def difference(_: Request) -> Any:
-        """Figures on the emulated truth, without and with the corrected twin; those that are there."""
+        """Return the available figures on the emulated truth, without and with the corrected twin."""
         job = jobs.state("difference")
-        found: dict[str, Any] = {"job": job}
+        result: dict[str, Any] = {"job": job}
         for name in ("before", "after"):
             if f"{name}.json" in job.get("files", ()):
-                found[name] = figures(jobs.file("difference", f"{name}.json"))
-        return found
+                result[name] = figures(jobs.file("difference", f"{name}.json"))
+        return result
 
     return [
         Route("/api/mismatch", clear(recordings)),

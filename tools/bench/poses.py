@@ -25,7 +25,7 @@ INPUTS = 8
 
 
 def at_nominal_supply(rows: NDArray[np.float64], sensing: Mapping[str, Any]) -> NDArray[np.float64]:
-    """(n, 6) volts of the axes from ``rows`` (n, 9): eight inputs and the supply, V, each the mean of a pose.
+    """Return volts (n, 6) of the axes from ``rows`` (n, 9): eight inputs and the supply, V, each the mean of a pose.
 
     The sensors are ratiometric, and the calibration file speaks of the nominal supply. ``sensing``: the firmware's
     sensing stage, for the inputs of the axes. ``InputError`` for rows or benches that do not fit.
@@ -42,7 +42,8 @@ def at_nominal_supply(rows: NDArray[np.float64], sensing: Mapping[str, Any]) -> 
 
 
 def identify(means_V: NDArray[np.float64], gravity_m_s2: float) -> dict[str, Any]:
-    """``means_V`` (n, 6) volts, one row per pose. ``InputError`` for too few poses or too similar ones."""
+    """Identify the axes from ``means_V`` (n, 6), one row per pose. Raises ``InputError`` for too few or too similar
+    poses."""
     if means_V.ndim != 2 or means_V.shape[1] != len(AXES) or len(means_V) < MIN_POSES:
         raise InputError(f"at least {MIN_POSES} poses of 6 voltages are needed, these are {means_V.shape}")
     if not np.isfinite(means_V).all():

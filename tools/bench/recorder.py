@@ -1,4 +1,4 @@
-"""Recordings made from the page: rows of the live memory, handed to the firmware's own recorder process.
+"""Makes recordings from the page: it hands rows of the live memory to the firmware's own recorder process.
 
 The firmware is not involved and the browser neither: the server feeds the recorder until somebody says stop.
 """
@@ -39,7 +39,7 @@ def is_own_file(path: Path) -> bool:
 
 
 class RunRecorder:
-    """At most one recording at a time, in ``folder``."""
+    """Makes one recording at a time, in ``folder``."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -104,7 +104,7 @@ class RunRecorder:
             self._recorder.event({"event": name, "reason": reason, "t_ns": t_ns})
 
     def trouble(self) -> str:
-        """What is wrong with the running recording, in words; empty when nothing is."""
+        """Return what is wrong with the running recording as text, empty when nothing is."""
         if self._recorder is None:
             return ""
         stats = self._recorder.stats()
@@ -118,7 +118,7 @@ class RunRecorder:
         return f"{lost} rows were lost" if lost else ""
 
     def state(self) -> dict[str, Any] | None:
-        """For the page; None when nothing is recorded."""
+        """Return the JSON values for the page, or None when nothing is recorded."""
         if self._recorder is None:
             return None
         stats = self._recorder.stats()
@@ -131,7 +131,7 @@ class RunRecorder:
         }
 
     async def stop(self, final: dict[str, Any]) -> dict[str, Any]:
-        """Finish the file."""
+        """Stop the recording and finish the file."""
         recorder = self._recorder
         if recorder is None:
             raise InputError("no recording is running")

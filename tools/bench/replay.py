@@ -47,10 +47,10 @@ class RecordedHistory:
         self.missing = [name for name in _NAMES if name not in names]
         if len(self.missing) > len(_NAMES) - 2:  # t alone is everybody's
             self._recording.close()
-            shown = ", ".join(names[:6])
+            some_names = ", ".join(names[:6])
             raise InputError(
-                f"{path.name} is a recording of another instrument: none of its columns ({shown} ...) is one of this "
-                "page's channels. Export it, and drop the csv into Mismatch"
+                f"{path.name} is a recording of another instrument: none of its columns ({some_names} ...) is a "
+                "channel of this page. Export it, and drop the csv into Mismatch"
             )
         self._column = np.array([names.index(name) if name in names else -1 for name in _NAMES])
         self.rate_hz = _rate_of(self._recording.metadata.get("tick_hz"))
@@ -135,10 +135,10 @@ class RecordedHistory:
         return low, high
 
 
-def _rate_of(said: Any) -> float:
+def _rate_of(value: Any) -> float:
     """Return the ticks per second that a recording states; 1000 where it states none."""
     try:
-        rate_hz = float(said)
+        rate_hz = float(value)
     except (TypeError, ValueError):
         return 1000.0
     return rate_hz if 1.0 <= rate_hz <= 1e5 else 1000.0
@@ -153,7 +153,7 @@ def _fill_single_gaps(values: NDArray[np.float32]) -> None:
 
 
 class Recorded:
-    """One opened recording and the process that reads its overview."""
+    """Holds one opened recording and the process that reads its overview."""
 
     def __init__(self, path: Path) -> None:
         self.name = path.stem
@@ -180,14 +180,14 @@ class Recorded:
     async def _follow(self, process: asyncio.subprocess.Process) -> None:
         assert process.stdout is not None
         assert process.stderr is not None
-        said = asyncio.create_task(process.stderr.read())
+        stderr = asyncio.create_task(process.stderr.read())
         async for line in process.stdout:
-            told = json.loads(line)
-            if "ready" in told:
-                self.history.use_overview(self._folder / EXTREMES, told["ready"])
-            if told.get("done"):
+            message = json.loads(line)
+            if "ready" in message:
+                self.history.use_overview(self._folder / EXTREMES, message["ready"])
+            if message.get("done"):
                 self.spans = json.loads((self._folder / SPANS).read_text(encoding="utf-8"))
-        words = (await said).decode(errors="replace").strip()
+        words = (await stderr).decode(errors="replace").strip()
         if await process.wait() > 0:
             self.error = words.splitlines()[-1] if words else f"{self.name}: its overview could not be read"
 
@@ -267,7 +267,7 @@ class Replay:
             await old.close()
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page."""
+        """Return the JSON values that the page shows."""
         first, second = self.first, self.second
         return {
             "type": "replay",

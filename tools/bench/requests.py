@@ -1,4 +1,4 @@
-"""What every request handler needs: its JSON, and bad input as one line."""
+"""Reads the JSON of a request and reports bad input as one line."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def clear(handler: Callable[[Request], Awaitable[Any]]) -> Handler:
 
 
 async def body(request: Request) -> dict[str, Any]:
-    """The JSON object of a request; ``InputError`` when it is none."""
+    """Return the JSON object of a request. Raises ``InputError`` when it is none."""
     try:
         value = json.loads(await request.body() or b"{}")
     except (ValueError, RecursionError):
@@ -41,7 +41,7 @@ async def body(request: Request) -> dict[str, Any]:
 
 
 def text(table: dict[str, Any], key: str, default: str = "", longest: int = 2000) -> str:
-    """A text of the request."""
+    """Return a text of the request."""
     value = table.get(key, default)
     if not isinstance(value, str) or len(value) > longest:
         raise InputError(f"{key} must be a text of at most {longest} characters")

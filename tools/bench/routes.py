@@ -1,4 +1,4 @@
-"""Requests of the single views, joined."""
+"""Joins the requests of the single views."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from tools.errors import InputError
 
 
 def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
-    """Everything besides the core."""
+    """Return the routes of the views, without those of the core."""
     applied = Applied(session)
     return [
         *_attitude(session, applied),

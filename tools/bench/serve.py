@@ -27,7 +27,7 @@ MAX_MESSAGE_BYTES = 65_536
 
 
 def bind(address: str, port: int) -> socket.socket:
-    """A listening socket, ``port`` 0 for any. ``InputError`` when that cannot be."""
+    """Return a listening socket (``port`` 0: any free port). Raises ``InputError`` when it cannot listen."""
     try:
         family = socket.AF_INET6 if ipaddress.ip_address(address).version == 6 else socket.AF_INET
     except ValueError:
@@ -44,7 +44,7 @@ def bind(address: str, port: int) -> socket.socket:
 
 
 def access_for(address: str, port: int, token: str, names: tuple[str, ...] = ()) -> Access:
-    """On loopback looking is free, elsewhere it is not. ``names``: further host names that may be used."""
+    """Return the access rules: reading is free on loopback only. ``names`` are further host names that may be used."""
     loopback = ipaddress.ip_address(address).is_loopback
     hosts = {address if ":" not in address else f"[{address}]", *names}
     if loopback:
@@ -62,7 +62,7 @@ def _own_addresses() -> set[str]:
 
 
 def config_for(app: Guard) -> uvicorn.Config:
-    """How uvicorn serves the page."""
+    """Return the settings with which uvicorn serves the page."""
     return uvicorn.Config(
         app,
         http=BoundedHttp,  # has its own limits; uvicorn's would refuse orders, too
@@ -116,8 +116,8 @@ def serve(
 
         for number in (signal.SIGINT, signal.SIGTERM):
             loop.add_signal_handler(number, leave, number)
-        shown = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
-        announce(f"http://{shown if ':' not in shown else f'[{shown}]'}:{port}/#token={token}")
+        host = address if not ipaddress.ip_address(address).is_unspecified else socket.gethostname()
+        announce(f"http://{host if ':' not in host else f'[{host}]'}:{port}/#token={token}")
         try:
             await server.serve(sockets=[sock])
         finally:

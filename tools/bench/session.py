@@ -1,4 +1,4 @@
-"""What the server knows and does: one firmware, its history, one recording, the viewers' orders."""
+"""Runs one firmware for the page, with its history, one recording and the viewers' orders."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ STATUS_S = 0.1
 DISK_S = 2.0
 STALE_S = 0.25
 OPERATOR = "the operator"
-"""What a hold of the firmware waits for when only a person is missing (``firmware_py.run.holds``)."""
+"""Text of a hold that waits only for a person (``firmware_py.run.holds``)."""
 DISK_LOW_BYTES = 2 << 30
 DISK_LOW_SHARE = 0.03
 
@@ -61,7 +61,7 @@ class Disk:
 
 @dataclass
 class Run:
-    """One life of a firmware, as far as it has told. ``phase``: starting, running, safe, ended, failed."""
+    """Holds the reported state of one firmware process. ``phase`` is starting, running, safe, ended or failed."""
 
     phase: str = "starting"
     reason: str = ""
@@ -201,33 +201,34 @@ class Session:
         self.log.append({"n": self.log_number, "time": time.time(), "level": level, "text": text})
 
     def stale_s(self) -> float:
-        """How long no row has come."""
+        """Return the seconds since the last row."""
         return time.monotonic() - self._fresh_s
 
     def alerts(self) -> list[dict[str, str]]:
-        """What must be said at once, in words; the worst first."""
-        run, found = self.run, list[tuple[str, str]]()
+        """Return the alerts as texts, the worst first."""
+        run, alerts = self.run, list[tuple[str, str]]()
         if run.phase == "starting":
-            found.append(("info", "Starting. The first start on a machine compiles, one to three minutes."))
+            alerts.append(("info", "Starting. The first start on a machine compiles, one to three minutes."))
         elif run.phase == "failed":
-            found.append(("error", self._failure()))
+            alerts.append(("error", self._failure()))
         elif run.phase == "ended":
-            found.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
+            alerts.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
         elif run.phase == "safe":
             kind = "info" if run.normal else "error"
-            found.append((kind, f"Safe state, outputs at neutral: {run.reason}."))
+            alerts.append((kind, f"Safe state, outputs at neutral: {run.reason}."))
         elif run.phase == "running" and self.stale_s() > STALE_S:
-            found.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
+            alerts.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
         if ticks := run.status.get("fallbacks", 0):
-            found.append(("warn", f"Kinematics: {ticks} ticks fell back to the other solution."))
+            alerts.append(("warn", f"Kinematics: {ticks} ticks fell back to the other solution."))
         if self.disk.low:
-            found.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
+            alerts.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
         if self.recorder.active and self.recorder.trouble():
-            found.append(("error", f"Recording: {self.recorder.trouble()}"))
-        return [*self._hold_alert(), *({"kind": kind, "text": text} for kind, text in found)]
+            alerts.append(("error", f"Recording: {self.recorder.trouble()}"))
+        return [*self._hold_alert(), *({"kind": kind, "text": text} for kind, text in alerts)]
 
     def _failure(self) -> str:
-        """What to do after a firmware that told no outcome depends on whether its outputs were driven."""
+        """Return the alert for a firmware that ended without an outcome. It depends on whether its outputs were
+        driven."""
         if not self.run.status:
             return f"The firmware did not start: {self.run.reason}"
         return (
@@ -246,7 +247,7 @@ class Session:
         return [{"kind": "warn", "text": text, **({"order": "rearm"} if hold["waits_for"] == OPERATOR else {})}]
 
     def state(self) -> dict[str, Any]:
-        """The status message of the page."""
+        """Return the status message of the page."""
         run, memory = self.run, self.firmware.memory if self.firmware is not None else None
         timing: dict[str, list[float]] = {}
         if memory is not None:
@@ -291,19 +292,19 @@ class Session:
         return self._frame_buckets[key]
 
     def counts(self) -> dict[str, dict[str, list[int]]]:
-        """The non-empty buckets of every histogram, for drawing: lower bounds and widths in ns, counts."""
+        """Return the non-empty buckets of every histogram: lower bounds and widths in ns, counts."""
         from firmware_py.scheduler.histogram import bucket_bounds_ns
 
         firmware = self.firmware
         if firmware is None:
             return {}
-        found: dict[str, dict[str, list[int]]] = {}
+        buckets: dict[str, dict[str, list[int]]] = {}
         for index, name in enumerate(self.run.histograms):
             counts = firmware.memory.histogram(index).counts()
             used = np.flatnonzero(counts)
             bounds = [bucket_bounds_ns(int(i)) for i in used]
-            found[name] = {"ns": [b[0] for b in bounds], "w": [b[1] for b in bounds], "n": counts[used].tolist()}
-        return found
+            buckets[name] = {"ns": [b[0] for b in bounds], "w": [b[1] for b in bounds], "n": counts[used].tolist()}
+        return buckets
 
     # -- rows -----------------------------------------------------------------------------------------------
 
@@ -356,7 +357,7 @@ class Session:
             self.shadow = await make_shadow(self.metadata(), method)
 
     def metadata(self) -> dict[str, Any]:
-        """Of the running firmware; empty when there is none."""
+        """Return the metadata of the running firmware, empty when there is none."""
         return self.firmware.metadata() if self.firmware is not None else {}
 
     # -- recording ------------------------------------------------------------------------------------------
@@ -367,7 +368,7 @@ class Session:
         self.note("info", f"recording {self.recorder.name}")
 
     async def stop_recording(self) -> dict[str, Any]:
-        """What became of it."""
+        """Stop the recording and return its result."""
         summary = await self.recorder.stop(self.run.outcome or {})
         level = "error" if summary["problem"] or summary["dropped"] else "info"
         self.note(level, f"recorded {summary['name']}: {summary['ticks']} ticks, {summary['dropped']} dropped")

@@ -1,4 +1,4 @@
-"""Requests of the Setup view: what is plugged in, a draft of a bench file, its check, and trying it out."""
+"""Answers requests of the Setup view: connected hardware, a draft of a bench file, its check, and a trial run."""
 
 from __future__ import annotations
 
@@ -37,20 +37,20 @@ def found_uris(emulated: bool) -> dict[str, dict[str, str]]:
 
     Serial ports are known by their USB descriptors: nothing is sent to them. The emulated bench has buses as well.
     """
-    found: dict[str, dict[str, str]] = {"serial": {}, "i2c": {}, "can": {}}
+    ports: dict[str, dict[str, str]] = {"serial": {}, "i2c": {}, "can": {}}
     products = {port.path: port.product for port in serial_ports()}
     for port in machine_ports():
         if "/i2c-" in port:
-            found["i2c"][f"linux-i2c://{port.rpartition('-')[2]}"] = ""
+            ports["i2c"][f"linux-i2c://{port.rpartition('-')[2]}"] = ""
         elif port.startswith("/sys/class/net/"):
-            found["can"][f"socketcan://{Path(port).name}"] = ""
+            ports["can"][f"socketcan://{Path(port).name}"] = ""
         else:
-            found["serial"][f"serial://{port}"] = products.get(port, "")
+            ports["serial"][f"serial://{port}"] = products.get(port, "")
     if emulated:
-        found["serial"] |= {"sim://daq0": "emulated DI-4108", "sim://e7270": "emulated E-727"}
-        found["i2c"] |= {"sim://i2c0": "emulated", "sim://i2c1": "emulated"}
-        found["can"]["sim://can0"] = "emulated"
-    return found
+        ports["serial"] |= {"sim://daq0": "emulated DI-4108", "sim://e7270": "emulated E-727"}
+        ports["i2c"] |= {"sim://i2c0": "emulated", "sim://i2c1": "emulated"}
+        ports["can"]["sim://can0"] = "emulated"
+    return ports
 
 
 def setup_routes(session: Session) -> list[BaseRoute]:

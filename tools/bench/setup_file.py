@@ -18,7 +18,7 @@ from tools.errors import InputError
 
 AXES = ("1x", "1z", "2y", "2z", "3x", "3y")
 PLACES = (*AXES, "supply", "temperature")
-"""What the inputs of the converter are for; axes as in the drawing of the instrument."""
+"""Uses of the converter's inputs. The axes are those of the drawing of the instrument."""
 INPUTS = 8
 _URIS = {
     "daq0": r"serial:///dev/[\w./:+-]+|sim://daq0",
@@ -46,8 +46,9 @@ OUTPUTS = {  # what people call it, its bus, s from a sample to what the command
 
 @dataclass(frozen=True)
 class Draft:
-    """A bench as a person described it. ``inputs``: the converter's input of each of ``PLACES``. Addresses on I2C are
-    None for a part that the bench lacks. ``cards``: names of NI cards for "daq" and "output", where they are some."""
+    """Holds a bench as a person described it. ``inputs`` is the converter's input of each of ``PLACES``. Addresses on
+    I2C are None for a part that the bench lacks. ``cards``: names of NI cards for "daq" and "output", where they are
+    some."""
 
     name: str
     uris: dict[str, str]
@@ -115,16 +116,16 @@ def _address(table: dict[str, Any], part: str) -> int | None:
 def _inputs(given: Any) -> dict[str, int]:
     if not isinstance(given, dict):
         raise InputError("say which input is which axis")
-    found: dict[str, int] = {}
+    inputs: dict[str, int] = {}
     for place in PLACES:
         value = given.get(place)
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < INPUTS:
             raise InputError(f"{place} has no input; drag one of the {INPUTS} to it")
-        if value in found.values():
-            other = next(p for p, v in found.items() if v == value)
+        if value in inputs.values():
+            other = next(p for p, v in inputs.items() if v == value)
             raise InputError(f"input {value} is both {other} and {place}; each input is for one")
-        found[place] = value
-    return found
+        inputs[place] = value
+    return inputs
 
 
 STILL_TIP = (

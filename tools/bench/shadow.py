@@ -1,5 +1,5 @@
-"""Another attitude filter beside the one that flies: the same raw inputs through a second sensing stage, here in the
-server, so that two filters can be looked at side by side without the firmware knowing."""
+"""Runs another attitude filter beside that of the firmware: the same raw inputs through a second sensing stage, here in
+the server, so that two filters can be looked at side by side without the firmware knowing."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ MAX_ROWS = 200
 
 
 class Shadow:
-    """One further attitude filter."""
+    """Runs one further attitude filter."""
 
     def __init__(self, config: SensingConfig) -> None:
         self.method = config.attitude_method
@@ -34,7 +34,7 @@ class Shadow:
         self._frame[:] = 0.0
 
     def follow(self, rows: NDArray[np.float64]) -> None:
-        """Take ``rows`` [n, columns] of the running firmware."""
+        """Filter ``rows`` (n, columns) of the running firmware."""
         for row in rows[-MAX_ROWS:]:
             self._frame[:VOLTS] = row[:VOLTS]
             self._frame[STATUS] = int(row[STATUS]) & _GIVEN_BITS
@@ -42,12 +42,12 @@ class Shadow:
 
     @property
     def quaternion(self) -> list[float]:
-        """Scalar first, body to world."""
+        """Return the attitude as a quaternion (4,), scalar first, body to world."""
         return self._frame[QUATERNION : QUATERNION + 4].tolist()
 
 
 async def make_shadow(metadata: dict[str, Any], method: str) -> Shadow:
-    """A shadow of the running firmware with another ``method``. ``InputError`` when that is none."""
+    """Return a shadow of the running firmware with another ``method``. Raises ``InputError`` for an unknown method."""
     if method not in METHODS:
         raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(METHODS)}")
     if not metadata:

@@ -13,7 +13,7 @@ from hal.children import child_command, child_environment
 
 @contextmanager
 def started(*options: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """Process of ``micron bench`` with ``options``, and the address that it printed, token included."""
+    """Start ``micron bench`` with ``options``. Yield its process and the address that it printed, with the token."""
     server = subprocess.Popen(
         child_command("tools.cli.main", "bench", "--port", "0", *options),
         stderr=subprocess.PIPE,

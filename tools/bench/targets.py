@@ -1,5 +1,5 @@
-"""The targeting experiment on the page: the firmware's state machine, driven by the pointer that a browser reports or
-by the motion card of an endoscope bench, read in a process of its own."""
+"""Runs the targeting experiment on the page: the firmware's state machine, driven by the pointer that a browser reports
+or by the motion card of an endoscope bench, read in a process of its own."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAX_ANGLE_DEG = 180.0
 
 
 class Game:
-    """One run of one user. ``read_clock_s`` returns seconds that never run backwards."""
+    """Runs the experiment once for one user. ``read_clock_s`` returns seconds that never run backwards."""
 
     def __init__(self, config: GameConfig, user: str, folder: Path, read_clock_s: Callable[[], float]) -> None:
         self.user = check_name(user or "user")
@@ -46,13 +46,13 @@ class Game:
         return self._read_clock_s() - self._started_s
 
     def pointer(self, psi_deg: float, theta_deg: float, pressed: bool) -> None:
-        """What the mouse says; angles that are no angles are dropped."""
+        """Take angles from the mouse. Values that are not finite are dropped."""
         if all(math.isfinite(v) and abs(v) <= MAX_ANGLE_DEG for v in (psi_deg, theta_deg)):
             self.state = self._game.step((psi_deg, theta_deg), pressed, self._now_s())
             self._keep_report()
 
     def card(self, psi_deg: float, theta_deg: float, status: int, use: bool) -> None:
-        """What the motion card says."""
+        """Take a sample of the motion card."""
         self.state = self._game.step_card((psi_deg, theta_deg), status, self._now_s(), use=use)
         self._keep_report()
 
@@ -64,11 +64,11 @@ class Game:
             write_text_atomic(self._report, report_csv(self.user, self.result()))
 
     def result(self) -> dict[str, Any]:
-        """The experiment so far."""
+        """Return the experiment so far."""
         return experiment(self._game)
 
     def as_dict(self) -> dict[str, Any]:
-        """For the page; the whole result once it is done."""
+        """Return the JSON values for the page, with the whole result once it is done."""
         c = self._game.config.control
         table: dict[str, Any] = {**self.state.as_dict(), "user": self.user, "screen": [c.width_px, c.height_px]}
         table["tolerance_px"] = self._game.config.tolerance_px
@@ -88,7 +88,7 @@ class CardReader:
 
     @classmethod
     async def start(cls, bench: Path, on_sample: Callable[[dict[str, Any]], None]) -> CardReader:
-        """``InputError`` for a bench without a motion card."""
+        """Start a game. Raises ``InputError`` for a bench without a motion card."""
         if not load_bench(bench).description.devices_with("motion_card"):
             raise InputError(f"{bench} has no motion_card; choose a bench like endoscope.toml")
         process = await asyncio.create_subprocess_exec(
@@ -106,9 +106,9 @@ class CardReader:
         async for line in self._process.stdout:
             with contextlib.suppress(ValueError):
                 on_sample(json.loads(line))
-        told = (await self._process.stderr.read()).decode(errors="replace").strip()
+        stderr = (await self._process.stderr.read()).decode(errors="replace").strip()
         if await self._process.wait() > 0:
-            self.error = told.splitlines()[-1] if told else "the motion card's reader ended"
+            self.error = stderr.splitlines()[-1] if stderr else "the motion card's reader ended"
 
     async def stop(self) -> None:
         if self._process.returncode is None:
@@ -154,7 +154,7 @@ class Targets:
             self.game.pointer(psi_deg, theta_deg, pressed)
 
     def as_dict(self) -> dict[str, Any] | None:
-        """For the page; None when nothing is played."""
+        """Return the JSON values for the page, or None when nothing is played."""
         if self.game is None:
             return None
         error = self._reader.error if self._reader is not None else ""

@@ -1,4 +1,4 @@
-"""One open page: what it subscribed to, what it may order, and what it is sent.
+"""Serves one open page: its subscriptions, its orders and its messages.
 
 A viewer that does not read is waited for by its own task alone; when it reads again it gets the present, not the
 past. A viewer that talks nonsense is cut off.
@@ -29,7 +29,7 @@ from tools.errors import InputError
 
 MAX_SUBSCRIPTIONS = 6
 SHOWN, SECOND, LIVE = 0, 1, 2
-"""What a subscription follows: what the page shows (live or a replay), the run laid over it, or the bench itself."""
+"""Source of a subscription: the view of the page (live or a replay), the run laid over it, or the bench itself."""
 MAX_CHANNELS = 64
 MAX_PIXELS = 8192
 MAX_NONSENSE = 100
@@ -46,8 +46,8 @@ class Nonsense(ValueError):
 
 @dataclass
 class Subscription:
-    """``next_bucket``: the first that the viewer does not have for good; None: it has nothing yet. ``sent_rows``: rows
-    of the history when it was sent something last."""
+    """Holds one subscription. ``next_bucket`` is the first that the viewer does not have for good (None: it has nothing
+    yet). ``sent_rows``: rows of the history when it was sent something last."""
 
     id: int
     channels: NDArray[np.intp]
@@ -112,7 +112,8 @@ class Viewer:
         self._opening = asyncio.Lock()
 
     async def serve(self) -> None:
-        """Both directions; the first that ends takes the other with it. An armed viewer that goes away is disarmed."""
+        """Serve both directions. The first that ends also ends the other. An armed viewer that goes away is
+        disarmed."""
         await self._socket.accept()
         tasks = [asyncio.create_task(self._receive()), asyncio.create_task(self._send())]
         try:
@@ -187,7 +188,7 @@ class Viewer:
         self._subscriptions[number] = Subscription(number, _channels(message), rows, k, _source(message))
 
     async def _range(self, message: dict[str, Any]) -> None:
-        """A part of the past, once; a later request replaces an earlier one that was not sent yet."""
+        """Send a part of the past once. A later request replaces an earlier one that is not sent yet."""
         first, stop = int(_number(message, "first", 0, 1e15)), int(_number(message, "stop", 0, 1e15))
         k = rows_per_bucket(max(1, stop - first), int(_number(message, "pixels", 1, MAX_PIXELS)))
         number = int(_number(message, "id", 0, 1e9))

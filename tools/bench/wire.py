@@ -1,4 +1,4 @@
-"""The binary form of a frame of the page: little endian, every array at a multiple of eight bytes.
+"""Encodes a frame of the page in binary form: little endian, every array at a multiple of eight bytes.
 
 0  uint32 kind (1)      4  uint32 subscription      8  uint32 channels c      12 uint32 buckets n
 16 uint32 rows a bucket 20 uint32 flags (1: no high part, it equals low)      24 float64 first bucket
@@ -17,7 +17,7 @@ FLAG_SINGLE = 1
 
 
 def encode(buckets: Buckets, subscription: int) -> bytes:
-    """One message."""
+    """Return one message as bytes."""
     single = buckets.per_bucket == 1
     channels, n = buckets.low.shape
     header = HEADER.pack(

@@ -1,4 +1,5 @@
-"""Calibration files: TOML, format = 1, a table per stage, as ``[firmware] calibration`` of a bench names them."""
+"""Writes calibration files (TOML, format = 1, one table per stage), which ``[firmware] calibration`` of a bench
+names."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ def _value(value: Any) -> str:
 
 
 def calibration_toml(title: str, made_by: str, stages: Mapping[str, Mapping[str, Any]]) -> str:
-    """The text of a calibration file."""
+    """Return the text of a calibration file."""
     lines = ["format = 1", f"title = {json.dumps(title)}", f"made_by = {json.dumps(made_by)}"]
     for stage, table in stages.items():
         lines += ["", f"[{stage}]"]

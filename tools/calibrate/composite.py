@@ -27,7 +27,8 @@ UNKNOWN = Estimate(0.0, -np.inf, np.inf)
 
 @dataclass(frozen=True)
 class AxisFit:
-    """One axis: parameters with 95 % intervals (``s_*`` in V/g, the others as in ``SensingConfig``), residual rms V.
+    """Holds the fit of one axis: parameters with 95 % intervals (``s_*`` in V/g, the others as in ``SensingConfig``),
+    residual rms V.
 
     ``linear_rms_V``: of bias, scale and direction alone. ``held_out_rms_V``: every fifth pose, from the others.
     ``drift``: change of the bias in V from the first pose to the last; an infinite interval: the poses cannot show it.
@@ -55,7 +56,7 @@ class AxisFit:
 
 @dataclass(frozen=True)
 class CompositeFit:
-    """All axes, and the directions of gravity that no pose showed."""
+    """Holds the fits of all axes, and the directions of gravity that no pose covers."""
 
     axes: tuple[AxisFit, ...]
     poses: int
@@ -79,10 +80,10 @@ def _fit(volts: Array, force: Array, y: Array, z: Array, when: Array, free: list
         x[free] = p
         return _forward(x, force, y, z, when) - volts
 
-    found = least_squares(residual, start[free], method="lm", xtol=1e-14, ftol=1e-14)
+    solution = least_squares(residual, start[free], method="lm", xtol=1e-14, ftol=1e-14)
     x = start.copy()
-    x[free] = found.x
-    return x, np.asarray(found.jac)
+    x[free] = solution.x
+    return x, np.asarray(solution.jac)
 
 
 def fit_composite(
@@ -107,26 +108,26 @@ def fit_composite(
     when = np.linspace(-0.5, 0.5, n)
     design = np.column_stack([np.ones(n), force])
     # poses that run from one pole to the other cannot tell a drift from the axis along which they run
-    shown = float(np.linalg.cond(np.column_stack([design, when]))) < LARGEST_CONDITION
-    if fit_drift and not shown:
+    is_determined = float(np.linalg.cond(np.column_stack([design, when]))) < LARGEST_CONDITION
+    if fit_drift and not is_determined:
         raise InputError("the poses follow gravity so regularly that a drift does not show; take them in another order")
     model = list(range(8 if quadratic else 4))
-    free = [*model, 8] if shown else model
+    free = [*model, 8] if is_determined else model
     lines = np.linalg.lstsq(design, volts, rcond=None)[0]
     bias, scale = lines[0], np.linalg.norm(lines[1:], axis=0)
     if np.any(scale == 0.0) or np.linalg.cond(design) > LARGEST_CONDITION:
         raise InputError(f"{n} poses do not turn gravity through all axes; missing: {', '.join(missing) or 'variety'}")
-    found: list[tuple[Array, Array]] = []
+    fits: list[tuple[Array, Array]] = []
     for _ in range(3):  # the neighbours' lines come from the same fit
         reading = (volts - bias) / scale
-        found = [
+        fits = [
             _fit(volts[:, i], force, reading[:, in_plane[i]], reading[:, out_of_plane[i]], when, free) for i in range(k)
         ]
-        bias, scale = np.array([x[0] for x, _ in found]), np.array([np.linalg.norm(x[1:4]) for x, _ in found])
+        bias, scale = np.array([x[0] for x, _ in fits]), np.array([np.linalg.norm(x[1:4]) for x, _ in fits])
     reading = (volts - bias) / scale
     kept = np.arange(n) % 5 != 4
     axes = []
-    for i, (x, jacobian) in enumerate(found):
+    for i, (x, jacobian) in enumerate(fits):
         y, z = reading[:, in_plane[i]], reading[:, out_of_plane[i]]
         intervals, condition = _intervals(x, jacobian, volts[:, i] - _forward(x, force, y, z, when), free)
         if condition > LARGEST_CONDITION:
@@ -134,7 +135,7 @@ def fit_composite(
                 f"axis {i}: condition number {condition:.0f}; the poses do not tell its parameters apart "
                 f"(missing: {', '.join(missing) or 'poses between the axes'})"
             )
-        drift = intervals.pop(DRIFT) if shown else UNKNOWN
+        drift = intervals.pop(DRIFT) if is_determined else UNKNOWN
         if not fit_drift:
             x, jacobian = _fit(volts[:, i], force, y, z, when, model)
             intervals, condition = _intervals(x, jacobian, volts[:, i] - _forward(x, force, y, z, when), model)

@@ -41,7 +41,7 @@ class Ellipsoid:
 
 
 def _algebraic(raw: Array) -> tuple[Array, Array]:
-    """Centre and shape: x^T M x + 2 n^T x = 1 by least squares about the middle."""
+    """Return centre and shape of x^T M x + 2 n^T x = 1 by least squares about the middle."""
     x, y, z = raw.T
     design = np.stack([x * x, y * y, z * z, 2 * x * y, 2 * x * z, 2 * y * z, 2 * x, 2 * y, 2 * z], axis=1)
     p, *_ = np.linalg.lstsq(design, np.ones(len(raw)), rcond=None)

@@ -20,7 +20,7 @@ from tools.errors import InputError
 Array = NDArray[np.float64]
 LEAST_POSES = 12
 STILL = 0.02
-"""How far |f| may be from its median: beyond, the body is accelerated."""
+"""Largest deviation of |f| from its median. Beyond it the body is accelerated."""
 LARGEST_CONDITION = 100.0
 
 
@@ -36,7 +36,8 @@ class BodyTurn:
 
 
 def fit_turn(field: Array, force: Array) -> BodyTurn:
-    """From calibrated field (n, 3) and force (n, 3) of any unit. ``InputError`` when the log does not show the turn."""
+    """Fit the turn from calibrated field (n, 3) and force (n, 3) in any unit. Raises ``InputError`` when the log lacks
+    it."""
     size = np.linalg.norm(force, axis=1)
     still = np.abs(size - np.median(size)) < STILL * np.median(size)
     if np.sum(still) < LEAST_POSES:
@@ -62,23 +63,24 @@ def fit_turn(field: Array, force: Array) -> BodyTurn:
     values = np.degrees(fit.x[:3])
     dip = float(np.degrees(np.arcsin(np.clip(-fit.x[3], -1.0, 1.0))))
     slant = max(1e-3, float(np.sqrt(max(0.0, 1.0 - fit.x[3] ** 2))))
-    found = {
+    estimates = {
         f"turn_{axis}_deg": Estimate(float(v), float(v - r), float(v + r))
         for axis, v, r in zip("xyz", values, np.degrees(reach[:3]), strict=True)
     }
     wide = float(np.degrees(reach[3] / slant))
-    found["dip_deg"] = Estimate(dip, dip - wide, dip + wide)
-    return BodyTurn(Rotation.from_rotvec(fit.x[:3]).as_matrix(), found, scale, condition, len(left))
+    estimates["dip_deg"] = Estimate(dip, dip - wide, dip + wide)
+    return BodyTurn(Rotation.from_rotvec(fit.x[:3]).as_matrix(), estimates, scale, condition, len(left))
 
 
 def _slope(function, x: Array) -> Array:  # pyright: ignore[reportMissingParameterType]
-    """(n, 4) derivative by central differences, without the loss function's weights."""
+    """Return the derivative (n, 4) by central differences, without the weights of the loss function."""
     step = 1e-6
     return np.stack([(function(x + d) - function(x - d)) / (2.0 * step) for d in step * np.eye(4)], axis=1)
 
 
 def strap(set_raw: Array, reset_raw: Array) -> tuple[Array, tuple[Estimate, ...]]:
-    """Outputs (n, 3) free of the bridge's offset, and that offset: a reset pulse turns the sign of all but it."""
+    """Return outputs (n, 3) without the bridge's offset, and the offset (3,): a reset pulse reverses everything but the
+    offset."""
     sums = 0.5 * (set_raw + reset_raw)
     mean, error = sums.mean(axis=0), sums.std(axis=0, ddof=1) / np.sqrt(len(sums))
     reach = float(student.ppf(0.975, len(sums) - 1)) * error

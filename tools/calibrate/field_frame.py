@@ -22,7 +22,8 @@ NOMINAL_V_PER_UT = 0.01
 
 @dataclass(frozen=True)
 class FieldFrame:
-    """``bias`` V and ``matrix`` V/uT (3, 3) with 95 % intervals; ``offset_V`` of the bridge if pulses were recorded."""
+    """Holds ``bias`` (V) and ``matrix`` (3, 3) (V/uT) with 95 % intervals, and ``offset_V`` if reset pulses were
+    recorded."""
 
     bias: tuple[Estimate, ...]
     matrix: Array
@@ -39,7 +40,8 @@ def _mean(values: Array) -> Estimate:
 
 
 def fit_field(attitude: Array, set_V: Array, reset_V: Array | None = None) -> FieldFrame:
-    """``attitude`` (n, 3, 3) body to world; outputs (n, 3) after a set and, if recorded, after a reset pulse."""
+    """Fit bias and matrix from ``attitude`` (n, 3, 3), body to world, and outputs (n, 3) in V after set and reset
+    pulses."""
     offset = None
     volts = set_V
     if reset_V is not None:

@@ -51,7 +51,7 @@ class GyroscopeFit:
 
 
 def rate_matrix(p: Array) -> Array:
-    """(3, 3) T K from ``p`` (9,)."""
+    """Return the matrix T K (3, 3) from ``p`` (9,)."""
     turn = np.array([[1.0, -p[0], p[1]], [p[2], 1.0, -p[3]], [-p[4], p[5], 1.0]])
     return turn * p[6:]
 
@@ -60,7 +60,8 @@ def rate_matrix(p: Array) -> Array:
 def turned_gravity(
     raw: Array, bounds: NDArray[np.int64], bias: Array, matrix: Array, dt_s: float, up: Array, out: Array
 ) -> None:
-    """``out`` (n, 3): ``up`` (n, 3) of the start of a turn, as the body sees it at its end; ``raw`` (m, 3) counts."""
+    """Fill ``out`` (n, 3) with ``up`` (n, 3) of the start of a turn, as the body sees it at its end; ``raw`` (m, 3)
+    counts."""
     q, c, rate, before = np.empty(4), np.empty((3, 3)), np.empty(3), np.empty(3)
     for k in range(len(bounds)):
         q[:] = 0.0
@@ -142,7 +143,7 @@ def fit_gyroscope(
     freedom = max(1, 2 * len(start) - 9)  # a direction has two angles
     sigma2 = float(fit.fun @ fit.fun) / freedom
     reach = float(student.ppf(0.975, freedom)) * unit * np.sqrt(np.diag(sigma2 * np.linalg.pinv(fit.jac.T @ fit.jac)))
-    found = {
+    estimates = {
         name: Estimate(float(v), float(v - r), float(v + r))
         for name, v, r in zip(NAMES, fit.x * unit, reach, strict=True)
     }
@@ -150,9 +151,9 @@ def fit_gyroscope(
     mean = weight @ rest
     spread = float(student.ppf(0.975, len(rest) - 1)) * np.sqrt(weight @ (rest - mean) ** 2 / (len(rest) - 1))
     for axis, b, r in zip("xyz", mean, spread, strict=True):
-        found[f"bias_{axis}"] = Estimate(float(b), float(b - r), float(b + r))
+        estimates[f"bias_{axis}"] = Estimate(float(b), float(b - r), float(b + r))
     angle = float(np.sqrt(np.mean(np.sum(fit.fun.reshape(-1, 3) ** 2, axis=1))))
-    return GyroscopeFit(found, angle, condition, len(start), saturated, accelerometer)
+    return GyroscopeFit(estimates, angle, condition, len(start), saturated, accelerometer)
 
 
 def _first_scale(raw: Array, bounds: NDArray[np.int64], bias: Array, start: Array, end: Array, dt_s: float) -> float:

@@ -1,4 +1,4 @@
-"""A recording of the whole instrument as calibrated readings: made by ``micron run``, or volts from the lab.
+"""Reads a recording of the whole instrument as calibrated readings: from ``micron run``, or volts from the lab.
 
 Volts (``analog_V_0`` ... and ``magnetometer_V_0`` ..., or ``volts_0`` ... and ``magnetometer_raw_x`` ... of a run) pass
 the firmware's own calibration with the bench's numbers.
@@ -44,7 +44,7 @@ def calibrate_rows(counts, field_V, params, smoothed, frame, readings, field):
 
 
 def bench_sensing(path: Path) -> SensingConfig:
-    """What the firmware of a bench computes its readings with. ``BenchError`` names what is wrong with the file."""
+    """Return the sensing configuration of a bench's firmware. ``BenchError`` names the fault in the file."""
     bench = load_bench(path)
     scan = next(iter(bench.description.devices_with("di4108", "nidaqmx")), None)
     if scan is None:
@@ -63,7 +63,7 @@ def calibrated_log(log: SensorLog, bench: Path) -> SensorLog:
 
 
 def instrument_readings(log: SensorLog, config: SensingConfig) -> tuple[Array, Array]:
-    """Readings (n, N) m/s^2 and field (n, 3) uT. ``InputError`` when the log is no recording of this instrument."""
+    """Return readings (n, N) in m/s^2 and field (n, 3) in uT. Raises ``InputError`` for a log of another instrument."""
     for analog, magnet in (
         (tuple(f"analog_V_{i}" for i in range(INPUTS)), tuple(f"magnetometer_V_{i}" for i in range(3))),
         (tuple(f"volts_{i}" for i in range(INPUTS)), tuple(f"magnetometer_raw_{axis}" for axis in XYZ)),

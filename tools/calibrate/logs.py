@@ -58,7 +58,7 @@ class SensorLog:
 
 
 def what_there_is(columns: Collection[str], most: int = 16) -> str:
-    """For a message: the names, the first of them where there are many."""
+    """Return the names as text for a message, only the first ones where there are many."""
     more = f" and {len(columns) - most} more" if len(columns) > most else ""
     return f"there are: {', '.join(list(columns)[:most])}{more}"
 
@@ -99,7 +99,7 @@ def load_log(path: Path, rate_hz: float | None = None) -> SensorLog:
 
 
 def _find(path: Path) -> tuple[Path, Path | None]:
-    """The data file and its descriptor."""
+    """Return the data file and its descriptor."""
     if path.is_dir():
         for name in ("recording.toml", "meta.toml"):
             if (path / name).is_file():

@@ -32,8 +32,9 @@ NAMES += ("mount_x_deg", "mount_y_deg", "mount_z_deg")
 
 @dataclass(frozen=True)
 class ManipulatorFit:
-    """``table`` for [actuation] of a calibration; ``parameters`` with 95 % intervals; residuals of the tip um, per axis
-    (x, y, z of the body), and what the geometry before the fit left."""
+    """Holds ``table`` for [actuation] of a calibration and ``parameters`` with 95 % intervals.
+
+    The residuals of the tip are in um per axis (x, y, z of the body), after the fit and with the geometry before it."""
 
     table: dict[str, Any]
     parameters: dict[str, Estimate]
@@ -97,8 +98,8 @@ def identify_manipulator(data: dict[str, Array], start: ActuationConfig | None =
         return (e - e.mean(axis=0)).ravel()
 
     scale = np.array([1.0, 10.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.5, 0.5, 0.5])
-    found: Any = least_squares(residuals, p0, x_scale=scale, method="lm")
-    jacobian = np.asarray(found.jac) * scale
+    solution: Any = least_squares(residuals, p0, x_scale=scale, method="lm")
+    jacobian = np.asarray(solution.jac) * scale
     singular = np.linalg.svd(jacobian, compute_uv=False)
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0.0 else float("inf")
     if condition > 1e5:
@@ -107,10 +108,10 @@ def identify_manipulator(data: dict[str, Array], start: ActuationConfig | None =
             "also against each other"
         )
     free = tip.size - len(p0) - 3
-    sigma = np.sqrt(2.0 * found.cost / free)
+    sigma = np.sqrt(2.0 * solution.cost / free)
     spread = scale * np.sqrt(np.diag(np.linalg.inv(jacobian.T @ jacobian))) * sigma
     width = float(student.ppf(0.975, free)) * spread
-    p: Array = np.asarray(found.x)
+    p: Array = np.asarray(solution.x)
     before, after = residuals(p0).reshape(-1, 3), residuals(p).reshape(-1, 3)
     return ManipulatorFit(
         table=_table(p),
@@ -153,5 +154,5 @@ def _weak(tip: Array, width: Array) -> tuple[str, ...]:
 
 
 def manipulator_calibration(fit: ManipulatorFit, title: str) -> str:
-    """Calibration file for the firmware."""
+    """Return the calibration file for the firmware."""
     return calibration_toml(title, "micron calibrate manipulator", {"actuation": fit.table})

@@ -1,4 +1,4 @@
-"""Calibration of a three-axis accelerometer from poses at unknown angles (Tedaldi, Pretto, Menegatti, ICRA 2014).
+"""Calibrates a three-axis accelerometer from poses at unknown angles (Tedaldi, Pretto, Menegatti, ICRA 2014).
 
 a = T K (raw - b), T = [[1, -t0, t1], [0, 1, -t2], [0, 0, 1]], and |a| = g in every still pose. Nine parameters, so nine
 poses at least; x keeps its direction. Ten poses hardly tell the misalignments: there a maker's limits
@@ -29,7 +29,7 @@ MISALIGNMENT_RAD = 0.02
 
 @dataclass(frozen=True)
 class Estimate:
-    """``value`` with its 95 % interval."""
+    """Holds ``value`` with its 95 % interval."""
 
     value: float
     low: float
@@ -57,13 +57,13 @@ class MultiPosition:
 
 
 def compensate(p: Array, raw: Array) -> Array:
-    """(n, 3) m/s^2; ``p`` (9,) in the order of ``NAMES``."""
+    """Return accelerations (n, 3) in m/s^2. ``p`` (9,) is in the order of ``NAMES``."""
     turn = np.array([[1.0, -p[0], p[1]], [0.0, 1.0, -p[2]], [0.0, 0.0, 1.0]])
     return ((raw - p[6:]) * p[3:6]) @ turn.T
 
 
 def missing_poses(directions: Array) -> tuple[str, ...]:
-    """Which of the six axis directions no pose (unit rows, body frame) comes within 35 degrees of."""
+    """Return the axis directions (of six) that no pose (unit rows, body frame) comes within 35 degrees of."""
     missing = []
     for axis, name in enumerate("xyz"):
         for sign, word in ((1.0, "up"), (-1.0, "down")):
@@ -133,8 +133,8 @@ def identify_poses(raw: Array, rate_hz: float, gravity: float, shortest_s: float
     level = quiet_level(raw, window)
     if level <= 0.0:
         raise InputError("the log does not change at all: is it the right column?")
-    found = [find_poses(raw, window, factor * level, max(3, round(shortest_s * rate_hz))) for factor in FACTORS]
-    most = max(len(poses.mean) for poses in found)
+    candidates = [find_poses(raw, window, factor * level, max(3, round(shortest_s * rate_hz))) for factor in FACTORS]
+    most = max(len(poses.mean) for poses in candidates)
     fits = [
         fit_poses(
             poses.mean,
@@ -143,7 +143,7 @@ def identify_poses(raw: Array, rate_hz: float, gravity: float, shortest_s: float
             poses.threshold,
             pose_noise=level / np.sqrt(3.0 * np.median(poses.samples)),
         )
-        for poses in found
+        for poses in candidates
         if len(poses.mean) >= max(9, 0.75 * most)
     ]
     if not fits:

@@ -138,8 +138,8 @@ def _lag(pieces: list[Piece], shape: Shape, centre_V: float) -> tuple[list[Piece
         solution, _ = fit(few, shape, axes, [])
         return float(np.mean([np.var(residual(p, shape, axes, solution)) for p in few]))
 
-    found: Any = minimize_scalar(misfit, bounds=(0.0, MAX_LAG_S), method="bounded", options={"xatol": 2e-5})
-    lag_s = float(found.x)
+    minimum: Any = minimize_scalar(misfit, bounds=(0.0, MAX_LAG_S), method="bounded", options={"xatol": 2e-5})
+    lag_s = float(minimum.x)
     if misfit(0.0) < 1.04 * misfit(lag_s):
         lag_s = 0.0
     return shifted(lag_s), Dynamics(delay_s=lag_s)
@@ -159,7 +159,7 @@ def rates_of(pieces: list[Piece], shape: Shape, centre_V: float) -> list[Piece]:
 
 
 def rate_of(x: Array, dt: float) -> Array:
-    """|dx/dt| by backward difference, Ang 2004 (7.16)."""
+    """Return |dx/dt| (n,) by backward difference (Ang 2004, eq. 7.16)."""
     return np.abs(np.diff(x, prepend=x[0])) / dt
 
 
@@ -200,12 +200,12 @@ def _select(
         candidate = replace(shape, **change)
         if candidate == shape:
             continue
-        found = score(candidate)
-        better = found[2] < LEAST_GAIN * best
-        tried.append((name, found[2], better))
+        scored = score(candidate)
+        better = scored[2] < LEAST_GAIN * best
+        tried.append((name, scored[2], better))
         if better:
             shape = candidate
-            axes, solution, best = found
+            axes, solution, best = scored
     return shape, axes, solution, best, tuple(tried)
 
 
@@ -276,12 +276,12 @@ def _report(
 
 
 def feedforward_of(fits: Sequence[PiezoFit], tick_hz: float = 1000.0) -> Feedforward:
-    """Taps and preview of these stacks for a firmware of ``tick_hz``."""
+    """Return taps and preview of these stacks for a firmware of ``tick_hz``."""
     return for_tip([fit.answer for fit in fits], 1.0 / tick_hz)
 
 
 def piezo_calibration(fits: Sequence[PiezoFit], title: str, tick_hz: float = 1000.0) -> str:
-    """Calibration file for the firmware: one fit for all three stacks, or one per stack in order 1, 2, 3."""
+    """Return the calibration file for the firmware, from one fit for all stacks or one per stack in order 1, 2, 3."""
     if len(fits) not in (1, 3):
         raise InputError(f"{len(fits)} stacks: give recordings of one (for all three stacks) or three (1, 2, 3)")
     stacks: list[dict[str, Any]] = [

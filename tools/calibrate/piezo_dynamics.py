@@ -1,4 +1,4 @@
-"""The linear part behind the hysteresis: dead time, amplifier lag and resonance of one stack.
+"""Models the linear part behind the hysteresis: dead time, amplifier lag and resonance of one stack.
 
 A demand that is held for a tick moves the stack by a step through amplifier (first order) and mechanism (second
 order); what is read at the sampling instants is the stroke's levels filtered with that step response. Recordings
@@ -38,7 +38,7 @@ class Dynamics:
     slow_s: float = 0.0
 
     def delay_at(self, hz: float = TREMOR_HZ) -> float:
-        """What a sinusoid of ``hz`` lags by, s."""
+        """Return the delay, in s, of a sinusoid of ``hz``."""
         return -float(np.angle(self.gain(np.array([hz]))[0])) / (2.0 * np.pi * hz)
 
     def mechanism(self, dt: float, held: bool) -> Dynamics:
@@ -57,7 +57,7 @@ class Dynamics:
         return fast * (1.0 - self.slow_share + self.slow_share / (1.0 + s * self.slow_s))
 
     def held_gain(self, hz: Array, tick_s: float) -> Complex:
-        """(n,) complex gain from demands held for ``tick_s`` to the stroke: what moves the tip."""
+        """Return the complex gain (n,) from demands held for ``tick_s`` to the stroke, which moves the tip."""
         x = hz * tick_s
         return self.gain(hz) * np.sinc(x) * np.exp(-1j * np.pi * x)
 
@@ -71,7 +71,7 @@ class Dynamics:
         return np.asarray(np.polynomial.polynomial.polyval(z, weights), dtype=np.complex128)
 
     def sampled_delay_s(self, dt: float, hz: float = TREMOR_HZ) -> float:
-        """What a sinusoid of ``hz`` lags by at the sampling instants, when the drive is held for ``dt``."""
+        """Return the delay, in s, of a sinusoid of ``hz`` at the sampling instants, with a drive held for ``dt``."""
         return -float(np.angle(self.sampled_gain(np.array([hz]), dt)[0])) / (2.0 * np.pi * hz)
 
     def step(self, t: Array) -> Array:
@@ -87,8 +87,8 @@ class Dynamics:
         return (1.0 - self.slow_share) * fast + self.slow_share * _step_through([*poles, 1.0 / self.slow_s], t)
 
     def response(self, dt: float, at_s: float | None = None) -> Array:
-        """(TAPS,) weights of the held levels at this tick, one, two, ... ticks ago, in what is read ``at_s`` after the
-        tick began (default: at its very beginning, when the new demand does not show yet)."""
+        """Return the weights (TAPS,) of the held levels at this tick, one, two, ... ticks ago, in a reading taken
+        ``at_s`` after the tick began (default: at its beginning, when the new demand has no effect yet)."""
         edges = np.arange(TAPS + 1) * dt + (0.0 if at_s is None else at_s)
         steps = self.step(np.asarray(edges, dtype=np.float64))
         # the level of m ticks ago came m dt (+ at_s) ago and was replaced one dt later
@@ -105,7 +105,8 @@ def _step_through(poles: list[complex], t: Array) -> Array:
 
 
 def fit_dynamics(levels: Sequence[Array], measured: Sequence[Array], dt: float, rows: Sequence[slice]) -> Dynamics:
-    """Amplifier lag and resonance from the model's held stroke ``levels`` and what was ``measured``, um."""
+    """Fit amplifier lag and resonance from the model's held stroke ``levels`` (n,) and ``measured`` (n,), both in
+    um."""
 
     def misfit(p: Array) -> float:
         dynamics = _from_logs(p)
@@ -119,9 +120,9 @@ def fit_dynamics(levels: Sequence[Array], measured: Sequence[Array], dt: float, 
     best: Any = None
     for share in (0.3, 0.65):
         x0 = np.log([0.1 * dt, share / dt, 0.05, 0.3, 0.6 * dt])
-        found: Any = minimize(misfit, x0, method="Nelder-Mead", options={"maxfev": 400, "xatol": 1e-3, "fatol": 1e-9})
-        if best is None or found.fun < best.fun:
-            best = found
+        minimum: Any = minimize(misfit, x0, method="Nelder-Mead", options={"maxfev": 400, "xatol": 1e-3, "fatol": 1e-9})
+        if best is None or minimum.fun < best.fun:
+            best = minimum
     return _from_logs(best.x)
 
 
@@ -139,6 +140,6 @@ def _misfit(response: Array, levels: Sequence[Array], measured: Sequence[Array],
 
 
 def delayed(drive: Array, lag_s: float, dt: float) -> Array:
-    """``drive`` as it was ``lag_s`` ago, linear between samples."""
+    """Return ``drive`` (n,) delayed by ``lag_s``, linear between samples."""
     t = np.arange(len(drive)) * dt
     return np.interp(t - lag_s, t, drive)

@@ -1,4 +1,4 @@
-"""What a recording must contain for a stack's model, and what one lacks."""
+"""Checks that a recording contains what a stack's model needs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def determined_from(drive: Array) -> int:
 
 
 def swings_V(drive: Array) -> Array:
-    """Size of each half cycle, V."""
+    """Return the size of each half cycle (k,), in V."""
     steps = np.diff(drive)
     moving = steps[steps != 0.0]
     turns = np.flatnonzero(np.diff(np.sign(moving)) != 0)
@@ -29,13 +29,14 @@ def swings_V(drive: Array) -> Array:
 
 
 def one_loop(drives: Sequence[Array]) -> bool:
-    """Whether a single recording holds loops of one size only."""
+    """Return True if a single recording (n,) holds loops of one size only."""
     sizes = swings_V(drives[0])
     return len(drives) == 1 and len(sizes) > 3 and bool(np.quantile(sizes, 0.9) < 1.5 * np.quantile(sizes, 0.1))
 
 
 def missing(drives: Sequence[Array], rates_um_s: Sequence[Array], seconds: Sequence[float]) -> list[str]:
-    """What the excitation did not contain, in words: range, small loops, reversals, rates of a tremor, rest."""
+    """Return the parts that the excitation ``drive`` (n,) in V lacks: range, small loops, reversals, rates of a tremor,
+    rest."""
     span = max(d.max() for d in drives) - min(d.min() for d in drives)
     swings = np.concatenate([swings_V(d) for d in drives])
     top = max(float(np.quantile(r, 0.995)) for r in rates_um_s)

@@ -26,9 +26,9 @@ MORE_S = (0.0, 0.5e-3, 1.0e-3)
 
 @dataclass(frozen=True)
 class Feedforward:
-    """``taps`` of each stack, newest first; ``preview_s`` from the demand to the stroke that it is for. ``left`` and
-    ``without``: largest error at 1 to 40 Hz, share of the amplitude, with the taps and with the preview alone;
-    ``peak``: largest gain of the taps at any frequency."""
+    """Holds ``taps`` of each stack, newest first, and ``preview_s`` from the demand to the stroke that it is for.
+    ``left`` and ``without``: largest error at 1 to 40 Hz, share of the amplitude, with the taps and with the preview
+    alone; ``peak``: largest gain of the taps at any frequency."""
 
     taps: tuple[tuple[float, ...], ...]
     preview_s: float
@@ -46,15 +46,15 @@ def design(answers: Sequence[Answer], delays_s: Sequence[float], dt: float) -> F
         # a whole number of 10 us reads better and costs nothing
         preview_s = round(max(delays_s) + more_s, 5)
         taps = [design_feedforward(answer, dt, preview_s, TAPS, BAND_HZ) for answer in answers]
-        found = Feedforward(
+        candidate = Feedforward(
             tuple(tuple(map(float, t)) for t in taps),
             preview_s,
             tuple(_worst(t, a, dt, preview_s, hz) for t, a in zip(taps, answers, strict=True)),
             tuple(_worst(np.ones(1), a, dt, round(max(delays_s), 5), hz) for a in answers),
             tuple(float(np.max(np.abs(np.polyval(t[::-1], np.exp(-2j * np.pi * everywhere * dt))))) for t in taps),
         )
-        if best is None or max(found.left) < 0.5 * max(best.left):
-            best = found
+        if best is None or max(candidate.left) < 0.5 * max(best.left):
+            best = candidate
         if max(best.left) < ENOUGH:
             break
     assert best is not None
@@ -67,8 +67,8 @@ def _worst(taps: Array, answer: Answer, dt: float, preview_s: float, hz: Array) 
 
 @dataclass(frozen=True)
 class Answers:
-    """How one stack follows a held demand: its ``mechanism``, and ``sampled``, what recordings of ``dt`` show of it.
-    Both come later by ``more_s``."""
+    """Holds the response of one stack to a held demand: its ``mechanism``, and ``sampled``, the response that
+    recordings of ``dt`` show. Both come later by ``more_s``."""
 
     mechanism: Dynamics
     sampled: Dynamics
@@ -79,7 +79,7 @@ class Answers:
         return np.exp(-2j * np.pi * hz * self.more_s)
 
     def tip(self, tick_s: float) -> Answer:
-        """To demands that are held for ``tick_s``."""
+        """Return the response to demands that are held for ``tick_s``."""
         return lambda hz: self.late(hz) * self.mechanism.held_gain(hz, tick_s)
 
     def instrument(self) -> Answer:
@@ -88,12 +88,12 @@ class Answers:
 
 
 def for_tip(stacks: Sequence[Answers], tick_s: float) -> Feedforward:
-    """For the firmware, whose demands are held for ``tick_s``."""
+    """Return the feedforward for the firmware, whose demands are held for ``tick_s``."""
     delays = [0.5 * tick_s + s.mechanism.delay_at() + s.more_s for s in stacks]
     return design([s.tip(tick_s) for s in stacks], delays, tick_s)
 
 
 def for_instrument(stacks: Sequence[Answers]) -> Feedforward:
-    """For a synchronous interferometer of the recordings' rate."""
+    """Return the feedforward for a synchronous interferometer of the recordings' rate."""
     dt = stacks[0].dt
     return design([s.instrument() for s in stacks], [s.sampled.sampled_delay_s(dt) + s.more_s for s in stacks], dt)

@@ -1,4 +1,4 @@
-"""What the identification of one piezo stack found: its model, how well it predicts, and where it ends."""
+"""Holds the result of the identification of one piezo stack: its model, its prediction error and its limits."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from tools.calibrate.piezo_feedforward import Answers
 
 @dataclass(frozen=True)
 class PiezoFit:
-    """One identified stack. Errors in um. ``held_out``: of recordings that the fit had not seen (leave one out), or of
-    the last 30 % of a single one; ``unseen`` by recording, ``parts`` what was tried and what it left."""
+    """Holds one identified stack. Errors are in um. ``held_out``: of recordings that the fit had not seen (leave one
+    out), or of the last 30 % of a single one; ``unseen`` by recording, ``parts`` what was tried and what it left."""
 
     stack: StackConfig
     dynamics: Dynamics
@@ -35,7 +35,7 @@ class PiezoFit:
     high_V: float
     span_um: tuple[float, float]
     answer: Answers
-    """What the taps undo: lag and resonance, from steps when there were any, and as late as the model says."""
+    """Lag and resonance that the taps undo, from steps if there were any, with the delay of the model."""
 
     @property
     def neutral_V(self) -> float:

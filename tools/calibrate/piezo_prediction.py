@@ -1,4 +1,4 @@
-"""What a fitted model predicts: displacement of a drive, drive of a wanted displacement, error of a tremor profile.
+"""Predicts with a fitted model: displacement of a drive, drive of a wanted displacement, error of a tremor profile.
 
 Both directions are the firmware's own kernels, one tick after the other.
 """
@@ -43,7 +43,8 @@ def forward_kernel(volts: Array, rate: Array, plays: Array, creep: Array, stack:
 def inverse_kernel(
     wanted: Array, tick_hz: float, limits: Array, plays: Array, creep: Array, stack: Record, out: Array
 ) -> tuple[int, int, int]:
-    """``limits``: low V, high V, slew V per tick, V at the start."""
+    """Invert the model for a wanted displacement (n,) in um. ``limits`` are low V, high V, slew V per tick, V at the
+    start."""
     slopes = np.empty(len(plays))
     singular, voltage, slew = 0, 0, 0
     before_V = limits[3]
@@ -61,7 +62,8 @@ def inverse_kernel(
 
 
 def rest_stroke(stack: StackConfig, drive_V: float, tick_hz: float, high_V: float) -> tuple[Record, Array, float]:
-    """The stack's numbers with creep counted from rest at ``drive_V``, its play states and stroke m there."""
+    """Return the stack's numbers with creep counted from rest at ``drive_V``, its play states (n,) and its stroke in m
+    there."""
     params = operator_params(stack, tick_hz)
     at = attributes(params)[0]
     plays, slopes, none = plays_at(at, drive_V, high_V), np.empty(len(at.r)), np.zeros(len(at.creep_share))
@@ -108,7 +110,7 @@ def command(
 
 @dataclass(frozen=True)
 class Prediction:
-    """Tracking of a tremor profile of ``wanted_um`` peak to peak: expected rms and largest error, um."""
+    """Holds the expected tracking of a tremor profile of ``wanted_um`` peak to peak: rms and largest error, in um."""
 
     wanted_um: float
     rms_um: float
@@ -117,7 +119,8 @@ class Prediction:
 
 
 def tremor_profile_um(peak_to_peak_um: float, tick_hz: float = 1000.0, seconds: float = 5.0) -> Array:
-    """A tremor as Ang 2004 describes it: tones of 8 to 12 Hz whose amplitudes wander, from neutral."""
+    """Return a tremor (n,) in um as Ang 2004 describes it: tones of 8 to 12 Hz with wandering amplitudes, from
+    neutral."""
     t = np.arange(round(seconds * tick_hz)) / tick_hz
     x = np.zeros(len(t))
     for hz, slow_hz, phase in ((8.3, 0.31, 0.0), (9.7, 0.23, 2.0), (11.4, 0.17, 4.0)):

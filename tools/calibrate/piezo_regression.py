@@ -1,4 +1,4 @@
-"""All parameters of a stack's model that enter linearly, by one bounded least squares.
+"""Fits all parameters of a stack's model that enter linearly, by one bounded least squares.
 
 z = z0 + S(W . H[u]) + creep is not linear in its parameters, but S^-1(z - z0 - creep) = W . H is (Kuhnen): dead-zone
 slopes of the inverse, slopes W_i at rest and at the highest rate, and creep shares are found together. The unknowns
@@ -30,7 +30,8 @@ PASSES = 3
 
 @dataclass(frozen=True)
 class Shape:
-    """What the model has: thresholds as fractions of half the drive's (plays) and of the displacement's range (zones).
+    """Holds the structure of the model: thresholds as fractions of half the drive's (plays) and of the displacement's
+    range (zones).
 
     ``rate``: slopes depend on the rate; ``rate_low_um_per_s`` and ``rate_high_um_per_s`` (for the first two slopes)
     are where that law is held, Ang 2004 Fig. 7.11.
@@ -46,7 +47,8 @@ class Shape:
 
 @dataclass(frozen=True)
 class Piece:
-    """One recording ready to be fitted: drive V as the stack sees it, displacement um, its rate um/s, usable rows.
+    """Holds one recording ready to be fitted: drive V as the stack sees it, displacement um, its rate um/s, usable
+    rows.
 
     ``response``: how the displacement follows a held stroke, weights of this and earlier samples.
     """
@@ -95,13 +97,13 @@ def play_states(drive: Array, r: Array, centre_V: float) -> Array:
 
 
 def low_pass(x: Array, tau_s: float, dt: float) -> Array:
-    """First-order follower of ``x`` at rest at ``x[0]``, as the firmware's creep element."""
+    """Return ``x`` (n,) through a first-order lag that rests at ``x[0]``, as the firmware's creep element."""
     keep = np.exp(-dt / tau_s)
     return np.asarray(lfilter([1.0 - keep], [1.0, -keep], x - x[0]), dtype=np.float64)
 
 
 def axes_of(pieces: Sequence[Piece], shape: Shape, centre_V: float) -> Axes:
-    """Thresholds that these pieces excite."""
+    """Return the thresholds that these pieces excite."""
     low, high = min(p.drive.min() for p in pieces), max(p.drive.max() for p in pieces)
     floor, top = min(p.z.min() for p in pieces), max(p.z.max() for p in pieces)
     rates = np.concatenate([p.rate[p.rows] for p in pieces])
@@ -116,7 +118,7 @@ def axes_of(pieces: Sequence[Piece], shape: Shape, centre_V: float) -> Axes:
 
 
 def _columns(piece: Piece, x: Array, shape: Shape, axes: Axes) -> Array:
-    """Regressors (rows, unknowns): slopes at rest, slopes at the top rate, zones, creep."""
+    """Return the regressors (rows, unknowns): slopes at rest, slopes at the top rate, zones, creep."""
     h = play_states(piece.drive, axes.r, axes.centre_V)
     steps = h.copy()
     steps[:, :-1] -= h[:, 1:]
@@ -143,14 +145,14 @@ def _target(piece: Piece, x: Array, axes: Axes) -> Array:
 
 
 def local_slope(x: Array, axes: Axes, zones: Array) -> Array:
-    """dS^-1/dx at ``x``: what an error of the displacement is multiplied by in these equations."""
+    """Return dS^-1/dx at ``x`` (n,): the factor of an error of the displacement in these equations."""
     return np.concatenate([[1.0], zones])[np.searchsorted(axes.d, x)] if len(axes.d) else np.ones(len(x))
 
 
 def triangle(piece: Piece, x: Array, shape: Shape, axes: Axes, zones: Array) -> Array:
-    """The piece's equations as a triangle; its zero is eliminated, every piece weighs the same. ``x``: (n,) stroke
-    without creep, um. ``zones``: slopes T_j so far; rows are divided by them, so that an error counts in um of
-    displacement: unweighted, a fit would flatten S^-1 to make its errors small."""
+    """Return the piece's equations as a triangle. Its zero is eliminated, and every piece has the same weight. ``x``:
+    (n,) stroke without creep, um. ``zones``: slopes T_j so far; rows are divided by them, so that an error counts in um
+    of displacement: unweighted, a fit would flatten S^-1 to make its errors small."""
     both = np.column_stack([_columns(piece, x, shape, axes), _target(piece, x, axes)])
     weight = 1.0 / local_slope(x[piece.rows], axes, zones)
     both *= weight[:, None]
@@ -159,7 +161,7 @@ def triangle(piece: Piece, x: Array, shape: Shape, axes: Axes, zones: Array) -> 
 
 
 def solve(triangles: Sequence[Array], shape: Shape, axes: Axes) -> Solution:
-    """Bounded least squares over the pieces' triangles."""
+    """Solve the bounded least squares over the pieces' triangles. Return the unknowns (n,)."""
     stack = np.vstack(triangles)
     n, m, k = len(axes.r), len(axes.d), len(shape.creep_times_s)
     slopes = 2 * n if shape.rate else n
@@ -175,7 +177,7 @@ def solve(triangles: Sequence[Array], shape: Shape, axes: Axes) -> Solution:
 
 
 def without_creep(piece: Piece, shape: Shape, solution: Solution) -> Array:
-    """Strokes of the piece less what creep adds, um: two passes, creep is a few percent."""
+    """Return the strokes (n,) of the piece in um without creep. Two passes suffice, because creep is a few percent."""
     x = piece.z
     for _ in range(2):
         creep = np.zeros(len(x))
@@ -186,7 +188,7 @@ def without_creep(piece: Piece, shape: Shape, solution: Solution) -> Array:
 
 
 def residual(piece: Piece, shape: Shape, axes: Axes, solution: Solution) -> Array:
-    """What the model leaves of the piece's rows, um of displacement; its mean is the displacement's zero."""
+    """Return the residual (n,) of the piece's rows, in um of displacement. Its mean is the displacement's zero."""
     x = without_creep(piece, shape, solution)
     slopes = [solution.rest, solution.top] if shape.rate else [solution.rest]
     values = np.concatenate([*slopes, solution.zones, solution.creep])
@@ -202,7 +204,7 @@ def fit(
     folds: Sequence[Sequence[int]],
     partials: list[Solution] | None = None,
 ) -> tuple[Solution, Array]:
-    """Solution from all ``pieces``, and (len(pieces),) rms of each when its fold had not been seen, um.
+    """Return the solution from all ``pieces``, and (len(pieces),) rms of each when its fold had not been seen, um.
 
     ``partials`` collects the solutions without each fold. ``folds``: indices that are held out together.
     """

@@ -60,8 +60,8 @@ def fit_lag(pieces: list[Piece], shape: Shape, centre_V: float) -> tuple[list[Pi
         return float(np.mean([np.var(residual(p, shape, axes, solution)) for p in late]))
 
     dt = pieces[0].dt
-    found: Any = minimize(
+    minimum: Any = minimize(
         misfit, [0.5, 2.0], method="Nelder-Mead", options={"maxfev": 80, "xatol": 0.02, "fatol": 1e-6}
     )
-    dynamics = Dynamics(float(found.x[0]) * dt, float(found.x[1]) * dt)
+    dynamics = Dynamics(float(minimum.x[0]) * dt, float(minimum.x[1]) * dt)
     return answering(dynamics), dynamics

@@ -24,7 +24,7 @@ LEAST_STEPS = 8
 
 
 def is_steps(recording: Recording) -> bool:
-    """Whether the drive rests nearly always and jumps now and then."""
+    """Return True if the drive rests nearly always and jumps now and then."""
     drive = recording.inputs.get("command")
     if drive is None or len(drive) < 2:
         return False
@@ -53,10 +53,10 @@ def mean_step(recording: Recording) -> tuple[Array, float]:
 
 
 def fit_steps(recording: Recording) -> Dynamics:
-    """Lag, resonance and damping; no resonance when none stands out of the noise."""
+    """Fit lag, resonance and damping. No resonance is returned when none exceeds the noise."""
     z, noise = mean_step(recording)
     t: Array = np.arange(len(z), dtype=np.float64) * recording.dt
-    # what follows slowly is hysteresis and creep, not lag
+    # a slow response is hysteresis and creep, not lag
     slow = [-np.expm1(-t / tau) for tau in SLOW_S]
 
     def left(dynamics: Dynamics) -> float:
@@ -72,7 +72,7 @@ def fit_steps(recording: Recording) -> Dynamics:
         d = with_mode(p)
         return left(d) if d.damping < 0.9 and d.resonance_hz < 0.5 / recording.dt and d.lag_s < SLOW_S[0] else 1e6
 
-    # what rings: the strongest line of the rate
+    # the ringing is the strongest line of the rate
     power = np.abs(np.fft.rfft(np.diff(z) * np.hanning(2 * len(z))[len(z) + 1 :], 8 * len(z)))
     hz = np.fft.rfftfreq(8 * len(z), recording.dt)
     usable = hz > 2.0 / (len(z) * recording.dt)
@@ -80,7 +80,7 @@ def fit_steps(recording: Recording) -> Dynamics:
     options = {"maxfev": 600, "xatol": 1e-4, "fatol": 1e-12}
     starts = [np.log([recording.dt, start_hz, damping]) for damping in (0.03, 0.2)]
     tried: list[Any] = [minimize(misfit, x0, method="Nelder-Mead", options=options) for x0 in starts]
-    best = min(tried, key=lambda found: found.fun)
+    best = min(tried, key=lambda result: result.fun)
     # without a resonance: what a lag alone leaves
     lag: Any = minimize(
         lambda p: left(Dynamics(lag_s=float(np.exp(min(p[0], 0.0))))), [np.log(recording.dt)], method="Nelder-Mead"

@@ -1,4 +1,4 @@
-"""Angles of a swung body as uniform quintic splines, and least squares for them and a few global parameters at once.
+"""Fits the angles of a swung body as uniform quintic splines together with a few global parameters, by least squares.
 
 Unknowns: coefficients (K, 3) of three angles and globals (G,). Residuals depend on the angles, their first and second
 derivative at one instant and on the globals, so the normal matrix is a band with a border; the band is eliminated.
@@ -22,19 +22,20 @@ BAND = 3 * SPAN
 
 @dataclass(frozen=True)
 class Basis:
-    """``weights`` (3, n, SPAN) of value, first and second derivative at n instants; ``first`` (n,) coefficient."""
+    """Holds ``weights`` (3, n, SPAN) of value, first and second derivative at n instants, and the ``first`` coefficient
+    (n,)."""
 
     weights: Array
     first: NDArray[np.intp]
     count: int
 
     def curves(self, coefficients: Array) -> Array:
-        """(3, n, 3): value, first and second derivative from coefficients (K, 3)."""
+        """Return value, first and second derivative (3, n, 3) from coefficients (K, 3)."""
         near = coefficients[self.first[:, None] + np.arange(SPAN)]
         return np.einsum("dnj,nja->dna", self.weights, near)
 
     def fit(self, values: Array) -> Array:
-        """Coefficients (K, 3) of the least-squares spline through values (n, 3)."""
+        """Return the coefficients (K, 3) of the least-squares spline through values (n, 3)."""
         band, right = np.zeros((SPAN, self.count)), np.zeros((self.count, 3))
         for i in range(SPAN):
             np.add.at(right, self.first + i, self.weights[0][:, i, None] * values)
@@ -45,7 +46,7 @@ class Basis:
 
 
 def uniform_basis(t_s: Array, knot_s: float) -> Basis:
-    """Knots every ``knot_s`` over the instants ``t_s`` (n,)."""
+    """Return the basis with knots every ``knot_s`` over the instants ``t_s`` (n,)."""
     place = (t_s - t_s[0]) / knot_s
     last = max(1, int(np.ceil(place[-1])))
     first = np.minimum(place.astype(np.intp), last - 1)
@@ -61,7 +62,8 @@ def uniform_basis(t_s: Array, knot_s: float) -> Basis:
 
 @dataclass(frozen=True)
 class Step:
-    """One Gauss-Newton step; ``projected`` (n, R, G): what of the globals' slope the splines cannot take over."""
+    """Holds one Gauss-Newton step. ``projected`` (n, R, G) is the part of the globals' slope that the splines cannot
+    fit."""
 
     coefficients: Array
     globals_: Array

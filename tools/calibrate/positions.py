@@ -1,4 +1,4 @@
-"""Where the accelerometers sit, from the instrument swung about its tip in a dimple.
+"""Finds the positions of the accelerometers from the instrument swung about its tip in a dimple.
 
 The tip does not move, so axis i reads s_i.(C^T g + alpha x rho_i + omega x (omega x rho_i)), rho_i its place from the
 tip: the attitude C(t) is the only unknown motion, and six readings and the magnetic field know it more than twice over.
@@ -36,11 +36,11 @@ LOWPASS_HZ, SLOPE_HZ = 10.0, 4.0
 BLOCK_S = 2.0
 SHORTEST_S = 10.0
 FIELD_ERROR, LEAST_FIELD_ERROR = 0.01, 3e-4
-"""Of the field's size: at first, and the least that a magnetometer in a room is believed."""
+"""Noise of the field, as a fraction of its size: the initial value, and the least for a magnetometer in a room."""
 EXPECTED = {"bias": 0.02, "sensitivity": 2e-3, "filter": 5e-4, "field delay": 0.01}
-"""m/s^2, 1, s, s: standard deviations that a calibrated axis and its filter still have."""
+"""Standard deviations (m/s^2, 1, s, s) of a calibrated axis and its filter."""
 CURVATURE = 5e-4
-"""g per g^2: what the calibrated axes still bend by, about the residual that ``micron calibrate sensors`` prints."""
+"""Curvature (g per g^2) of calibrated axes, about the residual that ``micron calibrate sensors`` prints."""
 LARGEST_RESIDUAL = 0.1
 WIDEST_M = 0.002
 ITERATIONS = 12
@@ -61,7 +61,7 @@ class PositionFit:
 
     @property
     def parameters(self) -> dict[str, Estimate]:
-        """``1_x`` ... in m."""
+        """Return the coordinates ``1_x`` ... in m."""
         return {
             f"{name}_{axis}": Estimate(float(v), float(v - r), float(v + r))
             for name, place, reach in zip(self.names, self.places, self.reach, strict=True)
@@ -95,7 +95,8 @@ class _Problem:
         return out
 
     def motion(self, curves: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-        """Body vectors of up and north-west (n, 3) each and rates from angle curves (3, n, 3); may be complex.
+        """Return the body vectors of up and north-west (n, 3) each and the rates from angle curves (3, n, 3); may be
+        complex.
 
         C = frame Rz(c2) Ry(c1) Rx(c0), as Euler angles are written in the errata.
         """
@@ -121,7 +122,7 @@ class _Problem:
         return world[:, 2], world[:, 0], omega, alpha
 
     def force(self, curves: Complex, places: Complex) -> Complex:
-        """(n, N, 3) specific force at each axis."""
+        """Return the specific force (n, N, 3) in m/s^2 at each axis."""
         up, _, omega, alpha = self.motion(curves)
         rho = (places.reshape(-1, 3) - self.tip)[self.place_of]
         along = omega @ rho.T
@@ -134,7 +135,7 @@ class _Problem:
         )
 
     def predict(self, curves: Complex, x: Complex) -> Complex:
-        """(n, N + 3) readings and field."""
+        """Return readings and field (n, N + 3)."""
         g = self.split(x)
         axes = self.axes + g["sensitivity"].reshape(-1, 3)
         readings = np.einsum("nik,ik->ni", self.force(curves, g["places"]), axes) + g["bias"]
@@ -147,7 +148,8 @@ class _Problem:
         return np.concatenate([readings, field], axis=1)
 
     def slopes(self, curves: Array, x: Array) -> tuple[Array, Array]:
-        """By curve (n, N + 3, 3, 3) and by globals (n, N + 3, G); complex steps, exact to rounding."""
+        """Return the slopes by curve (n, N + 3, 3, 3) and by globals (n, N + 3, G), by complex steps, exact to
+        rounding."""
         h = 1e-20
         n, rows = len(self.readings), len(self.axes) + 3
         by_curve, by_global = np.empty((n, rows, 3, 3)), np.empty((n, rows, len(x)))
@@ -259,7 +261,7 @@ def _prepare(readings: Array, field: Array, rate_hz: float, config: SensingConfi
     axes = np.array(config.axes)
     place_of = np.repeat(np.arange(places), len(axes) // places)
     undone = smooth + slope / config.cutoff_rad_s
-    # as regressors of what the filters are off, slopes must be free of the noise that the readings have too
+    # slopes are regressors of the filters' errors and must not share the noise of the readings
     quiet = butter(4, SLOPE_HZ, fs=rate_hz, output="sos")
     slope, magnet_slope, magnet_bend = (
         np.asarray(sosfiltfilt(quiet, a, axis=0)) for a in (slope, magnet_slope, magnet_bend)
@@ -281,7 +283,8 @@ def _not_held(field: Array) -> Array:
 
 
 def _first_angles(problem: _Problem, config: SensingConfig) -> Array:
-    """(n, 3) angles from gravity and field of each instant; sets the frame to the attitude in the middle."""
+    """Return angles (n, 3) in rad from gravity and field of each instant, and set the frame to the attitude in the
+    middle."""
     solve = np.linalg.pinv(np.array(config.observation()))
     motion = problem.readings @ solve.T
     force = motion[:, :3] + np.cross(motion[:, 3:], problem.tip)
@@ -306,7 +309,8 @@ def _variance(step: Step, residual: Array, block: int) -> Array:
 
 
 def _bent(step: Step, force_g: Array, noise: Array) -> Array:
-    """(G,) variance from readings that bend by ``CURVATURE`` with any product of two components of the force."""
+    """Return the variance (G,) from readings that bend by ``CURVATURE`` with any product of two components of the
+    force."""
     inverse = np.linalg.inv(step.information)
     variance = np.zeros(len(inverse))
     for i in range(force_g.shape[1]):

@@ -1,8 +1,7 @@
-"""The three quick accelerometer calibrations of Erat 2018 sec. 5.2.1: slow turn through 360 degrees, fall, flat
-surface.
+"""Implements the quick accelerometer calibrations of Erat 2018, sec. 5.2.1: slow turn by 360 degrees, fall, flat.
 
-Each fits as many numbers as it has mean readings, so no residual is left: the intervals come from the readings within
-the poses, and know nothing of a pose that is not what the method takes it for (``limits``).
+Each fits as many numbers as it has mean readings, so no residual is left. The intervals come from the readings within
+the poses and do not include a pose that differs from the assumed one (``limits``).
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ LARGEST_TURN_RESIDUAL = 0.15
 LEAST_TURN_STEPS = 20.0
 """Range of an axis over the rms change from sample to sample: 600 for a slow turn, 7 for noise."""
 FEW_TURN_SAMPLES = 1000
-"""Of made turns with 300 readings 73 % of the intervals of scale hold the truth; from 2000 on, 99 %."""
+"""With 300 readings of a simulated turn 73 % of the intervals of scale hold the truth; from 2000 on 99 % do."""
 LARGEST_FLAT_SPREAD_G = 0.05
 LARGEST_FLAT_BIAS_G = 0.5
 LEAST_REACH = 0.8
@@ -65,19 +64,19 @@ class QuickResult:
     limits: tuple[str, ...]
 
     def lines(self) -> list[str]:
-        """For a report."""
-        found = [
+        """Return the lines of a report."""
+        lines = [
             f"{self.poses} pose{'s' if self.poses > 1 else ''}: {self.readings} mean readings for "
             f"{len(self.parameters)} parameters, condition {self.condition:.1f}",
             "residual: none left, as many poses as parameters; intervals are from the readings within the poses "
             f"(spread {self.noise:.3g} rms)",
         ]
         if self.check is not None:
-            found.append(
+            lines.append(
                 f"check on {self.check.samples} readings that were not fitted: |a| {self.check.mean_g:.4f} g, off by "
                 f"{self.check.rms_error_g:.4f} g rms"
             )
-        return found + [f"not told: {text}" for text in self.limits]
+        return lines + [f"not told: {text}" for text in self.limits]
 
 
 def _exact(
@@ -90,7 +89,7 @@ def _exact(
     limits: tuple[str, ...],
     check: NormCheck | None = None,
 ) -> QuickResult:
-    """The result of a fit; ``design`` (readings, parameters), a reading for every parameter."""
+    """Return the result of a fit with one reading for every parameter. ``design`` is (readings, parameters)."""
     readings, count = design.shape
     assert readings == count == len(parameters)
     poses = 1 if method in ("fall", "flat") else readings
@@ -99,7 +98,7 @@ def _exact(
 
 
 def _step(values: Array) -> float:
-    """Smallest difference of two readings of an axis in (n, 3): a count, if they are counts."""
+    """Return the smallest difference of two readings of an axis in ``values`` (n, 3): one count, if they are counts."""
     steps = np.concatenate([np.diff(np.unique(column)) for column in values.T])
     if len(steps) == 0:
         raise InputError("the readings do not change at all: are they the right columns, is the sensor running?")
@@ -107,21 +106,22 @@ def _step(values: Array) -> float:
 
 
 def _one_pose(values: Array) -> dict[str, Estimate]:
-    """Means of (n, 3) with 95 % intervals from 16 block means (samples behind a filter are not independent)."""
+    """Return the means of ``values`` (n, 3) with 95 % intervals from 16 block means (samples behind a filter are not
+    independent)."""
     step = _step(values)
-    found: dict[str, Estimate] = {}
+    estimates: dict[str, Estimate] = {}
     for i, axis in enumerate("xyz"):
         blocks = np.array([part.mean() for part in np.array_split(values[:, i], 16)])
         reach = 2.131 * float(blocks.std(ddof=1)) / 4.0  # Student, 15 degrees of freedom
         if values[:, i].std() < 0.5 * step:
             reach = max(reach, UNDITHERED_STEPS * step)
         centre = float(values[:, i].mean())
-        found[f"bias_{axis}"] = Estimate(centre, centre - reach, centre + reach)
-    return found
+        estimates[f"bias_{axis}"] = Estimate(centre, centre - reach, centre + reach)
+    return estimates
 
 
 def _extremes(raw: Array) -> tuple[Rows, Rows]:
-    """(k, 3) samples that are each axis' lowest and highest 0.5 %, by the median of their neighbours.
+    """Return the samples (k, 3) that are each axis' lowest and highest 0.5 %, by the median of their neighbours.
 
     By its own value a sample would be chosen for its noise, and the scale would come out too large.
     """
@@ -133,11 +133,11 @@ def _extremes(raw: Array) -> tuple[Rows, Rows]:
 
 
 def _missing_turns(raw: Array, low: Rows, high: Rows, bias: Array, scale: Array) -> tuple[str, ...]:
-    """Poses that no axis came to; ``low`` and ``high`` are the samples of the extremes."""
-    told = scale >= LEAST_REACH * scale.max()
-    force = (raw - bias) / np.where(told, scale, np.inf)  # an axis that is not told counts as zero
+    """Return the poses that no axis reached. ``low`` and ``high`` are the samples of the extremes."""
+    is_known = scale >= LEAST_REACH * scale.max()
+    force = (raw - bias) / np.where(is_known, scale, np.inf)  # an axis that is not told counts as zero
     missing: list[str] = []
-    for i in np.flatnonzero(~told):
+    for i in np.flatnonzero(~is_known):
         # where it stands up the others, which are known, read nothing; where one of them does, it reads nothing itself
         upright = scale[i] >= LEAST_REACH / 2.0 * scale.max()
         words = [
@@ -205,7 +205,7 @@ def turn(raw: Array) -> QuickResult:
 
 
 def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float = 2.0) -> QuickResult:
-    """Offset of every axis while nothing is felt: the longest run below 0.35 g, ends trimmed."""
+    """Return the offset of every axis (n, 3) in free fall: the longest run below 0.35 g, ends trimmed."""
     force = raw / counts_per_g
     weightless = np.concatenate([[False], np.linalg.norm(force, axis=1) < 0.35, [False]])
     bounds = np.flatnonzero(np.diff(weightless.astype(np.int8))).reshape(-1, 2)
@@ -229,7 +229,8 @@ def free_fall(raw: Array, rate_hz: float, counts_per_g: float, longest_s: float 
 
 
 def flat(raw: Array, counts_per_g: float, up: str) -> QuickResult:
-    """Offset while lying flat with axis ``up`` ("x", "-z", ...) up: its 1 g is taken off first (erratum 115)."""
+    """Return the offset of a sensor that lies flat with axis ``up`` ("x", "-z", ...) up: its 1 g is subtracted (erratum
+    115)."""
     axis = "xyz".find(up[-1:]) if up else -1
     if axis < 0 or up[:-1] not in ("", "-", "+"):
         raise InputError(f"up = '{up}': name an axis, as z or -z")

@@ -1,4 +1,4 @@
-"""Rotary-stage recordings: columns of sensors beside the two stage angles, a row a pose or many.
+"""Reads rotary-stage recordings: columns of sensors beside the two stage angles, one row or more per pose.
 
 Angles: ``alpha_deg``/``beta_deg``, ``alpha_rad``/``beta_rad``, or the lab's ``stage_y_rad``/``stage_z_rad``. Rows in
 a run at one pair of angles are one pose: the mean of its last 5 s (Ang 2004 sec. 3.2.1.7) counts.
@@ -38,7 +38,7 @@ class StageLog:
 
 
 def stage_attitude(alpha: Array, beta: Array) -> Array:
-    """(n, 3, 3) C_WB = R_y(alpha) R_z(beta), rad."""
+    """Return the attitude C_WB (n, 3, 3) = R_y(alpha) R_z(beta) from angles (n,) in rad."""
     ca, sa, cb, sb = np.cos(alpha), np.sin(alpha), np.cos(beta), np.sin(beta)
     zero = np.zeros_like(ca)
     rows = [[ca * cb, -ca * sb, sa], [sb, cb, zero], [-sa * cb, sa * sb, ca]]

@@ -35,7 +35,8 @@ def spread(signal: Array, window: int) -> Array:
 
 
 def find_poses(signal: Array, window: int, threshold: float, shortest: int) -> StillPoses:
-    """Runs of at least ``shortest`` samples whose moving spread stays below ``threshold``."""
+    """Return the runs of at least ``shortest`` samples of ``raw`` (n, 3) whose moving spread stays below
+    ``threshold``."""
     still = np.concatenate([[False], spread(signal, window) < threshold, [False]])
     edges = np.flatnonzero(np.diff(still.astype(np.int8)))
     bounds = edges.reshape(-1, 2)
@@ -45,13 +46,14 @@ def find_poses(signal: Array, window: int, threshold: float, shortest: int) -> S
 
 
 def quiet_level(signal: Array, window: int) -> float:
-    """Moving spread of the sensor at rest: its lowest tenth."""
+    """Return the moving spread of the sensor (n, 3) at rest: its lowest tenth."""
     return float(np.quantile(spread(signal, window), 0.1))
 
 
 @dataclass(frozen=True)
 class WarmUp:
-    """``steady``: what is still to come (``remaining``, in the signal's unit) is below the tolerance."""
+    """Holds the warm-up of a signal. It is ``steady`` if the change to come (``remaining``, in its unit) is below the
+    tolerance."""
 
     steady: bool
     remaining: float
@@ -59,16 +61,16 @@ class WarmUp:
     time_constant_s: float
 
     def text(self) -> str:
-        """One line for a report."""
+        """Return one line for a report."""
         if self.steady:
             return f"warm-up: steady ({self.remaining:.3g} to come, {self.tolerance:.3g} allowed)"
         return f"warm-up: {self.remaining:.3g} still to come ({self.tolerance:.3g} allowed): drift fitted and removed"
 
 
 DRIFT_TOLERANCE = 2e-3
-"""Of the sensor's reach (about 1 g): 2 mg."""
+"""Tolerance as a fraction of the sensor's reach (about 1 g): 2 mg."""
 LARGEST_DRIFT = 0.25
-"""Of that reach: what changes more during a rest is an even turn and no drift."""
+"""Fraction of that reach. A larger change during a rest is a slow turn and no drift."""
 FIRST_REST_S = 20.0
 
 
@@ -89,9 +91,9 @@ def remove_drift(raw: Array, rate_hz: float, *, allowed: bool, reach: float | No
     if reach is None and float(np.ptp(means, axis=0).max()) > LARGEST_DRIFT / DRIFT_TOLERANCE * tolerance:
         return raw, WarmUp(True, 0.0, tolerance, float("inf"))
     t = np.arange(len(raw)) / rate_hz
-    found = [warm_up(t[first:last], raw[first:last, i], tolerance) for i in range(3)]
-    worst = max(found, key=lambda w: abs(w.remaining))
-    if all(w.steady for w in found):
+    warm_ups = [warm_up(t[first:last], raw[first:last, i], tolerance) for i in range(3)]
+    worst = max(warm_ups, key=lambda w: abs(w.remaining))
+    if all(w.steady for w in warm_ups):
         return raw, worst
     if not allowed:
         raise InputError(
@@ -101,11 +103,11 @@ def remove_drift(raw: Array, rate_hz: float, *, allowed: bool, reach: float | No
     out = raw.copy()
     span = t[last - 1] - t[first]
     constant, to_come = common_warm_up(t[first:last], raw[first:last])
-    for i, w in enumerate(found):
+    for i, w in enumerate(warm_ups):
         if w.steady:
             continue
         if constant <= 3.0 * span:
-            # what was still to come at the end of the rest, carried back and forth along the exponential
+            # the change still to come at the end of the rest, extrapolated along the exponential
             out[:, i] += to_come[i] * np.exp(-(t - t[last - 1]) / constant)
         else:
             out[:, i] -= w.remaining / span * (t - t[last - 1])
@@ -124,15 +126,15 @@ def common_warm_up(t_s: Array, value: Array) -> tuple[float, Array]:
     best, constant, to_come = np.inf, np.inf, np.zeros(value.shape[1])
     for tau in np.geomspace(span / 20.0, 20.0 * span, 240):
         shape = np.column_stack([np.ones(blocks), np.exp(-(t - t_s[-1]) / tau)])
-        found = np.linalg.lstsq(shape, v)[0]
-        left = float(np.sum((v - shape @ found) ** 2))
+        weights = np.linalg.lstsq(shape, v)[0]
+        left = float(np.sum((v - shape @ weights) ** 2))
         if left < best:
-            best, constant, to_come = left, float(tau), -found[1]
+            best, constant, to_come = left, float(tau), -weights[1]
     return constant, to_come
 
 
 def warm_up(t_s: Array, value: Array, tolerance: float) -> WarmUp:
-    """Whether ``value`` (n,) at rest has settled: an exponential is fitted and carried on to its end.
+    """Decide if ``value`` (n,) at rest has settled: an exponential is fitted and extrapolated to its end.
 
     A drift that a straight line describes as well as the exponential has no end in sight: what it would still do in
     another recording of this length counts.

@@ -1,4 +1,4 @@
-"""The sensors of a resting instrument from a tumble on two rotary stages (Ang 2004 sec. 3.2.1.7, 3.2.2.4).
+"""Identifies the sensors of a resting instrument from a tumble on two rotary stages (Ang 2004 sec. 3.2.1.7, 3.2.2.4).
 
 At rest every axis reads f = C_WB^T (0, 0, g) (erratum 2). Accelerometers: ``composite``, magnetometer: ``field_frame``.
 C_WB = R_y(alpha) R_z(beta) with the stage angles of Ang 2004 Fig. 3.3: alpha = 0 lays the x-y plane level, at alpha =
@@ -28,7 +28,7 @@ DRIFT_TOLERANCE_G = 2e-3
 
 @dataclass(frozen=True)
 class TumbleResult:
-    """What was identified: ``table`` for [sensing] of a calibration, fits with intervals and residuals."""
+    """Holds the identified ``table`` for [sensing] of a calibration, and the fits with intervals and residuals."""
 
     table: dict[str, Any]
     accelerometers: CompositeFit
@@ -41,11 +41,11 @@ class TumbleResult:
 
     @property
     def condition(self) -> float:
-        """The worst of the axes."""
+        """Return the largest condition number of the axes."""
         return max(axis.condition for axis in self.accelerometers.axes)
 
     def as_dict(self) -> dict[str, Any]:
-        """JSON values."""
+        """Return the result as JSON values."""
         return {
             "table": self.table,
             "positions": self.positions,
@@ -118,7 +118,7 @@ def identify(
 
 
 def refuse_drift(fit: CompositeFit) -> None:
-    """InputError when an axis' bias moved during the recording by more than 2 mg, beyond doubt."""
+    """Raise ``InputError`` if an axis' bias moved significantly during the recording by more than 2 mg."""
     for i, axis in enumerate(fit.axes):
         moved = axis.drift.value / axis.scale_V_per_g
         sure = min(abs(axis.drift.low), abs(axis.drift.high)) if axis.drift.low * axis.drift.high > 0.0 else 0.0
