@@ -1,6 +1,6 @@
 """Holds the data sheets of the drivers: quantity, unit, range and time of every part.
 
-One TOML file per driver. People and reports read them; a test holds them against what the drivers say.
+One TOML file per driver. People read them, and a test compares them with the drivers; no product code does.
 What lives here: facts of a part. What must not: what a bench makes of it (channels, wiring: the bench file).
 """
 

@@ -36,7 +36,14 @@ class Daq(AnalogInputScan, Protocol):
 
     name: str
 
+    def probe(self) -> str: ...
     def write_digital(self, bits: int) -> None: ...
+
+
+class ProbedOutput(AnalogOutput, Protocol):
+    """Describes an output that can identify itself."""
+
+    def probe(self) -> str: ...
 
 
 NOT_POLLED = Polling()
@@ -88,11 +95,11 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
         except HalError as error:
             failures.append(error)
 
-    daq, identify = open_daq(bench, daq_name, options[daq_name])
-    probe(daq_name, identify)
+    daq: Daq = open_device(bench, daq_name, options[daq_name])
+    probe(daq_name, daq.probe)
     can = _CanBuses(bench)
-    amplifier: AnalogOutput = open_device(bench, piezo_name, options[piezo_name], can=can)
-    probe(piezo_name, _identify(amplifier, options[piezo_name]))
+    amplifier: ProbedOutput = open_device(bench, piezo_name, options[piezo_name], can=can)
+    probe(piezo_name, amplifier.probe)
     magnetometer = None
     for name, spec in description.devices_with("hmc2003").items():
         magnetometer_options: Hmc2003Options = options[name]
@@ -197,20 +204,6 @@ class _CanBuses:
         if bus not in self._heartbeats:
             self._heartbeats[bus] = HostHeartbeat(self._bench.can(bus), self._bench.clock, load_database())
         return self._heartbeats[bus]
-
-
-Identify = Callable[[], str]
-
-
-def open_daq(bench: OpenBench, name: str, options: DaqOptions) -> tuple[Daq, Identify]:
-    """Return the DAQ ``name``, to which nothing has been sent yet, and the function that identifies it."""
-    daq = open_device(bench, name, options)
-    return daq, _identify(daq, options)
-
-
-def _identify(device: Any, options: Any) -> Identify:
-    """Return ``probe`` of the device; NI cards have none, and are called by the name that the bench file gives them."""
-    return getattr(device, "probe", lambda: f"NI {options.device}")
 
 
 def _axes(options: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

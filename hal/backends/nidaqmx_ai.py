@@ -38,6 +38,10 @@ class NidaqmxScan:
         self._volts = np.empty(0)
         self._counts_per_V = np.empty(0)
 
+    def probe(self) -> str:
+        """Return the card's product, serial number and number of inputs. Raises ``BenchError`` for an unknown name."""
+        return nidaqmx_package.identify_card(self._nidaqmx, self._device, self.name, "ai", highest=0)
+
     def configure(self, config: ScanConfig) -> ScanInfo:
         if len(config.range_V) != len(config.channels) or not config.channels:
             raise BenchError("one range per channel, and at least one channel, is needed", device=self.name)

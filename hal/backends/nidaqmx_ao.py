@@ -47,6 +47,7 @@ class NidaqmxOutput:
         self.limits = (OutputLimit(lo_V, hi_V, slew_V_per_s, neutral_V),) * len(channels)
         self.guard = OutputGuard(name, self.limits, clock)
         self._clock = clock
+        self._device, self._highest = device, max(channels)
         self._gain = gain
         self._nidaqmx = nidaqmx_package.load()
         self._data = np.zeros(len(channels))
@@ -67,6 +68,11 @@ class NidaqmxOutput:
             raise nidaqmx_package.translated(error, name) from error
         self._writer: Any = self._nidaqmx.stream_writers.AnalogMultiChannelWriter(self._out.out_stream, auto_start=True)
         self._reader: Any = self._nidaqmx.stream_readers.AnalogMultiChannelReader(self._back.in_stream)
+
+    def probe(self) -> str:
+        """Return the card's product, serial number and number of outputs. Raises ``WrongDevice`` for too few
+        outputs."""
+        return nidaqmx_package.identify_card(self._nidaqmx, self._device, self.name, "ao", highest=self._highest)
 
     def arm(self) -> None:
         self._known = False

@@ -9,7 +9,7 @@ import numpy as np
 
 from drivers.registry import Sensor, find_driver, open_device
 from drivers.specs import check_devices
-from firmware_py.control.wiring import open_daq
+from firmware_py.control.wiring import Daq
 from hal.bench import OpenBench
 from hal.errors import BenchError, HalTimeout
 from hal.types import ScanConfig
@@ -65,8 +65,8 @@ class _Inputs:
     def _scanned(self, name: str) -> dict[int, float]:
         if name not in self._means:
             options = self._options[name]
-            daq, identify = open_daq(self._bench, name, options)
-            identify()
+            daq: Daq = open_device(self._bench, name, options)
+            daq.probe()
             config = ScanConfig(options.rate_hz, options.channels, (options.range_V,) * len(options.channels))
             info = daq.configure(config)
             rows, got = np.zeros((SCANS, len(info.channels)), dtype=np.int16), 0

@@ -10,6 +10,7 @@ import nidaqmx
 import nidaqmx.errors
 import nidaqmx.stream_readers
 import nidaqmx.stream_writers
+import nidaqmx.system
 import nidaqmx.task.collections
 import numpy as np
 import pytest
@@ -19,11 +20,12 @@ from nidaqmx.task import InStream, OutStream, Task, Timing
 from hal.backends.nidaqmx_ai import NidaqmxScan
 from hal.backends.nidaqmx_ao import NidaqmxOutput
 from hal.clock import VirtualClock
-from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, HalError, Overrun, SafetyTrip
+from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, HalError, Overrun, SafetyTrip, WrongDevice
 from hal.output_guard import RAMP_STEPS
 from hal.types import ScanConfig, Status
 
 MS = 1_000_000
+DEVICE = nidaqmx.system.Device
 
 
 class Package:
@@ -201,6 +203,35 @@ def test_output_self_test(package: Package):
     device, _ = output(package, at_V=2.4)
     with pytest.raises(SafetyTrip, match="self-test"):
         device.arm()
+
+
+def card(monkeypatch: pytest.MonkeyPatch, **facts: Any) -> None:
+    """Let NI's driver report one card with ``facts``, whatever its name."""
+    device = create_autospec(DEVICE, instance=True, **facts)
+    monkeypatch.setattr(nidaqmx.system, "Device", lambda name: device)
+
+
+def test_probe_reports_what_the_driver_says_of_the_card(package: Package, monkeypatch: pytest.MonkeyPatch):
+    channels = {"ai_physical_chans": range(16), "ao_physical_chans": range(4)}
+    card(monkeypatch, product_type="USB-6343", serial_num=0x1B2C3D4, is_simulated=False, **channels)
+    assert NidaqmxScan("Dev1", VirtualClock()).probe() == "NI USB-6343 Dev1, serial number 1B2C3D4, 16 ai channels"
+    assert output(package)[0].probe() == "NI USB-6343 Dev1, serial number 1B2C3D4, 4 ao channels"
+    card(monkeypatch, product_type="USB-6343", serial_num=0, is_simulated=True, **channels)
+    assert NidaqmxScan("Dev1", VirtualClock()).probe().endswith("16 ai channels, simulated by NI-DAQmx")
+
+
+def test_probe_refuses_a_card_with_too_few_outputs(package: Package, monkeypatch: pytest.MonkeyPatch):
+    card(monkeypatch, product_type="USB-6001", serial_num=1, is_simulated=False, ao_physical_chans=range(2))
+    with pytest.raises(WrongDevice, match="USB-6001 with 2 ao channels, the bench uses ao2"):
+        output(package)[0].probe()
+
+
+def test_probe_of_an_unknown_name_is_a_bench_error(monkeypatch: pytest.MonkeyPatch):
+    device = create_autospec(DEVICE, instance=True)
+    type(device).product_type = PropertyMock(side_effect=daq_error(-200220))
+    monkeypatch.setattr(nidaqmx.system, "Device", lambda name: device)
+    with pytest.raises(BenchError, match="no NI device of this name"):
+        NidaqmxScan("Dev7", VirtualClock()).probe()
 
 
 def test_output_range_is_checked():
