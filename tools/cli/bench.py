@@ -1,4 +1,4 @@
-"""``micron bench``: the page, over a running firmware."""
+"""Implements ``micron bench``: it serves the page of a running firmware."""
 
 from __future__ import annotations
 
@@ -18,20 +18,26 @@ from tools.prepare import prepare
 
 def bench(
     bench: BenchOption = None,
-    port: Annotated[int, typer.Option(min=0, max=65535, help="0 takes any free one.")] = 8750,
+    port: Annotated[int, typer.Option(min=0, max=65535, help="Port of the page; 0 takes any free one.")] = 8750,
     listen: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Another address than loopback; everything needs the token.")
+        str | None,
+        typer.Option(
+            metavar="ADDRESS", help="Listen on this address instead of loopback; every request then needs the token."
+        ),
     ] = None,
     host_name: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="With --listen: names under which people reach it.")
+        list[str] | None,
+        typer.Option(metavar="NAME", help="With --listen: host names under which the page is reached."),
     ] = None,
-    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Where recordings go.")] = Path("out/recordings"),
+    recordings: Annotated[Path, typer.Option(metavar="FOLDER", help="Folder for recordings.")] = Path("out/recordings"),
     hand: Annotated[
         str | None, typer.Option(metavar="FILE", help="A recorded hand instead of the synthetic one.")
     ] = None,
     stale_ms: Annotated[
         float | None,
-        typer.Option(min=1.0, max=1000.0, help="Missing scans end the run after this; for machines that do more."),
+        typer.Option(
+            min=1.0, max=1000.0, help="Time without scans, in ms, that ends the run; raise it on a busy machine."
+        ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world.")] = None,
     realtime: Annotated[

@@ -31,11 +31,13 @@ def sensors(
         Path, typer.Argument(metavar="TUMBLE", help="Recording of the resting instrument on two rotary stages.")
     ],
     out: Out,
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = 9.80131,
-    model: Annotated[Model, typer.Option(help="Cross-axis bias and scale factor as well, or the line alone.")] = (
+    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = 9.80131,
+    model: Annotated[Model, typer.Option(help="Model: with cross-axis bias and scale factor, or the line alone.")] = (
         Model.COMPOSITE
     ),
-    drift: Annotated[OnDrift, typer.Option(help="When the sensors still warm up.")] = OnDrift.REFUSE,
+    drift: Annotated[
+        OnDrift, typer.Option(help="What to do when the sensors still warm up: refuse or fit.")
+    ] = OnDrift.REFUSE,
     json_file: JsonOption = None,
 ) -> None:
     """Bias, scale, direction and cross-axis terms of every sensor axis from a resting instrument in many attitudes.

@@ -21,12 +21,12 @@ Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="Calibration fi
 
 
 def recordings_of(path: Path) -> list[Path]:
-    """The recordings of one stack: ``path`` itself, or the recordings in the folder ``path``."""
+    """Return the recordings of one stack: ``path`` itself, or the recordings in the folder ``path``."""
     if path.is_dir() and not (path / "recording.toml").is_file():
-        found = sorted(child for child in path.iterdir() if (child / "recording.toml").is_file())
-        if not found:
+        recordings = sorted(child for child in path.iterdir() if (child / "recording.toml").is_file())
+        if not recordings:
             raise InputError(f"{path}: neither a recording (recording.toml) nor a folder of recordings")
-        return found
+        return recordings
     return [path]
 
 
@@ -34,7 +34,8 @@ def piezo(
     recordings: Annotated[
         list[Path],
         typer.Argument(
-            metavar="RECORDING...", help="One stack, or three in the order 1, 2, 3: recording or folder of."
+            metavar="RECORDING...",
+            help="One stack, or three in the order 1, 2, 3: each a recording or a folder of them.",
         ),
     ],
     out: Out,
@@ -110,10 +111,10 @@ def _show(fits: list[PiezoFit], predictions: list[Prediction], inverse: Feedforw
     row("slopes by rate", *("yes" if f.stack.slope_per_rate_s_per_V else "no" for f in fits))
     row("creep, sum of shares (%)", *(f"{100 * sum(f.stack.creep_shares):.1f}" for f in fits))
     row("lag (ms)", *(f"{1e3 * f.lag_s:.2f}" for f in fits))
-    found = [f.answer.mechanism for f in fits]
+    mechanisms = [f.answer.mechanism for f in fits]
     row(
         "resonance (Hz), damping",
-        *(f"{d.resonance_hz:.0f}, {d.damping:.3f}" if d.resonance_hz else "not found" for d in found),
+        *(f"{d.resonance_hz:.0f}, {d.damping:.3f}" if d.resonance_hz else "not found" for d in mechanisms),
     )
     row(
         "error at 1 to 40 Hz by lag (%)",

@@ -18,7 +18,7 @@ STANDARD_GRAVITY = 9.80665
 
 
 class Method(StrEnum):
-    """How the log was taken."""
+    """Names the way in which the log was recorded."""
 
     POSES = "poses"
     STAGE = "stage"
@@ -28,14 +28,14 @@ class Method(StrEnum):
 
 
 class OnDrift(StrEnum):
-    """What to do when the sensor still warms up."""
+    """Names the answers to a sensor that still warms up."""
 
     REFUSE = "refuse"
     FIT = "fit"
 
 
 class Model(StrEnum):
-    """How much of Ang 2004 sec. 3.2.1 is identified."""
+    """Names the parts of Ang 2004, sec. 3.2.1, that are identified."""
 
     COMPOSITE = "composite"
     LINEAR = "linear"
@@ -73,13 +73,19 @@ def accelerometer(
     method: Annotated[
         Method, typer.Option(help="Still poses at unknown angles, a rotary stage, or a quick method of Erat 2018.")
     ] = Method.POSES,
-    model: Annotated[Model, typer.Option(help="Stage: with cross-axis terms, or the line alone.")] = Model.COMPOSITE,
+    model: Annotated[
+        Model, typer.Option(help="Model of --method stage: with cross-axis terms, or the line alone.")
+    ] = Model.COMPOSITE,
     columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = STANDARD_GRAVITY,
+    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = STANDARD_GRAVITY,
     rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
-    counts_per_g: Annotated[float, typer.Option(min=1e-12, help="Nominal, for fall and flat.")] = 16384.0,
+    counts_per_g: Annotated[
+        float, typer.Option(min=1e-12, help="Nominal counts per g, for the methods fall and flat.")
+    ] = 16384.0,
     up: Annotated[str, typer.Option(help="Axis that points up in a flat log.")] = "z",
-    drift: Annotated[OnDrift, typer.Option(help="When the sensor still warms up at the first rest.")] = OnDrift.REFUSE,
+    drift: Annotated[
+        OnDrift, typer.Option(help="What to do when the sensor still warms up at the first rest: refuse or fit.")
+    ] = OnDrift.REFUSE,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -144,7 +150,8 @@ def _stage(
     out: Path | None,
     json_file: str | None,
 ) -> None:
-    """Three axes whose attitude two stages gave: x and y of one package, z of another (Ang 2004 sec. 3.2.1.7)."""
+    """Calibrate three axes whose attitude two stages gave: x and y of one package, z of another (Ang 2004 sec.
+    3.2.1.7)."""
     from tools.calibrate.calibration_file import calibration_toml
     from tools.calibrate.composite import fit_composite
     from tools.calibrate.stage_log import load_stage_log
@@ -178,18 +185,19 @@ def _stage(
 
 
 def magnetometer(
-    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording, turned through all directions.")],
+    recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="Recording turned through all directions.")],
     columns: Columns = "mag_x_raw,mag_y_raw,mag_z_raw",
     reset_columns: Annotated[
-        str | None, typer.Option(help="The same after a reset pulse: takes the bridge's offset off.")
+        str | None, typer.Option(help="The same columns after a reset pulse; they remove the bridge's offset.")
     ] = None,
     accelerometer_columns: Annotated[
-        str | None, typer.Option(help="Calibrated accelerometer beside it: gives the turn to the body.")
+        str | None, typer.Option(help="Columns of a calibrated accelerometer; they give the rotation to the body.")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1; turn to the body, offset.
+    """Fit hard and soft iron by an ellipsoid with outlier rejection: m = A (raw - b), |m| = 1; rotation to the body,
+    offset.
 
     Example: micron calibrate magnetometer turned.npz
 

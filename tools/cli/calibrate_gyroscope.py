@@ -19,7 +19,7 @@ def gyroscope(
     ],
     columns: Columns = "gyro_x_raw,gyro_y_raw,gyro_z_raw",
     accelerometer_columns: Columns = "acc_x_raw,acc_y_raw,acc_z_raw",
-    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, m/s^2.")] = STANDARD_GRAVITY,
+    gravity: Annotated[float, typer.Option(min=9.0, max=10.0, help="Local gravity, in m/s^2.")] = STANDARD_GRAVITY,
     rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
     shortest_s: Annotated[float, typer.Option(min=0.05, help="Shortest rest that is a pose.")] = 0.5,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,

@@ -16,14 +16,19 @@ from tools.output import check_writable, write_calibration, write_json
 def positions(
     recording: Annotated[
         Path,
-        typer.Argument(metavar="RECORDING", help="Swung for a minute about the tip, which stands in a dimple."),
+        typer.Argument(
+            metavar="RECORDING", help="Recording of the instrument swung about its tip in a dimple for a minute."
+        ),
     ],
-    bench: Annotated[Path, typer.Option(metavar="FILE|NAME", help="The instrument, calibrated otherwise.")],
+    bench: Annotated[
+        Path, typer.Option(metavar="FILE|NAME", help="Bench of the instrument; all but the positions is calibrated.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Calibration file for the bench.")] = None,
     rate_hz: Annotated[float | None, typer.Option(min=1e-3, help="Sampling rate, if the file does not say.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Positions of the accelerometers with 95 % intervals; name the file under [firmware] calibration of the bench.
+    """Find the positions of the accelerometers with 95 % intervals; name the file under [firmware] calibration of the
+    bench.
 
     Put the tip into a dimple, switch the manipulator to neutral, swing the handle by 20 degrees and more about all
     axes, slowly and at 1 to 2 Hz mixed, for a minute.

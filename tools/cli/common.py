@@ -1,4 +1,4 @@
-"""What all commands share: exit codes, ``--json``, consoles, and errors that become one clear line.
+"""Holds the parts that all commands share: exit codes, ``--json``, consoles, and errors as one clear line.
 
 Exit codes (contracts/commands.md): 0 done, 1 failed, 2 bad usage or input, 3 finished but data was lost,
 4 a declared device is missing, 5 the host was not fit for real time, 130 stopped by Ctrl-C.
@@ -35,12 +35,12 @@ DECIDING = (("mismatch", "diagnose"), ("mismatch", "apply"), ("mismatch", "simul
 
 
 def console() -> Console:
-    """For people: standard error."""
+    """Return the console for people, on standard error."""
     return plain_console(stderr=True)
 
 
 def data_console() -> Console:
-    """For data: standard output."""
+    """Return the console for data, on standard output."""
     return plain_console()
 
 
@@ -61,7 +61,7 @@ def print_whole(full: Table, narrow: Table | None = None) -> None:
 
 
 def print_error(message: str) -> None:
-    """``micron: message`` on standard error."""
+    """Print ``micron: message`` on standard error."""
     console().print(Text.assemble(("micron:", "bold red"), " ", message), soft_wrap=True)
 
 

@@ -1,4 +1,4 @@
-"""``micron data``: the public recordings that the documents and tests mention."""
+"""Implements ``micron data``: it lists and fetches the public recordings that documents and tests mention."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def fetch_sets(
     mirror: Annotated[str, typer.Option(metavar="URL", help="Take URL/NAME/FILE instead of the original places.")] = "",
     json_file: JsonOption = None,
 ) -> None:
-    """Download public recordings into the cache; what is there with the right checksum is not downloaded again.
+    """Download public recordings into the cache. A file with the right checksum is not downloaded again.
 
     Example: micron data fetch emps
     """
@@ -89,10 +89,10 @@ def fetch_sets(
         missing: list[Missing] = []
         files: dict[str, list[str]] = {}
         for wanted in named(names):
-            there, lost = fetch(wanted, folder, mirror, lambda text: console().print(text, soft_wrap=True))
+            fetched, lost = fetch(wanted, folder, mirror, lambda text: console().print(text, soft_wrap=True))
             missing += lost
-            files[wanted.name] = [str(path) for path in there]
-            for path in there:
+            files[wanted.name] = [str(path) for path in fetched]
+            for path in fetched:
                 if json_file != "-":
                     data_console().print(str(path), soft_wrap=True)
             console().print(f"{wanted.name}: licence {wanted.licence}; cite: {wanted.citation}", soft_wrap=True)

@@ -27,14 +27,14 @@ TURN_S = 60.0
 
 
 class ProbeChoice(StrEnum):
-    """How an I2C address is asked."""
+    """Names the ways to ask an I2C address."""
 
     READ = "read"
     WRITE = "write"
 
 
 class PolicyChoice(StrEnum):
-    """Which scheduling is measured."""
+    """Names the scheduling policies that are measured."""
 
     OTHER = "other"
     FIFO = "fifo"
@@ -48,8 +48,8 @@ def _ask(question: str, yes: bool) -> None:
 
 def scan(
     bench: BenchOption = None,
-    probe: Annotated[ProbeChoice, typer.Option(help="How I2C addresses are asked.")] = ProbeChoice.READ,
-    seconds: Annotated[float, typer.Option(min=0.0, max=3600.0, help="How long CAN is listened to.")] = 1.0,
+    probe: Annotated[ProbeChoice, typer.Option(help="Method of asking an I2C address.")] = ProbeChoice.READ,
+    seconds: Annotated[float, typer.Option(min=0.0, max=3600.0, help="Time of listening to CAN, in s.")] = 1.0,
     yes: YesOption = False,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
@@ -92,7 +92,7 @@ def scan(
 
 def scope(
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=0.05, max=3600.0, help="How long to look.")] = 5.0,
+    seconds: Annotated[float, typer.Option(min=0.05, max=3600.0, help="Time of the measurement, in s.")] = 5.0,
     width: Annotated[int, typer.Option(min=8, max=400, help="Characters per line.")] = 72,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
@@ -141,7 +141,7 @@ def latency(
     seconds: Annotated[float, typer.Option(min=0.1, max=3600.0, help="Length of each measurement.")] = 5.0,
     hours: Annotated[
         float | None,
-        typer.Option(min=0.001, max=168.0, help="Instead of --seconds: all loops take turns for so long."),
+        typer.Option(min=0.001, max=168.0, help="Let all loops take turns for so many hours, instead of --seconds."),
     ] = None,
     policy: Annotated[
         PolicyChoice | None, typer.Option(help="Scheduling policy to measure; default both, fifo with --hours.")
@@ -181,33 +181,33 @@ def latency(
         ]
         turn_s = seconds if hours is None else min(TURN_S, 3600.0 * hours / len(loops))
         rounds = 1 if hours is None else max(1, round(3600.0 * hours / (turn_s * len(loops))))
-        found: list[Lateness] = []
+        measurements: list[Lateness] = []
         with keep_what_is_there(), console().status("") as status:
-            for what in take_turns(loops, rounds, turn_s, found):
+            for what in take_turns(loops, rounds, turn_s, measurements):
                 status.update(what)
-        need_some(found)
+        need_some(measurements)
         machine = read_machine(MACHINE)
         out = data_console()
         for p in policies:
-            rows = [one for one in found if one.policy == p]
+            rows = [one for one in measurements if one.policy == p]
             if rows:
                 out.print(figures_table(rows))
                 out.print(histogram_table(rows))
                 out.print(f"scheduling granted: {rows[0].scheduling}\n")
         if slow := [state.setting.name for state in machine if not state.is_good]:
             out.print(f"machine: not as wanted: {', '.join(slow)}; see micron doctor")
-        told = {"compiler": reference.compiler} if isinstance(reference, CReference) else {"missing": reference}
-        result = {"format": 1, "seconds": turn_s, "rounds": rounds, "rows": [one.as_dict() for one in found]}
-        write_json({**result, "reference": told, "machine": [state.as_dict() for state in machine]}, json_file)
+        compiler = {"compiler": reference.compiler} if isinstance(reference, CReference) else {"missing": reference}
+        result = {"format": 1, "seconds": turn_s, "rounds": rounds, "rows": [one.as_dict() for one in measurements]}
+        write_json({**result, "reference": compiler, "machine": [state.as_dict() for state in machine]}, json_file)
 
 
 def ramp(
     bench: BenchOption = None,
-    arm: Annotated[bool, typer.Option("--arm", help="Without it nothing is moved.")] = False,
+    arm: Annotated[bool, typer.Option("--arm", help="Allow motion; without it nothing is moved.")] = False,
     channel: Annotated[list[int] | None, typer.Option(min=1, help="Output, from 1; default all.")] = None,
-    steps: Annotated[int, typer.Option(min=2, max=1000, help="Stairs between the limits.")] = 11,
-    dwell_s: Annotated[float, typer.Option(min=0.001, max=60.0, help="Time on each stair.")] = 0.05,
-    tolerance_V: Annotated[float, typer.Option("--tolerance", min=0.0, help="Largest error allowed, V.")] = 0.05,
+    steps: Annotated[int, typer.Option(min=2, max=1000, help="Number of steps between the limits.")] = 11,
+    dwell_s: Annotated[float, typer.Option(min=0.001, max=60.0, help="Time on each step, in s.")] = 0.05,
+    tolerance_V: Annotated[float, typer.Option("--tolerance", min=0.0, help="Largest allowed error, in V.")] = 0.05,
     yes: YesOption = False,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
@@ -246,17 +246,17 @@ def ramp(
             )
 
         with opened_bench(path, pace=pace_of(virtual)) as opened:
-            found: list[RampStep] = []
+            steps_done: list[RampStep] = []
 
             def keep(step: RampStep) -> None:
-                found.append(step)
+                steps_done.append(step)
                 show(step)
 
             with keep_what_is_there():
                 climb(opened, channels, steps, dwell_s, keep)
-        need_some(found)
+        need_some(steps_done)
         data_console().print(table)
-        worst = max(found, key=lambda s: abs(s.error_V))
+        worst = max(steps_done, key=lambda s: abs(s.error_V))
         write_json(
             {
                 "format": 1,
@@ -264,7 +264,7 @@ def ramp(
                 "worst_error_V": worst.error_V,
                 "rows": [
                     {"output": s.channel + 1, "wanted_V": s.wanted_V, "read_V": s.read_V, "error_V": s.error_V}
-                    for s in found
+                    for s in steps_done
                 ],
             },
             json_file,
@@ -276,7 +276,7 @@ def ramp(
 
 def dump(
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=0.01, max=86_400.0, help="How long to listen.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.01, max=86_400.0, help="Time of listening, in s.")] = 10.0,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after so many frames.")] = None,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
@@ -314,7 +314,7 @@ def capture(
         Path | None, typer.Option("--diff", metavar="FOLDER", help="Replay the transcript in this folder instead.")
     ] = None,
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=0.01, max=600.0, help="With --out: how long to scan.")] = 1.0,
+    seconds: Annotated[float, typer.Option(min=0.01, max=600.0, help="With --out: time of the scan, in s.")] = 1.0,
     virtual: VirtualOption = False,
     json_file: JsonOption = None,
 ) -> None:
@@ -371,7 +371,7 @@ def log(
     url: Annotated[str, typer.Option(help="Address of the page, with its token if it is not on loopback.")] = (
         "http://127.0.0.1:8750"
     ),
-    seconds: Annotated[float | None, typer.Option(min=0.1, help="How long; default until Ctrl-C.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0.1, help="Time in s; default: until Ctrl-C.")] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Print what a running 'micron bench' says, as it says it. Exit 4 when there is none.

@@ -1,4 +1,4 @@
-"""``micron doctor``: what this machine offers, what the bench file asks for, what is missing and how to get it."""
+"""Implements ``micron doctor``: it compares this machine with the bench file and says how to get what is missing."""
 
 from __future__ import annotations
 

@@ -1,4 +1,5 @@
-"""``micron imu``: how good an inertial sensor is, from a recording or on the bench (Erat 2018, chapter 5)."""
+"""Implements ``micron imu``: it evaluates an inertial sensor from a recording or on the bench (Erat 2018, chapter
+5)."""
 
 from __future__ import annotations
 
@@ -20,26 +21,39 @@ from tools.terminal import task_name
 
 def imu(
     recording: Annotated[
-        list[Path] | None, typer.Argument(metavar="[RECORDING]...", help="Motionless; more for other temperatures.")
+        list[Path] | None,
+        typer.Argument(metavar="[RECORDING]...", help="Motionless recordings; more than one for other temperatures."),
     ] = None,
-    fall: Annotated[list[Path] | None, typer.Option("--fall", metavar="RECORDING", help="Of a free fall.")] = None,
+    fall: Annotated[
+        list[Path] | None, typer.Option("--fall", metavar="RECORDING", help="Recording of a free fall.")
+    ] = None,
     turned: Annotated[
-        Path | None, typer.Option("--turned", metavar="RECORDING", help="Turned slowly through all six directions.")
+        Path | None,
+        typer.Option("--turned", metavar="RECORDING", help="Recording turned slowly through all six directions."),
     ] = None,
     rate: Annotated[
-        float | None, typer.Option("--rate-hz", min=0.1, help="Of recordings without a time column.")
+        float | None,
+        typer.Option("--rate-hz", min=0.1, help="Sampling rate, in Hz, of recordings without a time column."),
     ] = None,
-    accel_lsb: Annotated[float | None, typer.Option("--accel-lsb-per-g", min=1e-9, help="Of raw counts.")] = None,
-    gyro_lsb: Annotated[float | None, typer.Option("--gyro-lsb-per-dps", min=1e-9, help="Of raw counts.")] = None,
-    accel_factor: Annotated[float, typer.Option(min=1e-9, help="Repairs a range error of the logger.")] = 1.0,
+    accel_lsb: Annotated[
+        float | None, typer.Option("--accel-lsb-per-g", min=1e-9, help="Counts per g of raw columns.")
+    ] = None,
+    gyro_lsb: Annotated[
+        float | None, typer.Option("--gyro-lsb-per-dps", min=1e-9, help="Counts per deg/s of raw columns.")
+    ] = None,
+    accel_factor: Annotated[
+        float, typer.Option(min=1e-9, help="Factor that repairs a range error of the logger.")
+    ] = 1.0,
     bench: Annotated[
         Path | None, typer.Option("--bench", metavar="FILE|NAME", help="Measure the sensors of a bench.")
     ] = None,
     sensor: Annotated[str | None, typer.Option("--sensor", help="Only this device of the bench.")] = None,
     virtual: Annotated[bool, typer.Option("--virtual", help="Virtual time (emulated bench).")] = False,
-    seconds: Annotated[float, typer.Option(min=5.0, max=86_400.0, help="On a bench: how long to watch.")] = 600.0,
+    seconds: Annotated[
+        float, typer.Option(min=5.0, max=86_400.0, help="Time of the measurement on a bench, in s.")
+    ] = 600.0,
     picture: Annotated[
-        Path | None, typer.Option("--picture", metavar="FILE", help="PNG of the (first) sensor.")
+        Path | None, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the first sensor.")
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -61,26 +75,26 @@ def imu(
         if picture is not None and bench is None and not recording:
             raise InputError("--picture shows a motionless recording; give one, or leave --picture out")
         result: dict[str, Any] = {"format": 1, "sensors": [], "falls": [], "turned": None}
-        shown: Series | None = None
+        pictured: Series | None = None
         ok = True
         if bench is not None:
             series, result["sensors"] = _measure(bench, sensor, virtual, seconds)
-            shown = series[0]
+            pictured = series[0]
             ok = all(r["auto_calibration"] is None or r["auto_calibration"]["verified"] for r in result["sensors"])
         else:
             scales = Scales(accel_lsb, gyro_lsb, accel_factor)
             if recording:
                 parts = [load_series(path, scales, rate) for path in recording]
-                shown = parts[0]
+                pictured = parts[0]
                 result["sensors"] = [{**evaluate_parts(parts), "auto_calibration": None}]
             result["falls"] = [evaluate_fall(load_series(path, scales, rate)) for path in fall or []]
             if turned is not None:
                 result["turned"] = evaluate_turned(load_series(turned, scales, rate))
-        for found in result["sensors"]:
-            _show(found)
+        for report in result["sensors"]:
+            _show(report)
         _show_others(result)
-        if picture is not None and shown is not None:
-            save_imu_picture(shown, picture)
+        if picture is not None and pictured is not None:
+            save_imu_picture(pictured, picture)
             console().print(f"picture: {picture}")
         write_json(result, json_file)
         if not ok:
@@ -98,7 +112,7 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
     from tools.imu.live import auto_calibrate, record
 
     series: list[Series] = []
-    found: list[dict[str, Any]] = []
+    report: list[dict[str, Any]] = []
     described = load_bench(bench_path(bench))
     check_devices(described.description, str(described.path))
     columns = (task_name(), BarColumn(), TimeRemainingColumn())
@@ -132,14 +146,16 @@ def _measure(bench: Path, only: str | None, virtual: bool, seconds: float) -> tu
                     after = still["drift_deg_per_min"]["before"]
                     before = {a: after[a] - 60.0 * v for a, v in zip(AXES, calibrated.written_dps, strict=True)}
                     still["drift_deg_per_min"] = {"before": before, "after": after}
-                found.append({**still, "auto_calibration": None if calibrated is None else calibrated.as_dict()})
+                report.append({**still, "auto_calibration": None if calibrated is None else calibrated.as_dict()})
         finally:
             sensors.close()
-    return series, found
+    return series, report
 
 
-def _show(found: dict[str, Any]) -> None:
-    title = f"{found['sensor']}: {found['seconds']:.0f} s at {found['rate_hz']:g} Hz, |a| = {found['gravity_g']:.4f} g"
+def _show(report: dict[str, Any]) -> None:
+    title = (
+        f"{report['sensor']}: {report['seconds']:.0f} s at {report['rate_hz']:g} Hz, |a| = {report['gravity_g']:.4f} g"
+    )
     table = Table(title=title, title_justify="left")
     table.add_column("Erat 2018")
     table.add_column("quantity")
@@ -150,15 +166,15 @@ def _show(found: dict[str, Any]) -> None:
         if values is not None:
             table.add_row(source, what, *(format(values[a], form) for a in AXES))
 
-    row("5.2.1.3", "accelerometer offset, simple (g)", found["offset"]["simple_g"], ".4f")
+    row("5.2.1.3", "accelerometer offset, simple (g)", report["offset"]["simple_g"], ".4f")
     for key in ("max", "min", "difference"):
-        row("Table 5.4", f"accelerometer, {key} (g)", found["stability_g"][key], ".4f")
-    row("Table 5.5", "gyroscope offset (deg/s)", found["offset"]["gyroscope_dps"], ".4f")
-    row("Table 5.6", "drift before calibration (deg/min)", found["drift_deg_per_min"]["before"], ".2f")
-    row("Table 5.7", "drift after calibration (deg/min)", found["drift_deg_per_min"]["after"], ".3f")
-    row("Table 5.8", "gyroscope noise, rms (deg/s)", found["noise_rms_dps"], ".4f")
+        row("Table 5.4", f"accelerometer, {key} (g)", report["stability_g"][key], ".4f")
+    row("Table 5.5", "gyroscope offset (deg/s)", report["offset"]["gyroscope_dps"], ".4f")
+    row("Table 5.6", "drift before calibration (deg/min)", report["drift_deg_per_min"]["before"], ".2f")
+    row("Table 5.7", "drift after calibration (deg/min)", report["drift_deg_per_min"]["after"], ".3f")
+    row("Table 5.8", "gyroscope noise, rms (deg/s)", report["noise_rms_dps"], ".4f")
     data_console().print(table)
-    calibrated = found["auto_calibration"]
+    calibrated = report["auto_calibration"]
     if calibrated is not None:
         left = max(abs(v) for v in calibrated["left_dps"])
         left_g = max(abs(v) for v in calibrated["left_g"])
@@ -166,7 +182,7 @@ def _show(found: dict[str, Any]) -> None:
         data_console().print(
             f"auto-calibration in the chip: {1e3 * left_g:.2f} mg and {left:.4f} deg/s left, {verdict}"
         )
-    warm = found["thermal"]
+    warm = report["thermal"]
     if warm is not None:
         table = Table(title=f"temperature {warm['lowest_C']:.1f} .. {warm['highest_C']:.1f} degC", title_justify="left")
         for column in ("axis", "slope per K", "change", "rms before", "rms after", "unit", "verdict"):
@@ -175,8 +191,8 @@ def _show(found: dict[str, Any]) -> None:
             figures = (axis["slope_per_K"], axis["change"], axis["rms_before"], axis["rms_after"])
             table.add_row(name, *(f"{v:.3g}" for v in figures), axis["unit"], axis["verdict"])
         data_console().print(table)
-    for warning in found["warnings"]:
-        console().print(f"{found['sensor']}: {warning}", style="yellow", soft_wrap=True)
+    for warning in report["warnings"]:
+        console().print(f"{report['sensor']}: {warning}", style="yellow", soft_wrap=True)
 
 
 def _show_others(result: dict[str, Any]) -> None:

@@ -151,15 +151,15 @@ def _at(where: str) -> Any:
 
 def load(name: str) -> Any:
     """The command ``name`` with its modules, as typer makes it."""
-    found = _at(COMMANDS[name].where)
+    target = _at(COMMANDS[name].where)
     for inner, where in INSIDE.get(name, {}).items():
-        if inner not in {command.name for command in found.registered_commands}:
-            found.command(inner, rich_help_panel="Research")(_at(where))
+        if inner not in {command.name for command in target.registered_commands}:
+            target.command(inner, rich_help_panel="Research")(_at(where))
     around = typer.Typer(rich_markup_mode="rich")
-    if isinstance(found, typer.Typer):
-        around.add_typer(found, name=name, cls=Helpful)
+    if isinstance(target, typer.Typer):
+        around.add_typer(target, name=name, cls=Helpful)
     else:
-        around.command(name)(found)
+        around.command(name)(target)
     return _with_brackets(typer.main.get_group(around).commands[name])
 
 
@@ -187,7 +187,7 @@ class Helpful(TyperGroup):
 
 
 class OnDemand(Helpful):
-    """Its commands are lines of help until one is called."""
+    """Loads a command when it is called; until then it is a line of help."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> tuple[str | None, Any, list[str]]:
         name, line, rest = super().resolve_command(ctx, args)
@@ -234,7 +234,7 @@ for _name, _command in COMMANDS.items():
 
 
 def main() -> None:
-    """What the ``micron`` script calls."""
+    """Run the ``micron`` script."""
     use_one_thread()
     install_handler()
     handle = None

@@ -1,4 +1,4 @@
-"""``micron mismatch``: where simulation and recording differ, and which physics is missing."""
+"""Implements ``micron mismatch``: it finds where simulation and recording differ, and which physics is missing."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ RecordingArgument = Annotated[
 RecordingsArgument = Annotated[
     list[Path],
     typer.Argument(
-        metavar="RECORDING...", help="A recording (folder or .toml), a folder of them; several with --together."
+        metavar="RECORDING...", help="A recording (folder or .toml) or a folder of recordings; several with --together."
     ),
 ]
-EngineOption = Annotated[
-    str, typer.Option(metavar="old|new", help="Which engine decides; new is an experiment beside the old one.")
+EngineOption = Annotated[str, typer.Option(metavar="old|new", help="Engine that decides; 'new' is an experiment.")]
+SeedOption = Annotated[
+    int, typer.Option(min=0, help="Seed of the search; the same recording and seed give the same answer.")
 ]
-SeedOption = Annotated[int, typer.Option(min=0, help="Same recording and seed: same answer.")]
 
 
 MOST_SHARED = 1_000_000
@@ -53,13 +53,13 @@ def diagnose(
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report with pictures.")] = None,
     out: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="report.json and report.html there, per recording.")
+        Path | None, typer.Option(metavar="FOLDER", help="Folder for report.json and report.html of each recording.")
     ] = None,
     held_out: Annotated[
         float, typer.Option(min=0.1, max=0.6, help="Share of the record that no fit sees, unless it brings a split.")
     ] = 0.3,
     seed: SeedOption = 0,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one per core.")] = None,
     dask: Annotated[
         str | None, typer.Option(metavar="ADDRESS", help="With a folder: run on this Dask cluster (extra 'dask').")
     ] = None,
@@ -67,7 +67,8 @@ def diagnose(
     allow_outside: OutsideOption = False,
     engine: EngineOption = "old",
     together: Annotated[
-        bool, typer.Option("--together", help="Recordings of one system: one answer for all, and what differs.")
+        bool,
+        typer.Option("--together", help="Give all recordings of one system one diagnosis, and report what differs."),
     ] = False,
     per_recording: Annotated[
         list[str] | None,
@@ -206,7 +207,7 @@ def new(
         float | None, typer.Option(metavar="HZ", help="Bring the columns to even steps at this rate.")
     ] = None,
     cut: Annotated[bool, typer.Option("--cut", help="Cut at gaps into runs that are diagnosed together.")] = False,
-    force: Annotated[bool, typer.Option("--force", help="Write over what is there.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Make a recording.toml for a data file: guess time, roles, units and the twin, and draw the columns.
@@ -239,8 +240,8 @@ def _show_new(made: NewRecording, json_file: str | None) -> None:
         table.add_row(c.name, c.role or "not used", signal, c.unit or "?", f"{min(c.low):.4g}", f"{max(c.high):.4g}")
     (console() if json_file == "-" else data_console()).print(table)
     write_json(made.to_json(), json_file)
-    for heading, said in (("assumed", made.guess.assumed), ("note", made.guess.notes)):
-        for one in said:
+    for heading, lines in (("assumed", made.guess.assumed), ("note", made.guess.notes)):
+        for one in lines:
             console().print(f"{heading}: {one}", soft_wrap=True)
     rate = made.to_json()["rate_hz"]
     at = f" at {rate:.6g} Hz" if rate else ""
@@ -268,10 +269,10 @@ def physics(json_file: JsonOption = None) -> None:
         check_writable(json_file)
         from tools.mismatch.report.vocabulary import entries, print_vocabulary, to_json
 
-        found = entries()
+        effects = entries()
         if json_file != "-":
-            print_vocabulary(found, data_console())
-        write_json(to_json(found), json_file)
+            print_vocabulary(effects, data_console())
+        write_json(to_json(effects), json_file)
 
 
 def check_engine(engine: str) -> None:
@@ -285,7 +286,7 @@ def cut(
     out: Annotated[Path, typer.Option("--out", metavar="FOLDER", help="The new recording.")],
     start: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing before this time.")] = None,
     stop: Annotated[float | None, typer.Option(metavar="S", help="Keep nothing from this time on.")] = None,
-    every: Annotated[bool, typer.Option("--every", help="Keep every stretch, each as a run of its own.")] = False,
+    every: Annotated[bool, typer.Option("--every", help="Keep every stretch as a run of its own.")] = False,
 ) -> None:
     """Keep the longest stretch without gaps, on a uniform clock, as a recording of its own.
 
@@ -309,7 +310,9 @@ def cut(
 @app.command()
 def apply(
     recording: RecordingArgument,
-    report: Annotated[Path, typer.Argument(metavar="REPORT.json", help="What diagnose --json wrote for it.")],
+    report: Annotated[
+        Path, typer.Argument(metavar="REPORT.json", help="Report that 'diagnose --json' wrote for the recording.")
+    ],
     out: Annotated[
         Path, typer.Option("--out", metavar="FILE", help="The corrected twin: .toml, .py, .fmu, or .csv for columns.")
     ],
@@ -370,7 +373,9 @@ def apply(
 
 @app.command()
 def simulate(
-    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="What apply wrote: .toml, .py or .fmu.")],
+    twin: Annotated[
+        Path, typer.Argument(metavar="TWIN", help="Corrected twin that 'apply' wrote: .toml, .py or .fmu.")
+    ],
     recording: RecordingArgument,
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE.csv", help="The simulated columns.")] = None,
     json_file: JsonOption = None,
@@ -389,10 +394,10 @@ def simulate(
         from tools.mismatch.recording_load import load
 
         loaded = load(recording)
-        found = simulate_file(twin, recording)
-        rows: list[Residual] = residuals(loaded, found)
+        simulated = simulate_file(twin, recording)
+        rows: list[Residual] = residuals(loaded, simulated)
         if out is not None:
-            write_text_atomic(out, columns(loaded, found))
+            write_text_atomic(out, columns(loaded, simulated))
         say = console() if json_file == "-" else data_console()
         for row in rows:
             say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}", highlight=False)

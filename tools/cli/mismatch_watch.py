@@ -15,7 +15,8 @@ from tools.output import check_writable, write_json
 LEAST_PER_HOUR, MOST_PER_HOUR = 1e-6, 60.0
 
 FalseAlarmsOption = Annotated[
-    float, typer.Option("--false-alarms-per-hour", metavar="R", help="Stated rate of all channels together.")
+    float,
+    typer.Option("--false-alarms-per-hour", metavar="R", help="Stated sampling rate of all channels together, in Hz."),
 ]
 
 
@@ -28,7 +29,9 @@ def check_rate(false_alarms_per_hour: float) -> None:
 
 
 def watch(
-    twin: Annotated[Path, typer.Argument(metavar="TWIN", help="What apply wrote: .toml, .py or .fmu.")],
+    twin: Annotated[
+        Path, typer.Argument(metavar="TWIN", help="Corrected twin that 'apply' wrote: .toml, .py or .fmu.")
+    ],
     recording: Annotated[Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml).")],
     reference: Annotated[
         float | None,

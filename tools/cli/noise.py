@@ -1,4 +1,4 @@
-"""``micron noise``: the stochastic model of sensors at rest."""
+"""Implements ``micron noise``: it fits the stochastic model of sensors at rest."""
 
 from __future__ import annotations
 
@@ -32,9 +32,11 @@ def noise(
     ] = None,
     bench: Annotated[
         Path | None,
-        typer.Option(metavar="FILE|NAME", help="The log is of this instrument: calibrated axes instead."),
+        typer.Option(
+            metavar="FILE|NAME", help="Bench of the instrument that made the log; its calibrated axes are used."
+        ),
     ] = None,
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the deviation.")] = Path(
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the deviation.")] = Path(
         "out/noise.png"
     ),
     json_file: JsonOption = None,
@@ -64,21 +66,21 @@ def noise(
         if log.gaps:
             console().print(f"{log.path}: time jumps ahead {log.gaps} times; the deviation takes the samples as even")
         rate = log.need_rate()
-        found: dict[str, tuple[AllanCurve, NoiseModel]] = {}
+        models: dict[str, tuple[AllanCurve, NoiseModel]] = {}
         with keep_what_is_there():
             for name in names:
                 try:
                     curve = allan_curve(log.matrix((name,))[:, 0] * scale, rate)
-                    found[name] = curve, identify(curve, shortest_s)
+                    models[name] = curve, identify(curve, shortest_s)
                 except ValueError as error:
                     if isinstance(error, InputError):
                         raise
                     raise InputError(f"{log.path}: '{name}': {error}") from error
-        need_some(found)
+        need_some(models)
         table = Table(title=f"{log.path}, {rate:g} Hz", title_justify="left")
         for heading in ("column", "N (unit sqrt s)", "B (unit)", "K (unit/sqrt s)", "R (unit/s)", "fit from (s)"):
             table.add_column(heading, no_wrap=heading == "column")
-        for name, (_, model) in found.items():
+        for name, (_, model) in models.items():
             cells = []
             for term in TERMS:
                 c = getattr(model, term)
@@ -87,22 +89,22 @@ def noise(
             missed = f", off by {100.0 * model.excess:.0f} %" if model.excess > 0.0 else ""
             table.add_row(name, *cells, f"{model.shortest_s:g}{missed}")
         data_console().print(table)
-        save_allan_picture(found, image)
+        save_allan_picture(models, image)
         console().print(f"picture: {image}")
         write_json(
             {
                 "format": 1,
                 "rate_hz": rate,
                 "scale": scale,
-                "shortest_s": min(model.shortest_s for _, model in found.values()),
-                "columns": {n: {"curve": asdict(c), "model": asdict(m)} for n, (c, m) in found.items()},
+                "shortest_s": min(model.shortest_s for _, model in models.values()),
+                "columns": {n: {"curve": asdict(c), "model": asdict(m)} for n, (c, m) in models.items()},
             },
             json_file,
         )
 
 
 def _columns(log: SensorLog) -> list[str]:
-    """What is analysed when nobody says what."""
+    """Return the columns that are analysed by default."""
     import numpy as np
 
     names = [name for name in log.columns if name not in (log.time_column, "t_ns")]

@@ -47,12 +47,13 @@ def export(
         Path | None,
         typer.Argument(metavar="OUT", help=f"name.{', .'.join(FORMATS)} for viewers, or a folder."),
     ] = None,
-    out: Annotated[Path | None, typer.Option(metavar="PATH", help="The same as OUT.")] = None,
-    raw: Annotated[
-        bool, typer.Option("--raw", help="To .mcap: a recording as it was written, which can be replayed.")
-    ] = False,
-    from_s: Annotated[float | None, typer.Option("--from", metavar="S", help="First time, s. Default: all.")] = None,
-    to_s: Annotated[float | None, typer.Option("--to", metavar="S", help="End of the span, s.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="PATH", help="Output file, as the argument OUT.")] = None,
+    raw: Annotated[bool, typer.Option("--raw", help="With .mcap: write a recording that can be replayed.")] = False,
+    from_s: Annotated[
+        float | None,
+        typer.Option("--from", metavar="S", help="Start of the span, in s. Default: the start of the recording."),
+    ] = None,
+    to_s: Annotated[float | None, typer.Option("--to", metavar="S", help="End of the span, in s.")] = None,
     overwrite: Overwrite = False,
     json_file: JsonOption = None,
 ) -> None:
@@ -101,8 +102,8 @@ def _target(to: Path | None, out: Path | None, raw: bool) -> Path:
     """Return where an export goes. Raises ``InputError`` for no place, two places, or ``--raw`` to another format."""
     if (to is None) == (out is None):
         raise InputError("name one file or folder to write, as in: micron export RUN OUT")
-    found = to or out
-    assert found is not None
-    if raw and found.suffix != ".mcap":
-        raise InputError(f"{found}: --raw writes a recording; name a file that ends in .mcap")
-    return found
+    target = to or out
+    assert target is not None
+    if raw and target.suffix != ".mcap":
+        raise InputError(f"{target}: --raw writes a recording; name a file that ends in .mcap")
+    return target

@@ -1,4 +1,4 @@
-"""``micron replay``: the same firmware over a recording, as fast as the machine can."""
+"""Implements ``micron replay``: it runs the same firmware over a recording, as fast as the machine can."""
 
 from __future__ import annotations
 

@@ -40,12 +40,12 @@ if TYPE_CHECKING:
     from tools.reports.run_live import TipWatch
 
 SETTLE_S = 2.0
-"""After arming, the estimator locks and the soft start ends within this time; figures are taken after it."""
+"""Time after arming within which the estimator locks and the soft start ends. Figures are taken after it."""
 
 
 def run(
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="How long to run.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.5, max=86_400.0, help="Time of the run after arming, in s.")] = 10.0,
     virtual: Annotated[
         bool, typer.Option("--virtual", help="Emulated bench: as fast as it can instead of a second per second.")
     ] = False,
@@ -53,10 +53,10 @@ def run(
         bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
     ] = False,
     compiled: Annotated[
-        bool, typer.Option("--compiled", help="The ticks run in one compiled thread, with Python beside it.")
+        bool, typer.Option("--compiled", help="Run the ticks in one compiled thread without the interpreter.")
     ] = False,
     spin_us: Annotated[
-        float, typer.Option(min=0.0, help="With --compiled: wait awake so long before and after a scan is due, us.")
+        float, typer.Option(min=0.0, help="With --compiled: wait awake for so many us before and after a scan is due.")
     ] = 0.0,
     cpu: Annotated[
         int | None, typer.Option(min=0, help="In real time: the processor that the loop stays on (isolcpus).")
@@ -69,7 +69,7 @@ def run(
         typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz."),
     ] = None,
     sense_only: Annotated[
-        bool, typer.Option("--sense-only", help="Arm nothing: to record poses turned by hand, or raw sensors.")
+        bool, typer.Option("--sense-only", help="Arm nothing; use it to record poses turned by hand, or raw sensors.")
     ] = False,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
     method: Annotated[
@@ -90,7 +90,7 @@ def run(
     allow_outside: OutsideOption = False,
     json_file: JsonOption = None,
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Self-contained HTML report.")] = None,
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = Path(
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) before and after.")] = Path(
         "out/run.png"
     ),
 ) -> None:
@@ -166,9 +166,11 @@ def _check_processor(pace: str, cpu: int | None) -> None:
         return
     if pace != "realtime":
         raise InputError("--cpu belongs to real time; add --realtime, or leave it out")
-    there = sorted(os.sched_getaffinity(0))
-    if cpu not in there:
-        raise InputError(f"--cpu {cpu}: this process may use processors {format_processors(there)}; name one of them")
+    available = sorted(os.sched_getaffinity(0))
+    if cpu not in available:
+        raise InputError(
+            f"--cpu {cpu}: this process may use processors {format_processors(available)}; name one of them"
+        )
 
 
 def exit_status(result: Mapping[str, Any]) -> Exit:
@@ -203,7 +205,7 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
 
 
 def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
-    """In emulated time nothing waits for the loop, so it runs in this process."""
+    """Run an emulated bench in this process: in emulated time nothing waits for the loop."""
     from firmware_py.app import run_in_process
     from tools.reports.run_live import TipWatch
 
@@ -213,7 +215,7 @@ def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] |
 
         def show(status: dict[str, Any]) -> None:
             key.look(status)
-            live.update(_shown(status, request.seconds, watch))
+            live.update(_status_line(status, request.seconds, watch))
 
         return run_in_process(request, show, on_open=watch.attach)
 
@@ -282,8 +284,10 @@ def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
     limit_s = time.monotonic() + (float(started.read_text()) + END_S if started.exists() else 0.0)
     while not report.exists() and time.monotonic() < limit_s:
         time.sleep(0.01)
-    said = describe(json.loads(report.read_text())) if report.exists() else "no word from a guardian of the outputs"
-    console().print(f"the firmware was killed by signal {number}; {said}")
+    guardian_words = (
+        describe(json.loads(report.read_text())) if report.exists() else "no word from a guardian of the outputs"
+    )
+    console().print(f"the firmware was killed by signal {number}; {guardian_words}")
 
 
 def _watch(process: subprocess.Popen[str], seconds: float) -> None:
@@ -297,7 +301,7 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
         for line in process.stdout:
             status = json.loads(line)
             key.look(status)
-            live.update(_shown(status, seconds, watch))
+            live.update(_status_line(status, seconds, watch))
 
 
 def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None, json_file: str | None) -> None:
@@ -310,7 +314,7 @@ def finish_endoscope_run(outcome: dict[str, Any], truth: Mapping[str, Any] | Non
     raise typer.Exit(exit_status(result))
 
 
-def _shown(status: dict[str, Any], seconds: float, watch: TipWatch) -> RenderableType:
+def _status_line(status: dict[str, Any], seconds: float, watch: TipWatch) -> RenderableType:
     if "view" in status:
         from tools.reports.endoscope_report import status_table
 

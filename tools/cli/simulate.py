@@ -30,11 +30,13 @@ def simulate_command(
         float | None, typer.Option(help="With --hand: 1 leaves the recording as it is; default 50 um p-p in 8-12 Hz.")
     ] = None,
     delay_us: Annotated[
-        float | None, typer.Option(help="From scan to command; the default is what the default bench's wires take.")
+        float | None, typer.Option(help="Delay from scan to command, in us; the default is that of the default bench.")
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world; default from the bench file.")] = None,
     json_file: JsonOption = None,
-    image: Annotated[Path | None, typer.Option("--picture", metavar="FILE", help="PNG before and after.")] = None,
+    image: Annotated[
+        Path | None, typer.Option("--picture", metavar="FILE", help="Picture (PNG) before and after.")
+    ] = None,
 ) -> None:
     """Simulate the closed loop without wires, tens of times faster than real time; the same figures as micron run.
 

@@ -52,7 +52,10 @@ def _says_yes(question: str) -> bool:
 def trust(
     paths: Annotated[
         list[Path] | None,
-        typer.Argument(metavar="PATH...", help="A recording, twin, bench, folder, .py or .fmu; none: the list."),
+        typer.Argument(
+            metavar="PATH...",
+            help="A recording, twin, bench, folder, .py or .fmu; without it the decisions are listed.",
+        ),
     ] = None,
     allow_outside: OutsideOption = False,
     forget: Annotated[bool, typer.Option("--forget", help="Drop every decision.")] = False,
@@ -78,13 +81,13 @@ def trust(
         from tools.programs import Program, named_in
 
         for path in paths:
-            found = named_in(path)
-            for item in found:
+            programs = named_in(path)
+            for item in programs:
                 is_program = isinstance(item, Program)
                 if not is_program and not allow_outside and not item.is_trusted:
                     console().print(f"{item}: outside the folder; --allow-outside lets it be named", soft_wrap=True)
                     continue
                 item.trust()
                 console().print(f"{item}: may {'run' if is_program else 'be named'}", soft_wrap=True)
-            if not found:
+            if not programs:
                 console().print(f"{path}: names no program and no file outside its folder", soft_wrap=True)

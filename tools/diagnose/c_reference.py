@@ -66,8 +66,8 @@ def compile_reference() -> CReference | str:
             subprocess.run(command, check=True, capture_output=True, text=True, timeout=LIMIT_S)
             loaded = ctypes.CDLL(str(library))  # stays loaded without its file
         except subprocess.CalledProcessError as error:
-            told = (error.stderr.strip().splitlines() or ["it said nothing"])[0]
-            return f"{compiler} cannot compile it: {told}"
+            message = (error.stderr.strip().splitlines() or ["it said nothing"])[0]
+            return f"{compiler} cannot compile it: {message}"
         except (OSError, subprocess.SubprocessError) as error:
             return f"{compiler} cannot be used: {error}"
     return CReference((version.stdout.splitlines() or [compiler])[0], loaded)

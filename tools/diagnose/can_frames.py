@@ -12,7 +12,7 @@ from hal.types import CanFrame
 
 @dataclass(frozen=True)
 class Heard:
-    """One frame: time since the start of listening, and what it says, if it can be decoded."""
+    """Holds one frame: time since the start of listening, and its decoded content, if its id is known."""
 
     bus: str
     t_s: float

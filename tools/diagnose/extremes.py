@@ -9,7 +9,8 @@ Float32Array = NDArray[np.float32]
 
 
 def extremes(low: Float32Array, high: Float32Array, k: int) -> tuple[Float32Array, Float32Array]:
-    """Smallest of ``low`` and largest of ``high`` [channels, n] in groups of ``k``, the last may be shorter.
+    """Return the smallest of ``low`` and the largest of ``high`` (channels, n) in groups of ``k``; the last may be
+    shorter.
 
     NaN counts only where a group has nothing else.
     """

@@ -1,4 +1,4 @@
-"""What a machine offers and what a bench asks for, as findings with what to do."""
+"""Compares the offers of a machine with the needs of a bench, as findings with a remedy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Verdict = Literal["ok", "missing", "limited"]
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report. ``remedy`` is a thing to do, empty when all is well."""
+    """Holds one line of the report. ``remedy`` says what to do and is empty when all is well."""
 
     part: str
     verdict: Verdict
@@ -50,7 +50,7 @@ def _setting_finding(state: MachineState) -> Finding:
 
 
 def machine_findings() -> list[Finding]:
-    """What this machine offers, whatever bench is used."""
+    """Return the findings about this machine, for any bench."""
     findings = [Finding("python", "ok", f"{platform.python_version()} on {platform.system()} {platform.release()}")]
     ports = sorted(glob.glob("/dev/ttyACM*") + glob.glob("/dev/ttyUSB*"))
     findings.append(Finding("serial ports", "ok" if ports else "limited", ", ".join(ports) or "none"))
@@ -85,14 +85,14 @@ def machine_findings() -> list[Finding]:
         )
     )
     for package, need in (("nidaqmx", "NI DAQ"), ("pyarrow", "export to parquet"), ("fmpy", "FMU twins")):
-        there = importlib.util.find_spec(package) is not None
+        is_installed = importlib.util.find_spec(package) is not None
         extra = {"nidaqmx": "ni", "pyarrow": "parquet", "fmpy": "fmu"}[package]
         findings.append(
             Finding(
                 f"package {package} ({need})",
-                "ok" if there else "limited",
-                "installed" if there else "not installed",
-                "" if there else f"pip install 'micron-bench[{extra}]' when you need it",
+                "ok" if is_installed else "limited",
+                "installed" if is_installed else "not installed",
+                "" if is_installed else f"pip install 'micron-bench[{extra}]' when you need it",
             )
         )
     return findings
@@ -128,7 +128,7 @@ def _priority_finding() -> Finding:
 
 
 def bench_findings(bench: BenchFile) -> list[Finding]:
-    """What the bench file asks for and whether it is there."""
+    """Return the findings about the needs of the bench file."""
     description = bench.description
     options = check_devices(description, str(bench.path))
     uses = bus_uses(description, options, polling_of(description, options)[0])

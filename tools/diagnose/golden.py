@@ -1,5 +1,5 @@
-"""Golden transcripts: what went over every bus while the firmware's drivers opened a bench and scanned for a while,
-and what differs when the same is done again with today's drivers, or said again to the emulated devices.
+"""Makes golden transcripts: all traffic of every bus while the firmware's drivers opened a bench and scanned for a
+while, and what differs when the same is done again with today's drivers, or said again to the emulated devices.
 
 A folder with one transcript per bus (``hal.middleware.trace``) and ``golden.json``: bench text, scan time, clock.
 """
@@ -33,7 +33,8 @@ STREAM_SLACK_BYTES = 64
 
 @dataclass(frozen=True)
 class Difference:
-    """Where two sides part. ``kind``: protocol (other length, no answer, other question) or data (other values)."""
+    """Describes where two sides differ. ``kind``: protocol (other length, no answer, other question) or data (other
+    values)."""
 
     bus: str
     side: str
@@ -62,7 +63,8 @@ class GoldenReport:
 
 
 def run_scenario(bench: OpenBench, seconds: float) -> None:
-    """What every transcript is of: open and probe all devices, scan for ``seconds``, stop. Nothing is armed."""
+    """Run the scenario of every transcript: open and probe all devices, scan for ``seconds``, stop. Nothing is
+    armed."""
     devices = open_devices(bench)
     rows = np.zeros((1024, len(devices.scan.channels)), dtype=np.int16)
     devices.daq.start()
@@ -120,19 +122,19 @@ def diff(folder: Path, bench_file: Path | None = None) -> GoldenReport:
     facts = _facts(folder)
     bench_path = bench_file or Path(facts["bench_file"])
     entries = {bus: _entries(folder, bus) for bus in facts["kinds"]}
-    found = _against_driver(bench_path, entries, facts)
+    differences = _against_driver(bench_path, entries, facts)
     with opened_bench(bench_path, pace="virtual") as bench:
         for bus, kind in facts["kinds"].items():
             if kind == "i2c":
-                found += _i2c_against_emulator(bench, bus, entries[bus])
+                differences += _i2c_against_emulator(bench, bus, entries[bus])
             elif kind == "serial":
-                found += _serial_against_emulator(bench, bus, entries[bus])
+                differences += _serial_against_emulator(bench, bus, entries[bus])
     compared = sum(len(e) for e in entries.values())
-    protocol = sum(d.kind == "protocol" for d in found)
-    shown: list[Difference] = []
-    for bus, side in sorted({(d.bus, d.side) for d in found}):
-        shown += [d for d in found if (d.bus, d.side) == (bus, side)][:MAX_SHOWN]
-    return GoldenReport(compared, tuple(shown), protocol, len(found) - protocol)
+    protocol = sum(d.kind == "protocol" for d in differences)
+    selected: list[Difference] = []
+    for bus, side in sorted({(d.bus, d.side) for d in differences}):
+        selected += [d for d in differences if (d.bus, d.side) == (bus, side)][:MAX_SHOWN]
+    return GoldenReport(compared, tuple(selected), protocol, len(differences) - protocol)
 
 
 def _against_driver(bench_path: Path, entries: dict[str, list[Entry]], facts: dict[str, Any]) -> list[Difference]:
@@ -142,18 +144,18 @@ def _against_driver(bench_path: Path, entries: dict[str, list[Entry]], facts: di
     log: list[Divergence] = []
     ports = {bus: replay_port(bus, kind, entries[bus], clock, log) for bus, kind in facts["kinds"].items()}
     bench = OpenBench(file, clock, ports, None, bench_path.parent)
-    found: list[Difference] = []
+    differences: list[Difference] = []
     try:
         run_scenario(bench, float(facts["seconds"]))
     except HalError as error:
         if not log:
-            found.append(Difference("", "driver", -1, "protocol", "the scenario ran", str(error)))
-    return found + [Difference(d.bus, "driver", d.entry, "protocol", d.recorded, d.found) for d in log]
+            differences.append(Difference("", "driver", -1, "protocol", "the scenario ran", str(error)))
+    return differences + [Difference(d.bus, "driver", d.entry, "protocol", d.recorded, d.found) for d in log]
 
 
 def _i2c_against_emulator(bench: OpenBench, bus: str, entries: list[Entry]) -> list[Difference]:
     """Every recorded transfer again, at its time."""
-    port, found = bench.i2c(bus), list[Difference]()
+    port, differences = bench.i2c(bus), list[Difference]()
     start_ns = bench.clock.now_ns()
     for number, entry in enumerate(entries):
         bench.clock.sleep_until_ns(start_ns + entry.t_ns)
@@ -167,18 +169,18 @@ def _i2c_against_emulator(bench: OpenBench, bus: str, entries: list[Entry]) -> l
             answer = port.transfer(int(words[0], 16), ops).hex()
         except HalError as error:
             if not failed:
-                found.append(Difference(bus, "emulator", number, "protocol", " ".join(words), f"failed: {error}"))
+                differences.append(Difference(bus, "emulator", number, "protocol", " ".join(words), f"failed: {error}"))
             continue
         if failed:
-            found.append(Difference(bus, "emulator", number, "protocol", " ".join(words), f"answered {answer}"))
+            differences.append(Difference(bus, "emulator", number, "protocol", " ".join(words), f"answered {answer}"))
         elif answer != recorded:
-            found.append(Difference(bus, "emulator", number, "data", recorded, answer))
-    return found
+            differences.append(Difference(bus, "emulator", number, "data", recorded, answer))
+    return differences
 
 
 def _serial_against_emulator(bench: OpenBench, bus: str, entries: list[Entry]) -> list[Difference]:
     """Everything that the host wrote again, at its time; what came back between two writes is compared."""
-    port, found, buf = bench.serial(bus), list[Difference](), memoryview(bytearray(65536))
+    port, differences, buf = bench.serial(bus), list[Difference](), memoryview(bytearray(65536))
     start_ns = bench.clock.now_ns()
     exchanges: list[tuple[int, int, bytes, bytes]] = []
     for number, entry in enumerate(entries):
@@ -200,12 +202,12 @@ def _serial_against_emulator(bench: OpenBench, bus: str, entries: list[Entry]) -
             answer += bytes(buf[:n])
         answer = answer[: len(recorded)]
         if answer != recorded:
-            found.append(
+            differences.append(
                 Difference(
                     bus, "emulator", number, _kind(recorded, answer), _short(asked, recorded), _short(asked, answer)
                 )
             )
-    return found
+    return differences
 
 
 def _kind(recorded: bytes, answer: bytes) -> str:

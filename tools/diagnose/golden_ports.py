@@ -13,7 +13,7 @@ from hal.types import CanFrame, CanStats, I2cOp, I2cWrite, PortInfo
 
 @dataclass(frozen=True)
 class Divergence:
-    """At ``entry`` of the transcript of ``bus`` the driver did ``found`` where ``recorded`` was."""
+    """Is raised when the driver does ``found`` at ``entry`` of the transcript of ``bus``, where ``recorded`` was."""
 
     bus: str
     entry: int
@@ -28,7 +28,7 @@ class _Replay:
         self._start_ns: int | None = None
 
     def due_ns(self) -> int:
-        """When the next entry was, on our clock; the first one is now."""
+        """Return the time of the next entry on our clock. The first entry is now."""
         if self._start_ns is None:
             self._start_ns = self.clock.now_ns()
         return self._start_ns + self.entries[self.at].t_ns
@@ -51,7 +51,7 @@ class _Replay:
 
 
 class ReplaySerial(_Replay):
-    """SerialPort."""
+    """Replays a transcript as a SerialPort."""
 
     _rest = b""
 
@@ -84,7 +84,7 @@ class ReplaySerial(_Replay):
 
 
 class ReplayI2c(_Replay):
-    """I2cBus."""
+    """Replays a transcript as an I2cBus."""
 
     def transfer(self, address: int, ops: Sequence[I2cOp]) -> bytes:
         entry = self.next()
@@ -103,7 +103,7 @@ class ReplayI2c(_Replay):
 
 
 class ReplayCan(_Replay):
-    """CanBus."""
+    """Replays a transcript as a CanBus."""
 
     def send(self, frame: CanFrame, timeout_s: float) -> None:
         sent = f"{frame.can_id:08x}" if frame.extended else f"{frame.can_id:03x}"

@@ -1,4 +1,5 @@
-"""Our cyclictest: how late a 1 kHz loop wakes up on this machine, in C, compiled, in Python, and as the firmware."""
+"""Measures, like cyclictest, how late a 1 kHz loop wakes up on this machine: in C, compiled, in Python, as the
+firmware."""
 
 from __future__ import annotations
 
@@ -46,7 +47,7 @@ while data := os.read(0, 64):
 
 @dataclass(frozen=True)
 class Lateness:
-    """One measurement. ``what`` names the load, ``scheduling`` what was granted."""
+    """Holds one measurement. ``what`` names the load, ``scheduling`` the granted policy."""
 
     what: str
     policy: Policy
@@ -81,7 +82,7 @@ def octaves(histogram: DurationHistogram) -> list[tuple[float, int]]:
 
 
 def settings_of(policy: Policy) -> RealtimeConfig:
-    """What the firmware asks for (``fifo``), or nothing at all."""
+    """Return the settings that the firmware asks for (``fifo``), or none."""
     if policy == "fifo":
         return RealtimeConfig(priority=LOOP_PRIORITY, idle_exit_us=0)
     return RealtimeConfig(priority=None, lock_memory=False, timer_slack_ns=None, freeze_gc=False)
@@ -125,7 +126,7 @@ def _compiled_wake() -> Wake:
     return wake
 
 
-def take_turns(loops: Sequence[Loop], rounds: int, turn_s: float, found: list[Lateness]) -> Iterator[str]:
+def take_turns(loops: Sequence[Loop], rounds: int, turn_s: float, measurements: list[Lateness]) -> Iterator[str]:
     """Let each of ``loops`` run for ``turn_s``, ``rounds`` times over, so that all have the same neighbours. Yields
     what is about to run; results are in ``found`` as they come."""
     for number in range(rounds):
@@ -136,11 +137,11 @@ def take_turns(loops: Sequence[Loop], rounds: int, turn_s: float, found: list[La
             histogram, scheduling = DurationHistogram(), "interrupted"
             try:
                 scheduling = loop.measure(turn_s, histogram)
-            finally:  # what was counted until Ctrl-C counts
+            finally:  # the counts until Ctrl-C are kept
                 if number:
-                    found[i].histogram.add_histogram(histogram)
+                    measurements[i].histogram.add_histogram(histogram)
                 elif histogram.n:
-                    found.append(Lateness(loop.what, loop.policy, scheduling, histogram))
+                    measurements.append(Lateness(loop.what, loop.policy, scheduling, histogram))
 
 
 def wake_loop(wake: Wake, seconds: float, policy: Policy, histogram: DurationHistogram) -> str:
@@ -208,8 +209,8 @@ def firmware_loop(bench: Path, policy: Policy, seconds: float, histogram: Durati
     """Count how late the firmware's ticks are on ``bench``, in a process of its own. Return the scheduling. Raises
     ``HalError`` when it cannot run."""
     memory = LiveMemory.create(LAYOUT.size)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    fds = (memory.fd, theirs.fileno())
+    local, remote = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    fds = (memory.fd, remote.fileno())
     try:
         with tempfile.TemporaryDirectory(prefix="micron-") as folder:
             request = RunRequest(
@@ -229,6 +230,6 @@ def firmware_loop(bench: Path, policy: Policy, seconds: float, histogram: Durati
         histogram.add_histogram(memory.histogram(opening["histograms"].index("lateness")))
     finally:
         memory.close()
-        ours.close()
-        theirs.close()
+        local.close()
+        remote.close()
     return str(outcome["realtime"])

@@ -1,4 +1,4 @@
-"""The measurements of ``micron latency`` as tables of 80 columns: figures like cyclictest's, and a histogram."""
+"""Prints the measurements of ``micron latency`` as tables of 80 columns: figures like cyclictest's, and a histogram."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ BAR = 4
 EIGHTHS = " ▏▎▍▌▋▊▉█"
 
 
-def figures_table(found: Sequence[Lateness]) -> Table:
+def figures_table(measurements: Sequence[Lateness]) -> Table:
     """Return one row per loop: ticks, min, avg, percentiles, max in us, and how many ticks were beyond limits."""
-    table = _table(f"Lateness of a 1 ms tick, us; policy {found[0].policy}")
+    table = _table(f"Lateness of a 1 ms tick, us; policy {measurements[0].policy}")
     headings = ["loop", "ticks", "min", "avg", "p50", "p99", "p99.9", "max"]
     for heading in [*headings, *(f">{limit_us * 1e-3:g} ms" for limit_us in BEYOND_US)]:
         table.add_column(heading, justify="left" if heading == "loop" else "right", no_wrap=True)
-    for one in found:
+    for one in measurements:
         d = one.histogram.distribution()
         values = (d.min_us, d.mean_us, d.p50_us, d.p99_us, d.p99_9_us, d.max_us)
         beyond = (one.histogram.count_beyond(round(limit_us * 1e3)) for limit_us in BEYOND_US)
@@ -28,13 +28,13 @@ def figures_table(found: Sequence[Lateness]) -> Table:
     return table
 
 
-def histogram_table(found: Sequence[Lateness]) -> Table:
+def histogram_table(measurements: Sequence[Lateness]) -> Table:
     """Return the octaves of all loops side by side, with logarithmic bars."""
     table = _table("Ticks by lateness; bars are logarithmic")
     table.add_column("us", justify="right", no_wrap=True)
-    for one in found:
+    for one in measurements:
         table.add_column(one.what, justify="right")
-    columns = [dict(octaves(one.histogram)) for one in found]
+    columns = [dict(octaves(one.histogram)) for one in measurements]
     for bound_us in sorted({bound for column in columns for bound in column}):
         cells = (_cell(column.get(bound_us, 0), sum(column.values())) for column in columns)
         table.add_row(f"<{bound_us:.0f}" if bound_us >= 10 else f"<{bound_us:.1f}", *cells)

@@ -15,7 +15,7 @@ STEP_NS = 1_000_000
 
 @dataclass(frozen=True)
 class RampStep:
-    """One stair: wanted and read back, V."""
+    """Holds one step: wanted and read back, in V."""
 
     channel: int
     wanted_V: float
@@ -27,7 +27,7 @@ class RampStep:
 
 
 def staircase(low_V: float, high_V: float, neutral_V: float, steps: int) -> list[float]:
-    """From neutral up, down and back, ``steps`` stairs between the limits."""
+    """Return the levels in V from neutral up, down and back, with ``steps`` steps between the limits."""
     grid = np.linspace(low_V, high_V, steps)
     up, down = grid[grid > neutral_V], grid[::-1]
     rise = grid[(grid > low_V) & (grid <= neutral_V)]
@@ -48,7 +48,7 @@ def ramp(
     devices = open_devices(bench)
     amplifier, clock = devices.amplifier, bench.clock
     limits = amplifier.limits
-    found: list[RampStep] = []
+    steps_done: list[RampStep] = []
     try:
         amplifier.arm()
         wish = np.array([limit.safe_V for limit in limits])
@@ -63,8 +63,8 @@ def ramp(
                     clock.sleep_until_ns(due_ns)
                     if not limited and clock.now_ns() >= end_ns:
                         break
-                found.append(RampStep(channel, stair, float(amplifier.readback_V()[channel])))
-                progress(found[-1])
+                steps_done.append(RampStep(channel, stair, float(amplifier.readback_V()[channel])))
+                progress(steps_done[-1])
     finally:
         amplifier.close()
-    return found
+    return steps_done

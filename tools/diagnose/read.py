@@ -1,4 +1,4 @@
-"""One reading of every sensor whose driver is from another package, through the bus or DAQ that the bench names."""
+"""Reads every sensor whose driver is from another package once, through the bus or DAQ that the bench names."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCANS = 100
 
 @dataclass(frozen=True)
 class Value:
-    """A reading, with what the sensor said of itself."""
+    """Holds a reading and the identity that the sensor reported."""
 
     device: str
     identity: str

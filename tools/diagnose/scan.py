@@ -1,4 +1,4 @@
-"""Who is there: ports of the machine, addresses that answer on the I2C buses of a bench, traffic on its CAN buses."""
+"""Scans the ports of the machine, the addresses on the I2C buses of a bench, and the traffic on its CAN buses."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PROBES: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Answer:
-    """An I2C address: what the bench file has there, and whether something answered."""
+    """Holds an I2C address: the device of the bench file, and whether something answered."""
 
     bus: str
     address: int
@@ -44,7 +44,7 @@ class CanTraffic:
 
 @dataclass
 class ScanResult:
-    """Everything found. ``missing`` names declared I2C devices that did not answer."""
+    """Holds the result of a scan. ``missing`` names declared I2C devices that did not answer."""
 
     probe: Probe
     ports: list[str] = field(default_factory=list[str])
@@ -78,24 +78,24 @@ def serial_ports(root: Path = Path("/")) -> list[SerialPort]:
 
     ``root`` has ``dev`` and ``sys`` in it.
     """
-    found: list[SerialPort] = []
+    ports: list[SerialPort] = []
     for pattern in ("ttyACM*", "ttyUSB*", "ttyAMA*"):
         for port in sorted((root / "dev").glob(pattern)):
             # .../usb1/1-2/1-2:1.0/ttyUSB0: the descriptor is one or two folders above the interface
             device = (root / "sys/class/tty" / port.name / "device").resolve()
             usb = next((p for p in (device, *device.parents[:3]) if (p / "idVendor").is_file()), None)
             words = [] if usb is None else [_descriptor(usb / name) for name in ("manufacturer", "product", "serial")]
-            found.append(SerialPort("/" + str(port.relative_to(root)), " ".join(w for w in words if w)))
-    return found
+            ports.append(SerialPort("/" + str(port.relative_to(root)), " ".join(w for w in words if w)))
+    return ports
 
 
 def _descriptor(file: Path) -> str:
-    """A line of a USB descriptor; a device writes what it likes into it."""
+    """Return a line of a USB descriptor. A device can write anything into it."""
     try:
-        said = file.read_text(encoding="utf-8", errors="replace").strip()
+        line = file.read_text(encoding="utf-8", errors="replace").strip()
     except OSError:
         return ""
-    return "".join(c for c in said if c.isprintable())[:60]
+    return "".join(c for c in line if c.isprintable())[:60]
 
 
 def scan_bench(

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ChannelLine:
-    """One channel of the whole look, V."""
+    """Holds one channel of the whole measurement, in V."""
 
     name: str
     low_V: float
@@ -38,17 +38,17 @@ def sparkline(values: Array, width: int) -> str:
     data = values.astype(np.float32)[None]
     low, high = (part[0] for part in extremes(data, data, k))
     middle = float(np.mean(values))
-    shown = np.where(np.abs(high - middle) >= np.abs(low - middle), high, low)
+    furthest = np.where(np.abs(high - middle) >= np.abs(low - middle), high, low)
     bottom, top = float(values.min()), float(values.max())
     if top - bottom <= 0.0:
-        return BLOCKS[3] * len(shown)
-    steps = np.clip(((shown - bottom) / (top - bottom) * len(BLOCKS)).astype(int), 0, len(BLOCKS) - 1)
+        return BLOCKS[3] * len(furthest)
+    steps = np.clip(((furthest - bottom) / (top - bottom) * len(BLOCKS)).astype(int), 0, len(BLOCKS) - 1)
     return "".join(BLOCKS[i] for i in steps)
 
 
 @dataclass(frozen=True)
 class Look:
-    """What was seen: volts [channels, n], names, scans lost."""
+    """Holds the measurement: volts (channels, n), names, lost scans."""
 
     names: tuple[str, ...]
     volts: Array
@@ -70,7 +70,7 @@ def look(bench: OpenBench, seconds: float, show: Callable[[Look], None] = lambda
     lsb_V = np.array(scan.lsb_V)
     rows = np.zeros((MAX_SCANS, len(names)), dtype=np.int16)
     parts: list[Array] = []
-    wanted, got, lost, shown = round(seconds * scan.rate_hz), 0, 0, 0
+    wanted, got, lost, n_drawn = round(seconds * scan.rate_hz), 0, 0, 0
 
     def so_far() -> Look:
         volts = np.concatenate(parts, axis=0).T if parts else np.zeros((len(names), 0))
@@ -83,8 +83,8 @@ def look(bench: OpenBench, seconds: float, show: Callable[[Look], None] = lambda
             lost += block.lost
             parts.append(rows[: block.n].astype(np.float64) * lsb_V)
             got += block.n
-            if got - shown >= STEP_S * scan.rate_hz:
-                shown = got
+            if got - n_drawn >= STEP_S * scan.rate_hz:
+                n_drawn = got
                 show(so_far())
     finally:
         devices.daq.stop()

@@ -1,4 +1,4 @@
-"""A column of a recording as a stimulus: ``daq.0=out/run.csv:acc1_x_V``."""
+"""Reads a column of a recording as a stimulus: ``daq.0=out/run.csv:acc1_x_V``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TIMES = {"t": 1.0, "t_s": 1.0, "time": 1.0, "time_s": 1.0, "t_ms": 1e-3, "time_m
 
 @dataclass(frozen=True)
 class Stimulus:
-    """One column for one channel: ``t_s`` (n,) from zero, ``values`` (n,) in the unit of the channel."""
+    """Holds one column for one channel: ``t_s`` (n,) from zero, ``values`` (n,) in the unit of the channel."""
 
     channel: str
     t_s: NDArray[np.float64]
@@ -31,10 +31,10 @@ class Stimulus:
 
 def read_stimulus(text: str) -> Stimulus:
     """Read what ``--stimulus`` names. Raises ``InputError``."""
-    found = re.fullmatch(r"([^=]+\.[^=.]+)=(.+):([^:@]+)(?:@([0-9.eE+]+))?", text)
-    if found is None:
+    match = re.fullmatch(r"([^=]+\.[^=.]+)=(.+):([^:@]+)(?:@([0-9.eE+]+))?", text)
+    if match is None:
         raise InputError(f"--stimulus {text}: write it as {FORM}")
-    channel, file, column, rate = found.groups()
+    channel, file, column, rate = match.groups()
     path = Path(file)
     try:
         columns = _columns(path, column, needs_time=rate is None)

@@ -44,12 +44,12 @@ class VirtualBench:
 
     @property
     def part(self) -> Any:
-        """The emulated device itself, with its truth face; the first one of a bench with several."""
+        """Return the emulated device with its truth face; the first one of a bench with several."""
         return next(iter(self._world.world.devices.values()))
 
     @property
     def now_s(self) -> float:
-        """Age of the world in s."""
+        """Return the age of the world, in s."""
         return self.clock.now_ns() * 1e-9
 
     def advance(self, seconds: float) -> None:
@@ -97,7 +97,7 @@ class VirtualBench:
 
 
 class VirtualSMBus:
-    """The methods of ``smbus2.SMBus`` on an emulated bus; errors are OSError as from the kernel."""
+    """Implements the methods of ``smbus2.SMBus`` on an emulated bus. Errors are OSError, as from the kernel."""
 
     def __init__(self, bus: I2cBus) -> None:
         self._bus = bus

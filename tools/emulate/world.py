@@ -31,7 +31,7 @@ TRUTH_S = 60.0
 
 @dataclass(frozen=True)
 class ServedBus:
-    """One emulated bus: ``uri`` is for our own adapters, ``places`` say how other programs open it."""
+    """Describes one emulated bus: ``uri`` is for our own adapters, ``places`` say how other programs open it."""
 
     name: str
     kind: str
@@ -42,7 +42,7 @@ class ServedBus:
 
 @dataclass
 class Served:
-    """A running world. ``environment`` is what a program needs to see its buses; ``notes`` are for a person."""
+    """Holds a running world. A program needs ``environment`` to see its buses; ``notes`` are for a person."""
 
     world: ProcessWorld
     buses: list[ServedBus]
@@ -65,8 +65,8 @@ class Served:
 
 def vcan_interfaces() -> list[str]:
     """Return the virtual CAN interfaces of this machine that are up."""
-    found = [path for path in sorted(INTERFACES.glob("vcan*")) if _line(path / "type") == ARPHRD_CAN]
-    return [path.name for path in found if int(_line(path / "flags") or "0", 16) & 1]
+    interfaces = [path for path in sorted(INTERFACES.glob("vcan*")) if _line(path / "type") == ARPHRD_CAN]
+    return [path.name for path in interfaces if int(_line(path / "flags") or "0", 16) & 1]
 
 
 def _line(path: Path) -> str:

@@ -45,8 +45,8 @@ def overlapping_variance(phase, factors, dt_s, out):
 
 @dataclass(frozen=True)
 class AllanCurve:
-    """``tau_s``, ``deviation`` in the signal's unit, its 95 % interval ``low`` .. ``high``, degrees of freedom;
-    ``samples`` every ``dt_s`` it was made from."""
+    """Holds ``tau_s``, ``deviation`` in the signal's unit, its 95 % interval ``low`` .. ``high`` and degrees of
+    freedom; ``samples`` every ``dt_s`` it was made from."""
 
     tau_s: Array
     deviation: Array
@@ -58,7 +58,7 @@ class AllanCurve:
 
 
 def octave_factors(samples: int, shortest_terms: int = 3) -> NDArray[np.int64]:
-    """1, 2, 4, ... samples, as long as ``shortest_terms`` differences are left."""
+    """Return the factors (k,) 1, 2, 4, ... in samples, as long as ``shortest_terms`` differences are left."""
     factors = []
     m = 1
     while samples + 1 - 2 * m >= shortest_terms:
@@ -68,7 +68,7 @@ def octave_factors(samples: int, shortest_terms: int = 3) -> NDArray[np.int64]:
 
 
 def allan_curve(signal: Array, rate_hz: float, factors: NDArray[np.int64] | None = None) -> AllanCurve:
-    """Overlapping Allan deviation of evenly sampled ``signal`` (n,), n >= 8; octaves unless ``factors`` says.
+    """Return the overlapping Allan deviation of evenly sampled ``signal`` (n,), n >= 8, at octaves or ``factors``.
 
     Raises ValueError for a signal that is too short, not finite, or one-valued.
     """
@@ -112,7 +112,7 @@ def degrees_of_freedom(points: int, factors: NDArray[np.int64], variance: Array)
 
 @dataclass(frozen=True)
 class Coefficient:
-    """``value`` with its 95 % interval; 0 with an upper limit means: not seen."""
+    """Holds ``value`` with its 95 % interval. 0 with an upper limit means: not seen."""
 
     value: float
     low: float
@@ -121,7 +121,7 @@ class Coefficient:
 
 @dataclass(frozen=True)
 class NoiseModel:
-    """N (unit sqrt s: the one-sided density over sqrt 2), B (unit), K (unit / sqrt s), R (unit / s).
+    """Holds N (unit sqrt s: the one-sided density over sqrt 2), B (unit), K (unit / sqrt s), R (unit / s).
 
     Fitted to averages of ``shortest_s`` and more, in which the four terms are wrong by ``excess`` of the variance.
     """
@@ -134,7 +134,7 @@ class NoiseModel:
     excess: float
 
     def variance(self, tau_s: Array) -> Array:
-        """Allan variance of the model."""
+        """Return the Allan variance (k,) of the model, in unit^2."""
         return _terms(tau_s) @ np.array([getattr(self, name).value ** 2 for name in TERMS])
 
 
@@ -143,7 +143,7 @@ def _terms(tau_s: Array) -> Array:
 
 
 def identify(curve: AllanCurve, shortest_s: float | None = None) -> NoiseModel:
-    """N, B, K, R by non-negative least squares on the relative error of the variance.
+    """Fit N, B, K, R by non-negative least squares on the relative error of the variance.
 
     Averages shorter than ``shortest_s`` are left out; without it the fit starts where the four terms begin to explain
     the curve (a filter or quantisation in front of the converter bends it before). Short averages are so many that
@@ -174,8 +174,8 @@ def identify(curve: AllanCurve, shortest_s: float | None = None) -> NoiseModel:
     low, high = np.quantile(drawn, 0.025, axis=0), np.quantile(drawn, 0.975, axis=0)
     lower = np.maximum(0.0, 2.0 * best - high)
     upper = np.where(best > 0.0, np.maximum(2.0 * best - low, high), high)
-    found = [Coefficient(float(best[i]), float(lower[i]), float(upper[i])) for i in range(4)]
-    return NoiseModel(*found, shortest_s=float(tau[0]), excess=excess)
+    coefficients = [Coefficient(float(best[i]), float(lower[i]), float(upper[i])) for i in range(4)]
+    return NoiseModel(*coefficients, shortest_s=float(tau[0]), excess=excess)
 
 
 def _start(tau: Array, variance: Array, freedom: Array, *, given: bool) -> tuple[int, float]:
@@ -198,7 +198,7 @@ def _start(tau: Array, variance: Array, freedom: Array, *, given: bool) -> tuple
 
 
 def _weight(freedom: Array, excess: float) -> Array:
-    """One over the relative standard deviation of each variance."""
+    """Return one over the relative standard deviation of each variance (k,)."""
     return 1.0 / np.sqrt(2.0 / freedom + excess**2)
 
 
@@ -214,15 +214,15 @@ def _luck(curve: AllanCurve, value: Array, tau: Array, freedom: Array, rng: np.r
     piece = min(curve.samples, SIMULATED)
     for samples, dt_s, share in ((piece, curve.dt_s, piece / curve.samples), (n, curve.dt_s * thinned, 1.0)):
         factors = np.round(tau / dt_s).astype(np.int64)
-        there = (factors >= (1 if share < 1.0 or thinned == 1 else 4)) & (2 * factors + 1 < samples)
+        usable = (factors >= (1 if share < 1.0 or thinned == 1 else 4)) & (2 * factors + 1 < samples)
         if share < 1.0:
-            there &= factors < 4 * thinned
-        if np.any(there):
+            usable &= factors < 4 * thinned
+        if np.any(usable):
             phase = np.concatenate([[0.0], np.cumsum(_simulated(value, samples, dt_s, rng))]) * dt_s
-            found = np.empty(int(there.sum()))
-            overlapping_variance(phase, factors[there], dt_s, found)
-            chance = found / np.maximum(_terms(tau[there]) @ value, 1e-300)
-            ratio[there] = np.maximum(1.0 + (chance - 1.0) * np.sqrt(share), 1e-3)
+            variances = np.empty(int(usable.sum()))
+            overlapping_variance(phase, factors[usable], dt_s, variances)
+            chance = variances / np.maximum(_terms(tau[usable]) @ value, 1e-300)
+            ratio[usable] = np.maximum(1.0 + (chance - 1.0) * np.sqrt(share), 1e-3)
     return ratio
 
 

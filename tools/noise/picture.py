@@ -1,4 +1,4 @@
-"""The Allan deviation as a picture: estimates with their intervals, the fitted model, one colour a column."""
+"""Draws the Allan deviation: estimates with their intervals, the fitted model, one colour a column."""
 
 from __future__ import annotations
 

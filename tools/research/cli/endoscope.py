@@ -1,4 +1,4 @@
-"""``micron endoscope``: the targeting experiment, played by a synthetic user, and its tables."""
+"""Implements ``micron endoscope``: a synthetic user plays the targeting experiment, and its tables are printed."""
 
 from __future__ import annotations
 
@@ -18,9 +18,11 @@ endoscope = typer.Typer(
     help="Let a synthetic user steer the endoscope's field of view with the motion card (Erat 2018, chapter 6)."
 )
 
-MappingOption = Annotated[str, typer.Option("--mapping", help="position or speed.")]
-GainOption = Annotated[float, typer.Option(min=0.01, max=1000.0, help="Pixels per degree, or pixels/s per degree.")]
-ResponseOption = Annotated[float, typer.Option("--response", min=0.0, max=60.0, help="Response time constant, s.")]
+MappingOption = Annotated[str, typer.Option("--mapping", help="Mapping: position or speed.")]
+GainOption = Annotated[
+    float, typer.Option(min=0.01, max=1000.0, help="Gain in pixels per degree, or pixels/s per degree.")
+]
+ResponseOption = Annotated[float, typer.Option("--response", min=0.0, max=60.0, help="Response time constant, in s.")]
 SeedOption = Annotated[int, typer.Option(min=0, help="Seed of targets and user.")]
 
 
@@ -44,12 +46,16 @@ def play_command(
     gain: GainOption = 8.0,
     response: ResponseOption = 0.25,
     targets: Annotated[int, typer.Option(min=1, max=100)] = 5,
-    tolerance: Annotated[float, typer.Option(min=0.1, max=100.0, help="Pixels.")] = 9.0,
+    tolerance: Annotated[
+        float, typer.Option(min=0.1, max=100.0, help="Largest distance from a target, in pixels.")
+    ] = 9.0,
     seed: SeedOption = 1,
     bench: Annotated[
         Path | None, typer.Option("--bench", metavar="FILE|NAME", help="Emulated bench; default: endoscope.")
     ] = None,
-    direct: Annotated[bool, typer.Option("--direct", help="Without bench: angles straight into the game.")] = False,
+    direct: Annotated[
+        bool, typer.Option("--direct", help="Feed angles straight into the game, without a bench.")
+    ] = False,
     limit: Annotated[float, typer.Option(min=1.0, max=3600.0, help="Give up after so many seconds.")] = 300.0,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
     report: Annotated[Path | None, typer.Option(metavar="FILE", help="Report file of this user (CSV).")] = None,
@@ -122,7 +128,7 @@ def _show(user: str, result: dict[str, Any]) -> None:
 @endoscope.command("tables")
 def tables(
     gain: GainOption = 8.0,
-    experiments: Annotated[int, typer.Option(min=1, max=100, help="Per cell.")] = 5,
+    experiments: Annotated[int, typer.Option(min=1, max=100, help="Users per cell of the table.")] = 5,
     seed: SeedOption = 1,
     json_file: JsonOption = None,
 ) -> None:

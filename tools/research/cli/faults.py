@@ -1,4 +1,4 @@
-"""``micron faults``: the fault campaign on the emulated bench."""
+"""Implements ``micron faults``: it runs the fault campaign on the emulated bench."""
 
 from __future__ import annotations
 
@@ -34,18 +34,23 @@ def faults(
     bench: BenchOption = None,
     seeds: Annotated[int, typer.Option(min=1, max=1000, help="Runs per fault, phase and operating point.")] = 1,
     seed: Annotated[int, typer.Option(min=1, max=2**31, help="First seed: hands, noise, instants, pairs.")] = 1,
-    pairs: Annotated[int, typer.Option(min=0, max=5000, help="Pairs of faults beside them.")] = 0,
+    pairs: Annotated[
+        int, typer.Option(min=0, max=5000, help="Number of pairs of faults that are run in addition.")
+    ] = 0,
     only: Annotated[str, typer.Option(metavar="TEXT", help="Only faults whose name contains this.")] = "",
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.")] = os.cpu_count() or 1,
+    jobs: Annotated[int, typer.Option(min=1, help="Number of processes.")] = os.cpu_count() or 1,
     beside: Annotated[
         list[str] | None,
-        typer.Option(metavar="BENCH[#TEXT]", help="Another bench into the same page; faults whose name contains TEXT."),
+        typer.Option(
+            metavar="BENCH[#TEXT]",
+            help="Run another bench, BENCH#TEXT: only faults whose name contains TEXT. Goes into the same page.",
+        ),
     ] = None,
     compiled: Annotated[
-        bool, typer.Option("--compiled", help="The ticks run in the compiled thread, over socket pairs.")
+        bool, typer.Option("--compiled", help="Run the ticks in the compiled thread, over socket pairs.")
     ] = False,
     keep: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Keep what is done there; a stopped campaign goes on from it.")
+        Path | None, typer.Option(metavar="FOLDER", help="File of finished runs; a stopped campaign goes on from it.")
     ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
@@ -150,9 +155,9 @@ def _emulated(path: Path, chosen: Sequence[Fault]) -> None:
             f"{path}: the campaign breaks an instrument with a DI-4108 named 'daq' and an amplifier named 'piezo'; "
             f"this bench has {', '.join(description.device)}"
         )
-    there = {*description.device, *description.bus}
+    names = {*description.device, *description.bus}
     for fault in chosen:
-        if (part := fault.part_of_bench) and part not in there:
+        if (part := fault.part_of_bench) and part not in names:
             raise InputError(f"{path}: '{fault.name}' breaks '{part}', which is not on this bench; choose with --only")
     if len(description.emulated_buses()) < len(description.bus):
         raise InputError(

@@ -25,7 +25,10 @@ def hands(
         "../shared/data"
     ),
     heldout: Annotated[
-        Path | None, typer.Option(metavar="FOLDER", help="Score every recorded hand of this folder instead.")
+        Path | None,
+        typer.Option(
+            metavar="FOLDER", help="Score every recorded hand of this folder instead of the recordings of people."
+        ),
     ] = None,
     seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
     out: Annotated[
@@ -57,10 +60,10 @@ def hands(
 
             with keep_what_is_there():
                 if folder is None:
-                    found = run_hands(file, data, seconds, show)
+                    result = run_hands(file, data, seconds, show)
                 else:
-                    found = run_heldout(file, folder, seconds, show)
-                for row in found:
+                    result = run_heldout(file, folder, seconds, show)
+                for row in result:
                     rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
         need_some(rows)
         stamp = revision_and_day()

@@ -1,4 +1,4 @@
-"""``micron manipulator``: where the tip can go."""
+"""Implements ``micron manipulator``: it computes the workspace of the tip."""
 
 from __future__ import annotations
 
@@ -37,22 +37,24 @@ def manipulator(
         check_names(out)
         check_writable(json_file)
         config = load_plan(load_bench(bench_path(bench))).stages.actuation
-        found = analyse(config)
+        analysis = analyse(config)
         table = Table(title="Workspace of the tip (Ang 2004, Table 6.1, sec. 6.1.1)", title_justify="left")
         for heading in ("quantity", "required", "ours"):
             table.add_column(heading, justify="left" if heading == "quantity" else "right")
-        x, y, z = found.extent_m * 1e6
+        x, y, z = analysis.extent_m * 1e6
         table.add_row("extent x (um)", "> 1000", f"{x:.0f}")
         table.add_row("extent y (um)", "> 1000", f"{y:.0f}")
         table.add_row("extent z (um)", "> 100", f"{z:.1f}")
-        table.add_row("largest sphere, diameter (um)", ">= 100", f"{1e6 * found.sphere_m:.1f}")
-        table.add_row("the same around neutral (um)", "> 50 (tremor)", f"{1e6 * found.neutral_sphere_m:.1f}")
-        table.add_row("tilt in use, at the singularity (deg)", "", f"{found.tilt_deg:.2f}, {found.singular_deg:.1f}")
-        table.add_row("condition of the Jacobian, largest", "", f"{found.condition:.1f}")
-        table.add_row("determinant, smallest / at neutral", "> 0", f"{found.determinant:.3f}")
-        table.add_row("forward(inverse(tip)) - tip (nm)", "< 1", f"{1e9 * found.identity_m:.1e}")
-        table.add_row("Newton steps from level, most", "<= 3", str(found.newton))
+        table.add_row("largest sphere, diameter (um)", ">= 100", f"{1e6 * analysis.sphere_m:.1f}")
+        table.add_row("the same around neutral (um)", "> 50 (tremor)", f"{1e6 * analysis.neutral_sphere_m:.1f}")
+        table.add_row(
+            "tilt in use, at the singularity (deg)", "", f"{analysis.tilt_deg:.2f}, {analysis.singular_deg:.1f}"
+        )
+        table.add_row("condition of the Jacobian, largest", "", f"{analysis.condition:.1f}")
+        table.add_row("determinant, smallest / at neutral", "> 0", f"{analysis.determinant:.3f}")
+        table.add_row("forward(inverse(tip)) - tip (nm)", "< 1", f"{1e9 * analysis.identity_m:.1e}")
+        table.add_row("Newton steps from level, most", "<= 3", str(analysis.newton))
         data_console().print(table)
-        save_workspace_picture(config, found, out)
+        save_workspace_picture(config, analysis, out)
         console().print(f"picture: {out}")
-        write_json({"format": 1, "picture": str(out), **asdict(found)}, json_file)
+        write_json({"format": 1, "picture": str(out), **asdict(analysis)}, json_file)

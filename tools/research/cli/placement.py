@@ -1,4 +1,4 @@
-"""``micron placement``: where accelerometers should sit in a given space."""
+"""Implements ``micron placement``: it finds positions of accelerometers in a given space."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def placement(
     space_file: Annotated[
         Path, typer.Argument(metavar="SPACE.toml", help="Boxes, packages, noise; see benches/space-latt.toml.")
     ],
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the instrument.")] = Path(
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the instrument.")] = Path(
         "out/placement.png"
     ),
     seed: Annotated[int, typer.Option(help="Seed of the coarse search.")] = 0,

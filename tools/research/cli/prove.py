@@ -16,12 +16,16 @@ from tools.output import check_folder, check_writable, write_json
 
 def prove(
     cases: Annotated[int, typer.Option(min=1, help="Recordings to draw.")] = 40,
-    seed: Annotated[int | None, typer.Option(min=0, help="A fresh one if left out; it is printed.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the cases; a new one is drawn and printed if left out.")
+    ] = None,
     json_file: JsonOption = None,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core.")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes; default: one per core.")] = None,
     keep: Annotated[
         Path | None,
-        typer.Option(metavar="FOLDER", help="Recordings, sealed answers and reports; a stopped run goes on there."),
+        typer.Option(
+            metavar="FOLDER", help="Folder of recordings, sealed answers and reports; a stopped run goes on there."
+        ),
     ] = None,
     corpus: Annotated[
         str | None, typer.Option(metavar="NAME", help="calibrate, develop or sealed: exact scores on its own seeds.")
@@ -99,11 +103,18 @@ def _prove_corpus(
 
 
 def calibrate(
-    keep: Annotated[Path, typer.Option("--keep", metavar="FOLDER", help="Cases and their fits; a run goes on there.")],
+    keep: Annotated[
+        Path,
+        typer.Option(
+            "--keep", metavar="FOLDER", help="Folder of cases and their fits; an interrupted run goes on there."
+        ),
+    ],
     cases: Annotated[int, typer.Option(min=8, help="Cases of the calibrate corpus.")] = 120,
     samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording.")] = 8000,
-    minutes: Annotated[float | None, typer.Option(min=0.0, help="Begin no case after these; run again.")] = None,
-    partial: Annotated[bool, typer.Option("--partial", help="Learn from the cases that are done so far.")] = False,
+    minutes: Annotated[
+        float | None, typer.Option(min=0.0, help="Begin no case after these minutes; run again to go on.")
+    ] = None,
+    partial: Annotated[bool, typer.Option("--partial", help="Learn from the cases that are finished so far.")] = False,
     json_file: JsonOption = None,
 ) -> None:
     """Learn the constants of the new engine from the calibrate corpus and write them with their provenance.

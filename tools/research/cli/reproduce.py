@@ -1,4 +1,4 @@
-"""``micron reproduce``: published figures beside ours."""
+"""Implements ``micron reproduce``: it computes published figures again and prints them beside ours."""
 
 from __future__ import annotations
 
@@ -19,16 +19,18 @@ from tools.research.stamp import revision_and_day
 
 
 def reproduce(
-    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="sensing, real-sensors, ... or all.")],
+    names: Annotated[list[str], typer.Argument(metavar="NAME...", help="Section: sensing, real-sensors, ... or all.")],
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
     ] = None,
     json_file: JsonOption = None,
     sets: Annotated[
-        list[str] | None, typer.Option("--set", metavar="NAME", help="Of measured: only sets with this in their name.")
+        list[str] | None,
+        typer.Option("--set", metavar="NAME", help="Only sets of section measured with this in their name."),
     ] = None,
     rows: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Of measured: keeps each set that is done, goes on there.")
+        Path | None,
+        typer.Option(metavar="FILE", help="Folder of finished sets of section measured; a stopped run goes on there."),
     ] = None,
 ) -> None:
     """Compute published figures again and print them beside ours.
@@ -72,8 +74,9 @@ def reproduce(
             console().print(note, soft_wrap=True)
 
     def ready(chosen: list[str]) -> list[str]:
-        """Without what cannot be computed here: an error before the first minute, or a note when all were asked for."""
-        there = []
+        """Return the sections that can be computed here. Others are an error at once, or a note when all were asked
+        for."""
+        sections_here = []
         for name in chosen:
             try:
                 check(name)
@@ -82,8 +85,8 @@ def reproduce(
                     raise
                 console().print(f"left out: {error}", soft_wrap=True)
             else:
-                there.append(name)
-        return there
+                sections_here.append(name)
+        return sections_here
 
     with clear_errors():
         check_names(rows)

@@ -1,4 +1,4 @@
-"""``micron sensing``: what the sensing stage achieves on emulated sensors, source by source."""
+"""Implements ``micron sensing``: it computes the errors of the sensing stage on emulated sensors, source by source."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ def budget(
     with clear_errors():
         check_writable(json_file)
         with console().status("calibrating and running every variant"):
-            found = compute(seconds)
+            budget = compute(seconds)
         table = Table(title="Tip displacement, 8 to 12 Hz, rms error (um, vector)", title_justify="left")
         for heading in ("source", "alone", "all but this", "share of the square"):
             table.add_column(heading, justify="left" if heading == "source" else "right")
-        for share in sorted(found.shares, key=lambda s: -s.share):
+        for share in sorted(budget.shares, key=lambda s: -s.share):
             table.add_row(
                 share.source, f"{share.alone_um:.2f}", f"{share.without_um:.2f}", f"{100.0 * share.share:.1f} %"
             )
-        table.add_row("none (filters, quantisation)", f"{found.floor_um:.2f}", "", "")
-        table.add_row("all", f"{found.total_um:.2f}", "", "")
+        table.add_row("none (filters, quantisation)", f"{budget.floor_um:.2f}", "", "")
+        table.add_row("all", f"{budget.total_um:.2f}", "", "")
         data_console().print(table)
         data_console().print(
             "all sources by body axis: "
-            + ", ".join(f"{e:.2f} of {t:.1f}" for e, t in zip(found.axes_um, found.tremor_um, strict=True))
+            + ", ".join(f"{e:.2f} of {t:.1f}" for e, t in zip(budget.axes_um, budget.tremor_um, strict=True))
             + " um rms (goal: 5)"
         )
-        write_json({"format": 1, "seconds": seconds, **asdict(found)}, json_file)
+        write_json({"format": 1, "seconds": seconds, **asdict(budget)}, json_file)
 
 
 @app.command("variance")
@@ -60,18 +60,18 @@ def variance(
             "format = 1, positions_mm and axes, or the JSON of `micron placement`.",
         ),
     ],
-    noise_mg: Annotated[float, typer.Option(min=1e-6, help="Rms of an axis behind its 15 Hz filter.")] = 0.535,
+    noise_mg: Annotated[float, typer.Option(min=1e-6, help="Noise of an axis behind its 15 Hz filter, rms.")] = 0.535,
     gyroscope_deg_s: Annotated[
-        float, typer.Option(min=1e-9, help="Rms of a gyroscope behind the same filter (ADXRS150: 0.75).")
+        float, typer.Option(min=1e-9, help="Noise of a gyroscope behind the same filter, rms (ADXRS150: 0.75).")
     ] = 0.75,
-    tip_mm: Annotated[str, typer.Option(help="Tip in the body frame.")] = "0,0,155",
+    tip_mm: Annotated[str, typer.Option(help="Position of the tip in the body frame.")] = "0,0,155",
     turning_deg_s: Annotated[str, typer.Option(help="Body rate at which the solver is examined.")] = "0,0,0",
-    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="PNG of the comparison.")] = Path(
+    image: Annotated[Path, typer.Option("--picture", metavar="FILE", help="Picture (PNG) of the comparison.")] = Path(
         "out/variance.png"
     ),
     json_file: JsonOption = None,
 ) -> None:
-    """Error variance of accelerometer configurations, linear and unscented, beside a conventional 3G-3A.
+    """Compute the error variance of accelerometer configurations, linear and unscented, beside a conventional 3G-3A.
 
     Example: micron sensing variance micron-000 proposed-004 --noise-mg 2.25 --json out/variance.json
     """
@@ -103,29 +103,29 @@ def variance(
             float(np.radians(gyroscope_deg_s)),
             np.radians(_vector(turning_deg_s, "--turning-deg-s")),
         )
-        found: list[Analysis] = []
+        analyses: list[Analysis] = []
         judged: list[str] = []
         for given in configurations:
             placement, noise = load_configuration(given, noise_mg)
             try:
-                found.append(all_accelerometers(placement, noise, conditions))
+                analyses.append(all_accelerometers(placement, noise, conditions))
                 judged += verdicts(placement)
             except ValueError as error:
                 raise error if isinstance(error, InputError) else InputError(f"{given}: {error}") from error
-        found.append(conventional(np.zeros(3), noise_mg * 1e-3 * STANDARD_GRAVITY, conditions))
+        analyses.append(conventional(np.zeros(3), noise_mg * 1e-3 * STANDARD_GRAVITY, conditions))
         band = f"{BAND_HZ[0]:g}-{BAND_HZ[1]:g} Hz"
         table = Table(title="Rms error by body axis x, y, z, from sensor noise alone", title_justify="left")
-        for heading in ("quantity", *(a.name for a in found)):
+        for heading in ("quantity", *(a.name for a in analyses)):
             table.add_column(heading, overflow="fold")
         rows = (
-            ("axes", [str(a.axes) for a in found]),
-            ("angular acceleration (rad/s^2)", [cells(a.alpha, 1.0) for a in found]),
-            ("rate, one increment, linear (deg/s)", [cells(a.rate_linear, 180.0 / np.pi) for a in found]),
-            ("rate, one increment, unscented (deg/s)", [cells(a.rate_unscented, 180.0 / np.pi) for a in found]),
-            (f"rate, {band} (deg/s)", [cells(a.rate_band, 180.0 / np.pi) for a in found]),
-            ("acceleration at the sensors' centroid (mm/s^2)", [cells(a.force_centre, 1e3) for a in found]),
-            ("acceleration of the tip (mm/s^2)", [cells(a.force_tip, 1e3) for a in found]),
-            (f"tip displacement, {band} (um)", [cells(a.tip_band_m, 1e6) for a in found]),
+            ("axes", [str(a.axes) for a in analyses]),
+            ("angular acceleration (rad/s^2)", [cells(a.alpha, 1.0) for a in analyses]),
+            ("rate, one increment, linear (deg/s)", [cells(a.rate_linear, 180.0 / np.pi) for a in analyses]),
+            ("rate, one increment, unscented (deg/s)", [cells(a.rate_unscented, 180.0 / np.pi) for a in analyses]),
+            (f"rate, {band} (deg/s)", [cells(a.rate_band, 180.0 / np.pi) for a in analyses]),
+            ("acceleration at the sensors' centroid (mm/s^2)", [cells(a.force_centre, 1e3) for a in analyses]),
+            ("acceleration of the tip (mm/s^2)", [cells(a.force_tip, 1e3) for a in analyses]),
+            (f"tip displacement, {band} (um)", [cells(a.tip_band_m, 1e6) for a in analyses]),
         )
         for name, values in rows:
             table.add_row(name, *values)
@@ -135,7 +135,7 @@ def variance(
         console().print(
             "an increment of the rate is not its error: that is a random walk (erratum 20), compare the bands"
         )
-        save_analysis_picture(found, image)
+        save_analysis_picture(analyses, image)
         console().print(f"picture: {image}")
         write_json(
             {
@@ -143,7 +143,7 @@ def variance(
                 "band_hz": BAND_HZ,
                 "noise_mg": noise_mg,
                 "gyroscope_deg_s": gyroscope_deg_s,
-                "configurations": [asdict(a) for a in found],
+                "configurations": [asdict(a) for a in analyses],
                 "propositions": judged,
             },
             json_file,

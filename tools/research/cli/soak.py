@@ -1,4 +1,4 @@
-"""``micron soak``: the closed loop for hours in virtual time."""
+"""Implements ``micron soak``: it runs the closed loop for hours in virtual time."""
 
 from __future__ import annotations
 
@@ -20,12 +20,15 @@ from tools.research.stamp import revision_and_day
 
 def soak(
     bench: BenchOption = None,
-    seconds: Annotated[float, typer.Option(min=60.0, max=86_400.0, help="How long, in virtual time.")] = 1800.0,
+    seconds: Annotated[float, typer.Option(min=60.0, max=86_400.0, help="Virtual time of the run.")] = 1800.0,
     wires: Annotated[
-        bool, typer.Option("--wires/--without-wires", help="Without: no buses and no supervision, 15 times faster.")
+        bool,
+        typer.Option(
+            "--wires/--without-wires", help="With or without buses and supervision; without them 15 times faster."
+        ),
     ] = True,
     start_ns: Annotated[
-        int, typer.Option(min=0, max=2**62, help="Where the bench clock begins: marks of time are crossed.")
+        int, typer.Option(min=0, max=2**62, help="Start of the bench clock, in s, so that marks of time are crossed.")
     ] = 0,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Put the block into this result (FILE.json or .md).")

@@ -1,4 +1,4 @@
-"""``micron tremor``: what recorded hands do, and what the estimators make of it."""
+"""Implements ``micron tremor``: it inspects recorded hands and evaluates estimators on them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``micron tremor budget``: what each source of error costs at the tip."""
+"""Implements ``micron tremor budget``: it computes the cost of each source of error at the tip."""
 
 from __future__ import annotations
 
@@ -22,7 +22,10 @@ def budget(
     bench: BenchOption = None,
     seconds: Annotated[float, typer.Option(min=8.0, max=600.0, help="Virtual seconds of each run.")] = 15.0,
     ideal: Annotated[
-        bool, typer.Option("--ideal", help="Ideal sensors and manipulator, beside the bound, instead of the budget.")
+        bool,
+        typer.Option(
+            "--ideal", help="Run with ideal sensors and manipulator and compare with the bound, instead of the budget."
+        ),
     ] = False,
     json_file: JsonOption = None,
 ) -> None:
@@ -46,15 +49,15 @@ def budget(
             task = progress.add_task("starting")
             rows = list(runs(bench_path(bench), seconds, lambda text: progress.update(task, description=text)))
         if json_file != "-":
-            shown = Table(title="tip tremor in 8-12 Hz, um rms (vector)", title_justify="left")
-            shown.add_column("taken away")
+            table = Table(title="tip tremor in 8-12 Hz, um rms (vector)", title_justify="left")
+            table.add_column("taken away")
             for name in ("without the loop", "with it", "less (%)", "cost"):
-                shown.add_column(name, justify="right")
+                table.add_column(name, justify="right")
             for row in rows:
                 figures = (row.uncompensated_rms_um, row.compensated_rms_um, row.reduction_percent, row.cost_um)
                 name = "nothing: all errors on" if row is rows[0] else row.source
-                shown.add_row(name, *(f"{v:.2f}" for v in figures))
-            print_whole(shown)
+                table.add_row(name, *(f"{v:.2f}" for v in figures))
+            print_whole(table)
         write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
 
 
@@ -73,12 +76,12 @@ def _ideal(bench: Path, seconds: float, json_file: str | None) -> None:
             progress.update(task, description=f"ideal instrument, accelerometer noise {'on' if noise else 'off'}")
             rows.append(ideal_run(bench, seconds, noise))
     if json_file != "-":
-        shown = Table(title="ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted", title_justify="left")
-        shown.add_column("sensors")
+        table = Table(title="ideal instrument: left of 2-20 Hz, um rms, 8-12 Hz lifted", title_justify="left")
+        table.add_column("sensors")
         for name in ("loop", "estimator alone", "bound", f"loop / bound, goal {GOAL:g}", "less in 8-12 Hz (%)"):
-            shown.add_column(name, justify="right")
+            table.add_column(name, justify="right")
         for row in rows:
             figures = (row.loop_um, row.estimator_um, row.bound_um, row.ratio, row.reduction_percent)
-            shown.add_row(row.what, *(f"{v:.2f}" for v in figures))
-        print_whole(shown)
+            table.add_row(row.what, *(f"{v:.2f}" for v in figures))
+        print_whole(table)
     write_json({"format": 1, "seconds": seconds, "ideal": [row.as_dict() for row in rows]}, json_file)

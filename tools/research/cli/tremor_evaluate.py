@@ -26,17 +26,27 @@ def evaluate(
         ),
     ],
     method: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Again for more; default: all.", show_default=False)
+        list[str] | None,
+        typer.Option(metavar="NAME", help="Name of an estimator; repeat for more. Default: all.", show_default=False),
     ] = None,
-    horizons_ms: Annotated[str, typer.Option(metavar="MS,...", help="Horizons.")] = "0,2,8,20",
+    horizons_ms: Annotated[
+        str, typer.Option(metavar="MS,...", help="Prediction horizons, in ms, with commas.")
+    ] = "0,2,8,20",
     as_recorded: Annotated[
-        bool, typer.Option("--as-recorded", help="Size as recorded, no sensor noise added (default: the instrument's).")
+        bool,
+        typer.Option(
+            "--as-recorded", help="Keep the size as recorded and add no sensor noise (default: the instrument's)."
+        ),
     ] = False,
-    with_manners: Annotated[bool, typer.Option("--manners", help="Also onset, frequency jump, growing bias.")] = False,
+    with_manners: Annotated[
+        bool, typer.Option("--manners", help="Also score onset, frequency jump and growing bias.")
+    ] = False,
     png: Annotated[Path | None, typer.Option(metavar="FILE", help="Error against horizon as a picture.")] = None,
     series: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Motion and what each method leaves of it, in time: the first recording."),
+        typer.Option(
+            metavar="FILE", help="Picture of the first recording: motion and residual of each method over time."
+        ),
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
@@ -54,19 +64,19 @@ def evaluate(
 
     def table(group: str, lines: list[Summary]) -> Table:
         title = f"{group} ({lines[0].cases}): left of the involuntary motion, % rms"
-        shown = Table(title=title, title_justify="left", box=None, padding=(0, 1))
-        shown.add_column("method", no_wrap=True)
+        table = Table(title=title, title_justify="left", box=None, padding=(0, 1))
+        table.add_column("method", no_wrap=True)
         for name in ("ms", "all", "8-12", "lifted", "/others", "/oracle", "/unseen", "late ms", "Hz off", "us"):
-            shown.add_column(name, justify="right", no_wrap=True)
+            table.add_column(name, justify="right", no_wrap=True)
         for s in lines:
-            shown.add_row(
+            table.add_row(
                 s.method,
                 str(s.horizon_ms),
                 *(f"{v:.1f}" for v in (s.all_percent, s.band_percent, s.lifted_percent)),
                 *(f"{v:.2f}" for v in (s.to_others, s.to_oracle, s.to_unseen, s.delay_ms, s.frequency_error_hz)),
                 f"{s.us_per_sample:.1f}",
             )
-        return shown
+        return table
 
     with clear_errors():
         check_writable(json_file, png, series)
@@ -90,13 +100,13 @@ def evaluate(
             for group in dict.fromkeys(line.group for line in lines):
                 print_whole(table(group, [line for line in lines if line.group == group]))
             if behaviour:
-                shown = Table(title="a tone of 25 um, sensor noise on", title_justify="left")
+                tones = Table(title="a tone of 25 um, sensor noise on", title_justify="left")
                 for name in ("method", "onset s", "9 -> 11 Hz s", "bias +5 mg/s: left, ratio", "Hz off"):
-                    shown.add_column(name)
+                    tones.add_column(name)
                 for b in behaviour:
                     figures = (b.onset_s, b.jump_s, b.drift_share, b.drift_frequency_error_hz)
-                    shown.add_row(b.method, *(f"{v:.2f}" for v in figures))
-                data_console().print(shown)
+                    tones.add_row(b.method, *(f"{v:.2f}" for v in figures))
+                data_console().print(tones)
         write_json(
             {
                 "format": 1,

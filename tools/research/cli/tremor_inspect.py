@@ -1,4 +1,4 @@
-"""``micron tremor inspect``: is there tremor in a recording, and which."""
+"""Implements ``micron tremor inspect``: it finds tremor in a recording and measures it."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def inspect(
     from tools.research.tremor.inspect import Inspection, Rule, inspect_all
     from tools.research.tremor.signals import load_signals
 
-    def table(found: list[Inspection], whole: bool) -> Table:
+    def table(inspections: list[Inspection], whole: bool) -> Table:
         more = ("Hz", "s", "tremor (%)", "peak (Hz)", "95 % (Hz)", "amplitude", "excursion", "2f, 3f (%)")
         less = ("tremor %", "peak, 95 % (Hz)", "excursion")
-        shown = Table(title=recording, title_justify="left")
-        shown.add_column("signal", overflow="fold")
+        rows_table = Table(title=recording, title_justify="left")
+        rows_table.add_column("signal", overflow="fold")
         for column in more if whole else less:
-            shown.add_column(column, justify="right", no_wrap=True)
-        for one in found:
+            rows_table.add_column(column, justify="right", no_wrap=True)
+        for one in inspections:
             s = one.signal
             factor, unit = _readable(one.excursion_unit, one.excursion)
             share, peak, excursion = f"{100 * one.tremor_share:.0f}", f"{one.peak_hz:.2f}", factor * one.excursion
             interval = f"{one.low_hz:.2f}..{one.high_hz:.2f}" if one.steady else "not steady"
             if not whole:
-                shown.add_row(s.name, share, f"{peak} {interval}", f"{excursion:.3g} {unit}")
+                rows_table.add_row(s.name, share, f"{peak} {interval}", f"{excursion:.3g} {unit}")
                 continue
-            shown.add_row(
+            rows_table.add_row(
                 s.name,
                 f"{s.rate_hz:.2f}",
                 f"{s.seconds:.0f}",
@@ -63,7 +63,7 @@ def inspect(
                 f"{excursion:.3g} {unit}",
                 ", ".join(f"{100 * h:.0f}" if isfinite(h) else "-" for h in one.harmonics),
             )
-        return shown
+        return rows_table
 
     with clear_errors():
         check_writable(json_file, png, html)
@@ -75,30 +75,30 @@ def inspect(
             raise InputError(
                 f"--png shows one signal, {recording} holds {len(signals)}: choose one with #NAME ({names})"
             )
-        found = inspect_all(signals, Rule(band_hz=(low_hz, high_hz)))
+        result = inspect_all(signals, Rule(band_hz=(low_hz, high_hz)))
         for note in dict.fromkeys(note for s in signals for note in s.notes):
             console().print(f"note: {note}", soft_wrap=True)
         if json_file != "-":
-            print_whole(table(found, whole=True), table(found, whole=False))
+            print_whole(table(result, whole=True), table(result, whole=False))
         outputs = Outputs()
         with outputs.part("JSON"):
-            write_json({"format": 1, "source": recording, "signals": [one.as_dict() for one in found]}, json_file)
+            write_json({"format": 1, "source": recording, "signals": [one.as_dict() for one in result]}, json_file)
         if png is not None or html is not None:
             from tools.research.tremor.inspect_picture import inspection_figure, page, png_bytes
 
             if png is not None:
                 with outputs.part("picture"):
-                    write_bytes_atomic(png, png_bytes(inspection_figure(found[0])))
+                    write_bytes_atomic(png, png_bytes(inspection_figure(result[0])))
                     console().print(f"picture: {png}")
             if html is not None:
                 with outputs.part("page"):
-                    write_text_atomic(html, page(found))
+                    write_text_atomic(html, page(result))
                     console().print(f"page: {html}")
         outputs.finish()
 
 
 def _readable(unit: str, size: float) -> tuple[float, str]:
-    """Factor and unit for small excursions of about ``size``."""
+    """Return factor and unit for small excursions of about ``size``."""
     if unit == "m":
         return (1e3, "mm") if size >= 1e-3 else (1e6, "um")
     return (1e3, "mrad") if unit == "rad" else (1.0, unit)

@@ -1,4 +1,4 @@
-"""``micron tremor train``: a cascade network from recorded hands."""
+"""Implements ``micron tremor train``: it trains a cascade network on recorded hands."""
 
 from __future__ import annotations
 
@@ -18,25 +18,23 @@ def train(
     recordings: Annotated[
         list[str], typer.Argument(metavar="RECORDING[#NAME]...", help="Gyroscope recordings of hands.")
     ],
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Weights (JSON), what the firmware loads.")] = Path(
-        "out/cascade.json"
-    ),
+    out: Annotated[Path, typer.Option(metavar="FILE", help="File for the weights (JSON).")] = Path("out/cascade.json"),
     leave_out: Annotated[
-        list[str] | None, typer.Option(metavar="PERSON", help="Not trained on, tested on; may be repeated.")
+        list[str] | None, typer.Option(metavar="PERSON", help="Subject that is held out for the test; may be repeated.")
     ] = None,
     target: Annotated[
-        Literal["voluntary", "error"], typer.Option(help="What the network gives: NN_vm or NN_err.")
+        Literal["voluntary", "error"], typer.Option(help="Output of the network: NN_vm or NN_err.")
     ] = "voluntary",
     window: Annotated[
-        int | None, typer.Option(min=2, max=400, help="Inputs; without it several windows are tried.")
+        int | None, typer.Option(min=2, max=400, help="Number of inputs; without it several windows are tried.")
     ] = None,
     spacing: Annotated[int, typer.Option(min=1, max=20, help="Samples of 4 ms between inputs.")] = 1,
-    units: Annotated[int, typer.Option(min=0, max=20, help="Hidden units at most.")] = 4,
+    units: Annotated[int, typer.Option(min=0, max=20, help="Largest number of hidden units.")] = 4,
     centred: Annotated[
-        bool, typer.Option(help="Take the window's mean out: where the hand is does not matter.")
+        bool, typer.Option(help="Subtract the mean of the window, so that the hand's position does not matter.")
     ] = True,
     error_above_hz: Annotated[
-        float, typer.Option(min=0.1, max=5.0, help="What counts as error (Ang 2004, 5.3.3).")
+        float, typer.Option(min=0.1, max=5.0, help="Definition of the error (Ang 2004, sec. 5.3.3).")
     ] = 2.0,
     seed: Annotated[int, typer.Option(min=0)] = 1,
     json_file: JsonOption = None,
