@@ -1,4 +1,4 @@
-"""Small things that several drivers need."""
+"""Holds small functions that several drivers need."""
 
 from __future__ import annotations
 

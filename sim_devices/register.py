@@ -1,4 +1,4 @@
-"""The emulation provider that bench files name: ``provider = "sim_devices.register:provider"``.
+"""Provides the emulation that bench files name: ``provider = "sim_devices.register:provider"``.
 
 With a virtual clock the world lives in this process and moves in lockstep with whoever waits; without one it is a
 process of its own in real time (``sim_devices.process``), reached through the ordinary adapters of ``hal``. Either is
@@ -27,9 +27,8 @@ def provider(
     runtime_dir: Path,
     hand_file: Path | None,
     hand_scale: float | None,
-    plant: str = PLANT,
 ) -> LockstepWorld | ProcessWorld:
-    """The emulated side of a bench. ``plant`` names the factory of the physics; only tests need another one.
+    """Return the emulated side of a bench.
 
     Raises ``BenchError`` for a wrong ``[emulation]`` table or a device that cannot be emulated.
     """
@@ -38,10 +37,10 @@ def provider(
     if clock is not None:
         from sim_devices.lockstep_world import LockstepWorld
 
-        world = LockstepWorld(description, clock, file, hand_scale, plant)
+        world = LockstepWorld(description, clock, file, hand_scale, PLANT)
         if isinstance(clock, PacedClock):  # somebody may be watching, and want to break something
             world.obey(Path(runtime_dir))
         return world
     from sim_devices.process_world import ProcessWorld
 
-    return ProcessWorld(description, Path(runtime_dir), file, hand_scale, plant)
+    return ProcessWorld(description, Path(runtime_dir), file, hand_scale, PLANT)

@@ -28,9 +28,7 @@ def start(folder: Path, **changes: Any) -> ProcessWorld:
     table = load_bench(BENCH).description.model_dump()
     for key, value in changes.items():
         table["device"][key] = value
-    world = provider(table, clock=None, runtime_dir=folder, hand_file=None, hand_scale=None, plant=FAKE)
-    assert isinstance(world, ProcessWorld)
-    return world
+    return ProcessWorld(table, folder, None, None, FAKE)
 
 
 @pytest.fixture(scope="module")
@@ -154,8 +152,7 @@ def test_a_hand_that_cannot_be_read_is_named(tmp_path: Path) -> None:
 def test_can_as_a_serial_adapter_on_a_pty(tmp_path: Path) -> None:
     table = load_bench(BENCH).description.model_dump()
     table["bus"]["can0"]["uri"] = "sim://can0?via=slcan"
-    world = provider(table, clock=None, runtime_dir=tmp_path, hand_file=None, hand_scale=None, plant=FAKE)
-    assert isinstance(world, ProcessWorld)
+    world = ProcessWorld(table, tmp_path, None, None, FAKE)
     bus = open_can(world.endpoint("can0"))
     bus.send(CanFrame(0x201, bytes(8)), 1.0)
     frame = bus.recv(5.0)
