@@ -2,6 +2,8 @@
 
 A driver is found in one of three places, in this order: ``BUILT_IN``; a folder ``drivers/NAME`` whose module ``driver``
 holds ``DRIVER``; an entry point of group ``micron.drivers`` of another package. The record is the same everywhere.
+``hal.plugins.Registry`` searches them. A name of the first two cannot be replaced, and two packages that offer one name
+are refused.
 """
 
 from __future__ import annotations
@@ -42,6 +44,10 @@ BUILT_IN: Mapping[str, str] = MappingProxyType(
 )
 
 Role = Literal["sensor", "daq", "output", "converter", "part", "node", "inertial"]
+"""Use of a device in a bench. A "daq" delivers the scans that drive the tick, an "output" moves the stacks, a "sensor"
+is read by ``micron read``. The firmware's instruments open the others: a "converter" is the ADC of other devices, a
+"part" hangs on a DAQ or ADC, a "node" shares the CAN bus of the firmware, and an "inertial" sensor steers the
+endoscope."""
 Input = Callable[[int], float]
 """Volts at an input of the device's DAQ, the mean of the last scans."""
 
@@ -99,8 +105,8 @@ class Load(NamedTuple):
 
 
 class Traffic(NamedTuple):
-    """Describes a transaction that repeats: ``bits`` on the wire, ``per_s`` times a second. ``task`` is the firmware's
-    task that waits for it, empty where none does."""
+    """Describes a transaction that repeats: ``bits`` on the wire (9 for an I2C byte, 10 for a serial one), ``per_s``
+    times a second. ``task`` is the firmware's task that waits for it, empty where none does."""
 
     what: str
     bits: float
@@ -117,10 +123,9 @@ class Driver:
     instruments' own loops. ``needs`` is the key that connects the device and is required. ``inputs(options)`` returns
     the inputs of its DAQ or ADC that it uses. ``traffic(load)`` returns what it repeats on its bus; a device whose
     traffic no task waits for may give ``bits_per_s(options)`` instead, with 9 bits for an I2C byte and 10 for a serial
-    one.
-    ``addresses``: those that the pins of the part can select. ``max_bus_hz``: fastest I2C clock of the part.
-    ``leased``: class of an output (``DacOutput``) that a guardian can hold as well. ``verifies``: the output can be
-    read back.
+    one. ``addresses`` lists the 7-bit I2C addresses that the pins of the part select; empty means that it has none.
+    ``max_bus_hz`` is the fastest I2C clock of the part, in Hz. ``leased`` is the class of an output (``DacOutput``)
+    that a guardian can hold as well. ``verifies`` is True for an output that can be read back.
     """
 
     options: type[Options]
@@ -151,7 +156,8 @@ def driver_names() -> list[str]:
 
 
 def find_driver(name: str) -> Driver:
-    """Return the driver ``name``. Raises ``BenchError`` if there is none or its package is broken."""
+    """Return the driver ``name``. Raises ``BenchError`` if there is none, if two packages offer it, or if its package
+    cannot be imported."""
     driver = REGISTRY.find(name)
     if driver is None:
         raise BenchError(f"there is no driver '{name}'; drivers are {', '.join(driver_names())}")

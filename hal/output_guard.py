@@ -105,7 +105,7 @@ class OutputGuard:
         kept_ns, kept_V = state.kept_ns.tolist(), state.kept_V.tolist()
         oldest = max(0, state.words[N_SENT] - TOLD)
         places = (k % KEPT for k in range(oldest, newest))
-        return [Told(*kept_ns[2 * p : 2 * p + 2], tuple(kept_V[n * p : n * p + n])) for p in places]
+        return [Told(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n])) for p in places]
 
     def admit(self, values_V: Float64Array) -> int:
         """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.

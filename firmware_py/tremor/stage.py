@@ -43,10 +43,16 @@ from hal.compiled import kernel
 
 @kernel
 def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -> None:
-    """Fill the columns from ``tremor`` to ``confidence``; adds its bits to ``status``.
+    """Fill the columns from ``tremor`` to ``confidence`` and add the bit ``SETTLING`` to ``status``.
 
-    Without a valid new sample the model runs on by itself, so that the prediction stays one for the present
-    tick; after lost scans it runs on over the gap. Confidence is 0 until the estimator has settled.
+    Input: ``tip_acceleration`` (3,) in m/s^2 and ``angular_acceleration`` (3,) in rad/s^2, both in the body frame.
+    Output per axis: tremor now, tremor ``TremorConfig.loop_delay_s`` later, its core (the part that does not yield when
+    the stroke runs out) and amplitude in m, frequency in Hz, confidence from 0 to 1. ``params`` come from
+    ``TremorConfig`` (``estimator_params``); ``states`` is the memory of the estimator.
+
+    Without a valid new sample the model runs on by itself, so that the prediction stays one for the present tick. After
+    lost scans it runs over the gap; a gap of more than ``TremorConfig.max_gap_ticks`` restarts it. It also restarts
+    while the attitude is aligning. Confidence is 0 until ``TremorConfig.settle_s`` has passed.
     """
     param = params[0]
     status = int(frame[STATUS])
@@ -67,7 +73,8 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
     if not coast:
         for i in range(AXES):
             state.samples[i] = frame[TIP_ACCELERATION + i]
-            j, k = (i + 1) % AXES, (i + 2) % AXES  # angular acceleration x arm
+            # angular acceleration x arm (m, quiet point to tip): the part of the reading that is a turn
+            j, k = (i + 1) % AXES, (i + 2) % AXES
             state.turned[i] = (
                 frame[ANGULAR_ACCELERATION + j] * param.arm[k] - frame[ANGULAR_ACCELERATION + k] * param.arm[j]
             )
@@ -86,7 +93,7 @@ def estimate_kernel(frame: NDArray[np.float64], states: Record, params: Record) 
 
 
 class Tremor:
-    """The tremor stage with its state; ``step`` works on one frame."""
+    """Holds the configuration, parameters and state of the tremor stage."""
 
     def __init__(self, config: TremorConfig) -> None:
         self.config = config
@@ -94,6 +101,7 @@ class Tremor:
         self.state = estimator_state(self.params)
 
     def step(self, frame: NDArray[np.float64]) -> None:
+        """Compute one tick in place; ``frame`` is the vector of ``firmware_py.frame``."""
         estimate_kernel(frame, self.state, self.params)
 
     def reset(self) -> None:

@@ -8,7 +8,8 @@ import pytest
 from drivers.adc.ads1115 import Ads1115
 from drivers.amplifier_monitor import AmplifierMonitor, Usual, Window
 from hal.clock import VirtualClock
-from hal.output_guard import OutputGuard, Told
+from hal.output_guard import OutputGuard
+from hal.output_guard_steps import admit, note_sent
 from hal.types import OutputLimit
 from sim_devices.devices.ads1115 import Ads1115 as EmulatedAds1115
 from sim_devices.transports.i2c_line import I2cLine
@@ -140,9 +141,12 @@ def test_a_command_under_way_may_have_arrived_already():
 
 
 def told_at(stand: Stand, *commands: tuple[float, float, float]) -> None:
-    """Commands of output 1: offered at, taken in force at the latest at (ms), volts."""
+    """Send commands to output 1: offered at (ms), in force at the latest at (ms), volts. The slew limit is off."""
+    state = stand.guard.state
     for offered_ms, sent_ms, volts in commands:
-        stand.guard.told.append(Told(round(offered_ms * MS), round(sent_ms * MS), (volts, 50.0, 50.0)))
+        state.slew_V_per_s[0] = np.inf
+        admit(state, (volts, 50.0, 50.0), round(offered_ms * MS))
+        note_sent(state, round(sent_ms * MS))
 
 
 @pytest.mark.parametrize(
