@@ -37,7 +37,9 @@ RecordingsArgument = Annotated[
         metavar="RECORDING...", help="A recording (folder or .toml) or a folder of recordings; several with --together."
     ),
 ]
-EngineOption = Annotated[str, typer.Option(metavar="old|new", help="Engine that decides; 'new' is an experiment.")]
+EngineOption = Annotated[
+    str | None, typer.Option(metavar="old|new", help="Engine that decides; 'new' is an experiment.")
+]
 SeedOption = Annotated[
     int, typer.Option(min=0, help="Seed of the search; the same recording and seed give the same answer.")
 ]
@@ -65,7 +67,7 @@ def diagnose(
     ] = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
-    engine: EngineOption = "old",
+    engine: EngineOption = None,
     together: Annotated[
         bool,
         typer.Option("--together", help="Give all recordings of one system one diagnosis, and report what differs."),
@@ -85,16 +87,18 @@ def diagnose(
     with clear_errors():
         check_writable(json_file, html)
         check_folder(out)
+        from tools.mismatch.engines import check_engine
+
         check_engine(engine)
         processes = jobs or os.cpu_count() or 1
         if together:
-            if engine != "old" or dask is not None:
-                raise InputError("--together has one engine and runs on this machine; leave --engine and --dask out")
+            if dask is not None:
+                raise InputError("--together runs on this machine; leave --dask out")
             from tools.mismatch.together import load_together, recordings_of
 
             decide_on([*recordings_of(recordings).values()], trust, allow_outside)
             joined = load_together(recordings, per_recording or [])
-            _show(_diagnose_one(joined, held_out, seed, processes), json_file, html, out)
+            _show(_diagnose_one(joined, held_out, seed, processes, engine), json_file, html, out)
             return
         if per_recording:
             raise InputError("--per-recording needs --together: it says what differs between recordings")
@@ -107,11 +111,9 @@ def diagnose(
         from tools.mismatch.batch import is_folder_of_recordings
 
         if is_folder_of_recordings(recording):
-            if engine != "old":
-                raise InputError("--engine new is for one recording at a time")
             if html is not None:
                 raise InputError(f"--html is for one recording; {recording} is a folder of them: use --out FOLDER")
-            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask)
+            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask, engine)
             return
         if dask is not None:
             raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
@@ -119,14 +121,12 @@ def diagnose(
         _show(report, json_file, html, out)
 
 
-def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, engine: str = "old") -> Report:
+def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, engine: str | None) -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from tools.mismatch.engine.diagnose import diagnose as run_old
-    from tools.mismatch.infer import diagnose as run_new
+    from tools.mismatch.engines import diagnose
     from tools.mismatch.recording_load import load
 
-    run = run_new if engine == "new" else run_old
     loaded = load(recording) if isinstance(recording, Path) else recording
     for note in loaded.warnings:
         print_note(note)
@@ -140,7 +140,8 @@ def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs:
             progress.update(bar, description=what, completed=done, total=total)
 
         alone = loaded.n > MOST_SHARED
-        return run(loaded, held_out=held_out, seed=seed, jobs=1 if alone else jobs, progress=show)
+        shared = 1 if alone else jobs
+        return diagnose(loaded, held_out=held_out, seed=seed, jobs=shared, progress=show, engine=engine)
 
 
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
@@ -166,14 +167,15 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 
 
 def _diagnose_folder(
-    folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None
-) -> None:
+    folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None,
+    engine: str | None,
+) -> None:  # fmt: skip
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from tools.mismatch import batch
     from tools.mismatch.report.terminal import batch_report
 
-    work = batch.jobs_for(batch.find(folder), out, held_out, seed)
+    work = batch.jobs_for(batch.find(folder), out, held_out, seed, engine)
     stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
     rows: list[batch.Row] = []
     with Progress(
@@ -273,11 +275,6 @@ def physics(json_file: JsonOption = None) -> None:
         if json_file != "-":
             print_vocabulary(effects, data_console())
         write_json(to_json(effects), json_file)
-
-
-def check_engine(engine: str) -> None:
-    if engine not in ("old", "new"):
-        raise InputError(f"--engine {engine}: there is no such engine; use old or new")
 
 
 @app.command()

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tools.errors import InputError
+from tools.mismatch.engines import diagnose as run_engine
 from tools.mismatch.recording import Array, Simulate, TwinText
 from tools.mismatch.recording import Recording as Loaded
 
@@ -321,8 +322,9 @@ class Diagnosis:
 
 
 def diagnose(
-    recording: Recording, twin: Twin | None = None, *, held_out: float = 0.3, seed: int = 0, jobs: int = 1
-) -> Diagnosis:
+    recording: Recording, twin: Twin | None = None, *, held_out: float = 0.3, seed: int = 0, jobs: int = 1,
+    engine: str | None = None,
+) -> Diagnosis:  # fmt: skip
     """Find where a twin and a recording differ, which physics the twin lacks, and fit it.
 
     ``twin`` may be left out where the recording was loaded from a descriptor that has one. ``held_out`` is the share of
@@ -330,9 +332,7 @@ def diagnose(
     """
     if not 0.1 <= held_out <= 0.6:
         raise InputError(f"held_out must be a share between 0.1 and 0.6, not {held_out}")
-    from tools.mismatch.engine.diagnose import diagnose as engine
-
-    return Diagnosis(engine(recording.with_twin(twin), held_out=held_out, seed=seed, jobs=jobs))
+    return Diagnosis(run_engine(recording.with_twin(twin), held_out=held_out, seed=seed, jobs=jobs, engine=engine))
 
 
 def _frame(columns: Mapping[str, Any], t: Array | None = None) -> DataFrame:

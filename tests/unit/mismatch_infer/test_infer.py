@@ -43,7 +43,7 @@ class _Set:
 
     def __init__(self, density: float, names: set[str], parameters: int, idle: int = 0) -> None:
         self.density = {"y": density, **{f"idle{i}": 0.0 for i in range(idle)}}
-        self.names, self.parameters = frozenset(names), parameters
+        self.names, self.parameters, self.outputs = frozenset(names), parameters, float(1 + idle)
 
 
 def test_a_name_and_a_parameter_have_their_price_and_samples_count_up_to_a_number() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -27,13 +28,14 @@ from tools.mismatch.engine.reduce import OVER_ALL, SLOW, VERY_LONG, excerpt, fit
 from tools.mismatch.engine.report import Hold, Report, Withheld
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
+from tools.mismatch.engine.screen import Candidate
 from tools.mismatch.engine.select import Selection, search
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
-from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
 from tools.mismatch.engine.verdict import Decision
 from tools.mismatch.engine.workers import mapped
+from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
@@ -192,9 +194,12 @@ def pose(
     jobs: int,
     progress: Progress | None,
     effects: Iterable[Effect] | None,
-    rule: Rule,
+    look: Look,
 ) -> Posed:
-    """Prepare everything that comes before the search: runs joined, circuits opened, hold of the inputs, noise."""
+    """Prepare everything that comes before the search: runs joined, circuits opened, hold of the inputs, noise.
+
+    ``look`` says what a part of a very long recording shows.
+    """
     recording, was_joined = joined(with_equations(recording))
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     recording = opened(recording, held_out, seed)
@@ -205,7 +210,7 @@ def pose(
     # an effect that is too weak for one recording is too weak for an excerpt
     long = recording.n > VERY_LONG if recording.parts else is_long(recording, make(recording))
     if long:
-        catalogue, hints = nominated(recording, held_out, seed, jobs, progress, catalogue, rule)
+        catalogue, hints = nominated(recording, held_out, seed, catalogue, look)
     problem, raw, base = prepared(recording, held_out, seed, was_joined)
     hold = None
     if holdable(problem):
@@ -228,7 +233,7 @@ def _diagnose(
     effects: Iterable[Effect] | None,
     rule: Rule,
 ) -> Report:
-    posed = pose(recording, held_out, seed, jobs, progress, effects, rule)
+    posed = pose(recording, held_out, seed, jobs, progress, effects, partial(one_way_forward, rule, jobs, progress))
     recording, catalogue, problem, raw = posed.recording, posed.effects, posed.problem, posed.raw
     base, hold, twin = posed.base, posed.hold, posed.problem.twin
     stride = max(1, problem.fit_rows.size // 12000)
@@ -433,14 +438,12 @@ def preferred(problem: Problem, base: Fit) -> Fit:
     return base if base.ok and misfit(problem, base) <= misfit(problem, given) else given
 
 
+Look = Callable[[Problem, Fit, tuple[Effect, ...]], tuple[set[str], list[Hint]]]
+"""What a search on a part of a recording finds: names that may matter, and what the best of them were found to be."""
+
+
 def nominated(
-    recording: Recording,
-    held_out: float,
-    seed: int,
-    jobs: int,
-    progress: Progress | None,
-    catalogue: tuple[Effect, ...],
-    rule: Rule,
+    recording: Recording, held_out: float, seed: int, catalogue: tuple[Effect, ...], look: Look
 ) -> tuple[tuple[Effect, ...], tuple[Hint, ...]]:
     """Effects that an excerpt at full rate or a thinned copy of a long record accepts, with their close rivals, and
     what the excerpt found them to be.
@@ -459,23 +462,35 @@ def nominated(
         parts.append((thinned_copy(recording, part_of(recording)), slow))
     for part, allowed in parts:
         problem, _, base = prepared(part, held_out, seed, False)
-        stride = max(1, problem.fit_rows.size // 12000)
-        # second thoughts are for the whole: here one way forward is enough
-        way = forward(problem, base, base, (), Work(allowed, rule, stride, jobs, progress))
-        trials = [*way.steps, *(t for rivals in way.rivals for t in rivals[:2])]
-        names |= {t.name for t in trials}
+        found, shown = look(problem, base, allowed)
+        names |= found
         if part is parts[0][0]:
-            hints = [hint for t in trials if (hint := _hint(t)) is not None]
+            hints = shown
     return tuple(e for e in catalogue if e.name in names), tuple(hints)
 
 
-def _hint(trial: Trial) -> Hint | None:
-    """What a trial on a part found; None for what is about instants or the lattice of samples."""
-    if trial.fitted is None or trial.candidate.tested or not trial.placed.effect.driven:
-        return None
-    model, theta = trial.fitted.model, trial.fitted.theta
-    nonlinear, weights = model.slices(model.placed.index(trial.placed))
-    return Hint(trial.placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))
+def one_way_forward(
+    rule: Rule, jobs: int, progress: Progress | None, problem: Problem, base: Fit, allowed: tuple[Effect, ...]
+) -> tuple[set[str], list[Hint]]:
+    """A ``Look`` by one way forward: second thoughts are for the whole."""
+    stride = max(1, problem.fit_rows.size // 12000)
+    way = forward(problem, base, base, (), Work(allowed, rule, stride, jobs, progress))
+    trials = [*way.steps, *(t for rivals in way.rivals for t in rivals[:2])]
+    hints = [hint_of(t.placed, t.fitted) for t in trials if t.fitted is not None and may_hint(t.placed, t.candidate)]
+    return {t.name for t in trials}, hints
+
+
+def may_hint(placed: Placed, candidate: Candidate) -> bool:
+    """Whether what a part shows of an effect says where to begin on the whole: not what is about instants or the
+    lattice of samples."""
+    return not candidate.tested and placed.effect.driven
+
+
+def hint_of(placed: Placed, fitted: Fit) -> Hint:
+    """What the fit on a part found an effect of it to be."""
+    model, theta = fitted.model, fitted.theta
+    nonlinear, weights = model.slices(model.placed.index(placed))
+    return Hint(placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))
 
 
 __all__ = ["diagnose"]

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
 Meaning = Literal["", "floor_doubtful", "fit_failed", "place_not_reachable", "unknown"]
 """What an ``unexplained`` means; "" for the other verdicts."""
-WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance"]
+WithheldReason = Literal["holds_zero", "at_limit", "below_tolerance", "unlikely"]
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,25 @@ TRIAL_ROWS = 12_000  # over all outputs, that a candidate is fitted on; who is a
 
 
 @dataclass(frozen=True)
+class Effort:
+    """How much is spent on a candidate. A candidate that gains less than ``share`` of what one step of the best gains
+    in log density, or less than ``least`` (a share of the mean square of its outputs), is not refined.
+    """
+
+    share: float
+    least: float
+
+    def most_left(self, top: float) -> float:
+        """Share of an output's mean square that a candidate may leave there, where one step of the best takes ``top``:
+        the log density falls with the logarithm of what is left."""
+        return min((1.0 - min(top, MOST_TOP)) ** self.share, 1.0 - self.least)
+
+
+MOST_TOP = 0.999
+"""Share of an output's mean square that one step can be said to take at most: what is left is noise."""
+
+
+@dataclass(frozen=True)
 class Trial:
     """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfits`` per output on held-out
     samples (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds;
@@ -74,16 +93,27 @@ def screen_one(problem: Problem, current: Fit, place: Placed, ground: Ground) ->
     return one_step(problem, current, place, ground)
 
 
-def fit_one(problem: Problem, current: Fit, candidate: Candidate, stride: int, tops: dict[str, float]) -> Trial:
+def fit_one(
+    problem: Problem,
+    current: Fit,
+    candidate: Candidate,
+    stride: int,
+    tops: dict[str, float],
+    effort: Effort | None = None,
+) -> Trial:
     """Fit one candidate jointly with everything that is there, compare on held-out samples.
 
-    ``tops``: the best one-step share per output; who stays far below it is not refined.
+    ``tops``: the best one-step share per output; who stays far below it is not refined, by ``effort`` where it is
+    given.
     """
     model, _ = extended(problem, current, candidate.placed)
     rows = problem.fit_rows
     touched = candidate.placed.outputs
     now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
-    gone = max(0.5 * tops[o] * now[o] for o in touched)
+    if effort is None:
+        gone = max(0.5 * tops[o] * now[o] for o in touched)
+    else:
+        gone = max((1.0 - effort.most_left(tops[o])) * now[o] for o in touched)
     limit = (sum(now.values()) - gone) / len(now)
     thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
     fitted = fit(
@@ -150,6 +180,7 @@ def try_all(
     what: str = "candidates",
     least: int = LEAST_FITS,
     most: int = MOST_FITS,
+    effort: Effort | None = None,
 ) -> list[Trial]:
     """Every candidate screened, the ``hopeful`` ones fitted. The answer does not depend on ``jobs``."""
 
@@ -166,11 +197,21 @@ def try_all(
     keep = hopeful(screened, least, most)
     chosen = [c for c, k in zip(screened, keep, strict=True) if k]
     tops = dict.fromkeys(problem.twin.outputs, 0.0)
+    # shares are of the mean square of all outputs; one output may have little of it
+    part = dict.fromkeys(tops, 1.0) if effort is None else _parts(problem, current)
     for c in chosen:
         for o in c.placed.outputs:
-            tops[o] = max(tops[o], c.share / len(c.placed.outputs))
-    fitted = iter(run(fit_one, chosen, (stride, tops), f"{what}: fit"))
+            tops[o] = max(tops[o], c.share / len(c.placed.outputs) / part[o])
+    fitted = iter(run(fit_one, chosen, (stride, tops, effort), f"{what}: fit"))
     return [
         next(fitted) if k else Trial(c.placed, c, None, None, {}, np.empty((0, 0)), 0)
         for c, k in zip(screened, keep, strict=True)
     ]
+
+
+def _parts(problem: Problem, current: Fit) -> dict[str, float]:
+    """The share of every output in what ``current`` leaves on fitted samples, in noise variances."""
+    rows = problem.fit_rows
+    left = {o: float(np.mean((r[rows] / problem.sigma(o)) ** 2)) for o, r in current.residual.items()}
+    total = max(sum(left.values()), 1e-300)
+    return {o: max(v / total, 1e-12) for o, v in left.items()}

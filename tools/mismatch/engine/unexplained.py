@@ -53,8 +53,6 @@ def leftover(
         followed = bool(sizes)
         said += sizes
     loud = problem.floors[output].declared and ratio > 1.5
-    if (loud or ratio > 2.0) and not said:
-        said = found[:1]  # the likeliest, however weak: somebody has to look somewhere
     return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
 
 

@@ -18,9 +18,13 @@ LEAST_WORK = 1_500_000  # samples times outputs times pieces above which they pa
 
 
 def quietly(function: Callable[..., Any], arguments: tuple[Any, ...]) -> Any:
-    """One piece: the linear algebra with one thread, and no warnings of trials that run away."""
-    if parent_process() is not None:
-        begin_as_worker()
+    """One piece, without warnings of trials that run away. In a worker process the linear algebra has one thread; in
+    the process that asks, whoever asks has limited it (looking for its libraries takes longer than many a piece).
+    """
+    if parent_process() is None:
+        with np.errstate(all="ignore"):
+            return function(*arguments)
+    begin_as_worker()
     with np.errstate(all="ignore"), threadpool_limits(1):
         return function(*arguments)
 

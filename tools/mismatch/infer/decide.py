@@ -11,9 +11,11 @@ import numpy as np
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.report import Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover
+from tools.mismatch.infer.borne_out import borne_out, entry_of
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import unpredicted, weigh
 from tools.mismatch.infer.store import Scored, Store
@@ -46,7 +48,8 @@ class Rival:
 @dataclass(frozen=True)
 class Answer:
     """``chosen`` (the base where nothing is named); ``sure`` per name; ``rivals``; ``strange``: a recorded signal whose
-    free curve is a better account than any set; ``left`` per output; ``whole``: nothing more is left than form errors.
+    free curve is a better account than any set; ``left`` per output; ``whole``: nothing more is left than form errors;
+    ``withheld``: effects that scored better and are not borne out.
     """
 
     chosen: Scored
@@ -55,6 +58,7 @@ class Answer:
     strange: Stranger | None
     left: Mapping[str, Leftover]
     whole: bool
+    withheld: tuple[Withheld, ...] = ()
 
 
 def tested(store: Store) -> list[tuple[Scored, float]]:
@@ -154,7 +158,7 @@ def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger
 def curve_score(store: Store, s: Scored, found: Stranger) -> float:
     """The score of ``s`` with a free curve beside it: its gain on blocks that it has not seen, less its price."""
     c = store.constants
-    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held) / len(s.density)
+    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held) / store.outputs
     room = store.room(s)[found.output]
     return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
 
@@ -188,14 +192,24 @@ def is_whole(rest: float, taken: float, c: Constants) -> bool:
     return rest <= max(c.cut, c.cut_share * taken)
 
 
+def _with_leads(problem: Problem, rest: Fit, left: Mapping[str, Leftover]) -> dict[str, Leftover]:
+    """What is left, led by the recorded condition that most of it follows. ``rest``: as ``leftovers`` gives it."""
+    found = {o: lead(problem, rest, o) if v.real else None for o, v in left.items()}
+    return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in left.items()}
+
+
+LIKELIER_THAN_NOT = 0.5
+"""Probability below which a name beside something that is unexplained is not stated."""
+
+
 def decide(store: Store, first: Sequence[Trial]) -> Answer:
     """The answer of a finished search. ``first``: the candidates that were screened beside the base."""
     p, c = store.problem, store.constants
-    good = accepted(store)
+    good, withheld = borne_out(store, accepted(store))
     chosen = good[0]
     strange = free_curve(p, store.base.fitted, candidate_signals(first))
     if strange is not None and curve_score(store, store.base, strange) > store.score(chosen):
-        chosen = store.base
+        chosen, withheld = store.base, ()
     else:
         strange = None
     said = store.with_events(chosen)
@@ -203,22 +217,25 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     if strange is not None:
         left[strange.output] = left[strange.output].led_by(strange)
     else:
-        for o in [o for o in left if left[o].real]:
-            found = lead(p, rest_of, o)
-            if found is not None:
-                left[o] = left[o].led_by(found)
+        left = _with_leads(p, rest_of, left)
     rest, taken = worst_left(p, store.base.fitted, left)
     whole = strange is None and is_whole(rest, taken, c)
     sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
     sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
-    return Answer(said, sure, rivals_of(store, chosen), strange, left, whole)
+    unlikely = {name for name, v in sure.items() if v < LIKELIER_THAN_NOT} if not whole else set[str]()
+    if unlikely:
+        withheld += tuple(entry_of(store, said, k) for k, e in enumerate(said.placed) if e.effect.name in unlikely)
+        said = store.without(said, lambda e: e.effect.name in unlikely)
+        chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
+        left = _with_leads(p, *leftovers(p, said.fitted))
+    return Answer(said, sure, rivals_of(store, chosen), strange, left, whole, withheld)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:
     """Whether re-fitted base parameters predict better than the given ones by more than their price."""
     p, c = store.problem, store.constants
     before = float(np.mean([np.mean(w.density[p.held_rows]) for w in weigh(p, raw).values()]))
-    gain = min(c.samples, store.held) * (store.base.mean_density - before)
+    gain = min(c.samples, store.held) * (float(np.mean([*store.base.density.values()])) - before)
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 
 

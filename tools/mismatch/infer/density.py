@@ -171,10 +171,11 @@ TAILS = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 10.0, 30.0)
 
 def gain_of_events(r: Array, events: NDArray[np.bool_], span: float, least: float) -> float:
     """Nats by which residuals ``r`` (n,) are likelier as a mixture of noise and of ``events`` (n,), which are anywhere
-    within ``span``, than as noise alone, each with the tails that suit it best."""
+    within their own largest size and within ``span``, than as noise alone, each with the tails that suit it best."""
     share = float(np.mean(events))
     if not 0.0 < share < 1.0:
         return 0.0
+    span = min(span, 2.0 * float(np.max(np.abs(r[events]))))
 
     def tails(x: Array) -> float:
         def total(nu: float) -> float:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.stats import norm
@@ -13,10 +14,11 @@ from threadpoolctl import threadpool_limits
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.diagnose import Posed, conclude, gross, pose, run_through
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.hold import delay_is_hold, with_hold
 from tools.mismatch.engine.identifiability import experiment
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.parsimony import Rule
-from tools.mismatch.engine.report import Alternative, Equivalent, Report, Sealed
+from tools.mismatch.engine.report import Alternative, Equivalent, Hold, Report, Sealed
 from tools.mismatch.engine.revise import size
 from tools.mismatch.engine.score import block_energy, compare, held_rms, misfits
 from tools.mismatch.engine.screen import Candidate
@@ -26,7 +28,7 @@ from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, wit
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import Answer, decide, recalibrated
 from tools.mismatch.infer.sealed import score_sealed, seal
-from tools.mismatch.infer.search import Found, search
+from tools.mismatch.infer.search import Found, look, search
 from tools.mismatch.infer.store import Scored, Store, part_of
 from tools.mismatch.recording import Recording
 from tools.mismatch.report.wording import rival_remark
@@ -52,7 +54,7 @@ def infer(
     """Prepare and search; no decision yet. The linear algebra uses one thread."""
     kept, unsealed = seal(recording)
     with threadpool_limits(1):
-        posed = pose(kept, held_out, seed, jobs, progress, effects, Rule())
+        posed = pose(kept, held_out, seed, jobs, progress, effects, partial(look, constants, jobs, progress))
         found = search(posed.problem, posed.base, posed.effects, constants, jobs=jobs, progress=progress)
     return Inferred(posed, found, recording, unsealed)
 
@@ -63,12 +65,29 @@ def diagnose(
 ) -> Report:  # fmt: skip
     """Locate the mismatch, name the physics and say how sure that is, with the learned constants unless given."""
     began = time.perf_counter()
-    inferred = infer(
-        recording, constants or learned(), held_out=held_out, seed=seed, jobs=jobs, progress=progress, effects=effects
-    )
+    find = partial(
+        infer, constants=constants or learned(), held_out=held_out, seed=seed, jobs=jobs, progress=progress,
+        effects=effects,
+    )  # fmt: skip
+    inferred = find(recording)
     with threadpool_limits(1), np.errstate(all="ignore"):
-        report = report_of(inferred, decide(inferred.found.store, inferred.found.first), held_out, jobs)
+        answer = decide(inferred.found.store, inferred.found.first)
+        if names_the_hold(inferred, answer):
+            inferred = find(with_hold(recording, "zero"))
+            inferred = replace(inferred, posed=replace(inferred.posed, hold=Hold("zero", "instead_of_delay")))
+            answer = decide(inferred.found.store, inferred.found.first)
+        report = report_of(inferred, answer, held_out, jobs)
     return replace(report, seconds=time.perf_counter() - began)
+
+
+def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
+    """Whether the answer has a delay of half a sample where the data did not tell what the inputs do between their
+    samples: held inputs explain as much, and no machine has such a delay."""
+    hold, store = inferred.posed.hold, inferred.found.store
+    if hold is None or hold.how != "assumed" or not answer.chosen.placed:
+        return False
+    selection = Selection(store.problem, store.base.fitted, answer.chosen.fitted, (), ())
+    return delay_is_hold(store.problem, selection) is not None
 
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:
@@ -84,7 +103,9 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
     )  # fmt: skip
     remarks = gross(posed.recording, posed.problem.twin, posed.raw)
     ended = run_through(posed, selection, held_out)
-    report = conclude(posed, ended, dict(answer.left), Rule(), remarks, jobs, decision=decision)
+    report = conclude(
+        posed, ended, dict(answer.left), Rule(), remarks, jobs, withheld=answer.withheld, decision=decision
+    )
     sealed = Sealed(None, inferred.unsealed)
     if not inferred.unsealed:
         sealed = score_sealed(inferred.whole, posed, ended.base, ended.selection.fitted)
@@ -145,8 +166,9 @@ def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
         p = answer.strange.p_value if answer.strange is not None else least_p(answer.left.values())
         return Decision("unexplained", p, meaning_of(problem, dict(answer.left), trouble), trouble, floors)
     if answer.chosen.placed:
-        z = store.least_z(answer.chosen)
-        return Decision("missing_physics", float(norm.sf(z)), "", (), floors)
+        # corrected for every candidate that was looked at (Bonferroni)
+        p = min(1.0, float(norm.sf(store.least_z(answer.chosen))) * max(len(store.seen), 1))
+        return Decision("missing_physics", p, "", (), floors)
     return Decision("recalibrate" if recalibrated(store, raw) else "agrees", 1.0, "", (), floors)
 
 

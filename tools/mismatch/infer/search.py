@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.diagnose import hint_of, may_hint
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.problem import Problem
+from tools.mismatch.engine.problem import Hint, Problem
 from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.trial import Trial, try_all
+from tools.mismatch.engine.trial import Effort, Trial, try_all
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.store import Key, Scored, Store, part_of
 from tools.mismatch.placed import Placed
@@ -40,19 +41,31 @@ class Found:
     first: tuple[Trial, ...]
 
 
+PATIENCE = 2
+"""Sets extended in a row without a better set than before, after which nothing more is extended."""
+WORTH_REFINING = 0.2
+"""Share of the gain of the best candidate's one step that the coarse fit of a candidate must have to be refined. It is
+below ``HALF``, since a coarse fit may end far from the best one."""
+
+
 class Search:
     """One search. ``stride`` thins the rows of a candidate's fit."""
 
     def __init__(
         self, problem: Problem, base: Fit, effects: Sequence[Effect], constants: Constants, *,
-        jobs: int = 1, progress: Progress | None = None,
+        jobs: int = 1, progress: Progress | None = None, moves: int = MOVES,
     ) -> None:  # fmt: skip
         self.problem, self.jobs, self.progress = problem, jobs, progress
         self.effects = tuple(e for e in effects if e.claims is None)
         self.store = Store(problem, base, constants, [e for e in effects if e.claims is not None])
         self.expanded: set[Key] = set()
-        self.moves = MOVES
+        self.moves = moves
+        self.idle = 0
         self.stride = max(1, problem.fit_rows.size // 12000)
+        c = constants
+        # by half of the price of its name
+        least = 1.0 - float(np.exp(-c.per_name / max(min(c.samples, self.store.held), 1.0)))
+        self.effort = Effort(WORTH_REFINING, least)
         self.first: tuple[Trial, ...] = ()
 
     def run(self) -> Found:
@@ -129,16 +142,25 @@ class Search:
                 return
             self.moves -= 1
             self.expand(chosen)
+            self.idle = 0 if self.store.score(self.store.ranked()[0]) > best else self.idle + 1
+            if self.idle >= PATIENCE:
+                return
 
     def can_be_beaten(self, best: Scored) -> bool:
         """Whether a set with one more name may score more than ``best``: noise at its floor is as good as it gets."""
         c = self.store.constants
-        return sum(self.store.room(best).values()) + c.per_parameter * (best.parameters - 1) > c.per_name
+        return self.most_gain(best) + c.per_parameter * (best.parameters - 1) > c.per_name
 
     def can_gain(self, s: Scored, best: float) -> bool:
         """Whether ``s`` with one more name can score more than ``best`` if it explains everything down to the noise."""
         c = self.store.constants
-        return self.store.score(s) + sum(self.store.room(s).values()) - c.per_name - c.per_parameter > best
+        return self.store.score(s) + self.most_gain(s) - c.per_name - c.per_parameter > best
+
+    def most_gain(self, s: Scored) -> float:
+        """Nats that one more name brings at most: on the output with most room, or on all of them in their mean. Small
+        rooms of many outputs are errors of their noise floors, and no name."""
+        room = self.store.room(s)
+        return max(max(room.values()), sum(room.values()) * self.store.outputs / len(room))
 
     def expand(self, s: Scored) -> None:
         """Every candidate beside ``s`` screened, the promising ones fitted and put into the store."""
@@ -152,7 +174,7 @@ class Search:
         least_fits, most_fits = FITS_LATER if s.placed else FITS
         trials = try_all(
             self.problem, s.fitted, pool, stride=self.stride, jobs=self.jobs, progress=self.progress,
-            what=f"{len(s.names)}", least=least_fits, most=most_fits,
+            what=f"{len(s.names)}", least=least_fits, most=most_fits, effort=self.effort,
         )  # fmt: skip
         if not s.placed:
             self.first = tuple(trials)
@@ -192,3 +214,25 @@ def search(
     """The sets of effects worth a decision, fitted and scored. ``base``: the recalibrated twin."""
     with np.errstate(all="ignore"):
         return Search(problem, base, effects, constants, jobs=jobs, progress=progress).run()
+
+
+NOMINATED = 8
+"""Sets of a search on a part of a recording, best first, whose names are tried on the whole."""
+
+
+def look(
+    constants: Constants, jobs: int, progress: Progress | None, problem: Problem, base: Fit, allowed: tuple[Effect, ...]
+) -> tuple[set[str], list[Hint]]:
+    """The names and what they were found to be in the best sets of a short search on a part of a recording, as
+    ``nominated`` asks. Events are tried on the whole in any case: a part may have none."""
+    with np.errstate(all="ignore"):
+        store = Search(problem, base, allowed, constants, jobs=jobs, progress=progress, moves=2).run().store
+    best = [s for s in store.ranked() if s.names][:NOMINATED]
+    names = {n for s in best for n in s.names} | {e.name for e in allowed if e.claims is not None}
+    hints = {
+        part_of(p): hint_of(p, s.fitted)
+        for s in reversed(best)
+        for p in s.placed
+        if part_of(p) in store.seen and may_hint(p, store.seen[part_of(p)])
+    }
+    return names, list(hints.values())

@@ -48,7 +48,8 @@ def key_of(placed: Sequence[Placed]) -> Key:
 class Scored:
     """One set with its joint fit. ``density``: mean log density of held-out samples per output; ``blocks``
     (blocks, outputs) the same per held-out block; ``parameters``: how many numbers the effects bring; ``proper``: the
-    fit stayed within reach and every effect within what its physics can be.
+    fit stayed within reach and every effect within what its physics can be; ``outputs``: how many outputs are
+    averaged over (``Store.outputs``).
     """
 
     key: Key
@@ -57,6 +58,7 @@ class Scored:
     blocks: Array = field(repr=False)
     parameters: float
     proper: bool
+    outputs: float = 1.0
 
     @property
     def names(self) -> frozenset[str]:
@@ -64,8 +66,8 @@ class Scored:
 
     @property
     def mean_density(self) -> float:
-        """Nats per held-out sample, averaged over outputs."""
-        return sum(self.density.values()) / len(self.density)
+        """Nats per held-out sample, averaged over the outputs that have something to explain."""
+        return sum(self.density.values()) / self.outputs
 
     @property
     def placed(self) -> tuple[Placed, ...]:
@@ -75,7 +77,8 @@ class Scored:
         """Nats: the tempered log density (Miller and Dunson 2019: a likelihood raised to a power below one, because the
         form of a model is never quite right) less the prices of names and parameters. ``held``: samples held out.
 
-        The mean over outputs counts: what the form of an effect leaves on one output it leaves on all of them.
+        The mean over the outputs that have something to explain counts: what the form of an effect leaves on one of
+        them it leaves on all.
         """
         gain = min(c.samples, float(held)) * self.mean_density
         return gain - c.per_name * len(self.names) - c.per_parameter * self.parameters
@@ -97,6 +100,8 @@ class Store:
         self._shares: dict[Key, dict[str, tuple[float, float]]] = {}
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
+        self.outputs = float(len(problem.twin.outputs))
+        self.outputs = outputs_at_odds([*self.room(self.scored(base)).values()])
         self.base = self.put(base)
 
     def put(self, fitted: Fit) -> Scored:
@@ -117,9 +122,9 @@ class Store:
         proper = proper and all(self.lawful(w.predictable) for w in every.values())
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
-        free = min(self.constants.samples, self.held) / len(every) * sum(w.free for w in every.values())
+        free = min(self.constants.samples, self.held) / self.outputs * sum(w.free for w in every.values())
         figures = free + sum(figures_of(e) for e in fitted.model.placed)
-        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper)
+        return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper, self.outputs)
 
     def lawful(self, predictable: float) -> bool:
         """Whether so many nats per sample may be left in what a law of noise could not predict: no more than another
@@ -140,7 +145,7 @@ class Store:
     def room(self, s: Scored) -> dict[str, float]:
         """Nats per output by which a larger set can be better at most: up to noise at its floor, and where a set has
         found readings on a lattice, up to all of them exactly there."""
-        n = min(self.constants.samples, self.held) / len(s.density)
+        n = min(self.constants.samples, self.held) / self.outputs
         best = {
             o: b if d < b else max(b, self._exact[o])
             for (o, d), b in zip(s.density.items(), self._best.values(), strict=True)
@@ -272,6 +277,15 @@ class Store:
     def least_z(self, s: Scored) -> float:
         """The weakest of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+def outputs_at_odds(room: Sequence[float]) -> float:
+    """How many outputs have something to explain, from what each leaves above its noise: all of them where each leaves
+    as much, one where one leaves it all (the inverse participation ratio).
+    """
+    left = np.asarray(room)
+    squares = float(left @ left)
+    return float(np.sum(left)) ** 2 / squares if squares > 0.0 else float(left.size)
 
 
 def mean_square(problem: Problem, r: Array, output: str) -> float:

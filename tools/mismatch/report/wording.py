@@ -281,6 +281,8 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
         why = "the difference that it makes is below your tolerance"
     elif w.reason == "at_limit":
         why = f"{names} ended at a limit of the search"
+    elif w.reason == "unlikely":
+        why = "beside what is left unexplained it is likelier wrong than right"
     else:
         shown = []
         for n in w.shown_by[:3]:

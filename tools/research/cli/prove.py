@@ -9,8 +9,9 @@ from typing import Annotated, cast
 import typer
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
-from tools.cli.mismatch import EngineOption, check_engine
+from tools.cli.mismatch import EngineOption
 from tools.errors import InputError
+from tools.mismatch.engines import check_engine
 from tools.output import check_folder, check_writable, write_json
 
 
@@ -30,7 +31,7 @@ def prove(
     corpus: Annotated[
         str | None, typer.Option(metavar="NAME", help="calibrate, develop or sealed: exact scores on its own seeds.")
     ] = None,
-    engine: EngineOption = "old",
+    engine: EngineOption = None,
     samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording of a corpus.")] = 8000,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="With --corpus: begin no case after these; run again to go on.")
@@ -46,7 +47,7 @@ def prove(
         check_folder(keep, "--keep")
         if keep is not None:
             keep.mkdir(exist_ok=True)
-        check_engine(engine)
+        engine = check_engine(engine)
         if corpus is not None:
             if seed is not None:
                 raise InputError("--corpus has seeds of its own; leave --seed out")
@@ -88,12 +89,12 @@ def _prove_corpus(
 
     from tools.research.prove.corpus import NAMES, Name
     from tools.research.prove.corpus_table import corpus_table
-    from tools.research.prove.harness import Engine, Run, run_corpus
+    from tools.research.prove.harness import Run, run_corpus
 
     if corpus not in NAMES:
         raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
     limit = float("inf") if minutes is None else minutes
-    run = Run(cast(Name, corpus), cast(Engine, engine), cases, samples, limit, jobs or os.cpu_count() or 1, first)
+    run = Run(cast(Name, corpus), check_engine(engine), cases, samples, limit, jobs or os.cpu_count() or 1, first)
     err = console()
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))

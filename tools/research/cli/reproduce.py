@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.table import Table as RichTable
@@ -13,6 +13,7 @@ from rich.text import Text
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
+from tools.mismatch.engines import check_engine
 from tools.output import check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
@@ -32,6 +33,7 @@ def reproduce(
         Path | None,
         typer.Option(metavar="FILE", help="Folder of finished sets of section measured; a stopped run goes on there."),
     ] = None,
+    engine: Annotated[str | None, typer.Option(metavar="old|new", help="Of measured: which engine decides.")] = None,
 ) -> None:
     """Compute published figures again and print them beside ours.
 
@@ -92,9 +94,12 @@ def reproduce(
         check_names(rows)
         check_writable(json_file, out)
         wanted = expand(names)
-        options = {"only": tuple(sets or ()), "rows_file": rows} if sets or rows else {}
+        check_engine(engine)
+        options: dict[str, Any] = {}
+        if sets or rows or engine:
+            options = {"only": tuple(sets or ()), "rows_file": rows, "engine": engine}
         if options and wanted != ["measured"]:
-            raise InputError("--set and --rows belong to 'micron reproduce measured' alone")
+            raise InputError("--set, --rows and --engine belong to 'micron reproduce measured' alone")
         tables: list[Table] = []
         with keep_what_is_there():
             for name in ready(wanted):

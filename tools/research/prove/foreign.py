@@ -20,8 +20,8 @@ from typing import Any
 
 from firmware_py.recording.revision import git_revision
 from hal.trust import decide, trust_program
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.report import Report
+from tools.mismatch.engines import diagnose
 from tools.mismatch.recording_load import load
 from tools.research.results.artefact import write_result
 

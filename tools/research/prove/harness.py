@@ -10,15 +10,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from firmware_py.recording.revision import git_revision
+from tools.mismatch.engines import Engine
 from tools.research.prove.corpus import CORPORA, Corpus, Name, digest_of, draw_case, first_block, generator_digest
 from tools.research.prove.exact import score_exactly as score
 from tools.research.prove.exact import summarise
 from tools.research.prove.runner import Diagnose, in_processes, timed, tool
 
-Engine = Literal["old", "new"]
 SHARED = ("tools/mismatch/engine", "tools/mismatch/twins", "sim_devices/physics")
 SOURCES = MappingProxyType({"old": SHARED, "new": (*SHARED, "tools/mismatch/infer")})
 """What a diagnosis by an engine depends on: a row that was made with other sources is made again."""

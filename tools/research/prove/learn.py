@@ -95,7 +95,7 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
             for s in [*kept, *([] if store.base in kept else [store.base])]
         ],
         "strange": None if strange is None else {
-            "gain": -0.5 * math.log(max(1.0 - strange.share, 1e-12)) / len(store.base.density),
+            "gain": -0.5 * math.log(max(1.0 - strange.share, 1e-12)) / store.outputs,
             "room": _density_room(store, store.base, strange.output),
         },
     }  # fmt: skip

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hal.children import begin_as_worker, use_one_thread
+from tools.mismatch.engines import diagnose
 from tools.research.prove.guests import installed
 
 Diagnose = Callable[[Path], dict[str, Any]]
@@ -20,16 +21,11 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-def tool(path: Path, engine: str = "old") -> dict[str, Any]:
+def tool(path: Path, engine: str | None = None) -> dict[str, Any]:
     """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
-    from tools.mismatch.engine.diagnose import diagnose
     from tools.mismatch.recording_load import load
 
-    if engine == "new":
-        from tools.mismatch.infer import diagnose as infer
-
-        return as_plain(infer(load(path), jobs=1, seed=0))
-    return as_plain(diagnose(load(path), jobs=1, seed=0))
+    return as_plain(diagnose(load(path), engine=engine))
 
 
 def as_plain(report: Any) -> dict[str, Any]:

@@ -19,8 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.report import Report
+from tools.mismatch.engines import diagnose
 from tools.mismatch.recording import Part, Recording, Split
 from tools.mismatch.recording_load import load
 from tools.research.prove import disk, draw

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from firmware_py.recording.revision import git_revision
 from tools.errors import InputError
+from tools.mismatch.engines import diagnose
 from tools.research.prove.disk import toml_text
 from tools.research.prove.runner import as_plain
 from tools.research.reproduce.measured_page import document
@@ -51,7 +52,7 @@ def chosen(only: Sequence[str]) -> list[MeasuredSet]:
     return [s for s in SETS if not only or any(o in s.name for o in only)]
 
 
-def table(only: Sequence[str] = (), rows_file: Path | None = None) -> Table:
+def table(only: Sequence[str] = (), rows_file: Path | None = None, engine: str | None = None) -> Table:
     """Run the sets and compare. ``rows_file`` (JSON) keeps each that is done; what it holds is not run again."""
     begin = time.perf_counter()
     wanted = chosen(only)
@@ -63,7 +64,7 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None) -> Table:
         if s.name in found:
             continue
         with tempfile.TemporaryDirectory(prefix="micron-measured-") as tmp:
-            found[s.name] = score(s, Path(tmp), diagnosed)
+            found[s.name] = score(s, Path(tmp), diagnosed, engine)
         done = found[s.name]
         print(f"{s.name}: {done.verdict} {', '.join(done.named)} ({done.cpu_s:.0f} s of CPU)", file=sys.stderr)
         if rows_file is not None:
@@ -80,9 +81,10 @@ def _scored(name: str, kept: Mapping[str, Any]) -> Scored:
     return Scored(**{**kept, "name": name, "left": left})
 
 
-def score(s: MeasuredSet, folder: Path, diagnosed: dict[str, tuple[dict[str, Any], float]]) -> Scored:
+def score(
+    s: MeasuredSet, folder: Path, diagnosed: dict[str, tuple[dict[str, Any], float]], engine: str | None = None
+) -> Scored:
     """Diagnose the fit part of a set and score the sealed test. ``diagnosed``: reports that sets of one fit share."""
-    from tools.mismatch.engine.diagnose import diagnose
     from tools.mismatch.recording_load import load
 
     revision = git_revision() or "unknown"
@@ -91,7 +93,7 @@ def score(s: MeasuredSet, folder: Path, diagnosed: dict[str, tuple[dict[str, Any
     try:
         if key not in diagnosed:
             cpu = time.process_time()
-            report = as_plain(diagnose(load(fit), jobs=1, seed=0))
+            report = as_plain(diagnose(load(fit), engine=engine))
             diagnosed[key] = (report, time.process_time() - cpu)
         report, cpu_s = diagnosed[key]
         floors = report["fit"]["noise_floor_rms"]

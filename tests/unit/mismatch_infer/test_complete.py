@@ -1,0 +1,114 @@
+"""What a report of the engine on one score has beside the names: holds, what is withheld, true p-values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_engine.cases import recording, wave
+from tests.unit.mismatch_engine.test_hold_and_one_way import axis
+from tools.errors import InputError
+from tools.mismatch import engines
+from tools.mismatch.engine import diagnose as preparation
+from tools.mismatch.engine.report import Hold
+from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.trial import Effort
+from tools.mismatch.infer import borne_out as infer_borne_out
+from tools.mismatch.infer import diagnose
+from tools.mismatch.infer.borne_out import borne_out
+from tools.mismatch.infer.constants import START
+from tools.mismatch.infer.density import gain_of_events
+from tools.mismatch.infer.run import infer
+from tools.mismatch.infer.store import outputs_at_odds
+from tools.mismatch.recording import Recording
+
+N = 2500
+
+
+def stack(change: np.ndarray, u: np.ndarray) -> Recording:
+    y = 0.12 * u + change + 0.01 * np.random.default_rng(5).standard_normal(u.size)
+    return recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 0.12, "offset_um": 0.0})
+
+
+def test_a_named_delay_of_half_a_sample_is_the_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Held inputs through a twin that runs them straight, on data that are made not to tell which of the two it is."""
+    monkeypatch.setattr(preparation, "infer_hold", lambda problem, base: Hold("linear", "assumed"))
+    report = diagnose(axis(5, zero=True), jobs=1, constants=START, effects=[EFFECTS["dead_time"]])
+    assert {h.how for h in report.hold.values()} == {"instead_of_delay"}
+    assert not report.physics
+    late = diagnose(axis(5, zero=False, late=3.0), jobs=1, constants=START, effects=[EFFECTS["dead_time"]])
+    assert [p.name for p in late.physics] == ["dead_time"]
+    assert {h.how for h in late.hold.values()} == {"assumed"}
+
+
+def test_an_effect_whose_size_may_be_zero_is_withheld(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(infer_borne_out, "broken", lambda *_: "")  # a fit to noise may be worse than no fit
+    u = 40.0 * wave(np.random.default_rng(3), N)
+    store = infer(stack(np.zeros(N), u), START, jobs=1, effects=[EFFECTS["first_order_lag"]]).found.store
+    lag = store.with_one(store.base, places(store.problem, [EFFECTS["first_order_lag"]], ())[0])
+    left, withheld = borne_out(store, [lag, store.base])
+    assert left == [store.base]
+    assert [(w.name, w.output) for w in withheld] == [("first_order_lag", "displacement")]
+
+
+def test_an_effect_that_the_data_show_is_not_withheld() -> None:
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    change = 0.12 * (np.clip(u, -22.0, 25.0) - u)
+    store = infer(stack(change, u), START, jobs=1, effects=[EFFECTS["saturation"]]).found.store
+    best = store.ranked()[0]
+    assert best.names == {"saturation"}
+    assert borne_out(store, [best, store.base]) == ([best, store.base], ())
+
+
+def test_outputs_that_are_down_to_the_noise_do_not_thin_the_evidence_of_another() -> None:
+    assert outputs_at_odds([3.0, 3.0, 3.0]) == pytest.approx(3.0)
+    assert outputs_at_odds([30.0, 0.0, 0.0, 0.3]) == pytest.approx(1.02, abs=0.01)
+    assert outputs_at_odds([0.0, 0.0]) == 2.0
+
+
+def test_one_clipped_channel_of_three_is_named() -> None:
+    """Two channels are as simulated; a tenth of the third is clipped."""
+    rng = np.random.default_rng(8)
+    names = ("x", "y", "z")
+    inputs = {f"specific_force_{a}": 5.0 * wave(rng, N) for a in names}
+    outputs = {f"voltage_{a}": 0.3 * inputs[f"specific_force_{a}"] + 0.01 * rng.standard_normal(N) for a in names}
+    clean = outputs["voltage_x"].copy()
+    outputs["voltage_x"] = np.minimum(clean, np.quantile(clean, 0.9)) + 0.01 * rng.standard_normal(N)
+    believed: dict[str, object] = {"scale_V_per_g": [0.3, 0.3, 0.3], "bias_V": [0.0, 0.0, 0.0]}
+    r = recording("accelerometer", inputs, outputs, believed)
+    report = diagnose(r, jobs=1, constants=START, effects=[EFFECTS["saturation"], EFFECTS["first_order_lag"]])
+    assert [p.name for p in report.physics] == ["saturation"]
+
+
+def test_refinement_is_for_candidates_that_could_be_extended() -> None:
+    effort = Effort(share=0.5, least=0.05)
+    assert effort.most_left(0.99) == pytest.approx(0.1)
+    assert effort.most_left(0.0) == pytest.approx(0.95)
+    assert effort.most_left(1.0) > 0.0
+
+
+def test_events_within_their_own_size_are_told_from_heavy_tails() -> None:
+    rng = np.random.default_rng(9)
+    quiet, heavy = rng.standard_normal(2700), rng.standard_t(3.0, 2700)
+    at = np.zeros(2700, np.bool_)
+    at[rng.choice(2700, 14, replace=False)] = True
+    burst = np.where(at, rng.choice([-1.0, 1.0], 2700) * rng.uniform(10.0, 30.0, 2700), quiet)
+    assert gain_of_events(burst, at, 2000.0, 0.05) > START.per_name
+    assert gain_of_events(heavy, np.abs(heavy) > 6.0, 2000.0, 0.05) < 0.0
+
+
+def test_the_chance_of_a_name_counts_every_candidate() -> None:
+    u = 40.0 * wave(np.random.default_rng(4), N)
+    change = 0.12 * (np.minimum(u, np.quantile(u, 0.95)) - u)
+    report, alone = (
+        diagnose(stack(change, u), jobs=1, constants=START, effects=of)
+        for of in ([EFFECTS[n] for n in ("saturation", "first_order_lag", "dead_zone")], [EFFECTS["saturation"]])
+    )
+    assert [p.name for p in report.physics] == [p.name for p in alone.physics] == ["saturation"]
+    assert report.checks.false_alarm_p_value > alone.checks.false_alarm_p_value
+
+
+def test_an_engine_that_there_is_not_is_refused() -> None:
+    with pytest.raises(InputError, match="use old or new"):
+        engines.check_engine("third")

@@ -1,0 +1,78 @@
+"""Effects that lower the residual and are not named, because the data do not bear out a figure that they stand on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tools.mismatch.engine.evidence import Doubt, doubt_of
+from tools.mismatch.engine.fit import as_given
+from tools.mismatch.engine.found import human_values, parameters_of
+from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.report import ParameterValue, Withheld
+from tools.mismatch.engine.score import held_rms
+from tools.mismatch.engine.trust import broken
+from tools.mismatch.infer.store import Scored, Store
+
+Values = dict[str, dict[str, ParameterValue]]
+
+
+def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple[Withheld, ...]]:
+    """``sets`` (best first, the last one empty) from the first one on that the data bear out, and what was in front.
+
+    A set with an effect all of whose sizes may be zero is skipped, and so is every other set with that name.
+    """
+    left, withheld = list(sets), list[Withheld]()
+    given = as_given(store.problem).residual
+    while left[0].placed:
+        s = left[0]
+        if broken(store.problem, given, s.fitted.theta, s.fitted.residual):
+            # candidates are fitted on some of the rows
+            left[0] = s = store.refined(s)
+        if broken(store.problem, given, s.fitted.theta, s.fitted.residual):
+            left.pop(0)
+            continue
+        values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
+        doubts = [d for k in range(len(s.placed)) if (d := _doubt(store, s, k, values)) is not None]
+        if not doubts:
+            break
+        names = {s.placed[d.k].effect.name for d in doubts}
+        left = [other for other in left if not names & other.names]
+        withheld += [_entry(store, s, d, values, left[0].names) for d in doubts]
+    return left, tuple(withheld)
+
+
+def _doubt(store: Store, s: Scored, k: int, values: Values) -> Doubt | None:
+    """Why effect ``k`` of a set is not named: a figure, or a size within the tolerances that the recording declares."""
+    p, placed = store.problem, s.placed[k]
+    doubt = doubt_of(placed, k, values.get(placed.label, {}), s.fitted.at_bound)
+    if doubt is not None:
+        return doubt
+    limits = {o: p.recording.tolerance.get(o, 0.0) for o in placed.outputs}
+    if not all(limits.values()):
+        return None
+    without = store.without(s, lambda e: e is placed).fitted
+    small = all(
+        float(np.std((without.residual[o] - s.fitted.residual[o])[p.held_rows])) < most for o, most in limits.items()
+    )
+    return Doubt(k, "below_tolerance", ()) if small else None
+
+
+def entry_of(store: Store, s: Scored, k: int) -> Withheld:
+    """The entry of effect ``k`` of a set whose name is likelier wrong than right."""
+    values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
+    return _entry(store, s, Doubt(k, "unlikely", ()), values, frozenset())
+
+
+def _entry(store: Store, s: Scored, doubt: Doubt, values: Values, named: frozenset[str]) -> Withheld:
+    """The entry of a doubted effect; ``named``: the names that stand instead."""
+    p, placed = store.problem, s.placed[doubt.k]
+    with_it = held_rms(p, s.fitted)
+    without = held_rms(p, store.without(s, lambda e: e is placed).fitted)
+    o = max(placed.outputs, key=lambda q: without[q] / p.sigma(q))
+    plain = placed.effect.plain
+    return Withheld(
+        placed.effect.name, o, doubt.reason, parameters_of(p, placed, o, values.get(placed.label, {})), doubt.shown_by,
+        without[o], with_it[o], plain if plain and plain in named - s.names else "",
+    )  # fmt: skip
