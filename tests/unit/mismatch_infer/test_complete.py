@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ from tests.unit.mismatch_engine.test_hold_and_one_way import axis
 from tools.errors import InputError
 from tools.mismatch import engines
 from tools.mismatch.engine import diagnose as preparation
-from tools.mismatch.engine.report import Hold
+from tools.mismatch.engine.report import Hold, Report
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort
 from tools.mismatch.infer import borne_out as infer_borne_out
@@ -112,3 +114,20 @@ def test_the_chance_of_a_name_counts_every_candidate() -> None:
 def test_an_engine_that_there_is_not_is_refused() -> None:
     with pytest.raises(InputError, match="use old or new"):
         engines.check_engine("third")
+
+
+def test_the_smallest_effect_that_would_have_been_named_is_true() -> None:
+    """A response to temperature of twice the stated limit is named, of half of it is not."""
+    rng = np.random.default_rng(12)
+    u = 40.0 * wave(rng, N)
+    warm = 20.0 + 3.0 * wave(rng, N, low=0.1, high=1.0)
+    few = [EFFECTS["temperature_sensitivity"], EFFECTS["saturation"]]
+
+    def report(rms: float) -> Report:
+        course = (warm - warm.mean()) / warm.std()
+        r = replace(stack(rms * course, u), context={"temperature": warm})
+        return diagnose(r, jobs=1, effects=few)
+
+    limit = report(0.0).detection_limit["displacement"]["temperature_sensitivity"]
+    assert not report(0.5 * limit).physics
+    assert [p.name for p in report(2.0 * limit).physics] == ["temperature_sensitivity"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -104,7 +105,14 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
     remarks = gross(posed.recording, posed.problem.twin, posed.raw)
     ended = run_through(posed, selection, held_out)
     report = conclude(
-        posed, ended, dict(answer.left), Rule(), remarks, jobs, withheld=answer.withheld, decision=decision
+        posed,
+        ended,
+        dict(answer.left),
+        least_named(store.constants),
+        remarks,
+        jobs,
+        withheld=answer.withheld,
+        decision=decision,
     )
     sealed = Sealed(None, inferred.unsealed)
     if not inferred.unsealed:
@@ -118,6 +126,14 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
         alternatives=alternatives_of(store, answer) if chosen.placed else (),
         equivalent=equivalents_of(store, answer) if chosen.placed else (),
     )
+
+
+def least_named(c: Constants) -> Rule:
+    """What an effect of one parameter on one output must show to be named, as the limits of detection are computed: its
+    test, and the noise variances that pay for it and are more than the form of others may leave."""
+    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / c.samples)
+    least = max(pays, c.cut)
+    return Rule(z=c.least_z, gain=least / (1.0 + least))
 
 
 def effect_size(store: Store, chosen: Scored, name: str) -> float:
