@@ -129,5 +129,6 @@ def test_the_smallest_effect_that_would_have_been_named_is_true() -> None:
         return diagnose(r, jobs=1, effects=few)
 
     limit = report(0.0).detection_limit["displacement"]["temperature_sensitivity"]
+    assert limit is not None
     assert not report(0.5 * limit).physics
     assert [p.name for p in report(2.0 * limit).physics] == ["temperature_sensitivity"]

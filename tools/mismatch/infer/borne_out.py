@@ -60,7 +60,7 @@ def _doubt(store: Store, s: Scored, k: int, values: Values) -> Doubt | None:
 
 
 def entry_of(store: Store, s: Scored, k: int) -> Withheld:
-    """The entry of effect ``k`` of a set whose name is likelier wrong than right."""
+    """The entry of effect ``k`` of a set that is not likely enough to be named."""
     values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
     return _entry(store, s, Doubt(k, "unlikely", ()), values, frozenset())
 

@@ -198,8 +198,8 @@ def _with_leads(problem: Problem, rest: Fit, left: Mapping[str, Leftover]) -> di
     return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in left.items()}
 
 
-LIKELIER_THAN_NOT = 0.5
-"""Probability below which a name beside something that is unexplained is not stated."""
+UNLIKELY = 0.5
+"""Share of the probability that the surest name has beside something unexplained, below which a name is not stated."""
 
 
 def decide(store: Store, first: Sequence[Trial]) -> Answer:
@@ -222,7 +222,8 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     whole = strange is None and is_whole(rest, taken, c)
     sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
     sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
-    unlikely = {name for name, v in sure.items() if v < LIKELIER_THAN_NOT} if not whole else set[str]()
+    least = 0.0 if whole else UNLIKELY * stated(1.0, False, c)
+    unlikely = {name for name, v in sure.items() if v < least}
     if unlikely:
         withheld += tuple(entry_of(store, said, k) for k, e in enumerate(said.placed) if e.effect.name in unlikely)
         said = store.without(said, lambda e: e.effect.name in unlikely)

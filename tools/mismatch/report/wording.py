@@ -282,7 +282,7 @@ def why_withheld(w: Withheld, fit: FitSummary) -> str:
     elif w.reason == "at_limit":
         why = f"{names} ended at a limit of the search"
     elif w.reason == "unlikely":
-        why = "beside what is left unexplained it is likelier wrong than right"
+        why = "beside what is left unexplained it is too likely to be wrong"
     else:
         shown = []
         for n in w.shown_by[:3]:
