@@ -84,6 +84,7 @@ wheel: setup
 	$(BIN)/python -m zipfile -l out/wheel/*.whl > out/wheel/files.txt
 	for file in hal/py.typed drivers/dbc/micron.dbc benches/calibration/piezo.toml tools/bench/static/index.html; do \
 	  grep -q "^$$file " out/wheel/files.txt || { echo "the wheel lacks $$file"; exit 1; }; done
+	! grep "^tools/research/" out/wheel/files.txt
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
 # coverage by branch of every room in one run. Kernels are left out (a tracer cannot see compiled code; their pure-Python

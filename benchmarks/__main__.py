@@ -17,13 +17,13 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.machine import machine
 from benchmarks.row import Row
 from hal.children import use_one_thread
+from hal.jsonable import to_jsonable
 
 RESULTS = Path(__file__).with_name("results.json")
 PAGE = Path(__file__).with_name("results.md")
@@ -99,12 +99,6 @@ def page(rows: list[Row], failed: list[Failure], about: dict[str, object]) -> st
     return "\n\n".join(parts) + "\n"
 
 
-def plain(row: Row) -> dict[str, object]:
-    """JSON has no nan, and numpy's numbers are none of its own."""
-    table = {k: v.item() if isinstance(v, np.generic) else v for k, v in asdict(row).items()}
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in table.items()}
-
-
 def row_of(found: dict[str, object]) -> Row:
     """``plain`` backwards."""
     return Row(**{k: math.nan if v is None and k in ("ours", "peer", "ratio") else v for k, v in found.items()})  # type: ignore[arg-type]
@@ -114,7 +108,7 @@ def work(module: str, destination: Path) -> None:
     """In the module's own process: its rows as JSON lines, each written when it is known."""
     with destination.open("w") as file:
         for row in importlib.import_module(f"benchmarks.{module}").rows():
-            file.write(json.dumps(plain(row)) + "\n")
+            file.write(json.dumps(to_jsonable(asdict(row))) + "\n")
             file.flush()
 
 
@@ -166,7 +160,11 @@ def main(chosen: list[str]) -> int:
     for failure in failed:
         out.print(f"failed: {failure.module}: {failure.reason}", highlight=False)
     if not chosen:
-        tables = {"machine": about, "rows": [plain(row) for row in measured], "failed": [asdict(f) for f in failed]}
+        tables = {
+            "machine": about,
+            "rows": [to_jsonable(asdict(row)) for row in measured],
+            "failed": [asdict(f) for f in failed],
+        }
         RESULTS.write_text(json.dumps(tables, indent=2) + "\n")
         PAGE.write_text(page(measured, failed, about))
     return 1 if failed else 0

@@ -11,13 +11,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from drivers.imu.base import RAD_PER_DEG, STANDARD_GRAVITY, ImuSample
+from drivers.imu.base import RAD_PER_DEG, ImuSample
 from drivers.motion_card_protocol import CardReading, Fields, LineParser, SpikeFilter, line_bytes, to_si
 from drivers.options import MotionCardOptions
 from drivers.registry import Driver, Load, Traffic
 from hal.contracts import Clock, SerialPort
 from hal.errors import HalTimeout, WrongDevice
-from hal.types import ChannelInfo, Status, TimeSource
+from hal.types import STANDARD_GRAVITY, ChannelInfo, Status, TimeSource
 from hal.wire_bits import serial_bits
 
 ACCEL_RANGE_G = 2.0

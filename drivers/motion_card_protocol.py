@@ -14,6 +14,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
+from hal.types import STANDARD_GRAVITY
+
 Fields = Literal["raw", "scaled"]
 
 INACTIVE, ROTATE, ZOOM = 0, 1, 2  # card status, section 6.2
@@ -191,7 +193,7 @@ def to_si(fields: Fields, accel_lsb_mps2: float, gyro_lsb_rad_s: float) -> Calla
     if fields == "raw":
         accel, gyro, slope, zero = accel_lsb_mps2, gyro_lsb_rad_s, 1.0 / 340.0, 36.53
     else:
-        accel, gyro, slope, zero = 9.80665, math.pi / 180.0, 1.0, 0.0
+        accel, gyro, slope, zero = STANDARD_GRAVITY, math.pi / 180.0, 1.0, 0.0
     factors = (accel, accel, accel, gyro, gyro, gyro, slope)
 
     def convert(reading: CardReading) -> list[float]:

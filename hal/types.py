@@ -5,6 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum, IntFlag
 
+STANDARD_GRAVITY = 9.80665
+"""m/s^2 in one g, as data sheets and files count it."""
+
 
 class TimeSource(Enum):
     """Names the clock that stamped a sample."""

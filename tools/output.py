@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import io
 import json
-import math
 import os
 import sys
 import tempfile
@@ -14,31 +13,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from pydantic import BaseModel
-
+from hal.jsonable import to_jsonable
 from hal.trust import allow_name
 from tools.errors import InputError, OutputError
 from tools.interrupt import is_stopped
-
-
-def to_jsonable(value: Any) -> Any:
-    """Plain JSON values; numpy scalars and arrays become lists, NaN and infinities null."""
-    if isinstance(value, dict):
-        return {str(k): to_jsonable(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [to_jsonable(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return to_jsonable(value.tolist())
-    if isinstance(value, np.generic):
-        return to_jsonable(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, Path):
-        return str(value)
-    if isinstance(value, BaseModel):
-        return value.model_dump(mode="json")
-    return value
 
 
 def write_text_atomic(path: Path, text: str) -> None:

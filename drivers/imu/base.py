@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from hal.contracts import Float64Array
 from hal.errors import BenchError
 from hal.scan_time import ScanTimeline
-from hal.types import ChannelInfo, Status, TimeSource
+from hal.types import STANDARD_GRAVITY, ChannelInfo, Status, TimeSource
 
-STANDARD_GRAVITY = 9.80665  # m/s^2 per g, the data sheets' unit
 RAD_PER_DEG = math.pi / 180.0
 AXES = ("x", "y", "z")
 LATE = 0.02  # periods; a read this much short of two periods after the last one has still missed a sample

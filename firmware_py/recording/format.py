@@ -7,7 +7,6 @@ makes zstd twice as effective on slowly changing float64; measured in design/eco
 from __future__ import annotations
 
 import json
-import math
 import re
 import struct
 import zlib
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.recording.errors import RecordingError
+from hal.jsonable import to_jsonable
 
 Float64Array = NDArray[np.float64]
 
@@ -190,28 +190,13 @@ def decode_block(message: bytes | memoryview, crc: int, layout_columns: int) -> 
     return Block(row0, data.astype(np.float64, copy=False))
 
 
-def plain(value: object) -> Any:
-    """The same as plain JSON values: numpy scalars and arrays unpacked, NaN and infinities null, the rest text."""
-    if value is None or isinstance(value, str | bool | int):
-        return value
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(k): plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(v) for v in value]
-    if isinstance(value, np.generic | np.ndarray):
-        return plain(value.tolist())
-    return str(value)
-
-
 def encode_metadata(name: str, value: object) -> dict[str, str]:
     """A metadata record: the text, how to read it, and a CRC-32 of name, type and text, because MCAP protects only
     chunks."""
     if isinstance(value, str):
         kind, text = "text", value
     else:
-        kind, text = "json", json.dumps(plain(value), ensure_ascii=False)
+        kind, text = "json", json.dumps(to_jsonable(value), ensure_ascii=False)
     return {"text": text, "type": kind, "crc32": _metadata_crc(name, kind, text)}
 
 

@@ -23,6 +23,7 @@ from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.errors import RecorderFailed, RecordingError
 from firmware_py.recording.ring import EventRing, RowRing, RowsView
 from hal.children import child_command, child_environment
+from hal.jsonable import to_jsonable
 
 _PAUSE_S = 0.0005
 
@@ -108,7 +109,7 @@ class RecorderProcess:
         order = {
             "path": str(path),
             "columns": columns,
-            "metadata": fmt.plain(metadata),
+            "metadata": to_jsonable(metadata),
             "overwrite": overwrite,
         }
         try:
@@ -140,7 +141,7 @@ class RecorderProcess:
 
     def event(self, event: Mapping[str, Any]) -> bool:
         """Record something that happened once (give it ``t_ns``); False, and counted, when there is no room."""
-        return self._events.push(json.dumps(fmt.plain(event)).encode())
+        return self._events.push(json.dumps(to_jsonable(event)).encode())
 
     def stats(self) -> RecorderStats:
         """Return the counters, read from shared memory."""
@@ -160,7 +161,7 @@ class RecorderProcess:
         if self._summary is not None:
             return self._summary
         with suppress(OSError):  # it may have ended by itself
-            self._send({"stop": fmt.plain(final_statistics) if final_statistics is not None else None})
+            self._send({"stop": to_jsonable(final_statistics) if final_statistics is not None else None})
         problem = ""
         last: dict[str, Any] = {}
         try:

@@ -18,6 +18,7 @@ from firmware_py.recording import format as fmt
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import lock, refuse_existing
 from firmware_py.recording.format import Float64Array
+from hal.jsonable import to_jsonable
 
 
 class FileDisturbed(RecordingError):
@@ -164,7 +165,7 @@ class RecordingWriter:
     def write_event(self, number: int, event: Mapping[str, Any], time_ns: int | None = None) -> None:
         """Add event ``number``, stamped with the time of the last block; in the file after the next ``flush``."""
         time_ns = self._now_ns if time_ns is None else time_ns
-        text = json.dumps(fmt.plain(event), ensure_ascii=False).encode()
+        text = json.dumps(to_jsonable(event), ensure_ascii=False).encode()
         self._mcap.add_message(fmt.EVENTS_CHANNEL, time_ns, text, time_ns, number)
         self.events += 1
 
@@ -214,7 +215,7 @@ class RecordingWriter:
         """
         number, content = event
         last = fmt.encode_metadata(fmt.END_METADATA, self._last_words(end))
-        text = json.dumps(fmt.plain(content), ensure_ascii=False).encode()
+        text = json.dumps(to_jsonable(content), ensure_ascii=False).encode()
         try:
             self._output.back_to_good()
             for record in (

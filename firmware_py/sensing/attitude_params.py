@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 from firmware_py.designs import design
 from firmware_py.records import Record, new_record
-from firmware_py.sensing.config import DRIFT_S, STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import DRIFT_S, SensingConfig
 from firmware_py.sensing.error_state_records import ERROR_STATE
 from firmware_py.sensing.quaternion_kalman import QUATERNION_KALMAN
+from hal.types import STANDARD_GRAVITY
 
 OBSERVER, ERROR_STATE_METHOD, QUATERNION_KALMAN_METHOD = 0, 1, 2
 METHODS = {

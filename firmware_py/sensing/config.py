@@ -30,7 +30,6 @@ PER_AXIS = (
     "scale_out_of_plane",
 )
 """Keys with a value for each axis; absent ones are filled with the default of all."""
-STANDARD_GRAVITY = 9.80665
 DRIFT_S = 100.0
 """Time over which a slow drift is stated."""
 UNIT_AXES: tuple[Vector, ...] = (

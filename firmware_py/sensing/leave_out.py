@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.records import Record
-from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params
 from firmware_py.sensing.redundant_rate import parity_rows
+from hal.types import STANDARD_GRAVITY
 
 NOTHING_V = 1e12
 """Volts per m/s^2 of an axis that is to read nothing."""

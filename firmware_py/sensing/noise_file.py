@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from firmware_py.frame import XYZ
 from firmware_py.sensing.calibration import reading_names
-from firmware_py.sensing.config import DRIFT_S, STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import DRIFT_S, SensingConfig
 from hal.errors import BenchError
+from hal.types import STANDARD_GRAVITY
 from hal.validation import describe_validation_error
 
 FLAT = 2.0 * log(2.0) / pi

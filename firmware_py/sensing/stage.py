@@ -41,7 +41,7 @@ from firmware_py.sensing.calibration import (
     calibration_dtype,
     calibration_params,
 )
-from firmware_py.sensing.config import MOST_AXES, STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import MOST_AXES, SensingConfig
 from firmware_py.sensing.kinematics import kinematic_params, kinematics_dtype, plausible_rate, solve_motion
 from firmware_py.sensing.leave_out import leave_out
 from firmware_py.sensing.numeric_kinematics import solve_guarded, solve_numeric
@@ -56,6 +56,7 @@ from firmware_py.sensing.translation import (
 )
 from hal.compiled import kernel
 from hal.scratch import scratch, scratch_matrix
+from hal.types import STANDARD_GRAVITY
 
 GUARD = 0.1
 """Largest change of a centripetal part that the analytic solution may leave out, in units of a sample's noise."""

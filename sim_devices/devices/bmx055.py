@@ -42,7 +42,8 @@ from sim_devices.devices.bmx055_die import (
     DieFacts,
 )
 from sim_devices.devices.register_map import signed_byte, signed_limited
-from sim_devices.plant.imu import STANDARD_GRAVITY, Imu
+from sim_devices.plant.imu import Imu
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 A_SELF_TEST, A_OFFSET_CONTROL, A_OFFSET_TARGET, A_OFFSET_X, A_WATERMARK = 0x32, 0x36, 0x37, 0x38, 0x30
 A_LSB_PER_G = {0x3: 1024.0, 0x5: 512.0, 0x8: 256.0, 0xC: 128.0}  # A, register 0x0F

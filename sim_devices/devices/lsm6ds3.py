@@ -27,7 +27,8 @@ from collections import deque
 import numpy as np
 
 from sim_devices.devices.register_map import Outputs, RegisterFace, SampleClock, signed_limited
-from sim_devices.plant.imu import STANDARD_GRAVITY, Imu
+from sim_devices.plant.imu import Imu
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 FIFO_CTRL1, FIFO_CTRL2, FIFO_CTRL3, FIFO_CTRL4, FIFO_CTRL5 = range(0x06, 0x0B)
 WHO_AM_I, CTRL1_XL, CTRL2_G, CTRL3_C, CTRL4_C, CTRL5_C = range(0x0F, 0x15)

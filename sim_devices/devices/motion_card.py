@@ -33,7 +33,8 @@ import numpy as np
 
 from sim_devices.devices.register_map import SampleClock, signed_limited
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
-from sim_devices.plant.imu import MPU6050_SPEC, REFERENCE_C, STANDARD_GRAVITY, Imu
+from sim_devices.plant.imu import MPU6050_SPEC, REFERENCE_C, Imu
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 ACCEL_LSB_PER_G, GYRO_LSB_PER_DPS = 16384.0, 16.4
 BANDWIDTH_HZ = 94.0

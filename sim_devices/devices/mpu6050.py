@@ -34,7 +34,8 @@ from collections import deque
 import numpy as np
 
 from sim_devices.devices.register_map import Outputs, RegisterFace, SampleClock, signed_limited
-from sim_devices.plant.imu import STANDARD_GRAVITY, Imu
+from sim_devices.plant.imu import Imu
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 SMPLRT_DIV, CONFIG, GYRO_CONFIG, ACCEL_CONFIG, FIFO_EN = 0x19, 0x1A, 0x1B, 0x1C, 0x23
 INT_PIN_CFG, INT_ENABLE, INT_STATUS, ACCEL_XOUT_H, SENSOR_END = 0x37, 0x38, 0x3A, 0x3B, 0x49

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from hal.errors import BenchError
 from hal.even_samples import evenly
 from hal.npz import open_npz
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 Array = NDArray[np.float64]
 
-_G = 9.80665
 _UNITS = {
-    "g": ("acceleration", _G),
-    "mg": ("acceleration", 1e-3 * _G),
+    "g": ("acceleration", STANDARD_GRAVITY),
+    "mg": ("acceleration", 1e-3 * STANDARD_GRAVITY),
     "m/s^2": ("acceleration", 1.0),
     "m/s2": ("acceleration", 1.0),
     "m_s2": ("acceleration", 1.0),

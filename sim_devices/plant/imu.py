@@ -19,13 +19,12 @@ from numpy.typing import NDArray
 
 from hal.compiled import kernel
 from sim_devices.plant.body_motion import BodyMotion, MotionSource, Mount
-from sim_devices.plant.sensors import rc_weights
+from sim_devices.plant.sensors import STANDARD_GRAVITY, rc_weights
 from sim_devices.plant.streams import stream
 
 Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
-STANDARD_GRAVITY = 9.80665
 REFERENCE_C = 25.0
 _SIGMAS = 4.0
 _NOISE_BLOCK = 256
@@ -66,19 +65,37 @@ class ImuSpec:
 
 MPU6050_SPEC = ImuSpec(
     TriadSpec((50 * _MG, 50 * _MG, 80 * _MG), (0.5 * _MG, 0.5 * _MG, 0.86 * _MG), 0.03, 0.02, 0.4 * _MG, 2e-4),
-    TriadSpec(_each(20 * _DPS), _each(0.16 * _DPS), 0.03, 0.02, 5e-3 * _DPS, 1.6e-4, 0.1 * _DPS / 9.80665, 3e-3 * _DPS),
+    TriadSpec(
+        _each(20 * _DPS),
+        _each(0.16 * _DPS),
+        0.03,
+        0.02,
+        5e-3 * _DPS,
+        1.6e-4,
+        0.1 * _DPS / STANDARD_GRAVITY,
+        3e-3 * _DPS,
+    ),
 )
 LSM6DS3_SPEC = ImuSpec(
     TriadSpec(_each(40 * _MG), _each(0.5 * _MG), 0.01, 0.01, 0.09 * _MG, 1e-4),
     TriadSpec(
-        _each(10 * _DPS), _each(0.05 * _DPS), 0.015, 0.01, 7e-3 * _DPS, 1.2e-4, 0.1 * _DPS / 9.80665, 2e-3 * _DPS
+        _each(10 * _DPS),
+        _each(0.05 * _DPS),
+        0.015,
+        0.01,
+        7e-3 * _DPS,
+        1.2e-4,
+        0.1 * _DPS / STANDARD_GRAVITY,
+        2e-3 * _DPS,
     ),
     self_heating_K=0.8,
     temperature_spread_K=5.0,
 )
 BMX055_SPEC = ImuSpec(
     TriadSpec(_each(80 * _MG), _each(1.0 * _MG), 0.01, 0.01, 0.15 * _MG, 2e-4),
-    TriadSpec(_each(1 * _DPS), _each(0.015 * _DPS), 0.01, 0.01, 14e-3 * _DPS, 3e-4, 0.1 * _DPS / 9.80665, 2e-3 * _DPS),
+    TriadSpec(
+        _each(1 * _DPS), _each(0.015 * _DPS), 0.01, 0.01, 14e-3 * _DPS, 3e-4, 0.1 * _DPS / STANDARD_GRAVITY, 2e-3 * _DPS
+    ),
     TriadSpec(_each(40.0), _each(0.0), 0.02, 0.01, 0.0),
     self_heating_K=1.5,
     temperature_spread_K=5.0,

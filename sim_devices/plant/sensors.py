@@ -143,7 +143,7 @@ def field_gauss(config: EnvironmentConfig) -> Array:
 def accelerometer_V(a, f, supply_V, temperature_C):
     """Return the output before the RC filter, in V, for the specific force ``f`` (3,) in m/s^2 at the sensor, body
     axes."""
-    g = 9.80665
+    g = STANDARD_GRAVITY
     along = (a["axis"][0] * f[0] + a["axis"][1] * f[1] + a["axis"][2] * f[2]) / g
     other, across = f[a["in_plane"]] / g, f[a["out_of_plane"]] / g
     warm = temperature_C - 25.0

@@ -32,6 +32,7 @@ from firmware_py.recording.writer import RecordingWriter
 from hal.bench import load_bench
 from hal.clock import VirtualClock
 from hal.errors import HalError
+from hal.jsonable import to_jsonable
 from hal.types import CanFrame, CanStats, PortInfo, ScanConfig
 from sim_devices.plant.hand_file import HandFileError, load_hand
 from tests.conftest import DEFAULT_BENCH
@@ -44,7 +45,6 @@ from tools.errors import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.fmu import check_archive
-from tools.output import to_jsonable
 
 MS = 1_000_000
 

@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.routing import BaseRoute, Route
 
 from firmware_py.frame import LAYOUT
+from hal.types import STANDARD_GRAVITY
 from tools.bench.applied import Applied
 from tools.bench.history import BLOCK
 from tools.bench.jobs import Jobs
@@ -25,7 +26,6 @@ from tools.output import write_text_atomic
 
 TEMPERATURE_TOLERANCE_K = 0.2
 WARM_UP_ROWS = 600_000
-STANDARD_GRAVITY = 9.80665
 
 
 class Calibration:

@@ -21,11 +21,11 @@ from tools.bench.recorder import SUFFIX, check_name, is_own_file
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
-from tools.mismatch.cut import toml_text
 from tools.mismatch.key_tables import of_kind
 from tools.mismatch.recording_columns import SUFFIXES
 from tools.mismatch.twins.vocabulary import KINDS
 from tools.output import write_text_atomic
+from tools.toml_text import toml_text
 
 OFFERED = (
     "piezo_stack",

@@ -21,8 +21,9 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 from scipy.stats import t as student
 
-from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
+from hal.types import STANDARD_GRAVITY
 from tools.calibrate.multi_position import Estimate
 from tools.calibrate.pivot_spline import Step, gauss_newton, uniform_basis
 from tools.errors import InputError

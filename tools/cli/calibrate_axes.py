@@ -10,11 +10,10 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from hal.types import STANDARD_GRAVITY
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_writable, write_calibration, write_json
-
-STANDARD_GRAVITY = 9.80665
 
 
 class Method(StrEnum):

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import typer
 
-from tools.cli.calibrate_axes import STANDARD_GRAVITY, Columns, print_parameters, three
+from hal.types import STANDARD_GRAVITY
+from tools.cli.calibrate_axes import Columns, print_parameters, three
 from tools.cli.common import JsonOption, clear_errors
 from tools.output import check_writable, write_calibration, write_json
 

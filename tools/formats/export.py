@@ -6,7 +6,6 @@ Everything streams block by block; a failed export leaves nothing behind.
 
 from __future__ import annotations
 
-import json
 import shutil
 import zipfile
 from collections.abc import Callable, Mapping
@@ -23,6 +22,7 @@ from firmware_py.recording.files import new_file, new_folder, refuse_existing
 from firmware_py.recording.format import Float64Array
 from firmware_py.recording.reader import Recording
 from tools.formats import mdf, netcdf, parquet, view
+from tools.toml_text import toml_text
 
 LAYOUTS = Path(__file__).with_name("layouts")
 _ROLES = (("command", "input"), ("volts", "output"))  # what the instrument twin computes
@@ -122,21 +122,10 @@ def _default_role(name: str) -> str | None:
 def _descriptor(
     recording: Recording, data: str, kind: str, twin: Mapping[str, object], channels: list[dict[str, str]]
 ) -> str:
-    lines = ["format = 1", f"title = {_toml(recording.path.stem)}", f'data = "data.{data}"']
-    if fmt.TIME_COLUMN in recording.names:
-        lines.append(f"time_column = {_toml(fmt.TIME_COLUMN)}")
-    else:
-        lines.append(f"rate_hz = {recording.tick_hz}")
-    lines += ["", "[twin]", f"kind = {_toml(kind)}", "", "[twin.parameters]"]
-    lines += [f"{key} = {_toml(value)}" for key, value in twin.items()]
-    for channel in channels:
-        lines += ["", "[[channels]]", *(f"{key} = {_toml(value)}" for key, value in channel.items())]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: object) -> str:
-    """A TOML value; JSON's texts, numbers and lists are TOML's as well."""
-    return json.dumps(value, ensure_ascii=False)
+    timed = fmt.TIME_COLUMN in recording.names
+    clock = {"time_column": fmt.TIME_COLUMN} if timed else {"rate_hz": recording.tick_hz}
+    head = {"format": 1, "title": recording.path.stem, "data": f"data.{data}", **clock}
+    return toml_text({**head, "twin": {"kind": kind, "parameters": twin}, "channels": channels})
 
 
 def _finite_columns(recording: Recording) -> np.ndarray:

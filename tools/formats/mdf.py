@@ -13,6 +13,7 @@ import numpy as np
 
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
+from hal.jsonable import to_jsonable
 from tools.errors import InputError, RecordingError, missing_column
 from tools.formats.blocks import batches
 from tools.formats.columns import Array, as_numbers, check_size
@@ -99,7 +100,7 @@ def write(recording: Recording, path: Path) -> None:
             ]
             file.append(signals, comment="one row per tick", common_timebase=True)
             file.groups[0].channels[0].name = fmt.TIME_COLUMN
-        texts = {name: fmt.plain(value) for name, value in recording.metadata.items()}
+        texts = {name: to_jsonable(value) for name, value in recording.metadata.items()}
         texts["events"] = [event.content for event in recording.events]
         file.header.comment = json.dumps(texts, ensure_ascii=False)
         file.save(path, overwrite=True, compression=blocks.CompressionAlgorithm.TRANSPOSED_DEFLATE)

@@ -19,6 +19,7 @@ import numpy as np
 from firmware_py.frame import LAYOUT, Clip, FrameStatus
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
+from hal.jsonable import to_jsonable
 from tools.errors import InputError, RecordingError, missing_column
 from tools.formats.blocks import batches, event_times_ns
 from tools.formats.columns import Array, as_numbers, check_size
@@ -108,7 +109,7 @@ def _health(recording: Recording) -> dict[str, str]:
 
 
 def _text(value: object) -> str:
-    return value if isinstance(value, str) else json.dumps(fmt.plain(value), ensure_ascii=False)
+    return value if isinstance(value, str) else json.dumps(to_jsonable(value), ensure_ascii=False)
 
 
 def _events(recording: Recording) -> tuple[Array, list[str]]:

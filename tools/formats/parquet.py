@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
+from hal.jsonable import to_jsonable
 from tools.errors import RecordingError, missing_column
 from tools.formats.blocks import batches
 from tools.formats.columns import Array, as_numbers, check_size
@@ -58,7 +58,7 @@ def write(recording: Recording, path: Path) -> None:
     pa, pq = need(path.name, EXTRA, "pyarrow", "pyarrow.parquet")
     schema = pa.schema(
         [pa.field(name, pa.float64(), metadata={"unit": unit}) for name, unit in recording.columns],
-        metadata={name: json.dumps(fmt.plain(value)) for name, value in recording.metadata.items()},
+        metadata={name: json.dumps(to_jsonable(value)) for name, value in recording.metadata.items()},
     )
     with pq.ParquetWriter(path, schema, compression="zstd") as writer:
         for _, rows in batches(recording, _BATCH_BLOCKS):

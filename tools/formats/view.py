@@ -40,6 +40,7 @@ from numpy.typing import NDArray
 from firmware_py.frame import LAYOUT
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
+from hal.jsonable import to_jsonable
 from tools.formats.blocks import batches, event_times_ns
 from tools.formats.packages import need
 
@@ -168,7 +169,7 @@ def _slice(numbers: Any, start: int, count: int) -> Any:
 
 
 def _texts(recording: Recording) -> dict[str, str]:
-    return {k: v if isinstance(v, str) else json.dumps(fmt.plain(v)) for k, v in recording.metadata.items()}
+    return {k: v if isinstance(v, str) else json.dumps(to_jsonable(v)) for k, v in recording.metadata.items()}
 
 
 def _times(t_s: NDArray[np.float64], last_ns: int) -> NDArray[np.uint64]:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from hal.types import STANDARD_GRAVITY
 from tools.errors import InputError
 from tools.imu.offsets import free_fall, gyroscope_mean, manual, moved, simple
 from tools.imu.series import AXES, Array, Series, join_series
@@ -140,7 +141,6 @@ def evaluate_fall(series: Series) -> dict[str, Any]:
 def evaluate_turned(series: Series) -> dict[str, Any]:
     """Offsets by the manual method, and by still poses at unknown angles where there are nine of them."""
     from tools.calibrate.multi_position import identify_poses
-    from tools.imu.series import STANDARD_GRAVITY
 
     found = manual(series)
     result: dict[str, Any] = {

@@ -13,10 +13,10 @@ from drivers.base import wait_s
 from drivers.imu.base import ImuOffsets
 from firmware_py.endoscope.wiring import Sensor
 from hal.contracts import Clock
-from hal.types import Status
+from hal.types import STANDARD_GRAVITY, Status
 from tools.errors import InputError
 from tools.imu.offsets import gyroscope_mean, moved, simple
-from tools.imu.series import STANDARD_GRAVITY, Series
+from tools.imu.series import Series
 
 SETTLE_S, MEAN_S = 10.0, 10.0
 PATIENCE_S = 2.0

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.types import STANDARD_GRAVITY
 from tools.calibrate.still import quiet_level, spread
 from tools.errors import InputError
 from tools.imu.series import AXES, Array, Series
@@ -68,7 +69,7 @@ class FreeFall:
     @property
     def speed_m_s(self) -> float:
         """At its end, from rest."""
-        return 9.80665 * self.seconds
+        return STANDARD_GRAVITY * self.seconds
 
 
 def free_fall(series: Series) -> FreeFall | None:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +18,7 @@ from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_text import describe, restore
 from tools.mismatch.twins.fmu import with_equations
 from tools.mismatch.twins.make import make
+from tools.toml_text import toml_text
 
 EVENTS = ("spikes", "step_shift", "random_walk", "dropped_samples")
 """What happened in one recording and will not happen again at the same time: no part of a twin."""
@@ -133,33 +132,13 @@ def _same_weight(recording: Recording, report: Mapping[str, Any], model: Model, 
 
 
 def twin_toml(table: Mapping[str, Any]) -> str:
-    """The ``[twin]`` table as TOML; figures as exact as they are in memory."""
-    lines = ["[twin]", f"kind = {_value(table['kind'])}", "", "[twin.parameters]"]
-    lines += [f"{_key(k)} = {_value(v)}" for k, v in table["parameters"].items()]
-    for effect in table["effects"]:
-        lines += ["", "[[twin.effects]]"]
-        lines += [f"{_key(k)} = {_value(v)}" for k, v in effect.items() if not isinstance(v, Mapping)]
-        for name in ("settings", "parameters"):
-            lines += ["", f"[twin.effects.{name}]"]
-            lines += [f"{_key(k)} = {_value(v)}" for k, v in effect[name].items()]
-    return "\n".join(lines) + "\n"
+    """Return the ``[twin]`` table as TOML. Raises ``InputError`` for a figure that is not finite."""
+    _require_finite(table)
+    return toml_text({"twin": table})
 
 
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value)
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{_key(str(k))} = {_value(v)}" for k, v in value.items()) + " }"
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(_value(v) for v in value) + "]"
-    if isinstance(value, int | np.integer):
-        return str(int(value))
-    if not math.isfinite(value):
+def _require_finite(value: Any) -> None:
+    for inner in value.values() if isinstance(value, Mapping) else value if isinstance(value, list | tuple) else ():
+        _require_finite(inner)
+    if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"the report holds {value}, which no twin can use")
-    return repr(float(value))

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from tools.errors import InputError
 from tools.mismatch.recording import Array
 from tools.mismatch.recording_columns import read_columns
 from tools.mismatch.recording_load import LONGEST_GAP, MIN_SAMPLES, MIN_SPAN, descriptor, on_grid
+from tools.toml_text import toml_text
 
 
 @dataclass(frozen=True)
@@ -187,35 +186,3 @@ def _write(
         head["twin"] = {"file": os.path.relpath(file, out.resolve())}
     np.savez(out / "data.npz", **columns)  # pyright: ignore[reportArgumentType]
     (out / "recording.toml").write_text(toml_text(head), encoding="utf-8")
-
-
-def toml_text(table: Mapping[str, Any], name: str = "") -> str:
-    """A table as TOML: its plain values, then its tables and lists of tables, each under its own head."""
-    plain = {k: v for k, v in table.items() if not isinstance(v, Mapping) and not _of_tables(v)}
-    lines = [f"{_key(k)} = {_value(v)}" for k, v in plain.items()]
-    for k, v in table.items():
-        if k in plain:
-            continue
-        below = f"{name}.{_key(k)}" if name else _key(k)
-        for entry in v if _of_tables(v) else [v]:
-            head = f"[[{below}]]" if _of_tables(v) else f"[{below}]"
-            lines += ["", head, toml_text(entry, below).rstrip("\n")]
-    return "\n".join(lines) + "\n"
-
-
-def _of_tables(value: object) -> bool:
-    return isinstance(value, list) and bool(value) and all(isinstance(v, Mapping) for v in value)
-
-
-def _key(name: str) -> str:
-    return name if re.fullmatch(r"[A-Za-z0-9_-]+", name) else json.dumps(name)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return json.dumps(value)
-    if isinstance(value, Sequence):
-        return "[" + ", ".join(_value(v) for v in value) + "]"
-    return repr(value)

@@ -10,12 +10,13 @@ from types import MappingProxyType
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.types import STANDARD_GRAVITY
+
 Array = NDArray[np.float64]
 Dimension = tuple[int, ...]
 """Exponents of metre, kilogram, second, ampere, kelvin, radian, count."""
 
 _NONE: Dimension = (0, 0, 0, 0, 0, 0, 0)
-STANDARD_GRAVITY = 9.80665  # m/s^2, CGPM 1901
 
 
 class UnitError(ValueError):

@@ -16,7 +16,6 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tests.unit.mismatch_model.test_cascade import circuit, in_two
 from tools.mismatch.apply import corrected_twin
-from tools.mismatch.cut import toml_text
 from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.export.run import simulate_file
 from tools.mismatch.export.write import write_twin
@@ -25,6 +24,7 @@ from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
+from tools.toml_text import toml_text
 
 Array = NDArray[np.float64]
 N, DT = 1500, 0.01

@@ -9,11 +9,12 @@ import pytest
 
 from firmware_py.control.parity import LIMIT, Parity, Verdict
 from firmware_py.control.plan import load_plan
-from firmware_py.sensing.config import STANDARD_GRAVITY, SensingConfig
+from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.kinematics import observation_matrix
 from firmware_py.sensing.leave_out import tip_noise
 from firmware_py.sensing.stage import Sensing
 from hal.bench import load_bench
+from hal.types import STANDARD_GRAVITY
 
 BENCH = Path(__file__).parents[3] / "benches" / "micron-eight.toml"
 MOTION = np.array([0.3, -0.2, 9.7, 1.0, -2.0, 0.5])  # f m/s^2, alpha rad/s^2

@@ -6,7 +6,8 @@ import numpy as np
 
 from sim_devices.devices.register_map import RegisterFace
 from sim_devices.plant.body_motion import BodyMotion
-from sim_devices.plant.imu import STANDARD_GRAVITY, Imu, ImuSpec
+from sim_devices.plant.imu import Imu, ImuSpec
+from sim_devices.plant.sensors import STANDARD_GRAVITY
 
 
 class Stand:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+
+from hal.jsonable import to_jsonable
 
 Array = NDArray[np.float64]
 Verdict = Literal["agrees", "recalibrate", "missing_physics", "unexplained"]
@@ -300,20 +301,4 @@ class Report:
         body.pop("pictures")
         if self.together is None:
             body.pop("together")
-        return _plain({"format": 1, **body})
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {str(k): _plain(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(v) for v in value]
-    if isinstance(value, np.ndarray):
-        return [_plain(v) for v in value.tolist()]
-    if isinstance(value, bool | np.bool_):
-        return bool(value)
-    if isinstance(value, int | np.integer):
-        return int(value)
-    if isinstance(value, float | np.floating):
-        return float(value) if math.isfinite(float(value)) else None
-    return value
+        return to_jsonable({"format": 1, **body})

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
+from hal.types import STANDARD_GRAVITY
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
@@ -88,7 +89,7 @@ def variance(
         conventional,
     )
     from tools.research.placement.analysis_picture import save_analysis_picture
-    from tools.research.placement.configuration_file import STANDARD_GRAVITY, load_configuration
+    from tools.research.placement.configuration_file import load_configuration
     from tools.research.placement.propositions import verdicts
 
     def cells(values: object, factor: float) -> str:

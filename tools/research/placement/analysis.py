@@ -15,6 +15,7 @@ from math import pi
 import numpy as np
 from numpy.typing import NDArray
 
+from hal.types import STANDARD_GRAVITY
 from tools.research.placement.configurations import Placement
 from tools.research.placement.variance import (
     angular_noise,
@@ -26,7 +27,6 @@ from tools.research.placement.variance import (
 
 Array = NDArray[np.float64]
 BAND_HZ = (8.0, 12.0)
-GRAVITY = 9.80665
 RC_RAD_S = 1.0 / (32e3 * 0.33e-6)
 DOWN_40 = (0.643, 0.0, -0.766)
 """Up in the body frame of an instrument held like a pen, 40 degrees from straight down."""
@@ -75,7 +75,7 @@ def all_accelerometers(placement: Placement, noise: Array, conditions: Condition
     density = motion_covariance(placement, noise * np.sqrt(4.0 / RC_RAD_S))  # one-sided, per Hz
 
     def tip(w: float) -> Array:
-        lever = conditions.tip_m - GRAVITY / w**2 * conditions.up
+        lever = conditions.tip_m - STANDARD_GRAVITY / w**2 * conditions.up
         carry = np.hstack([np.eye(3), -cross(lever)])
         return np.diag(carry @ density @ carry.T) / w**4
 
@@ -99,7 +99,7 @@ def conventional(place_m: Array, noise: float, conditions: Conditions) -> Analys
     arm = conditions.tip_m - place_m
 
     def tip(w: float) -> Array:
-        lever = cross(arm - GRAVITY / w**2 * conditions.up)
+        lever = cross(arm - STANDARD_GRAVITY / w**2 * conditions.up)
         return force / w**4 * np.ones(3) + rate / w**2 * np.diag(lever @ lever.T)
 
     # at the tip the rate must be differentiated: its noise grows with frequency, within the filter's bandwidth

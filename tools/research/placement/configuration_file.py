@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from hal.types import STANDARD_GRAVITY
 from hal.validation import describe_validation_error
 from tools.errors import InputError
 from tools.research.placement.configurations import (
@@ -23,7 +24,6 @@ from tools.research.placement.configurations import (
 )
 
 Vector = tuple[float, float, float]
-STANDARD_GRAVITY = 9.80665
 RC_HZ_FACTOR = (np.pi / 2.0 * 15.07) ** 0.5
 NAMED = {
     "micron-000": micron_000,

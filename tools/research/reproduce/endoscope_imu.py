@@ -9,6 +9,7 @@ from typing import Any
 import benches
 from firmware_py.endoscope.wiring import open_sensors
 from hal.bench import load_bench, open_bench
+from hal.types import STANDARD_GRAVITY
 from tools.imu.evaluate import evaluate_fall, evaluate_parts, evaluate_turned
 from tools.imu.live import auto_calibrate, record
 from tools.imu.offsets import gyroscope_mean
@@ -18,8 +19,7 @@ from tools.research.reproduce.recordings import data_folder, meta
 from tools.research.reproduce.rows import Row
 
 WATCH_S = 120.0
-G = 9.80665
-SCATTER_G = 0.0042 / G
+SCATTER_G = 0.0042 / STANDARD_GRAVITY
 """Standard deviation of |a| over the ten poses with the published calibration (meta.toml of the set)."""
 PUBLISHED: dict[str, dict[str, tuple[float, float, float]]] = {
     "mpu6050": {
@@ -142,7 +142,7 @@ def _recordings() -> list[Row]:
                     "m/s",
                     "g times the time of free fall, free-fall method of Erat 2018, 5.2.1.2",
                     speed,
-                    G * found["fall_s"],
+                    STANDARD_GRAVITY * found["fall_s"],
                     "equal",
                     "recording",
                     tolerance=0.5,

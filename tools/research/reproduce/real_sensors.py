@@ -11,6 +11,7 @@ from math import floor, log10
 
 import numpy as np
 
+from hal.types import STANDARD_GRAVITY
 from tools.calibrate.ellipsoid import fit_ellipsoid
 from tools.calibrate.gyroscope import fit_gyroscope
 from tools.calibrate.logs import load_log
@@ -84,12 +85,12 @@ def mpu6050() -> list[Row]:
     about = meta("mpu6050_tomisuarez")
     reference, intervals = about["reference_accelerometer"], about["reference_static_intervals"]
     raw = log.matrix(ACCELEROMETER)
-    found = identify_poses(raw, 100.0, 9.80665)
+    found = identify_poses(raw, 100.0, STANDARD_GRAVITY)
     bounds = list(zip(intervals["start_sample"], intervals["stop_sample"], strict=True))
     mean = np.array([raw[a : b + 1].mean(axis=0) for a, b in bounds])
     samples = np.array([b + 1 - a for a, b in bounds], dtype=np.float64)
     noise = quiet_level(raw, 50) / np.sqrt(3.0 * np.median(samples))
-    result = fit_poses(mean, np.minimum(samples, 200.0), 9.80665, pose_noise=float(noise))
+    result = fit_poses(mean, np.minimum(samples, 200.0), STANDARD_GRAVITY, pose_noise=float(noise))
     source, condition = "tomisuarez2/ImuCalibration, MPU-6050", "the author's own ten intervals"
     published = reference["magnitude_calibrated_m_s2"][1]
     rows = [
@@ -109,7 +110,7 @@ def mpu6050() -> list[Row]:
                 "equal",
                 "recording",
                 # 0.0042 m/s^2 of 9.80665: the scatter that the published calibration leaves
-                tolerance=reference["scale_m_s2_per_count"][i] * published / 9.80665,
+                tolerance=reference["scale_m_s2_per_count"][i] * published / STANDARD_GRAVITY,
                 why="within the published calibration's own scatter, 0.0042 m/s^2",
             ),
             Row(
@@ -145,8 +146,8 @@ def gyroscopes() -> list[Row]:
     cheap = "mpu6050_tomisuarez/calibration.npz"
     for source, file, rate_hz, gravity, published, digits, keep in (
         ("imu_tk, Xsens MTi (factory)", "imu_tk_xsens", None, 9.81744, xsens_factory, half_count, False),
-        (author, cheap, 100.0, 9.80665, mpu, printed, False),
-        (author, cheap, 100.0, 9.80665, mpu, printed, True),
+        (author, cheap, 100.0, STANDARD_GRAVITY, mpu, printed, False),
+        (author, cheap, 100.0, STANDARD_GRAVITY, mpu, printed, True),
     ):
         log = load_log(data_folder() / file, rate_hz)
         force, turning = log.matrix(ACCELEROMETER), log.matrix(GYROSCOPE)

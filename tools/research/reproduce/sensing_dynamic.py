@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from firmware_py.sensing.config import SensingConfig
 from firmware_py.sensing.triad import triad
+from hal.types import STANDARD_GRAVITY
 from sim_devices.config import EmulationConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.hand import SyntheticHand
 from tools.calibrate.stage_log import stage_attitude
@@ -114,7 +115,7 @@ def translation_noise_limit() -> float:
     """White noise of the data sheet through the same zero-phase filter, mm/s^2 rms."""
     f = np.linspace(0.0, 500.0, 20_001)
     gain = np.abs(sosfreqz(butter(2, 20.0, fs=RATE_HZ, output="sos"), f, fs=RATE_HZ)[1]) ** 2
-    return float(1e3 * 110e-6 * 9.80665 * np.sqrt(np.trapezoid(gain**2, f)))
+    return float(1e3 * 110e-6 * STANDARD_GRAVITY * np.sqrt(np.trapezoid(gain**2, f)))
 
 
 def translation_rows() -> list[Row]:
@@ -198,7 +199,7 @@ def arm_rows(both: Calibrated | None = None) -> list[Row]:
     f = np.linspace(0.0, 100.0, 10_001)
     squared = np.abs(sosfreqz(band, f, fs=RATE_HZ)[1]) ** 4
     geometry = Placement("Micron", placement.axis_positions(), np.array(placement.axes))
-    density = 110e-6 * 9.80665
+    density = 110e-6 * STANDARD_GRAVITY
     noise = float(np.sqrt(motion_covariance(geometry, density)[3, 3] * np.trapezoid(squared, f)))
     condition = "emulated sensors, calibrated; arm turned about body x, 1 to 5 Hz, zero-phase band-pass as in the paper"
     return [

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hal.even_samples import evenly
+from hal.types import STANDARD_GRAVITY
 from tools.errors import InputError
-from tools.mismatch.units import STANDARD_GRAVITY
 from tools.research.tremor.clock import rate_from_known
 from tools.research.tremor.signal import Reference, TremorSignal, Windows
 from tools.research.tremor.spectrum import highest_line, periodogram
