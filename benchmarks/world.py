@@ -14,11 +14,11 @@ import numpy as np
 
 from benchmarks.row import Row, exponent, process_cpu_s
 from firmware_py.app import run_in_process
-from firmware_py.control.replay import replay_recording
 from firmware_py.control.stages import StageConfigs, Stages
 from firmware_py.frame import LAYOUT
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.writer import RecordingWriter
+from firmware_py.replay import replay_recording
 from firmware_py.run_request import RunRequest
 from hal.bench import load_bench
 from tools.cli.bench_option import bench_path

@@ -6,7 +6,7 @@ Column starts are plain integers (``frame[RATE + 1]``), because compiled kernels
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import IntFlag
 
@@ -107,12 +107,13 @@ class Clip(IntFlag):
 
 
 class Layout:
-    """Names, units and slices of the frame's columns; ``layout["rate"]`` is a slice."""
+    """Names, units and slices of a frame's columns; ``layout["rate"]`` is a slice. ``quantities`` lists name, unit,
+    parts and meaning of each, from left to right."""
 
-    def __init__(self) -> None:
+    def __init__(self, quantities: Iterable[tuple[str, str, tuple[str, ...], str]]) -> None:
         columns: list[Column] = []
         start = 0
-        for name, unit, parts, what in _QUANTITIES:
+        for name, unit, parts, what in quantities:
             columns.append(Column(name, unit, parts, what, start))
             start = columns[-1].span.stop
         self.columns: tuple[Column, ...] = tuple(columns)
@@ -144,7 +145,7 @@ class Layout:
         return np.zeros(self.size)
 
 
-LAYOUT = Layout()
+LAYOUT = Layout(_QUANTITIES)
 
 TICK = LAYOUT.start("tick")
 TIME = LAYOUT.start("t")

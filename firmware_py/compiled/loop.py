@@ -1,6 +1,6 @@
-"""The instrument's loop with its ticks in the compiled thread, as long as the outputs may move and nothing is odd.
+"""The first instrument with its ticks in the compiled thread, as long as the outputs may move and nothing is odd.
 
-``CompiledLoop`` is an ``InstrumentLoop``. Self-test, arming, holds and ramps run as there. In between it enters the
+``CompiledMicron`` is a ``Micron``. Self-test, arming, holds and ramps run as there. In between ``wait`` enters the
 thread and comes back when the thread hands over; meanwhile a Python thread beside it runs the slow devices, the
 supervision and the page. One of the two Python threads at a time touches the loop's objects (``_lock``). In virtual
 time there is no thread beside: its pass follows each entry, so that both loops run the same tasks in the same ticks.
@@ -24,14 +24,17 @@ from drivers.daq.di4108 import Di4108
 from drivers.piezo.e727 import E727
 from firmware_py.compiled import memory as at
 from firmware_py.compiled.memory import Memory, Sinks, Timing
-from firmware_py.control.loop import LATE_PART, InstrumentLoop
+from firmware_py.control.config import FirmwareConfig
+from firmware_py.control.instrument import LATE_PART, Micron
+from firmware_py.control.stages import Stages
 from firmware_py.control.wiring import Devices
 from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.recording.ring import RowsView
+from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding
 from firmware_py.run.safety import State
 from firmware_py.scheduler.task import TickInfo
-from firmware_py.scheduler.ticker import ScanTicker, Ticks, silent_at_ns
+from firmware_py.scheduler.ticker import Ticks, silent_at_ns
 from hal.clock import VirtualClock
 from hal.contracts import Clock, Float64Array
 from hal.errors import BenchError
@@ -82,16 +85,18 @@ def reasons_against(devices: Devices, clock: Clock, n_axes: int) -> list[str]:
     return reasons
 
 
-class CompiledLoop(InstrumentLoop):
-    """``InstrumentLoop``, with its arguments, over devices for which ``reasons_against`` is empty.
+class CompiledMicron(Micron):
+    """``Micron``, with its arguments, over devices for which ``reasons_against`` is empty.
 
     Raises ``BenchError`` for others. ``spin_us``: the thread waits awake from so long before each scan is expected
     until so long after. ``entries`` counts how often the thread was entered, ``ticks_compiled`` the ticks that it
     ran."""
 
-    def __init__(self, devices: Devices, *arguments: Any, spin_us: float = 0.0, **options: Any) -> None:
-        super().__init__(devices, *arguments, **options)
-        reasons = reasons_against(devices, self._clock, len(devices.sensing_table["channels"]))
+    def __init__(
+        self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run, *, spin_us: float = 0.0
+    ) -> None:
+        super().__init__(devices, stages, config, run)
+        reasons = reasons_against(devices, run.clock, len(devices.sensing_table["channels"]))
         if reasons:
             raise BenchError("; ".join(reasons))
         assert isinstance(devices.daq, Di4108)
@@ -100,7 +105,7 @@ class CompiledLoop(InstrumentLoop):
 
         self._thread = thread
         self._daq, self._output = devices.daq, devices.amplifier
-        self._is_virtual = isinstance(self._clock, VirtualClock)
+        self._is_virtual = isinstance(self.run.clock, VirtualClock)
         self.entries = self.ticks_compiled = 0
         self._done: tuple[int, int, int] | None = None
         self._lock = threading.Lock()
@@ -114,11 +119,15 @@ class CompiledLoop(InstrumentLoop):
         self._inside_ns = 0
         self._told = self._words.copy()
         self._tasks_told = np.zeros((3, len(at.STAGES)), np.int64)
-        self._memory: Memory | None = self._gather()
-        thread.serve(self._memory)  # compiles or loads; CALLED_BACK: returns at once
+        self._memory: Memory | None = None
+
+    def prepare(self) -> None:
+        """Gather the memory that Python and the thread share, and compile or load the thread."""
+        self._memory = self._gather()
+        self._thread.serve(self._memory)  # CALLED_BACK: returns at once
 
     def _gather(self) -> Memory:
-        words, period_ns, safety = self._words, self._period_ns, self._config.safety
+        words, period_ns, safety = self._words, self.run.period_ns, self.run.limits
         words[at.FIXED_NS] = at.REAL_TIME
         words[at.BEAT_LIMIT_NS] = round(BEAT_LIMIT_MS * 1e6)
         words[at.PERIOD_NS], words[at.DT_NS] = period_ns, self._daq.dt_ns
@@ -141,44 +150,46 @@ class CompiledLoop(InstrumentLoop):
         def words(histogram: Any) -> at.Words:
             return np.frombuffer(histogram.words, np.int64)
 
-        parts = [self.scheduler.task_memory(name) for name in at.STAGES]
+        parts = [self.run.scheduler.task_memory(name) for name in at.STAGES]
         tasks = np.zeros((5, len(at.STAGES)), np.int64)
         tasks[at.BUDGET_NS], tasks[at.DEADLINE_NS] = [p[2] for p in parts], [p[3] for p in parts]
-        duration, lateness = self.scheduler.tick_memory
+        duration, lateness = self.run.scheduler.tick_memory
         return Timing(
             tasks, tuple(words(p[0]) for p in parts), tuple(words(p[1]) for p in parts), words(duration),
-            words(lateness), words(self.counts.latency),
+            words(lateness), words(self.run.counts.latency),
         )  # fmt: skip
 
     def _sinks(self) -> Sinks:
-        width = len(self._frame)
+        width = len(self.frame)
         live_words, live_rows = np.zeros(0, np.int64), np.zeros((0, width))
-        if self._live is not None:
-            live_words, live_rows = self._live.view()
+        if self.run.live is not None:
+            live_words, live_rows = self.run.live.view()
         slots = np.zeros((2, 1 + width))
         ring = RowsView(np.zeros(0, np.int64), slots.view(np.int64)[:, 0], slots[:, 1:])
-        if self._recorder is not None:
-            assert isinstance(self._recorder, RecorderProcess)
-            ring = self._recorder.view()
+        if self.run.recorder is not None:
+            assert isinstance(self.run.recorder, RecorderProcess)
+            ring = self.run.recorder.view()
         return Sinks(live_words, live_rows, ring, np.zeros(width))
 
-    def describe(self) -> dict[str, Any]:
-        """Return, as JSON values, what ran the ticks."""
+    def report(self) -> dict[str, Any]:
+        """See ``Micron.report``; says, as JSON values, what ran the ticks."""
         spin = {}
         if self._words[at.SPIN_NS]:
             share = int(self._words[at.SPUN_NS]) / max(self._inside_ns, 1)
             spin = {"spin_us": int(self._words[at.SPIN_NS]) * 1e-3, "spin_share": share}
-        return {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **spin}
+        how = {"kind": "compiled", "entries": self.entries, "ticks": self.ticks_compiled, **spin}
+        return {**super().report(), "loop": how}
 
     # -- running -----------------------------------------------------------------------------------------
 
-    def run(self, seconds: float) -> None:
-        """See ``InstrumentLoop.run``."""
+    @contextlib.contextmanager
+    def running(self) -> Iterator[None]:
+        """See ``Micron.running``: the thread of the passes lives within the block."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._close)
             if not self._is_virtual:
                 stack.enter_context(self._python_beside())
-            super().run(seconds)
+            yield
 
     def _close(self) -> None:
         self._memory = None  # lets go of the rings, which their owners close
@@ -205,60 +216,63 @@ class CompiledLoop(InstrumentLoop):
             if before is not None:
                 signal.set_wakeup_fd(before)
 
-    def _wait(self, ticker: ScanTicker) -> Ticks | None:
-        while (place := self._place_to_enter(ticker)) is not None:
-            result = self._enter(ticker, *place)
+    def wait(self) -> Ticks | None:
+        """See ``Micron.wait``: the thread runs the ticks in between; ``None`` where the loop must not wait any more."""
+        while (place := self._place_to_enter()) is not None:
+            result = self._enter(*place)
             if result != at.SPENT:
                 break
-        if self.supervisor.must_not_wait:  # found beside the thread: the ramp does not wait for the next scan
+        if self.run.supervisor.must_not_wait:  # found beside the thread: the ramp does not wait for the next scan
             return None
-        return super()._wait(ticker)
+        return super().wait()
 
-    def _place_to_enter(self, ticker: ScanTicker) -> tuple[int, int, int] | None:
+    def _place_to_enter(self) -> tuple[int, int, int] | None:
         """Return where the thread goes on, None while Python has to run the ticks."""
         self._done = None
         is_free = (
-            self.supervisor.state is State.RUNNING
-            and not (self.manual.active or self._interrupted or self._rearm_signalled)
+            self.run.supervisor.state is State.RUNNING
+            and not (self.manual.active or self.run.signals.interrupted or self.run.signals.rearm_asked)
             and self.scans.are_well
-            and not self.scheduler.is_announced
+            and not self.run.scheduler.is_announced
             and self._output.link.is_well
         )
-        return ticker.place if is_free else None
+        return self._ticker.place if is_free else None
 
-    def _enter(self, ticker: ScanTicker, seq_of_tick0: int, last_k: int, last_due_ns: int) -> int:
+    def _enter(self, seq_of_tick0: int, last_k: int, last_due_ns: int) -> int:
         words, memory = self._words, self._memory
         assert memory is not None
         words[at.DAQ_FD], words[at.OUTPUT_FD] = _fd_of(self._daq.port), _fd_of(self._output.port)
-        words[at.STARTED_NS] = self._started_ns
-        words[at.END_NS] = at.NO_END if self._end_ns is None else self._end_ns
+        words[at.STARTED_NS] = self.run.started_ns
+        words[at.END_NS] = at.NO_END if self.run.end_ns is None else self.run.end_ns
         words[at.SEQ_OF_TICK0], words[at.LAST_K], words[at.LAST_DUE_NS] = seq_of_tick0, last_k, last_due_ns
         words[at.WARNED], words[at.READS_LEFT] = self._warned, -1
-        memory.sinks.shown[:] = self._frame
+        memory.sinks.shown[:] = self.frame
         if self._is_virtual:
             self._feed(last_due_ns)
-        words[at.BEAT_NS] = self._clock.now_ns()
-        words[at.ORDER] = at.CALLED_BACK if self._interrupted else at.GO  # a signal may have come in the meantime
+        words[at.BEAT_NS] = self.run.clock.now_ns()
+        words[at.ORDER] = (
+            at.CALLED_BACK if self.run.signals.interrupted else at.GO
+        )  # a signal may have come in the meantime
         self.entries += 1
         self._is_inside.set()
-        entered_ns = self._clock.now_ns()
+        entered_ns = self.run.clock.now_ns()
         result = self._thread.serve(memory)
-        self._inside_ns += self._clock.now_ns() - entered_ns
+        self._inside_ns += self.run.clock.now_ns() - entered_ns
         with self._lock:
             self._is_inside.clear()
             words[at.ORDER] = at.CALLED_BACK
             if self._is_virtual:
                 self._flush()
-            self._take_over(ticker, result)
+            self._take_over(result)
         if self._beside_error is not None:
             raise self._beside_error
         if self._is_virtual and result in (at.SPENT, at.GAP):
             self._pass_beside(last_k)
         return result
 
-    def _take_over(self, ticker: ScanTicker, result: int) -> None:
+    def _take_over(self, result: int) -> None:
         """Bring the loop's objects to where the thread is, and prepare the next wait for why it has come back."""
-        words = self._words
+        words, ticker = self._words, self._ticker
         self._sync()
         self._warned = int(words[at.WARNED])
         ticker.go_on_from(int(words[at.LAST_K]), int(words[at.LAST_DUE_NS]))
@@ -278,10 +292,10 @@ class CompiledLoop(InstrumentLoop):
             case at.STREAM:
                 self.scans.hand_over(self._failed_block)
             case at.GAP:
-                self.scans.host_gaps.look(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
+                self.run.host_gaps.look(int(words[at.GAP_DUE_NS]), int(words[at.GAP_NOW_NS]))
             case at.DEAF:
-                silent_ms = (self._clock.now_ns() - int(words[at.BEAT_NS])) * 1e-6
-                self.incidents.report(Finding.SUPERVISION_SILENT, silent_ms=silent_ms)
+                silent_ms = (self.run.clock.now_ns() - int(words[at.BEAT_NS])) * 1e-6
+                self.run.incidents.report(Finding.SUPERVISION_SILENT, silent_ms=silent_ms)
             case _:
                 pass
 
@@ -298,7 +312,7 @@ class CompiledLoop(InstrumentLoop):
 
     def _sync(self) -> None:
         """Count what the thread has done since the last time."""
-        words, memory, counts = self._words.copy(), self._memory, self.counts
+        words, memory, counts = self._words.copy(), self._memory, self.run.counts
         assert memory is not None
         new = words - self._told
         self._told = words
@@ -316,13 +330,13 @@ class CompiledLoop(InstrumentLoop):
         each = (tasks - self._tasks_told).T.tolist()
         self._tasks_told = tasks
         by_name = {name: (runs, overruns, slips) for name, (runs, overruns, slips) in zip(at.STAGES, each, strict=True)}
-        self.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), by_name)
+        self.run.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), by_name)
         if words[at.PAIR_TOLD]:
             self._check.judge_pairs(-int(words[at.PAIR_TOLD]))
             self._words[at.PAIR_TOLD] = 0
         first = max(int(words[at.NOTES] - new[at.NOTES]), int(words[at.NOTES]) - at.NOTE_ROOM)
         for number in range(first, int(words[at.NOTES])):
-            rising, self.incidents.tick = (int(w) for w in memory.notes[number % at.NOTE_ROOM])
+            rising, self.run.incidents.tick = (int(w) for w in memory.notes[number % at.NOTE_ROOM])
             self._warn(rising)
 
     # -- beside ------------------------------------------------------------------------------------------
@@ -344,39 +358,39 @@ class CompiledLoop(InstrumentLoop):
                         self._beside_error = error
                         self._call_back()
             words = self._words
-            next_k = self.scheduler.next_beside(last_k, at.STAGES)
-            due_ns = int(words[at.LAST_DUE_NS]) + (next_k - int(words[at.LAST_K])) * self._period_ns + AFTER_TICK_NS
-            now_ns = self._clock.now_ns()
-            self._clock.sleep_until_ns(min(max(due_ns, now_ns + AFTER_TICK_NS), now_ns + LONGEST_PAUSE_NS))
+            next_k = self.run.scheduler.next_beside(last_k, at.STAGES)
+            due_ns = int(words[at.LAST_DUE_NS]) + (next_k - int(words[at.LAST_K])) * self.run.period_ns + AFTER_TICK_NS
+            now_ns = self.run.clock.now_ns()
+            self.run.clock.sleep_until_ns(min(max(due_ns, now_ns + AFTER_TICK_NS), now_ns + LONGEST_PAUSE_NS))
 
     def _pass_beside(self, last_k: int) -> int:
         """Run what was due in the ticks after ``last_k``, and call the thread back if Python has to decide something.
         Return the newest tick."""
         words, memory = self._words, self._memory
         assert memory is not None
-        words[at.BEAT_NS] = self._clock.now_ns()
+        words[at.BEAT_NS] = self.run.clock.now_ns()
         if not self._is_virtual:
             self._sync()
         k, due_ns = int(words[at.LAST_K]), int(words[at.LAST_DUE_NS])
         if k == last_k:
             return k
         first = k if last_k < 0 or k - last_k > at.LONG_AGO else last_k + 1
-        self.incidents.tick = k
-        self._ticks = Ticks(k, 1, due_ns, self._period_ns, TimeSource.DEVICE_CLOCK)
+        self.run.incidents.tick = k
+        self.run.ticks = Ticks(k, 1, due_ns, self.run.period_ns, TimeSource.DEVICE_CLOCK)
         if not self._is_virtual:
             self._show(memory.sinks.shown)
         try:
-            self.scheduler.run_beside(due_ns, first, k, at.STAGES, in_tick=self._is_virtual)
-            self.scheduler.run_slack(due_ns + self._daq.dt_ns + self._period_ns)
+            self.run.scheduler.run_beside(due_ns, first, k, at.STAGES, in_tick=self._is_virtual)
+            self.run.scheduler.run_slack(due_ns + self._daq.dt_ns + self.run.period_ns)
         finally:
             self._show(self.stages.frame)
-        if not self.supervisor.may_move or self.manual.active:
+        if not self.run.supervisor.may_move or self.manual.active:
             self._call_back()
         return k
 
     def _show(self, frame: Float64Array) -> None:
         """Let everything in Python that reads the frame read ``frame``: the thread is at work on its own."""
-        self._frame = self._watch.frame = self.shown.frame = frame
+        self.frame = self._watch.frame = frame
 
     def _call_back(self) -> None:
         self._words[at.ORDER] = at.CALLED_BACK
@@ -388,25 +402,29 @@ class CompiledLoop(InstrumentLoop):
     def _is_done(self, k: int, stage: int) -> bool:
         return self._done is not None and (k, stage) < self._done[:2]
 
-    def _sense(self, info: TickInfo) -> None:
+    def sense(self, info: TickInfo) -> None:
+        """See ``Micron.sense``; does what the thread has not done of a block that it handed over."""
         if not self._is_done(info.k, at.SENSE):
-            super()._sense(info)
+            super().sense(info)
 
-    def _estimate(self, info: TickInfo) -> None:
+    def estimate(self, info: TickInfo) -> None:
+        """See ``Micron.estimate``; does what the thread has not done of a block that it handed over."""
         if self._is_done(info.k, at.ESTIMATE):
             return
         if self._done is not None and self._done[:2] == (info.k, at.ESTIMATE):
             self._judge_step(self._check.judge_pairs(self._done[2]))
         else:
-            super()._estimate(info)
+            super().estimate(info)
 
-    def _actuate(self, info: TickInfo) -> None:
+    def actuate(self, info: TickInfo) -> None:
+        """See ``Micron.actuate``; does what the thread has not done of a block that it handed over."""
         if not self._is_done(info.k, at.ACTUATE):
-            super()._actuate(info)
+            super().actuate(info)
 
-    def _publish(self, info: TickInfo) -> None:
+    def publish(self, info: TickInfo) -> None:
+        """See ``Micron.publish``; does what the thread has not done of a block that it handed over."""
         if not self._is_done(info.k, at.PUBLISH):
-            super()._publish(info)
+            super().publish(info)
 
     # -- virtual time ------------------------------------------------------------------------------------
 
@@ -415,14 +433,14 @@ class CompiledLoop(InstrumentLoop):
         daq, output = self._daq.port, self._output.port
         assert isinstance(daq, Fed)
         assert isinstance(output, Fed)
-        words, now_ns = self._words, self._clock.now_ns()
+        words, now_ns = self._words, self.run.clock.now_ns()
         if words[at.SILENT_OF_NS] != last_due_ns:
             words[at.SILENT_AT_NS] = silent_at_ns(last_due_ns, int(words[at.STALE_NS]), now_ns)
             words[at.SILENT_OF_NS] = last_due_ns
         silent_ns = int(words[at.SILENT_AT_NS])
         daq.feed(max(0, silent_ns - now_ns) * 1e-9)
         output.feed(0.0)
-        words[at.FIXED_NS] = self._clock.now_ns()
+        words[at.FIXED_NS] = self.run.clock.now_ns()
         words[at.READS_LEFT] = 1
 
     def _flush(self) -> None:

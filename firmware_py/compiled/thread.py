@@ -147,7 +147,7 @@ def save(check: Any, saved: Words, back: bool) -> None:
 
 @kernel
 def sense(m: Memory, frame: NDArray[np.float64], row: int, k: int, due_ns: int) -> bool:
-    """Do what ``InstrumentLoop._sense`` does with a scan. Return False, and leave the checks as they were, if it is
+    """Do what ``Micron.sense`` does with a scan. Return False, and leave the checks as they were, if it is
     implausible."""
     scan = m.rows[row]
     frame[TIME] = (due_ns - m.words[STARTED_NS]) * 1e-9
@@ -165,7 +165,7 @@ def sense(m: Memory, frame: NDArray[np.float64], row: int, k: int, due_ns: int) 
 
 @inlined_kernel
 def estimate(m: Memory, frame: NDArray[np.float64], k: int, newest: bool) -> int:
-    """Do what ``InstrumentLoop._estimate`` does while the outputs may move. Return the number of a pair that disagrees
+    """Do what ``Micron.estimate`` does while the outputs may move. Return the number of a pair that disagrees
     permanently, else 0."""
     words = m.words
     if newest:
@@ -190,7 +190,7 @@ def estimate(m: Memory, frame: NDArray[np.float64], k: int, newest: bool) -> int
 
 @kernel
 def actuate(m: Memory, frame: NDArray[np.float64], k: int, due_ns: int) -> bool:
-    """Do what ``InstrumentLoop._actuate`` does while the outputs may move. Return False if Python must do it."""
+    """Do what ``Micron.actuate`` does while the outputs may move. Return False if Python must do it."""
     words = m.words
     result, mask = write(m.output, words[OUTPUT_FD], frame[COMMAND : COMMAND + 3], clock_ns(words))
     if result == HANDED_OVER:
@@ -210,7 +210,7 @@ def actuate(m: Memory, frame: NDArray[np.float64], k: int, due_ns: int) -> bool:
 
 @kernel
 def publish(m: Memory, frame: NDArray[np.float64]) -> None:
-    """Do what ``InstrumentLoop._publish`` does with a frame."""
+    """Do what ``Micron.publish`` does with a frame."""
     sinks = m.sinks
     if len(sinks.live_words) > 0:
         live_put(sinks.live_words, sinks.live_rows, frame)

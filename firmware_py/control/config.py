@@ -7,19 +7,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field
 
 from firmware_py.control.plausibility import PlausibilityLimits
-from firmware_py.run.safety import SafetyLimits
-
-
-class SelfTestLimits(BaseModel):
-    """Sets how long the sensors must be good without interruption before arming, and the time limit of the self-test.
-
-    ``watch_ms``: required time without interruption. ``limit_ms``: a self-test that takes longer trips.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    watch_ms: float = Field(default=500.0, ge=50.0, le=10_000.0)
-    limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)
+from firmware_py.run.safety import SafetyLimits, SelfTestLimits
 
 
 class FirmwareConfig(BaseModel):

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from drivers.hmc2003 import Hmc2003
 from firmware_py.control.fresh_field import fill_field
+from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding
-from firmware_py.run.incidents import Incidents, LoopCounts
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
@@ -19,17 +19,15 @@ USUAL_NS = 11_000_000
 class FieldInput:
     """Polls the magnetometer and checks its readings.
 
-    ``limit_ms``: how long the field may be missing or stand still before the outputs hold. ``outlier_V``: a second
+    The outputs hold after a field that was missing or stood still for ``magnetometer_ms``. ``outlier_V``: a second
     difference of an axis' readings beyond it is noticed; a hand turns and trembles too slowly for it.
     """
 
-    def __init__(
-        self, magnetometer: Hmc2003, incidents: Incidents, counts: LoopCounts, limit_ms: float, outlier_V: float
-    ) -> None:
+    def __init__(self, magnetometer: Hmc2003, run: Run, outlier_V: float) -> None:
         self._magnetometer = magnetometer
-        self._incidents = incidents
-        self._counts = counts
-        self._limit_ms = limit_ms
+        self._incidents = run.incidents
+        self._counts = run.counts
+        self._limit_ms = run.limits.magnetometer_ms
         self._outlier_V = outlier_V
         self.volts, self.fresh = np.zeros(3), np.zeros(1, np.int64)
         """Hold the newest reading, and 1 in ``fresh`` until it has been taken."""

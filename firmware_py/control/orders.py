@@ -1,62 +1,29 @@
-"""Obeys the bench page's orders to a running loop: safe state, end of a hold, jogging by hand, compensation gain."""
+"""Obeys the bench page's orders that only this instrument has: jogging by hand, and the compensation's gain."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.stages import Stages
-from firmware_py.live.link import LiveLink
-from firmware_py.run.findings import Finding
-from firmware_py.run.incidents import Incidents
-from firmware_py.run.safety import Supervisor
-from hal.contracts import Clock
+from firmware_py.run.context import Run
 
 MAX_GAIN = 1.5
 
 
-class PageOrders:
-    """Obeys the orders that have arrived, and drops invalid ones. ``asked_safe_ns`` is the bench time at which the page
-    asked for the safe state."""
+class HandOrders:
+    """Obeys orders for ``manual`` and ``stages``, and drops invalid ones."""
 
-    def __init__(
-        self,
-        link: LiveLink,
-        manual: ManualDrive,
-        stages: Stages,
-        supervisor: Supervisor,
-        incidents: Incidents,
-        clock: Clock,
-        host_ns: Callable[[], int] = time.monotonic_ns,
-    ) -> None:
-        self._link = link
+    def __init__(self, manual: ManualDrive, stages: Stages, run: Run) -> None:
         self._manual = manual
         self._stages = stages
-        self._supervisor = supervisor
-        self._incidents = incidents
-        self._clock = clock
-        self._host_ns = host_ns
-        self.asked_safe_ns: int | None = None
+        self._run = run
 
-    def obey_all(self) -> None:
-        for order in self._link.orders():
-            self._obey(order)
-
-    def _obey(self, order: Mapping[str, Any]) -> None:
-        now_ns = self._clock.now_ns()
+    def obey(self, order: Mapping[str, Any], now_ns: int) -> None:
+        """Obey ``order``, which came at ``now_ns``."""
         match order:
-            case {"order": "safe"}:
-                asked_ns = order.get("t_ns")
-                # the page stamps with the host's clock, which is not the bench's where bench time is emulated
-                age_ns = self._host_ns() - asked_ns if isinstance(asked_ns, int) else 0
-                self.asked_safe_ns = now_ns - max(0, age_ns)
-                self._incidents.report(Finding.STOPPED_ON_PAGE)
-            case {"order": "rearm"}:
-                if not self._incidents.holds.ask():
-                    self._incidents.note({"event": "rearm refused", "reason": self._incidents.holds.waits_for})
-            case {"order": "arm"} if self._supervisor.may_move:
+            case {"order": "arm"} if self._run.supervisor.may_move:
                 self._manual.arm(now_ns, self._stages.command_V)
             case {"order": "disarm"}:
                 self._manual.disarm()
@@ -64,6 +31,6 @@ class PageOrders:
                 self._manual.jog(now_ns, channel, float(rate))
             case {"order": "gain", "value": float(gain) | int(gain)} if 0.0 <= gain <= MAX_GAIN:
                 self._stages.actuation.params["gain"] = float(gain)
-                self._incidents.note({"event": "compensation gain", "value": float(gain)})
+                self._run.incidents.note({"event": "compensation gain", "value": float(gain)})
             case _:
                 return

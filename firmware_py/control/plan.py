@@ -24,8 +24,9 @@ from drivers.polling import Polling
 from drivers.specs import check_devices
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.stages import StageConfigs
-from firmware_py.control.tasks import Works, task_table
+from firmware_py.control.tasks import task_rows
 from firmware_py.control.wiring import bus_plan
+from firmware_py.run.tasks import bind_tasks
 from firmware_py.scheduler.check import check_table
 from firmware_py.scheduler.task import TickInfo
 from firmware_py.sensing.attitude_params import tip_lever
@@ -179,25 +180,21 @@ def _check_tasks(bench: BenchFile, firmware: FirmwareConfig, polling: Polling, b
     """Raise ``BenchError`` where the rates and budgets of the bench do not fit its ticks, before it is opened."""
     description, where = bench.description, str(bench.path)
 
-    def idle(_: TickInfo) -> None:
-        pass
-
-    works = Works(
-        sense=idle,
-        estimate=idle,
-        actuate=idle,
-        publish=idle,
-        supervise=idle,
-        magnetometer=idle if polling.magnetometer is not None else None,
-        verify=idle if polling.verify is not None else None,
-        monitor=idle if polling.monitor is not None else None,
-        telemetry=idle if polling.telemetry is not None else None,
-    )
     tick_hz = description.clock.tick_hz
     try:
-        check_table(task_table(works, tick_hz, firmware.budget_us, polling, bus_us), (), 1_000_000_000 // tick_hz)
+        rows = task_rows(_Idle(), polling, bus_us)
+        check_table(bind_tasks(rows, tick_hz, firmware.budget_us), (), 1_000_000_000 // tick_hz)
     except BenchError as error:
         raise BenchError(f"{where}: {error}") from error
+
+
+class _Idle:
+    """``Works`` that do nothing: rates and budgets of a table are checked before there is an instrument."""
+
+    def idle(self, info: TickInfo) -> None:
+        pass
+
+    sense = estimate = actuate = publish = supervise = verify = monitor = magnetometer = telemetry = idle
 
 
 def _calibration(bench: BenchFile, name: str) -> dict[str, dict[str, Any]]:

@@ -13,8 +13,7 @@ from firmware_py.control.parity import Parity, Verdict
 from firmware_py.control.plausibility import ScanCheck
 from firmware_py.control.stages import Stages
 from firmware_py.frame import PARITIES, PARITY, STATUS, FrameStatus
-from firmware_py.run.incidents import Incidents
-from firmware_py.run.safety import Supervisor
+from firmware_py.run.context import Run
 
 UNBELIEVED = FrameStatus.INVALID | FrameStatus.STALE | FrameStatus.ALIGNING
 
@@ -23,14 +22,12 @@ class Redundancy:
     """Decides whether to leave out an axis or to end the run. ``labels`` names the axes. An axis is left out only while
     the outputs may move; in a self-test a failing axis is reported instead."""
 
-    def __init__(
-        self, stages: Stages, check: ScanCheck, supervisor: Supervisor, incidents: Incidents, labels: tuple[str, ...]
-    ) -> None:
+    def __init__(self, stages: Stages, check: ScanCheck, run: Run, labels: tuple[str, ...]) -> None:
         self._sensing = stages.sensing
         self._told = stages.frame[PARITY : PARITY + len(PARITIES)]
         self._check = check
-        self._supervisor = supervisor
-        self._incidents = incidents
+        self._supervisor = run.supervisor
+        self._incidents = run.incidents
         self._labels = labels
         self._parity = Parity(self._null()) if self._parities() else None
 

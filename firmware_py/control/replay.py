@@ -39,7 +39,7 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     return StageConfigs.from_dict(tables, str(recording.path))
 
 
-def replay_recording(recording: Recording) -> ReplayReport:
+def replay_micron(recording: Recording) -> ReplayReport:
     """Run the recorded configuration over the recorded inputs and return how the outputs compare."""
     stages = Stages(recorded_configs(recording))
     stages.warm_up(batch=True)

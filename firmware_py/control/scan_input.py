@@ -1,7 +1,7 @@
 """The scans of the DAQ as the loop reads them: failures are reported, starts repeated, every scan counted.
 
 A scan that the device took is received, lost or, at the end, unread. Silence is the device's only while this host was
-awake (``HostGaps``, and what other processes of this host tell of themselves).
+awake (``Run.host_stalled_ms``).
 """
 
 from __future__ import annotations
@@ -10,14 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from firmware_py.control.config import SafetyLimits
-from firmware_py.control.wiring import Devices
+from firmware_py.control.wiring import Daq
+from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding, finding_of_scans
-from firmware_py.run.host_gaps import HostGaps
-from firmware_py.run.incidents import Incidents, LoopCounts
-from firmware_py.run.safety import Supervisor
 from firmware_py.scheduler.ticker import Ticks
-from hal.contracts import Clock
 from hal.errors import HalError
 from hal.types import ScanBlock, Status, TimeSource
 
@@ -25,33 +21,20 @@ MAX_BLOCK = 1024  # the deepest FIFO of a DAQ: one read empties it
 
 
 class ScanInput:
-    """Reads the scans of ``devices.daq`` into ``rows`` and ``block``. ``others_stalled_ms(now_ns, within_ms)`` tells
-    how long another process of this host, which answers for devices, stands or stood still."""
+    """Reads the scans of ``daq`` into ``rows`` (of ``columns`` readings each) and ``block``."""
 
-    def __init__(
-        self,
-        devices: Devices,
-        limits: SafetyLimits,
-        clock: Clock,
-        period_ns: int,
-        counts: LoopCounts,
-        supervisor: Supervisor,
-        incidents: Incidents,
-        others_stalled_ms: Callable[[int, float], float] | None,
-    ) -> None:
-        self.rows = np.zeros((MAX_BLOCK, len(devices.scan.channels)), dtype=np.int16)
-        self.block = ScanBlock(0, 0, period_ns, 0, TimeSource.HOST)
-        self.host_gaps = HostGaps(limits.stale_ms)
+    def __init__(self, daq: Daq, columns: int, run: Run) -> None:
+        self.rows = np.zeros((MAX_BLOCK, columns), dtype=np.int16)
+        self.block = ScanBlock(0, 0, run.period_ns, 0, TimeSource.HOST)
         self.failed = False
         """The scan must be started anew."""
-        self._daq = devices.daq
-        self._limits = limits
-        self._clock = clock
-        self._period_ns = period_ns
-        self._counts = counts
-        self._supervisor = supervisor
-        self._incidents = incidents
-        self._others_stalled_ms = others_stalled_ms
+        self._daq = daq
+        self._run = run
+        self._limits = run.limits
+        self._clock = run.clock
+        self._period_ns = run.period_ns
+        self._counts = run.counts
+        self._incidents = run.incidents
         self._handed_over: Callable[[], ScanBlock] | None = None
         self._was_silent = False
         self._newest_ns = 0  # of the scans that are counted; the start of the scan before the first
@@ -76,13 +59,13 @@ class ScanInput:
             else:
                 block = self._daq.read_scans(self.rows, timeout_s)
         except HalError as error:
-            self.host_gaps.look(due_ns, self._clock.now_ns())
-            stall_ms = self.host_stalled_ms()
+            self._run.host_gaps.look(due_ns, self._clock.now_ns())
+            stall_ms = self._run.host_stalled_ms()
             finding = finding_of_scans(error, stall_ms)
             self._incidents.report_error(finding, self._daq.name, error, stall_ms=stall_ms)
             self.failed = True
             raise
-        self.host_gaps.look(due_ns, self._clock.now_ns())
+        self._run.host_gaps.look(due_ns, self._clock.now_ns())
         self.block = block
         if block.n:
             self._newest_ns = block.t0_ns + (block.n - 1) * block.dt_ns
@@ -123,7 +106,7 @@ class ScanInput:
             self._incidents.notice("scans came late")
             if ticks.n * ticks.dt_ns > limits.stalled_ms * 1e6:
                 self._incidents.report(Finding.HOST_LATE, scans=ticks.n, device=name)
-            elif self._supervisor.is_holding and ticks.n * ticks.dt_ns > limits.stale_ms * 1e6:
+            elif self._run.supervisor.is_holding and ticks.n * ticks.dt_ns > limits.stale_ms * 1e6:
                 holds.interrupt(self._clock.now_ns(), "scans that come in time")
         if ticks.source is not TimeSource.HOST:
             # bytes may have been lost: only a scan that is started anew is known to be whole, and when it was taken
@@ -131,16 +114,10 @@ class ScanInput:
             self._was_silent = False
         elif not self.failed:
             self._was_silent = True
-            if stall_ms := self.host_stalled_ms():
+            if stall_ms := self._run.host_stalled_ms():
                 self._incidents.report(Finding.HOST_OVERSLEPT, stall_ms=stall_ms, device=name)
             else:
                 self._incidents.report(Finding.SCANS_MISSING, device=name, limit_ms=limits.stale_ms)
-
-    def host_stalled_ms(self) -> float:
-        """Return how long (ms) this loop or another process of this host has just stood still, 0 if neither has."""
-        now_ns, within_ms = self._clock.now_ns(), 2.0 * self._limits.stale_ms
-        others_ms = self._others_stalled_ms(now_ns, within_ms) if self._others_stalled_ms is not None else 0.0
-        return max(self.host_gaps.recent_ms(now_ns, within_ms), others_ms)
 
     def restart(self) -> None:
         """Begin a new scan after one that failed, with outputs at neutral, because the driver may take a while for it.

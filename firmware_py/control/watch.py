@@ -1,22 +1,19 @@
-"""Watches over a run: performs the self-test before arming, and checks at 100 Hz everything that no task sees."""
+"""Watches over a run: checks at 100 Hz everything that no task sees, and says what prevents arming."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.plausibility import ScanCheck
 from firmware_py.control.wiring import Devices
 from firmware_py.frame import STATUS, SUPPLY, TEMPERATURE, FrameStatus
+from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding, finding_of_button, finding_of_output
-from firmware_py.run.incidents import Incidents
-from firmware_py.run.safety import State, Supervisor
+from firmware_py.run.safety import State
 from firmware_py.scheduler.task import TickInfo
 from hal.errors import HalError
 
-HOST_PATIENCE = 10.0
-"""The self-test may take so many times longer on a host that stands still now and then."""
 ROOM_MS = 100.0
 """Time for which temperature or supply may be outside their limits. Both are smoothed, and change slowly."""
 
@@ -24,26 +21,19 @@ ROOM_MS = 100.0
 class Watch:
     """Reads the frame and the devices; its only consequence is a finding."""
 
-    def __init__(
-        self,
-        devices: Devices,
-        config: FirmwareConfig,
-        frame: NDArray[np.float64],
-        check: ScanCheck,
-        supervisor: Supervisor,
-        incidents: Incidents,
-    ) -> None:
+    def __init__(self, devices: Devices, frame: NDArray[np.float64], check: ScanCheck, run: Run) -> None:
         self._devices = devices
-        self._config = config
         self.frame = frame
         self._check = check
-        self._supervisor = supervisor
-        self._incidents = incidents
+        self._run = run
+        self._limits = run.limits
+        self._supervisor = run.supervisor
+        self._incidents = run.incidents
 
     def supervise(self, info: TickInfo) -> None:
         """Run the supervising task: check for invalid or saturated readings, temperature, supply, guardian and stop
         button."""
-        frame, limits, incidents = self.frame, self._config.safety, self._incidents
+        frame, limits, incidents = self.frame, self._limits, self._incidents
         status = int(frame[STATUS])
         t_ns = info.due_ns
         if status & FrameStatus.INVALID:
@@ -61,7 +51,7 @@ class Watch:
         incidents.bad_for(Finding.SUPPLY_OUTSIDE, outside, t_ns, ROOM_MS, value=value, low=low, high=high)
         if odd := self._check.odd():
             incidents.notice(odd)
-        self._look_after_the_guardian()
+        self._run.look_after_guardian()
         self._listen_to_the_button()
 
     def _listen_to_the_button(self) -> None:
@@ -76,31 +66,11 @@ class Watch:
         if telemetry.button_silent() and (self._supervisor.may_move or self._supervisor.is_holding):
             incidents.report(Finding.BUTTON_SILENT, device=telemetry.name)
 
-    def _look_after_the_guardian(self) -> None:
-        """Report a lost guardian. Heartbeats go both ways: outputs do not move without a guardian that would take them
-        to neutral."""
-        care, supervisor = self._devices.guardian, self._supervisor
-        if care is None or not (supervisor.may_move or supervisor.is_holding or supervisor.state is State.SELF_TEST):
-            return
-        if why := care.look():
-            self._incidents.report(Finding.GUARDIAN_LOST, what=why)
-
-    def restore_guardian(self, now_ns: int) -> None:
-        """Replace a guardian that is lost; called once per pass of the loop while the outputs rest at neutral."""
-        care = self._devices.guardian
-        if care is None:
-            return
-        try:
-            if waits_for := care.restore(now_ns):
-                self._incidents.holds.wait_for(now_ns, waits_for)
-        except HalError as error:
-            self._incidents.report(Finding.GUARDIAN_FAILED, error=error)
-
     def verify_output(self, info: TickInfo) -> None:
         """Run the read-back task (100 Hz, 300 Hz without a monitor): the amplifier must hold the value it was sent. A
         DAC that restarted or received a wrong value does not, nor one that rests beside neutral in a hold."""
         assert self._devices.verify_output is not None
-        care = self._devices.guardian
+        care = self._run.guardian
         rests = self._supervisor.state is State.HOLD and not (care is not None and care.heart.taken_ns)
         if not (self._supervisor.may_move or rests):
             return
@@ -114,7 +84,7 @@ class Watch:
     def _report_difference(self, what: str) -> None:
         """Report that the outputs differ from the command. After a stall of this process they differ because the
         guardian has moved them; then that is reported instead."""
-        care, name = self._devices.guardian, self._devices.amplifier.name
+        care, name = self._run.guardian, self._devices.amplifier.name
         if care is not None and care.heart.taken_ns:
             self._incidents.report(Finding.OUTPUT_TAKEN, device=name)
         else:
@@ -128,7 +98,7 @@ class Watch:
         if not (self._supervisor.may_move or self._supervisor.state is State.HOLD):
             monitor.forget()
             return
-        limit_ms = self._config.safety.monitor_ms
+        limit_ms = self._limits.monitor_ms
         deaf, reason = False, ""
         try:
             if wrong := monitor.poll():
@@ -153,19 +123,3 @@ class Watch:
             )
             if wrong
         ]
-
-    def self_test_passed(self, watched_ms: float, since_start_ms: float, undisturbed_ms: float) -> bool:
-        """Return True once the sensors were good for ``watch_ms`` without interruption. Trips when that takes longer
-        than ``limit_ms`` since the start, or since the host last stood still (``undisturbed_ms``), up to
-        ``HOST_PATIENCE`` times as long. ``Holds.waits_for`` names an interruption."""
-        limits = self._config.self_test
-        waiting = self.waiting_for()
-        if not waiting and watched_ms >= limits.watch_ms:
-            return True
-        if what := ", ".join(waiting) or self._incidents.holds.waits_for:
-            longest_ms = HOST_PATIENCE * limits.limit_ms
-            if min(since_start_ms, undisturbed_ms) > limits.limit_ms:
-                self._incidents.report(Finding.SELF_TEST_FAILED, what=what, limit_ms=limits.limit_ms)
-            elif since_start_ms > longest_ms:
-                self._incidents.report(Finding.SELF_TEST_DISTURBED, what=what, limit_ms=longest_ms)
-        return False

@@ -19,10 +19,10 @@ from drivers.piezo.dac_output import DacOutput
 from drivers.polling import Polling, polling_of
 from drivers.registry import Role, find_driver, open_device
 from drivers.specs import check_devices
-from firmware_py.guardian.care import GuardianCare
+from firmware_py.run.opening import Probes
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
-from hal.errors import BenchError, HalError, OpenFailed, name_device
+from hal.errors import BenchError, HalError, name_device
 from hal.middleware.share import SharedCan
 from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
@@ -55,9 +55,8 @@ class Devices:
 
     ``scan_labels`` names the six accelerometer axes, supply and temperature for people. ``verify_output`` reads the
     amplifier back in less than a tick and says what differs from the last command, where the device can do that.
-    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``guardian`` looks after the
-    guardian process beside the firmware, where there is one. ``polling``: polling rate of each device; ``bus_us``:
-    time that a transaction of each task takes on the wires, us.
+    ``monitor`` measures what arrives at the stacks, where the bench has wires for it. ``polling``: polling rate of each
+    device; ``bus_us``: time that a transaction of each task takes on the wires, us.
     """
 
     daq: Daq
@@ -70,7 +69,6 @@ class Devices:
     verify_output: Callable[[], str] | None = None
     monitor: AmplifierMonitor | None = None
     identities: dict[str, str] = field(default_factory=dict[str, str])
-    guardian: GuardianCare | None = None
     polling: Polling = NOT_POLLED
     bus_us: Mapping[str, float] = field(default_factory=dict[str, float])
 
@@ -86,15 +84,8 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     options = check_devices(description, where) if options is None else options
     daq_name = _only(description, "daq", "DAQ", where)
     piezo_name = _only(description, "output", "piezo output", where)
-    identities: dict[str, str] = {}
-    failures: list[HalError] = []
-
-    def probe(name: str, ask: Callable[[], str]) -> None:
-        try:
-            identities[name] = ask()
-        except HalError as error:
-            failures.append(error)
-
+    probes = Probes()
+    probe = probes.probe
     daq: Daq = open_device(bench, daq_name, options[daq_name])
     probe(daq_name, daq.probe)
     can = _CanBuses(bench)
@@ -125,8 +116,7 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     for name, spec in description.device.items():
         if spec.bus is not None and find_driver(spec.driver).role == "sensor":
             probe(name, lambda name=name: open_device(bench, name, options[name]).probe())
-    if failures:
-        raise failures[0] if len(failures) == 1 else OpenFailed(failures)
+    probes.raise_failures()
     daq_options: DaqOptions = options[daq_name]
     scan = daq.configure(
         ScanConfig(daq_options.rate_hz, daq_options.channels, (daq_options.range_V,) * len(daq_options.channels))
@@ -147,7 +137,7 @@ def open_devices(bench: OpenBench, options: Mapping[str, Any] | None = None) -> 
     verify = amplifier.verify if isinstance(amplifier, DacOutput) else None
     polling, bus_us = bus_plan(description, options)
     return Devices(
-        daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, identities,
+        daq, scan, amplifier, magnetometer, telemetry, sensing, labels, verify, monitor, probes.identities,
         polling=polling, bus_us=bus_us,
     )  # fmt: skip
 

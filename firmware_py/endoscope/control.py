@@ -63,6 +63,7 @@ class EndoscopeControl:
         self._delayed = (0.0, 0.0)
         self._moved = (0.0, 0.0)
         self._from = self.view
+        self._resumes = False
 
     @property
     def status(self) -> int:
@@ -77,6 +78,8 @@ class EndoscopeControl:
             raise ValueError(f"angles {psi_deg}, {theta_deg} deg and step {dt_s} s must be numbers, dt >= 0")
         if status != self._status:
             self._begin(psi_deg, theta_deg, status)
+        elif self._resumes:
+            self._start_from(psi_deg, theta_deg)
         if status == INACTIVE:
             return self.view
         c = self.config
@@ -90,13 +93,21 @@ class EndoscopeControl:
         self.view, self._moved = self._place(dx, dy)
         return self.view
 
+    def resume(self) -> None:
+        """Let the view go on from where a hold has kept it: the angles of the next sample count as zero."""
+        self._resumes = True
+
     def _begin(self, psi_deg: float, theta_deg: float, status: int) -> None:
         self._status = status
+        self._start_from(psi_deg, theta_deg)
+        self.activations += status != INACTIVE
+
+    def _start_from(self, psi_deg: float, theta_deg: float) -> None:
+        self._resumes = False
         self._zero = self._delayed = (psi_deg, theta_deg)
         self._moved = (0.0, 0.0)
         self.turn_deg = (0.0, 0.0)
         self._from = self.view
-        self.activations += status != INACTIVE
 
     def _place(self, dx: float, dy: float) -> tuple[View, tuple[float, float]]:
         """Return the view after a displacement, kept inside the screen, and the part of the displacement that took

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol
 
 from drivers.ble_motion_card import BleMotionCard
@@ -13,8 +14,9 @@ from drivers.motion_card import MotionCard
 from drivers.options import BleMotionCardOptions, MotionCardOptions
 from drivers.registry import find_driver
 from drivers.specs import check_devices
+from firmware_py.run.opening import Probes
 from hal.bench import BenchDescription, DeviceSpec, OpenBench
-from hal.errors import BenchError, HalError, OpenFailed
+from hal.errors import BenchError, HalError
 from hal.types import Status
 
 
@@ -22,6 +24,11 @@ def is_endoscope(description: BenchDescription) -> bool:
     """Return True if a bench declares inertial sensors or a motion card, and neither a DAQ nor a piezo output."""
     roles = {find_driver(spec.driver).role for spec in description.device.values()}
     return "inertial" in roles and not roles & {"daq", "output"}
+
+
+def inertial_devices(description: BenchDescription) -> dict[str, DeviceSpec]:
+    """Return the inertial sensors and motion cards that a bench declares, by name."""
+    return {name: spec for name, spec in description.device.items() if find_driver(spec.driver).role == "inertial"}
 
 
 class Card(Protocol):
@@ -79,6 +86,10 @@ class Sensors:
     identities: dict[str, str]
     closers: list[Callable[[], None]] = field(default_factory=list[Callable[[], None]])
 
+    def kinds(self) -> dict[str, bool]:
+        """Return for each sensor, by name, whether it is a card."""
+        return {name: sensor.card is not None for name, sensor in self.by_name.items()}
+
     def start(self) -> None:
         """Begin to measure."""
         for sensor in self.by_name.values():
@@ -97,28 +108,28 @@ def open_sensors(bench: OpenBench, only: str | None = None) -> Sensors:
     """
     where, description = str(bench.file.path), bench.file.description
     options = check_devices(description, where)
-    found = {name: spec for name, spec in description.device.items() if find_driver(spec.driver).role == "inertial"}
+    found = inertial_devices(description)
     if only is not None and only not in found:
         raise BenchError(
             f"{where}: [device] there is no inertial sensor '{only}'; there are {', '.join(found) or 'none'}"
         )
-    sensors = Sensors({}, {})
-    failures: list[HalError] = []
+    probes = Probes()
+    sensors = Sensors({}, probes.identities)
     for name, spec in found.items():
         if only in (None, name):
-            try:
-                sensors.by_name[name] = _open(bench, name, spec, options[name], sensors)
-            except HalError as error:
-                failures.append(error)
-    if failures:
+            probes.probe(name, partial(_open, bench, name, spec, options[name], sensors))
+    try:
+        probes.raise_failures()
+    except HalError:
         sensors.close()
-        raise failures[0] if len(failures) == 1 else OpenFailed(failures)
+        raise
     if not sensors.by_name:
         raise BenchError(f"{where}: [device] declares no inertial sensor and no motion card")
     return sensors
 
 
-def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors: Sensors) -> Sensor:
+def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors: Sensors) -> str:
+    """Open and probe one sensor and add it to ``sensors``. Return what it says of itself."""
     match option:
         case ImuOptions():
             if option.mode != "data ready":
@@ -126,8 +137,9 @@ def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors
                     f"{bench.file.path}: [device.{name}.mode] the loop reads sample by sample: 'data ready'"
                 )
             imu = open_imu(spec, option, bench.i2c(spec.bus or ""), bench.clock, name)
-            sensors.identities[name] = imu.probe()
-            return Sensor(name, imu.setup.rate_hz, imu=imu)
+            identity = imu.probe()
+            sensors.by_name[name] = Sensor(name, imu.setup.rate_hz, imu=imu)
+            return identity
         case MotionCardOptions():
             card = MotionCard(
                 bench.serial(spec.bus or ""),
@@ -137,15 +149,17 @@ def _open(bench: OpenBench, name: str, spec: DeviceSpec, option: object, sensors
                 spike_filter=option.spike_filter,
                 name=name,
             )
-            sensors.identities[name] = card.probe()
-            return Sensor(name, option.rate_hz, card=card)
+            identity = card.probe()
+            sensors.by_name[name] = Sensor(name, option.rate_hz, card=card)
+            return identity
         case BleMotionCardOptions():
             from hal.backends.bleak_gatt import BleakGatt  # bleak is optional
 
             link = BleakGatt(option.peripheral, bench.clock)
             card = BleMotionCard(link, bench.clock, rate_hz=option.rate_hz, spike_filter=option.spike_filter, name=name)
             sensors.closers.append(card.close)
-            sensors.identities[name] = card.probe()
-            return Sensor(name, option.rate_hz, card=card)
+            identity = card.probe()
+            sensors.by_name[name] = Sensor(name, option.rate_hz, card=card)
+            return identity
         case _:
             raise BenchError(f"{bench.file.path}: [device.{name}] is no inertial sensor")

@@ -176,6 +176,25 @@ class Finding(Enum):
         "{device}: its converter gives one reading for all axes; it hangs",
         "As for a silent one: nothing false is used, and fresh readings show that it works again.",
     )
+    # -- sensors of another kind
+    SAMPLES_MISSING = _recoverable(
+        "no samples",
+        _LINK,
+        "{device}: no sample for {limit_ms:g} ms; check its link and battery",
+        "A sensor that is silent has said nothing that is wrong; the view goes on from where it stands.",
+    )
+    SENSOR_TRANSFER = _recoverable(
+        "a transfer from a sensor failed",
+        _LINK,
+        "{error}",
+        "The driver knows that the reading was lost; the next one is whole.",
+    )
+    SENSOR_FAILED = _latched(
+        "a sensor failed",
+        _DEVICE,
+        "{error}",
+        "It went away, or answered what its manual does not allow: it must be opened and probed anew.",
+    )
     # -- outputs
     OUTPUT_TRANSFER = _recoverable(
         "a transfer to the outputs failed",
@@ -306,6 +325,12 @@ class Finding(Enum):
         "stopped by the operator (safe button of the bench page)",
         "A person wants the end.",
     )
+    TARGETS_REACHED = _end(
+        "targets reached",
+        _OPERATOR,
+        "all targets reached",
+        "The experiment is over.",
+    )
     FINISHED = _end(
         "finished",
         _OPERATOR,
@@ -328,6 +353,17 @@ def finding_of_scans(error: HalError, stall_ms: float) -> Finding:
             return Finding.DAQ_TRANSFER
         case _:
             return Finding.DAQ_FAILED
+
+
+def finding_of_sensor(error: HalError) -> Finding:
+    """Return the finding for an error of reading a sensor that has no scans."""
+    match error:
+        case Disconnected():
+            return Finding.SENSOR_FAILED
+        case BusError() | HalTimeout():
+            return Finding.SENSOR_TRANSFER
+        case _:
+            return Finding.SENSOR_FAILED
 
 
 def finding_of_button(error: HalError) -> Finding:

@@ -92,6 +92,18 @@ class SafetyLimits(BaseModel):
         return limits
 
 
+class SelfTestLimits(BaseModel):
+    """Sets how long the sensors must be good without interruption before arming, and the time limit of the self-test.
+
+    ``watch_ms``: required time without interruption. ``limit_ms``: a self-test that takes longer trips.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    watch_ms: float = Field(default=500.0, ge=50.0, le=10_000.0)
+    limit_ms: float = Field(default=3000.0, ge=100.0, le=60_000.0)
+
+
 @dataclass(frozen=True)
 class Trip:
     """Records why and when the outputs were taken to their safe state. ``cause``: class of the cause."""
@@ -124,10 +136,11 @@ class Hold:
 
 
 class Supervisor:
-    """Owns the permission to move. ``amplifier`` is the only thing it touches."""
+    """Owns the permission to move. ``output`` is the only thing it touches; an instrument without outputs (``None``) is
+    at neutral at once."""
 
-    def __init__(self, amplifier: AnalogOutput) -> None:
-        self._amplifier = amplifier
+    def __init__(self, output: AnalogOutput | None) -> None:
+        self._output = output
         self._ramp_ticks = 0
         self.state = State.BOOT
         self.trip_cause: Trip | None = None
@@ -163,6 +176,11 @@ class Supervisor:
         """True during a hold, on the way to neutral and at neutral."""
         return self.state in (State.HOLD_RAMP, State.HOLD)
 
+    @property
+    def is_active(self) -> bool:
+        """True from the self-test to the end of the run, also in a hold; never where nothing is armed."""
+        return self.may_move or self.is_holding or self.state is State.SELF_TEST
+
     def begin_self_test(self) -> None:
         if self.state is State.BOOT:
             self.state = State.SELF_TEST
@@ -173,10 +191,9 @@ class Supervisor:
             self.state = State.SENSING_ONLY
 
     def arm(self) -> None:
-        """Arm the amplifier (it tests itself) and allow motion. Nothing is armed after a trip."""
+        """Arm the output (it tests itself) and allow motion. Nothing is armed after a trip."""
         if self.state is State.SELF_TEST:
-            self._amplifier.arm()
-            self.state = State.RUNNING
+            self._arm_output()
 
     def hold(self, finding: Finding, reason: str, *, tick: int, t_ns: int) -> None:
         """Begin a ramp to neutral from which the run can resume. Has no effect unless the state is RUNNING."""
@@ -184,12 +201,19 @@ class Supervisor:
             self.holds.append(Hold(finding, reason, tick, t_ns, finding.value.cause))
             self._ramp_ticks = 0
             self.state = State.HOLD_RAMP
+            if self._output is None:
+                self.holds[-1].neutral_ns = t_ns
+                self.step()
 
     def resume(self) -> None:
-        """Arm the amplifier again (it reads neutral back) and allow motion. If arming raises, the hold continues."""
+        """Arm the output again (it reads neutral back) and allow motion. If arming raises, the hold continues."""
         if self.state is State.HOLD:
-            self._amplifier.arm()
-            self.state = State.RUNNING
+            self._arm_output()
+
+    def _arm_output(self) -> None:
+        if self._output is not None:
+            self._output.arm()
+        self.state = State.RUNNING
 
     def trip(self, finding: Finding, reason: str, *, tick: int, t_ns: int, cause: CauseClass | None = None) -> None:
         """Decide for the safe state; later reasons do not replace the first. ``cause`` replaces the finding's own class
@@ -202,6 +226,8 @@ class Supervisor:
         if self.state is not State.HOLD_RAMP:  # a ramp that is under way keeps its time
             self._ramp_ticks = 0
         self.state = State.SAFE_RAMP
+        if self._output is None:
+            self.step()
 
     def warn(self, what: str) -> None:
         """Count a warning ``what``, which does not end the run."""
@@ -220,7 +246,7 @@ class Supervisor:
         at_neutral = False
         for _ in range(ATTEMPTS):
             try:
-                at_neutral = self._amplifier.safe_step()
+                at_neutral = self._output is None or self._output.safe_step()
             except HalError as error:
                 self.ramp_failure = str(error)
                 if isinstance(error, I2cNack):

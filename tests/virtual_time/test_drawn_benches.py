@@ -15,10 +15,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from firmware_py.control.loop import InstrumentLoop
+from firmware_py.control.app import MicronPlan
+from firmware_py.control.instrument import Micron
 from firmware_py.control.plan import load_plan
-from firmware_py.control.stages import Stages
-from firmware_py.control.wiring import Devices, open_devices
+from firmware_py.run.context import Run
+from firmware_py.run.loop import Loop
 from hal.bench import OpenBench, load_bench, open_bench
 from hal.errors import BenchError
 from sim_devices.lockstep_world import LockstepWorld
@@ -121,10 +122,10 @@ def drawn(seed: int, *, coherent: bool = False) -> Draw:
     )
 
 
-def check_parts(draw: Draw, bench: OpenBench, devices: Devices, loop: InstrumentLoop) -> None:
+def check_parts(draw: Draw, bench: OpenBench, micron: Micron) -> None:
     """Compare the state of each part that runs with the draw."""
     tick_hz, tick_s = draw.tick_hz, 1.0 / draw.tick_hz
-    stages = loop.stages
+    stages, devices = micron.stages, micron.devices
     lag_s = (draw.filter_ohm or 32_000.0) * 0.33e-6
     sense, estimate, act = (stage.params[0] for stage in (stages.sensing, stages.tremor, stages.actuation))
     assert sense["attitude"]["dt_s"] == pytest.approx(tick_s)
@@ -150,8 +151,8 @@ def check_parts(draw: Draw, bench: OpenBench, devices: Devices, loop: Instrument
     ten_bytes = output.duration_ns([]), converters.duration_ns([])
     assert ten_bytes == (int(1e9 / draw.output_hz), int(1e9 / draw.converter_hz))
     # the physical outputs, which no part of the firmware sees: neutral is where the bench file says
-    assert loop.armed_ns is not None
-    assert loop.counts.lost == 0
+    assert micron.run.armed_ns is not None
+    assert micron.run.counts.lost == 0
     lsb_V = 5.0 * draw.gain / 65536
     assert np.asarray(world.world.plant.stack_V) == pytest.approx([draw.neutral_V] * 3, abs=lsb_V)
     assert devices.monitor is not None
@@ -165,13 +166,12 @@ def run_as_drawn(draw: Draw, path: Path) -> None:
     bench = load_bench(path)
     plan = load_plan(bench)
     with open_bench(bench, pace="virtual", runtime_dir=path.parent) as opened:
-        devices = open_devices(opened, plan.options)
-        plan = plan.with_wiring(devices.sensing_table)
-        stages = Stages(plan.stages)
-        stages.warm_up()
-        loop = InstrumentLoop(devices, stages, plan.firmware, opened.clock, tick_hz=plan.tick_hz)
-        loop.run(RUN_S)
-        check_parts(draw, opened, devices, loop)
+        parts = MicronPlan(plan).open(opened)
+        run = Run(opened.clock, 1_000_000_000 // plan.tick_hz, parts.output, plan.firmware.safety)
+        micron = parts.assemble(run)
+        micron.stages.warm_up()
+        Loop(run, micron).run(RUN_S)
+        check_parts(draw, opened, micron)
 
 
 @pytest.mark.parametrize("seed", range(DRAWS))

@@ -21,8 +21,8 @@ def replay(
 
     Example: micron replay out/run.mcap
     """
-    from firmware_py.control.replay import replay_recording
     from firmware_py.recording.reader import Recording
+    from firmware_py.replay import replay_recording
 
     with clear_errors():
         check_writable(json_file)

@@ -74,7 +74,10 @@ def print_run(result: dict[str, Any], console: Console) -> None:
 
 def status_table(status: dict[str, Any], seconds: float) -> Table:
     """A few numbers while it runs."""
-    table = Table(title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}]", title_justify="left")
+    table = Table(
+        title=f"micron run  {status['t_s']:.1f} of {seconds:g} s  [{status['state']}, {status['mode']}]",
+        title_justify="left",
+    )
     for column in ("", "", "", ""):
         table.add_column(column, justify="right")
     table.add_row("roll, pitch, yaw (deg)", *(f"{v:.1f}" for v in status["angles_deg"]))

@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from firmware_py.app import run_in_process
-from firmware_py.compiled.loop import CompiledLoop
+from firmware_py.compiled.loop import CompiledMicron
 from firmware_py.compiled.memory import BEAT_LIMIT_NS
 from firmware_py.recording.reader import Recording
 from firmware_py.run_request import RunRequest
@@ -69,26 +69,26 @@ def test_a_quiet_run(tmp_path: Path):
 
 def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Python's heartbeat counts as stopped for one entry: neutral without Python, a hold, and on."""
-    feed = CompiledLoop._feed  # pyright: ignore[reportPrivateUsage]
+    feed = CompiledMicron._feed  # pyright: ignore[reportPrivateUsage]
     told_V: list[list[float]] = []
 
-    def feed_late(loop: CompiledLoop, last_due_ns: int) -> None:
+    def feed_late(loop: CompiledMicron, last_due_ns: int) -> None:
         feed(loop, last_due_ns)
         words = loop._words  # pyright: ignore[reportPrivateUsage]
         if loop.entries == 200:
             words[BEAT_LIMIT_NS] = -1
 
-    flush = CompiledLoop._flush  # pyright: ignore[reportPrivateUsage]
+    flush = CompiledMicron._flush  # pyright: ignore[reportPrivateUsage]
 
-    def flush_and_look(loop: CompiledLoop) -> None:
+    def flush_and_look(loop: CompiledMicron) -> None:
         flush(loop)
         words = loop._words  # pyright: ignore[reportPrivateUsage]
         if words[BEAT_LIMIT_NS] < 0:
             told_V.append(loop._output.guard.last_V)  # pyright: ignore[reportPrivateUsage]
             words[BEAT_LIMIT_NS] = 100_000_000
 
-    monkeypatch.setattr(CompiledLoop, "_feed", feed_late)
-    monkeypatch.setattr(CompiledLoop, "_flush", flush_and_look)
+    monkeypatch.setattr(CompiledMicron, "_feed", feed_late)
+    monkeypatch.setattr(CompiledMicron, "_flush", flush_and_look)
     outcome, _, _ = run(tmp_path, {}, compiled=True)
     assert told_V == [[50.0, 50.0, 50.0]], "neutral before Python knows"
     assert [hold["finding"] for hold in outcome["holds"]] == ["supervision_silent"]

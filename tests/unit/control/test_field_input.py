@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
 from firmware_py.control.field_input import FieldInput
-from firmware_py.run.incidents import LoopCounts
 from firmware_py.scheduler.task import TickInfo
+from tests.unit.control.stand import StandRun
 
 OUTLIER_V = 0.01
 CURVATURE_V_PER_S2 = 80.0  # second difference 8 mV at 10 ms
@@ -36,10 +35,9 @@ class Magnetometer:
 @pytest.mark.parametrize("interval_ms", [8, 10, 40, 80])
 @pytest.mark.parametrize("broken", [0, 6])
 def test_what_is_out_of_line_depends_on_the_time_between_readings(interval_ms: int, broken: int):
-    noticed: list[str] = []
-    incidents: Any = SimpleNamespace(notice=noticed.append, bad_for=lambda *_, **__: None)
+    run = StandRun()
     magnetometer: Any = Magnetometer(interval_ms * 1_000_000, broken)
-    field = FieldInput(magnetometer, incidents, LoopCounts(), 150.0, OUTLIER_V)
+    field = FieldInput(magnetometer, run, OUTLIER_V)
     for k in range(10):
         field.poll(TickInfo(k, 0, 0, 0))
-    assert bool(noticed) == bool(broken)
+    assert bool(run.counts.noticed) == bool(broken)

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from firmware_py.run.findings import CauseClass, Finding
 from firmware_py.run.holds import MINUTE_NS, OPERATOR
 from firmware_py.run.host_gaps import HostGaps
-from firmware_py.run.incidents import Incidents, LoopCounts
-from firmware_py.run.safety import SafetyLimits, State, Supervisor
-from hal.clock import VirtualClock
+from firmware_py.run.safety import SafetyLimits, State
+from tests.unit.control.stand import StandRun
 
 MS = 1_000_000
 
@@ -21,14 +19,10 @@ class Stand:
     """A running supervisor with an amplifier that is at neutral at once."""
 
     def __init__(self, state: State = State.RUNNING, **limits: Any) -> None:
-        self.clock = VirtualClock()
+        run = StandRun(state, SafetyLimits(**limits))
+        self.clock, self.limits, self.counts = run.clock, run.limits, run.counts
+        self.supervisor, self.incidents = run.supervisor, run.incidents
         self.clock.burn_ns(1000 * MS)
-        self.limits = SafetyLimits(**limits)
-        amplifier = SimpleNamespace(arm=lambda: None, safe_step=lambda: True)
-        self.supervisor = Supervisor(cast(Any, amplifier))
-        self.supervisor.state = state
-        self.counts = LoopCounts()
-        self.incidents = Incidents(self.supervisor, self.counts, self.clock, None, self.limits)
         self.holds = self.incidents.holds
 
     def silence(self) -> None:

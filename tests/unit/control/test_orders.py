@@ -14,35 +14,17 @@ import numpy as np
 import pytest
 
 from firmware_py.control.manual import ManualDrive
-from firmware_py.control.orders import PageOrders
+from firmware_py.control.orders import HandOrders
 from firmware_py.control.stages import Stages
 from firmware_py.exit_codes import Exit, exit_code_of
 from firmware_py.live.link import MAX_ORDERS, LiveLink
 from firmware_py.live.memory import LiveMemory
 from firmware_py.run.findings import CauseClass, Finding
-from firmware_py.run.incidents import Incidents, LoopCounts
-from firmware_py.run.safety import State, Supervisor, Trip
+from firmware_py.run.orders import PageOrders
+from firmware_py.run.safety import State, Trip
 from firmware_py.scheduler.histogram import DurationHistogram
-from hal.clock import VirtualClock
-from hal.contracts import AnalogOutput
 from hal.errors import BenchError, DeviceNotFound, HalTimeout, OpenFailed
-
-MS = 1_000_000
-
-
-class Events:
-    """A recorder that keeps what it is told."""
-
-    def __init__(self) -> None:
-        self.events: list[dict[str, object]] = []
-
-    def push(self, row: np.ndarray) -> bool:
-        return True
-
-    def event(self, event: dict[str, object]) -> bool:
-        self.events.append(event)
-        return True
-
+from tests.unit.control.stand import MS, StandRun
 
 HOST_AHEAD_NS = 1_000_000_000_000
 
@@ -51,28 +33,19 @@ class Desk:
     """A page at the other end of the control socket, and a loop that may move."""
 
     def __init__(self, *, sensing_only: bool = False) -> None:
-        self.clock = VirtualClock()
-        amplifier = cast(AnalogOutput, SimpleNamespace(arm=lambda: None))
-        self.supervisor = Supervisor(amplifier)
-        if sensing_only:
-            self.supervisor.begin_sensing()
-        else:
-            self.supervisor.begin_self_test()
-            self.supervisor.arm()
-        self.recorder, self.counts = Events(), LoopCounts()
-        self.incidents = Incidents(self.supervisor, self.counts, self.clock, self.recorder)
         self.memory = LiveMemory.create(2, 64)
         self.page, ours = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.link = LiveLink(os.dup(self.memory.fd), ours.detach())
+        self.run = StandRun(State.SENSING_ONLY if sensing_only else State.RUNNING, live=self.link)
+        self.clock, self.supervisor, self.incidents = self.run.clock, self.run.supervisor, self.run.incidents
+        self.recorder, self.counts = self.run.recorder, self.run.counts
         self.manual = ManualDrive(0.0, 100.0, 50.0)
         self.params = {"gain": 1.0}
         stages = cast(
             Stages,
             SimpleNamespace(command_V=np.array([40.0, 50.0, 60.0]), actuation=SimpleNamespace(params=self.params)),
         )
-        self.orders = PageOrders(
-            self.link, self.manual, stages, self.supervisor, self.incidents, self.clock, self.host_ns
-        )
+        self.orders = PageOrders(self.run, HandOrders(self.manual, stages, self.run).obey, self.host_ns)
 
     def host_ns(self) -> int:
         """The page stamps its orders with the host's clock, which is not the bench's in emulated time."""
@@ -108,7 +81,7 @@ def test_the_safe_button_is_the_operators_end_of_the_run(desk: Desk):
     desk.say({"order": "safe", "t_ns": HOST_AHEAD_NS + 6_500_000})
     reason = "stopped by the operator (safe button of the bench page)"
     assert desk.supervisor.trip_cause == Trip(Finding.STOPPED_ON_PAGE, reason, 7, 7 * MS, CauseClass.OPERATOR)
-    assert desk.orders.asked_safe_ns == 6_500_000
+    assert desk.run.asked_safe_ns == 6_500_000
     assert desk.recorder.events == [{"t_ns": 7 * MS, "tick": 7, "event": "safe state", "reason": reason}]
     desk.incidents.report(Finding.BUTTON_PRESSED)
     assert desk.supervisor.trip_cause.reason == reason
@@ -118,7 +91,7 @@ def test_the_safe_button_is_the_operators_end_of_the_run(desk: Desk):
 def test_a_safe_order_without_a_time_was_asked_for_now(desk: Desk):
     desk.clock.burn_ns(3 * MS)
     desk.say({"order": "safe", "t_ns": "soon"})
-    assert desk.orders.asked_safe_ns == 3 * MS
+    assert desk.run.asked_safe_ns == 3 * MS
     assert desk.supervisor.state is State.SAFE_RAMP
 
 

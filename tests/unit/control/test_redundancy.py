@@ -11,9 +11,8 @@ import pytest
 from firmware_py.control.parity import ALONE_TICKS, LEARN_TICKS, PATIENCE_TICKS
 from firmware_py.control.redundancy import Redundancy
 from firmware_py.frame import LAYOUT, PARITIES, PARITY, STATUS, FrameStatus
-from firmware_py.run.incidents import Incidents, LoopCounts
-from firmware_py.run.safety import State, Supervisor
-from hal.clock import VirtualClock
+from firmware_py.run.safety import State
+from tests.unit.control.stand import StandRun
 
 # eight directions in the plane of two parities, 22.5 degrees apart
 TURN = np.pi * np.arange(8) / 8
@@ -27,9 +26,8 @@ class Bench:
     def __init__(self, axes: int = 8, state: State = State.RUNNING) -> None:
         self.left_out: list[int] = []
         self.ignored: list[int] = []
-        self.supervisor = Supervisor(cast(Any, SimpleNamespace()))
-        self.supervisor.state = state
-        self.counts = LoopCounts()
+        run = StandRun(state)
+        self.supervisor, self.counts = run.supervisor, run.counts
         self.check = SimpleNamespace(ignore=self.ignored.append, stepped_together=False)
         params = {"parities": np.array([axes - 6]), "null": np.array([NULL[:, :axes]])}
         self.sensing = SimpleNamespace(
@@ -39,8 +37,7 @@ class Bench:
         self.redundancy = Redundancy(
             cast(Any, SimpleNamespace(sensing=self.sensing, frame=self.frame)),
             cast(Any, self.check),
-            self.supervisor,
-            Incidents(self.supervisor, self.counts, VirtualClock(), None),
+            run,
             tuple(f"acc{i}" for i in range(axes)),
         )
 

@@ -8,16 +8,14 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.watch import Watch
 from firmware_py.frame import LAYOUT, STATUS, SUPPLY, TEMPERATURE, FrameStatus
 from firmware_py.guardian.heart import Heart, Why
 from firmware_py.run.findings import CauseClass
-from firmware_py.run.incidents import Incidents, LoopCounts
-from firmware_py.run.safety import SafetyLimits, State, Supervisor
+from firmware_py.run.safety import SafetyLimits, State
 from firmware_py.scheduler.task import TickInfo
-from hal.clock import VirtualClock
 from hal.errors import HalTimeout
+from tests.unit.control.stand import StandRun
 
 WIDTH = max(column.start + column.size for column in LAYOUT)
 
@@ -32,20 +30,17 @@ WIDTH = max(column.start + column.size for column in LAYOUT)
     ],
 )
 def test_an_output_that_the_guardian_has_moved_is_not_the_amplifiers_fault(taken: bool, look: str, says: str) -> None:
-    supervisor = Supervisor(cast(Any, SimpleNamespace()))
-    supervisor.state = State.RUNNING
-    incidents = Incidents(supervisor, LoopCounts(), VirtualClock(), None)
     heart = Heart()
     if taken:
         heart.take(Why.SILENT, 7)
+    run = StandRun(guardian=SimpleNamespace(heart=heart))
+    supervisor = run.supervisor
     devices = SimpleNamespace(
         amplifier=SimpleNamespace(name="piezo"),
         verify_output=lambda: "output 1 holds 50 V and was told 29 V",
         monitor=SimpleNamespace(poll=lambda: "output 1 is at 50 V", forget=lambda: None, name="monitor"),
-        guardian=SimpleNamespace(heart=heart),
     )
-    config = SimpleNamespace(safety=SimpleNamespace(monitor_ms=100.0))
-    watch = Watch(cast(Any, devices), cast(Any, config), cast(Any, None), cast(Any, None), supervisor, incidents)
+    watch = Watch(cast(Any, devices), np.zeros(WIDTH), cast(Any, None), run)
     getattr(watch, look)(cast(TickInfo, SimpleNamespace(due_ns=0, k=0)))
     if taken:  # the guardian gives them back
         assert supervisor.holds[0].reason.startswith(says)
@@ -59,20 +54,16 @@ class Watched:
     """A watch over a bench of fakes; ``supervise`` and what was said."""
 
     def __init__(self, state: State = State.RUNNING, **devices: Any) -> None:
-        self.supervisor = Supervisor(cast(Any, SimpleNamespace()))
-        self.supervisor.state = state
-        self.counts = LoopCounts()
-        incidents = Incidents(self.supervisor, self.counts, VirtualClock(), None)
+        self.run = StandRun(state, guardian=devices.pop("guardian", None))
+        self.counts = self.run.counts
         self.frame = np.zeros(WIDTH)
         self.frame[TEMPERATURE], self.frame[SUPPLY] = 25.0, 5.0
-        found = {"telemetry": None, "guardian": None, "monitor": None, "verify_output": None, **devices}
+        found = {"telemetry": None, "monitor": None, "verify_output": None, **devices}
         self.watch = Watch(
             cast(Any, SimpleNamespace(amplifier=SimpleNamespace(name="piezo"), **found)),
-            FirmwareConfig(),
             self.frame,
             cast(Any, SimpleNamespace(odd=lambda: "")),
-            self.supervisor,
-            incidents,
+            self.run,
         )
 
     def supervise(self, at_ms: float = 0.0) -> str:
@@ -82,10 +73,7 @@ class Watched:
 
     @property
     def tripped(self) -> str:
-        cause = self.supervisor.trip_cause
-        if cause is None and self.supervisor.holds:
-            return self.supervisor.holds[-1].reason
-        return "" if cause is None else cause.reason
+        return self.run.reason
 
 
 def button(pressed: bool = False, silent: bool = False) -> Any:
@@ -167,18 +155,8 @@ def test_outputs_that_may_not_move_are_not_looked_at() -> None:
     assert not bench.counts.noticed
 
 
-def test_the_self_test_waits_and_then_names_all_that_it_waits_for() -> None:
-    bench = Watched(State.SELF_TEST, telemetry=button())
-    limits = FirmwareConfig().self_test
-    assert not bench.watch.self_test_passed(limits.watch_ms - 1.0, 5000.0, 5000.0)
-    assert bench.watch.self_test_passed(limits.watch_ms, 5000.0, 5000.0)
+def test_all_that_prevents_arming_is_named() -> None:
+    assert Watched(State.SELF_TEST, telemetry=button()).watch.waiting_for() == []
     bench = Watched(State.SELF_TEST, telemetry=button(silent=True))
     bench.frame[STATUS] = FrameStatus.ALIGNING
-    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms, limits.limit_ms)
-    assert not bench.tripped
-    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms + 1.0, 1.0)
-    assert not bench.tripped
-    assert not bench.watch.self_test_passed(limits.limit_ms, limits.limit_ms + 1.0, limits.limit_ms + 1.0)
-    assert bench.tripped == (
-        f"self-test: attitude is not aligned, the stop button has not been heard after {limits.limit_ms:g} ms"
-    )
+    assert bench.watch.waiting_for() == ["attitude is not aligned", "the stop button has not been heard"]

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from firmware_py.app import run_in_process
-from firmware_py.control.replay import replay_recording
 from firmware_py.recording.reader import Recording
+from firmware_py.replay import replay_recording
 from firmware_py.run_request import RunRequest
 from tests.conftest import DEFAULT_BENCH
 

@@ -43,10 +43,11 @@ def test_it_is_where_the_page_says(name: str, path: str):
 
 def test_each_leads_to_the_next():
     nodes = dict(zip((name.rsplit(".", 1)[-1] for name, _ in STEPS), (found(*step) for step in STEPS), strict=True))
-    loop = ast.parse((ROOT / "firmware_py" / "control" / "loop.py").read_text(encoding="utf-8"))
+    micron = ast.parse((ROOT / "firmware_py" / "control" / "instrument.py").read_text(encoding="utf-8"))
+    table = ast.parse((ROOT / "firmware_py" / "control" / "tasks.py").read_text(encoding="utf-8"))
     scans = ast.parse((ROOT / "firmware_py" / "control" / "scan_input.py").read_text(encoding="utf-8"))
     assert "read_scans" in called(scans)
-    assert "ScanInput" in called(loop)
+    assert {"ScanInput", "task_rows"} <= called(micron)
     assert {"sense_kernel", "estimate_kernel", "actuate_kernel"} <= called(nodes["step_kernel"])
-    assert "write" in called(nodes["_actuate"])
-    assert {"_sense", "_actuate"} <= called(loop)
+    assert "write" in called(nodes["actuate"])
+    assert {"sense", "estimate", "actuate"} <= called(table)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from firmware_py.endoscope.app import run_endoscope
+from firmware_py.endoscope.app import EndoscopePlan
 from firmware_py.endoscope.config import EndoscopeConfig, load_endoscope_config
 from firmware_py.endoscope.report import experiment
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
 from firmware_py.endoscope.wiring import is_endoscope
+from firmware_py.run.session import run_plan
 from firmware_py.run_request import RunRequest, open_requested
 from hal.bench import OpenBench, load_bench
 from hal.clock import VirtualClock
@@ -72,10 +73,8 @@ def play_on_bench(
     led = replace(bench, description=described)
     with open_requested(request, led, None) as opened:
         hands = _HandsOn(opened, next(iter(cards)), SyntheticUser(user, task_of(config.game)))
-        loop, outcome = run_endoscope(
-            request, led, opened, on_status, config=config, on_state=hands.see, until_done=True
-        )
-        return {**outcome, "experiment": experiment(loop.game)}
+        plan = EndoscopePlan(led, config, hands.see, until_done=True)
+        return run_plan(request, plan, opened, on_status)[1]
 
 
 class _HandsOn:

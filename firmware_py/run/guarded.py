@@ -1,15 +1,14 @@
-"""Start the guardian of a bench: a process in real time, callbacks of the clock in virtual time."""
+"""Starts the guardian of a bench's output: a process in real time, callbacks of the clock in virtual time."""
 
 from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable, Iterator
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 from drivers.piezo.dac_output import DacOutput
 from drivers.specs import device_options
-from firmware_py.control.wiring import Devices
 from firmware_py.guardian.amplifier import GuardedAmplifier
 from firmware_py.guardian.care import GuardianCare, start_failed
 from firmware_py.guardian.gate import LEASE_MARGIN_MS
@@ -19,23 +18,32 @@ from firmware_py.guardian.process import GuardianProcess
 from firmware_py.run.safety import SafetyLimits
 from hal.bench import I2cSpec, OpenBench, Processes
 from hal.clock import VirtualClock
+from hal.contracts import AnalogOutput
 
 START_NS = 500_000_000
 """In virtual time: how long a new guardian takes to start, about as long as its process takes."""
 
 
+@dataclass(frozen=True)
+class Guarded:
+    """Holds the output of a run. ``care`` and ``heart`` are those of its guardian, ``None`` without one."""
+
+    output: AnalogOutput | None
+    care: GuardianCare | None = None
+    heart: Heart | None = None
+
+
 @contextlib.contextmanager
 def guarded(
-    opened: OpenBench, devices: Devices, limits: SafetyLimits, runtime_dir: Path, *, may_end_us: bool = False
-) -> Iterator[Heart | None]:
-    """Puts a guardian beside ``devices.amplifier`` where that is a DAC without a watchdog; yields its heartbeat.
+    opened: OpenBench, output: AnalogOutput | None, limits: SafetyLimits, *, may_end_us: bool = False
+) -> Iterator[Guarded]:
+    """Puts a guardian beside ``output`` where that is a DAC without a watchdog of its own.
 
-    ``may_end_us``: it may kill this process when that stands still in the middle of a command.
-    Raises ``OpenFailed`` when it has no way to the amplifier.
+    ``may_end_us``: the guardian may kill this process when it stands still in the middle of a command.
+    Raises ``OpenFailed`` when the guardian has no way to the output.
     """
-    amplifier = devices.amplifier
-    if not limits.guardian or not isinstance(amplifier, DacOutput):
-        yield None
+    if not limits.guardian or not isinstance(output, DacOutput):
+        yield Guarded(output)
         return
     # without scans there are no commands: the loop's own limit for those comes first
     lease_ms = max(limits.guardian_ms, 2.0 * limits.stale_ms)
@@ -44,23 +52,22 @@ def guarded(
         "limit_ms": lease_ms + LEASE_MARGIN_MS,
         "retry_s": limits.neutral_retry_s,
     }
-    options, part = _options(opened, amplifier.name), type(amplifier)
+    options, part = _options(opened, output.name), type(output)
     if isinstance(opened.clock, VirtualClock):
-        clock, bus = opened.clock, _bus_of(opened, amplifier.name)
+        clock, bus = opened.clock, _bus_of(opened, output.name)
         keeper = VirtualGuardian(
             lambda heart: Guardian(heart, part(bus, clock, **options), clock, **times), clock, opened.processes
         )
     else:
-        driver = opened.file.description.device[amplifier.name].driver
-        order = {**_uri(opened, amplifier.name), "driver": driver, "options": options, **times}
-        keeper = GuardianProcess(order, runtime_dir, may_end_us=may_end_us)
+        driver = opened.file.description.device[output.name].driver
+        order = {**_uri(opened, output.name), "driver": driver, "options": options, **times}
+        keeper = GuardianProcess(order, opened.runtime_dir, may_end_us=may_end_us)
     try:
         if isinstance(keeper, GuardianProcess):
             keeper.await_ready()
         keeper.heart.watch(opened.clock.now_ns())
-        devices.guardian = GuardianCare(keeper)
-        devices.amplifier = GuardedAmplifier(amplifier, keeper, opened.clock, lease_ms=lease_ms)
-        yield keeper.heart
+        leased = GuardedAmplifier(output, keeper, opened.clock, lease_ms=lease_ms)
+        yield Guarded(leased, GuardianCare(keeper), keeper.heart)
     finally:
         keeper.stop()
 
