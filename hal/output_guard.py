@@ -21,7 +21,6 @@ from hal.output_guard_steps import (
     RAMP_DONE,
     RAMP_NEXT,
     RAMP_STEPS,
-    SLEW_LIMITED,
     WRITES,
     admit,
     new_state,
@@ -89,10 +88,6 @@ class OutputGuard:
     @property
     def clipped(self) -> int:
         return self.state.words[CLIPPED]
-
-    @property
-    def slew_limited(self) -> int:
-        return self.state.words[SLEW_LIMITED]
 
     @property
     def told(self) -> list[Told]:

@@ -65,11 +65,6 @@ class ScanTimeline:
         """Number that the next scan will get."""
         return int(self.state["next"][0])
 
-    @property
-    def skew_ppm(self) -> float:
-        """Return the frequency error of the device clock in ppm; positive if it runs slower than the bench clock."""
-        return float(self.state["skew_ns"][0]) / self.dt_ns * 1e6
-
     def stamp(self, n: int, arrival_ns: int) -> tuple[int, int, int]:
         """``n`` scans have just arrived: their first time in ns, their first number, how many were lost before."""
         return self._kernels.stamp_kernel(self.state, n, arrival_ns)

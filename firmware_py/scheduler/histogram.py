@@ -162,9 +162,8 @@ class DurationHistogram:
     def quantile_ns(self, q: float) -> float:
         """Return the value below which a share ``q`` of the counted values lies, 0 when nothing was counted."""
         cumulated = np.cumsum(self.counts())
-        return self._quantile_ns(q, cumulated) if cumulated[-1] else 0.0
-
-    def _quantile_ns(self, q: float, cumulated: np.ndarray) -> float:
+        if not cumulated[-1]:
+            return 0.0
         rank = max(1, int(np.ceil(q * int(cumulated[-1]))))
         index = int(np.searchsorted(cumulated, rank))
         below = int(cumulated[index - 1]) if index else 0
@@ -175,11 +174,10 @@ class DurationHistogram:
 
     def distribution(self) -> Distribution:
         """Return percentiles and extremes; the histogram does not change."""
-        cumulated = np.cumsum(self.counts())
-        n = int(cumulated[-1])
+        n = int(self.counts().sum())
         if n == 0:
             return Distribution(0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1)
-        p50, p99, p99_9 = (self._quantile_ns(q, cumulated) * 1e-3 for q in (0.5, 0.99, 0.999))
+        p50, p99, p99_9 = (self.quantile_ns(q) * 1e-3 for q in (0.5, 0.99, 0.999))
         return Distribution(
             n=n,
             min_us=self.words[_MIN] * 1e-3,

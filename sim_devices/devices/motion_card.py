@@ -42,7 +42,7 @@ STEP_HZ = 500.0  # the filter runs at least so fast
 LONG_PRESS_NS = 500_000_000  # exactly this long is long (errata no. 121)
 SPIKE_NS = 20_000_000
 SPIKE_G, SPIKE_DPS, SPIKE_HZ, SPIKE_TAU_S = (0.25, 0.15, 0.9), (35.0, 25.0, 8.0), 60.0, 5e-3
-BATTERY_MAH, CURRENT_MA, BATTERY_PERIOD_NS = 220.0, 6.184, 1_800_000_000_000
+BATTERY_MAH, CURRENT_MA = 220.0, 6.184
 MAX_WAITING = 4096
 HOUR_NS = 3_600_000_000_000
 
@@ -132,12 +132,6 @@ class MotionCard:
     @battery_percent.setter
     def battery_percent(self, percent: float) -> None:
         self._charge += percent - self.battery_percent
-
-    @property
-    def battery_level(self) -> int:
-        """Return the charge in percent that the battery service (0x180F) publishes, updated every 30 minutes."""
-        since_ns = (self._now_ns - self._start_ns) % BATTERY_PERIOD_NS
-        return min(100, round(self.battery_percent + since_ns / HOUR_NS * CURRENT_MA / BATTERY_MAH * 100.0))
 
     # ------------------------------------------------------------------ wire face
 

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from hal.clock import VirtualClock
 from hal.errors import ErrorKind, SafetyTrip
 from hal.output_guard import RAMP_STEPS, TOLD, OutputGuard, Told
+from hal.output_guard_steps import SLEW_LIMITED
 from hal.types import OutputLimit
 
 LIMIT = OutputLimit(lo_V=5.0, hi_V=95.0, slew_V_per_s=2000.0, safe_V=50.0)
@@ -100,7 +101,7 @@ def test_wishes_in_numbers():
         assert out.admit(np.array(wish)) == mask
         out.sent()
         assert out.last_V == out.next_V == pytest.approx(next_V)
-        assert (out.clipped, out.slew_limited) == (clipped, slew_limited)
+        assert (out.clipped, out.state.words[SLEW_LIMITED]) == (clipped, slew_limited)
 
 
 def test_the_limits_themselves_are_allowed():
@@ -115,7 +116,7 @@ def test_the_edge_of_the_slew_limit_is_allowed():
     out, clock = guard()
     clock.burn_ns(1_000_000)
     assert out.admit(np.array([52.0, 48.0])) == 0
-    assert out.slew_limited == 0
+    assert out.state.words[SLEW_LIMITED] == 0
 
 
 def refused(out: OutputGuard, wish: list[float]) -> SafetyTrip:
@@ -126,7 +127,7 @@ def refused(out: OutputGuard, wish: list[float]) -> SafetyTrip:
 
 def test_a_new_guard_is_not_armed_and_has_done_nothing():
     out = OutputGuard("out", [LIMIT, LIMIT], VirtualClock())
-    assert (out.armed, out.writes, out.clipped, out.slew_limited, list(out.told)) == (False, 0, 0, 0, [])
+    assert (out.armed, out.writes, out.clipped, out.state.words[SLEW_LIMITED], list(out.told)) == (False, 0, 0, 0, [])
     error = refused(out, [50.0, 50.0])
     assert (error.device, "not armed: call arm() first" in str(error)) == ("out", True)
     assert out.ramp()  # it is where a ramp ends

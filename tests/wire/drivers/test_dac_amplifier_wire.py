@@ -11,6 +11,7 @@ from drivers.piezo.dac_amplifier import DacAmplifier
 from hal.clock import VirtualClock
 from hal.errors import BenchError, I2cNack, ProtocolError, SafetyTrip, WrongDevice
 from hal.output_guard import RAMP_STEPS
+from hal.output_guard_steps import SLEW_LIMITED
 from tests.wire.drivers.scripted_ports import ScriptedI2c
 
 MS = 1_000_000
@@ -107,7 +108,7 @@ def test_slew_limit_follows_the_clock():
     # 10 V/ms: one tick allows 10 V = 6553.6 codes
     amplifier, bus, clock = armed(update(39322, 26214, 0x8000), update(0xFFFF, 0x0000, 0x8000))
     assert amplifier.write(np.array([99.0, 1.0, 50.0])) == 0b011
-    assert amplifier.guard.slew_limited == 2
+    assert amplifier.guard.state.words[SLEW_LIMITED] == 2
     clock.burn_ns(4 * MS)
     assert amplifier.write(np.array([99.9984, 0.0, 50.0])) == 0
     bus.done()

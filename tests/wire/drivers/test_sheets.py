@@ -18,10 +18,10 @@ from drivers.piezo.can_amplifier import CanAmplifier
 from drivers.piezo.dac_amplifier import DacAmplifier
 from drivers.piezo.e727 import E727
 from drivers.registry import BUILT_IN
-from drivers.sheets import load_sheet, names
 from hal.clock import VirtualClock
 from hal.types import ScanConfig
 from tests.wire.drivers.scripted_ports import ScriptedCan, ScriptedI2c, ScriptedSerial
+from tests.wire.drivers.sheets import load_sheet, names
 
 # a bare voltage, any of NI's devices, dividers in front of an ADC, a part of another sheet
 NOT_PARTS = {"analog", "nidaqmx", "nidaqmx_ao", "amplifier_monitor", "ble_motion_card"}
