@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tools.research.prove import corpus_page
+from tools.research.prove import corpus_page, gate
 from tools.research.prove.corpus import BLOCK, CORPORA, draw_case, first_block
 from tools.research.prove.corpus_table import corpus_table
 from tools.research.prove.exact import compare_paired, reliability, score_exactly, summarise
@@ -188,7 +188,7 @@ def test_the_page_pairs_the_cases_that_both_engines_have(tmp_path: Path) -> None
         body = {"corpus": "develop", "max_samples": 1000, "revision": "0" * 40, "date": "today", "rows": rows}
         (tmp_path / name).write_text(json.dumps(body))
         runs.append(corpus_page.read(tmp_path / name))
-    text = corpus_page.document(*runs, {"provenance": {"learned": False}})
+    text = corpus_page.document(runs[0], runs[1], {"provenance": {"learned": False}})
     assert "2 cases that both engines have" in text
     assert "| set of names right | 1 | 0 | 1 | 0 |" in text
     assert "| c1 | piezo_stack | creep (severity 4) | wrong, missing_physics: spikes | right," in text
@@ -197,3 +197,49 @@ def test_the_page_pairs_the_cases_that_both_engines_have(tmp_path: Path) -> None
     (tmp_path / "old").write_text("{}")
     with pytest.raises(ValueError, match="not a run over a corpus"):
         corpus_page.read(tmp_path / "old")
+
+
+def _rows(*said: tuple[str, str, tuple[str, ...]]) -> list[dict[str, Any]]:
+    """Rows of (kind, verdict, names said); what is missing is a creep, or a creep and spikes in a pair."""
+    true = {"single": ("creep",), "pair": ("creep", "spikes")}
+    return [
+        {
+            "case": f"c{i:05d}",
+            **score_exactly(_answer(kind, *true.get(kind, ())), _report(verdict, *names)),
+            "cpu_s": 2.0,
+        }
+        for i, (kind, verdict, names) in enumerate(said)
+    ]
+
+
+def test_the_gate_is_passed_by_an_engine_that_is_right_and_by_no_other() -> None:
+    right = _rows(
+        ("single", "missing_physics", ("creep",)), ("pair", "missing_physics", ("creep", "spikes")),
+        ("agrees", "agrees", ()),
+    )  # fmt: skip
+    wrong = _rows(
+        ("single", "missing_physics", ("backlash",)), ("pair", "missing_physics", ("creep",)),
+        ("agrees", "missing_physics", ("creep",)),
+    )  # fmt: skip
+    better = {c.text.split(":")[0]: c.passes for c in gate.criteria((wrong, right))}
+    assert better.pop("95 % intervals that hold") is None  # no case has one
+    assert better.pop('expected calibration error of "sure"') is False  # 0.9 is said, and all are right
+    assert set(better.values()) == {True}
+    worse = {c.text.split(":")[0]: c.passes for c in gate.criteria((right, wrong))}
+    assert {k for k, v in worse.items() if v} == {"CPU"}
+
+
+def test_the_gate_pairs_the_cases_of_one_draw(tmp_path: Path) -> None:
+    (tmp_path / "rows").mkdir()
+    rows = _rows(("single", "missing_physics", ("creep",)), ("agrees", "agrees", ()))
+    for engine, starts in (("old", ("7", "7")), ("new", ("7", "8"))):
+        lines = [json.dumps({**r, "digest": f"a-b-{start}"}) for r, start in zip(rows, starts, strict=True)]
+        (tmp_path / "rows" / f"sealed-2000-{engine}.jsonl").write_text("\n".join(lines))
+    old, new = gate.paired(tmp_path, 2000)
+    assert (old, new) == ([], [])  # the last draw has no case of both
+    (tmp_path / "rows" / "sealed-2000-new.jsonl").write_text(json.dumps({**rows[0], "digest": "c-b-7"}))
+    old, new = gate.paired(tmp_path, 2000)
+    assert [r["case"] for r in old] == [r["case"] for r in new] == ["c00000"]
+    page = gate.document((old, new), 2000, "0123456789abcdef", 1)
+    assert "1 sealed cases" in page
+    assert "partial" in page
