@@ -1,4 +1,4 @@
-"""ADXL-203: two-axis accelerometer with analog outputs, read through a DAQ.
+"""Describes the ADXL-203: two-axis accelerometer with analog outputs, read through a DAQ.
 
 The firmware calibrates it from volts (``firmware_py.sensing``); its facts are in ``drivers/sheets/adxl203.toml``.
 """

@@ -1,4 +1,4 @@
-"""Motion card without its scanner card: 15-byte packets and battery level straight from the air.
+"""Reads a motion card without its scanner card: 15-byte packets and battery level over Bluetooth Low Energy.
 
 Source: Erat 2018 (Erat 2018), 4.3.2 (services and characteristics) and Fig. 4.13. Tested against a stand-in for
 the Bluetooth stack, never yet against a radio.

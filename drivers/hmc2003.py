@@ -1,4 +1,4 @@
-"""HMC-2003: three-axis magnetometer with analog outputs and a set/reset strap, read through an ADS1115.
+"""Drives an HMC-2003: three-axis magnetometer with analog outputs and a set/reset strap, read through an ADS1115.
 
 Source: Honeywell HMC2003 data sheet (1 V/gauss, 2.5 V at zero field, +-2 gauss) and application note AN-201
 (set/reset pulses): a reset pulse reverses the sign of the sensitivity but not of the offset, so

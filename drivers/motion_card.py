@@ -1,4 +1,5 @@
-"""Motion card behind its scanner card: six axes, temperature and the activation button as text on a serial line.
+"""Reads a motion card behind its scanner card: six axes, temperature and the activation button as text on a serial
+line.
 
 Source: Erat 2018 (Erat 2018), section 4.2; formats in ``drivers.motion_card_protocol``. The card's MPU-6050 runs
 at 2 g, 2000 deg/s and 100 Hz. The line has no field for the battery: that level is only on the air (4.3.2).

@@ -1,4 +1,4 @@
-"""Motion card: its text line, its 15-byte packet, its button. Bytes and times in, values out; no port, no clock.
+"""Decodes the motion card's text line, its 15-byte packet and its button, from bytes and times, without port or clock.
 
 Source: Erat 2018, sections 4.2.1, 4.2.2, 6.2, 6.3, with erratum 112 (packet: big-endian int16
 a_x a_y a_z w_x w_y w_z T, then status), 113 (the text says not whether its numbers are counts or scaled: both are

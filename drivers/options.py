@@ -86,10 +86,10 @@ class AnalogOptions(Options):
 
 
 class Ads1115Options(Options):
-    """ADS1115, single-ended channels one after the other.
+    """Holds the keys of an ADS1115, which converts its single-ended channels one after the other.
 
-    ``rate_hz``: how often each input of a magnetometer is read, 100 Hz unless said otherwise. A converter that an
-    amplifier monitor reads has the monitor's rate.
+    ``rate_hz`` is the rate of each input of a magnetometer; the default is 100 Hz. A converter that an amplifier
+    monitor reads has the monitor's rate.
     """
 
     rate_hz: float | None = Field(default=None, gt=0, le=286.0)
@@ -104,7 +104,7 @@ class Hmc2003Options(Options):
 
 
 class AmplifierMonitorOptions(Options):
-    """Monitor voltages of the amplifier's three outputs on an ADC: output volts = ADC volts x ``ratio``.
+    """Holds the keys of an amplifier monitor: output volts = ADC volts x ``ratio``.
 
     ``rate_hz``: readings per second, of one output each; two in five ticks unless said otherwise, fewer
     where conversions take longer than that.
@@ -119,7 +119,7 @@ class AmplifierMonitorOptions(Options):
 
 
 class DacAmplifierOptions(OutputOptions):
-    """AD5696R and an amplifier: output volts = DAC volts x ``gain``.
+    """Holds the keys of an AD5696R with an amplifier: output volts = DAC volts x ``gain``.
 
     ``read_back``: every command is read back within its own transfer; takes 0.21 ms more of the bus, and task budgets
     that leave room for it.

@@ -246,7 +246,7 @@ class Processes:
 
 @dataclass
 class OpenBench:
-    """An opened bench: its clock, its ports by bus name and, where something is emulated, the world behind."""
+    """Holds an opened bench: its clock, its ports by bus name and, if buses are emulated, their world."""
 
     file: BenchFile
     clock: Clock

@@ -79,7 +79,7 @@ class BusError(HalError):
 
 
 class I2cNack(BusError):
-    """Nobody acknowledged the address, or the device refused a data byte."""
+    """Is raised when no device acknowledges the address, or the device refuses a data byte."""
 
     default_kind = ErrorKind.NACK_ADDRESS
 
@@ -91,13 +91,13 @@ class HalTimeout(HalError):
 
 
 class Overrun(HalError):
-    """A buffer overflowed; ``lost`` says how many samples, as far as known."""
+    """Is raised when a buffer overflowed. ``lost`` is the number of lost samples, as far as it is known."""
 
     default_kind = ErrorKind.OVERRUN
 
 
 class Disconnected(HalError):
-    """The port or peer went away."""
+    """Is raised when the port or its peer is gone."""
 
     default_kind = ErrorKind.DISCONNECTED
 

@@ -1,4 +1,4 @@
-"""ADS1115: 16-bit I2C converter, single-ended inputs, one conversion at a time.
+"""Drives an ADS1115: 16-bit I2C converter, single-ended inputs, one conversion at a time.
 
 Source: Texas Instruments ADS1115 data sheet SBAS444, sections "Pointer register", "Conversion register",
 "Config register", "Single-shot mode" and the data-rate tolerance of the electrical characteristics.

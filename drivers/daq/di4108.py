@@ -1,4 +1,4 @@
-"""DATAQ DI-4108 in CDC mode: 8 analog inputs of 16 bit, scanned by the device's own clock.
+"""Drives a DATAQ DI-4108 in CDC mode: 8 analog inputs of 16 bit, scanned by the device's own clock.
 
 Source: DATAQ "Data Acquisition Instrument Command Protocol", 1 Aug 2019 (sections info, slist, srate, dec,
 filter, ps, start, stop, "Binary stream output formats", "Internal FIFO overflow").

@@ -1,4 +1,4 @@
-"""The DI-4108's binary stream as compiled kernels on bytes: the driver and a compiled loop call the same ones.
+"""Decodes the DI-4108's binary stream in compiled kernels, which the driver and a compiled loop share.
 
 ``accept`` looks at bytes that have just been read and decides how many of all can be trusted; ``decode`` turns those
 into scans. Neither reads a port or a clock. See ``drivers.daq.di4108`` for the rules and their source.

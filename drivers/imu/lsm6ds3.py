@@ -1,4 +1,4 @@
-"""LSM6DS3: six axes over I2C, 16 bit, both sensors off after power-up.
+"""Drives an LSM6DS3: six axes over I2C, 16 bit, both sensors off after power-up.
 
 Source: STMicroelectronics DocID026899 (registers, limits) and AN4650 (self-test procedure). Block data update
 keeps the bytes of one sample together (CTRL3_C), and the burst begins with STATUS_REG, so one burst is one

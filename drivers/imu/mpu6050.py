@@ -1,4 +1,4 @@
-"""MPU-6050: six axes over I2C, 16 bit, asleep after power-up.
+"""Drives an MPU-6050: six axes over I2C, 16 bit, asleep after power-up.
 
 Source: InvenSense RM-MPU-6000A-00 rev 4.2 (registers) and PS-MPU-6000A-00 rev 3.4 (times, self-test limits).
 The sensor registers are handed over to the bus side only while the bus is idle (4.17), so one burst is one

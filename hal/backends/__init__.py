@@ -1,4 +1,4 @@
-"""Adapters to the outside world. Each is the only importer of its vendor package, and imports it when opened.
+"""Adapts vendor packages to the contracts. Each adapter alone imports its package, when it is opened.
 
 What lives here: one file per package or kernel interface, and ``open`` that picks one by URI.
 What must not: device knowledge, retries that hide a loss. Raises at opening, with what to do about it, when the

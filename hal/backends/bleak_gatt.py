@@ -1,4 +1,4 @@
-"""Bluetooth Low Energy through the ``bleak`` package (extra ``ble``): a ``GattClient`` over its asyncio client.
+"""Implements ``GattClient`` over the asyncio client of the ``bleak`` package (Bluetooth Low Energy, extra ``ble``).
 
 Its event loop runs in a thread of its own; every call into it has a limit. Never yet run against a radio: the
 tests put a stand-in in the place of ``bleak``.

@@ -1,4 +1,4 @@
-"""AnalogInputScan over NI-DAQmx: hardware-timed, continuous, unread samples never overwritten.
+"""Implements AnalogInputScan over NI-DAQmx: hardware-timed and continuous. Unread samples are never overwritten.
 
 Scaled volts are read and given back as counts of a 16-bit converter of the same range, because each NI channel
 has a calibration polynomial of its own, which ``counts * lsb_V`` could not carry.

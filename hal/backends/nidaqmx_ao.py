@@ -1,4 +1,4 @@
-"""AnalogOutput over NI-DAQmx: one output channel per stack, in front of an amplifier of fixed gain.
+"""Implements AnalogOutput over NI-DAQmx: one output channel per stack, in front of an amplifier of fixed gain.
 
 Software-timed: one sample per tick, on demand. The readback uses the internal channels ``_aoN_vs_aognd`` that
 multifunction devices have, so it measures what the converter really gives.

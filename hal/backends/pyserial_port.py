@@ -1,4 +1,4 @@
-"""SerialPort over the real pyserial: it opens and configures the port, we wait with select on its descriptor.
+"""Implements SerialPort over pyserial, which opens and configures the port; waits use select on its descriptor.
 
 The port's own timeout stays 0 for ever, because changing it reconfigures the port on some systems and may
 corrupt a byte (pyserial issue 394); each call brings its own.
@@ -22,7 +22,7 @@ _GONE = {errno.EIO, errno.ENXIO, errno.ENODEV, errno.EBADF, errno.EPIPE}
 
 
 class PyserialPort:
-    """A tty (USB CDC, UART or pty), 8N1, exclusively opened.
+    """Opens a tty (USB CDC, UART or pty), 8N1, exclusively.
 
     Raises ``DeviceNotFound`` when the path is absent, busy or forbidden.
     """

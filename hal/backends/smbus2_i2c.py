@@ -1,4 +1,4 @@
-"""I2cBus over the real smbus2 on Linux: only ``i2c_rdwr``, which is one combined transfer without the 32-byte
+"""Implements I2cBus over smbus2 on Linux. It uses only ``i2c_rdwr``, which is one combined transfer without the 32-byte
 limit of SMBus blocks.
 
 Error numbers: Linux ``Documentation/i2c/fault-codes.rst``.

@@ -1,4 +1,4 @@
-"""Transcripts: wrap any port, and every transfer is written down with its time, as a golden file for tests.
+"""Writes transcripts: it wraps any port and records every transfer with its time, as a golden file for tests.
 
 Line format (one transfer per line, times in ns since the first line, bytes in hex):
 

@@ -138,7 +138,7 @@ def hand_pose(p, s, reaches, jerks, pose, parts):
 
 @kernel
 def hand_nodes(p, s, noise, reaches, jerks, pose, parts):
-    """The next n nodes: ``pose`` (n, 18), ``parts`` (n, 6).
+    """Fill the next n nodes: ``pose`` (n, 18), ``parts`` (n, 6).
 
     ``noise`` (n, PROCESSES) standard normal, held from node to node. ``p``, ``s``: one-row structured arrays HAND,
     HAND_STATE; ``s`` moves on.
@@ -179,7 +179,7 @@ def between(node0, node1, span, coefficients):
 
 @kernel
 def pose_between(coefficients, s, span, pose):
-    """``pose`` (18,) at the fraction ``s`` (0..1) of the way."""
+    """Fill ``pose`` (18,) at the fraction ``s`` (0..1) between two nodes."""
     for c in range(6):
         k0, k1, k2 = coefficients[c, 0], coefficients[c, 1], coefficients[c, 2]
         k3, k4, k5 = coefficients[c, 3], coefficients[c, 4], coefficients[c, 5]

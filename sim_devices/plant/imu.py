@@ -1,4 +1,4 @@
-"""The analog side of an inertial measurement unit: what its sensing elements make of the motion they feel.
+"""Simulates the analog side of an inertial measurement unit: the outputs of its sensing elements.
 
 out = (I + S) u + b + k (T - 25 degC) + G f + drift, through one pole at the chip's bandwidth, plus noise.
 S: scale errors and misalignment, G: sensitivity of a gyroscope to specific force, drift: first-order Gauss-Markov.
@@ -104,7 +104,7 @@ BMX055_SPEC = ImuSpec(
 
 @dataclass(frozen=True)
 class TriadUnit:
-    """One three-axis sensor as the seed drew it; ``gain`` (3, 3) = I + S."""
+    """Holds the parameters of one three-axis sensor, which the seed draws. ``gain`` (3, 3) is I + S."""
 
     gain: Array
     bias: Array
@@ -136,7 +136,7 @@ def triad_unit(spec: TriadSpec, rng: np.random.Generator, errors: float = 1.0, n
 
 @kernel
 def _triad_step(gain, bias, bias_per_K, scale_per_K, per_m_s2, feels, force, warm_K, state, draw, weights, out):
-    """One sample (3,) into ``out``; ``state`` (4, 3) goes on. ``draw`` (6,) standard normal."""
+    """Compute one sample ``out`` (3,) and update ``state`` (4, 3). ``draw`` (6,) is standard normal."""
     keep, start, end, sigma, drift_keep, drift = weights
     for i in range(3):
         u = gain[i, 0] * feels[0] + gain[i, 1] * feels[1] + gain[i, 2] * feels[2]
@@ -164,7 +164,7 @@ class Triad:
         self._weights: dict[tuple[float, int], tuple[float, float, float, float]] = {}
 
     def sample(self, t_ns: int, bandwidth_hz: float) -> Array:
-        """(3,) after one pole at ``bandwidth_hz``; the signal runs linearly between calls."""
+        """Return a sample (3,) behind one pole at ``bandwidth_hz``. The signal is linear between calls."""
         feels, force, temperature_C = self._feel(t_ns)
         unit = self.unit
         keep, start, end, drift_keep = 0.0, 0.0, 1.0, 1.0  # the first sample is settled
@@ -207,7 +207,7 @@ class Triad:
 
 
 class Imu:
-    """The sensing elements of one chip on a moving body. All times are bench ns and do not run backwards."""
+    """Simulates the sensing elements of one chip on a moving body. All times are bench ns and do not run backwards."""
 
     def __init__(
         self,

@@ -90,7 +90,7 @@ def measure_motion(config: EmulationConfig, kind: str, seconds: float) -> tuple[
     n = round(seconds / NODE_S)
     nodes = pivot_path(seconds, config.seed) if kind == "pivot" else np.zeros((n, 18))
     plant, state = plant_arrays(config, build_unit(config, config.unit), holding_frame(config.hand))
-    # one step a millisecond: the RC filters are exact for input that runs straight in between
+    # one step per millisecond: the RC filters are exact for input that is linear in between
     plant[0]["accelerometer"] = sensor_unit(config.sensors, config.instrument, config.unit, NODE_S).accelerometers
     begin(plant, state, np.zeros(18), np.zeros(6), np.zeros(TRUTH_COLUMNS))
     rng = stream(config.seed, f"lab.{kind}")

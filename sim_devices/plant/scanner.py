@@ -97,7 +97,7 @@ class Scanner:
         return {"t_ns": t_ns, **columns}
 
     def motion(self) -> BodyMotion:
-        """Now."""
+        """Return the motion of the body now."""
         return self.motion_at(self.now_ns)
 
     # ------------------------------------------------------------------ the motion itself

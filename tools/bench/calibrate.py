@@ -36,7 +36,7 @@ class Calibration:
         self._jobs = jobs
         self._applied = applied
         self._folder = session.recorder.folder / "calibrations"
-        self.found: dict[str, Any] | None = None
+        self.identified: dict[str, Any] | None = None
         self._file: Path | None = None
 
     async def poses(self, request: Request) -> Any:
@@ -114,17 +114,17 @@ class Calibration:
 
     async def discard(self, _: Request) -> Any:
         """Forget what was found; back to the original bench if something was applied."""
-        self.found, self._file = None, None
+        self.identified, self._file = None, None
         await self._applied.discard()
 
     def _keep(self, kind: str, toml: str, result: dict[str, Any]) -> None:
         self._folder.mkdir(parents=True, exist_ok=True)
         self._file = self._folder / f"{kind}.found.toml"
         write_text_atomic(self._file, toml)
-        self.found = result
+        self.identified = result
 
     async def state(self, _: Request) -> Any:
-        return {"job": self._jobs.state("calibrate"), "applied": self._applied.what, "found": self.found}
+        return {"job": self._jobs.state("calibrate"), "applied": self._applied.what, "found": self.identified}
 
 
 def calibrate_routes(session: Session, jobs: Jobs, applied: Applied) -> list[BaseRoute]:

@@ -1,4 +1,4 @@
-"""``python -m tools.bench.card BENCH``: the motion card of a bench as JSON lines, for the targeting experiment.
+"""Prints the motion card of a bench as JSON lines for the targeting experiment (``python -m tools.bench.card BENCH``).
 
 psi is the roll, theta the pitch of the card, degrees, from gravity and the rate gyroscope (complementary filter with
 ``BLEND_S``). One line per sample; ``use`` is false for samples that the driver's spike filter held back.

@@ -101,13 +101,13 @@ def description(table: dict[str, Any], data: str) -> dict[str, Any]:
     channels = table.get("channels", [])
     if not isinstance(given, dict) or not isinstance(channels, list) or not all(isinstance(c, dict) for c in channels):
         raise InputError("parameters must be an object and channels a list of objects")
-    typed = {key: said for key, said in given.items() if isinstance(said, str) and said.strip()}
+    typed = {key: value for key, value in given.items() if isinstance(value, str) and value.strip()}
     for line in filter(str.strip, text(table, "others").splitlines()):
-        key, sign, said = line.partition("=")
+        key, sign, value = line.partition("=")
         if not sign or not key.strip() or key.strip() in typed:
             raise InputError(f"other parameters: {line.strip()!r} is not a new name = value; write one a line")
-        typed[key.strip()] = said
-    parameters = {key: parameter_value(key, said.strip()) for key, said in typed.items()}
+        typed[key.strip()] = value
+    parameters = {key: parameter_value(key, value.strip()) for key, value in typed.items()}
     descriptor: dict[str, Any] = {"format": 1, "title": text(table, "title", longest=200) or data, "data": data}
     if clock := text(table, "time_column", longest=200):
         descriptor["time_column"] = clock
@@ -147,14 +147,14 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
                 path.rename(kept)
                 shutil.rmtree(path.parent, ignore_errors=True)
                 return {"recording": kept.name}
-            found = json.loads(await run_module("tools.mismatch.guess", str(path)))
+            guess = json.loads(await run_module("tools.mismatch.guess", str(path)))
         except BaseException as error:
             shutil.rmtree(path.parent, ignore_errors=True)
             if isinstance(error, InputError):
                 raise InputError(str(error).replace(str(path), name)) from None
             raise
         dropped.files[number] = path
-        return {"number": number, "name": name, **found}
+        return {"number": number, "name": name, **guess}
 
     async def describe(request: Request) -> Any:
         """Write the recording folder; what is wrong is one message, and the file stays for the next try."""
@@ -171,8 +171,8 @@ def dropped_routes(session: Session, dropped: Dropped) -> list[BaseRoute]:
         try:
             await run_module("tools.mismatch.guess", "--check", str(descriptor))
         except InputError as error:
-            said = re.sub(r"\[\[channels\]\] \d+ \((.*?)\)", r"column \1", str(error))
-            raise InputError(said.replace(f"{descriptor}: ", "").replace(f"{path}: ", "")) from None
+            message = re.sub(r"\[\[channels\]\] \d+ \((.*?)\)", r"column \1", str(error))
+            raise InputError(message.replace(f"{descriptor}: ", "").replace(f"{path}: ", "")) from None
         path.parent.rename(target)
         dropped.files.pop(text(table, "number"), None)
         return {"recording": f"{title}/"}

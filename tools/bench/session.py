@@ -79,7 +79,7 @@ class Session:
 
     def __init__(self, choice: Choice, recordings: Path) -> None:
         self.choice = choice
-        self.home = choice.bench.parent  # where benches to choose from are; copies run from elsewhere
+        self.home = choice.bench.parent  # folder of the benches to choose from; copies run from elsewhere
         self.identity = secrets.token_hex(8)  # tells an open page that the server is another one
         self.layouts = Layouts(self.home / "layouts")
         self.bench = instrument_bench(choice.bench)
@@ -176,7 +176,7 @@ class Session:
             run.reason = outcome["safe_state"]["reason"]
             run.phase = "safe" if outcome["safe_state"]["reached"] else "ended"
             run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
-            # what was lost, or fell back, at the very end, too
+            # counts of the last ticks, too
             run.status |= {"lost": outcome["samples"]["lost"], "fallbacks": outcome["kinematics"]["fallbacks"]}
             if run is self.run:
                 self.holds.name_by_outcome(outcome["holds"])

@@ -74,8 +74,8 @@ def setup_routes(session: Session) -> list[BaseRoute]:
         The former reads a byte from each address, so that the bus must not be in use; the latter sends nothing.
         """
         uri = text(await body(request), "uri", longest=100)
-        found = found_uris(bool(session.bench.description.emulated_buses()))
-        kind = next((k for k in _SPEEDS if uri in found[k]), None)
+        ports = found_uris(bool(session.bench.description.emulated_buses()))
+        kind = next((k for k in _SPEEDS if uri in ports[k]), None)
         if kind is None:
             raise InputError(f"{uri!r} is not an I2C or CAN bus of this machine")
         busy = [name for name, spec in session.bench.description.bus.items() if spec.uri == uri]

@@ -36,7 +36,7 @@ _BUSES = {  # kind, what hangs on it, more keys
 }
 _SENSORS = {"acc1": "xz", "acc2": "yz", "acc3": "xy"}
 DAQS = {"di4108": "DATAQ DI-4108", "nidaqmx": "NI card (NI-DAQmx)"}
-OUTPUTS = {  # what people call it, its bus, s from a sample to what the command does (benches of this project)
+OUTPUTS = {  # name for people, bus, delay in s from a sample to the effect of its command (this project's benches)
     "dac_amplifier": ("AD5696R and amplifier, I2C", "i2c0", 0.0017),
     "e727": ("PI E-727, serial", "e7270", 0.0070),
     "can_amplifier": ("piezo node on CAN", "can0", 0.0015),
@@ -213,7 +213,7 @@ def checked(content: str, folder: Path) -> list[dict[str, str]]:
         file.write(content)
         file.flush()
         try:
-            found = bench_findings(load_bench(Path(file.name)))
+            findings = bench_findings(load_bench(Path(file.name)))
         except HalError as error:
             raise InputError(str(error).replace(file.name, "the bench file")) from None
-    return [{"part": f.part, "verdict": f.verdict, "detail": f.detail, "remedy": f.remedy} for f in found]
+    return [{"part": f.part, "verdict": f.verdict, "detail": f.detail, "remedy": f.remedy} for f in findings]

@@ -85,7 +85,9 @@ def rest_heights(circle_m: float, ax: float, ay: float) -> Array:
 
 
 def identify_manipulator(data: dict[str, Array], start: ActuationConfig | None = None) -> ManipulatorFit:
-    """Fit all ten parameters. Raises ``InputError`` when the scan cannot fix them."""
+    """Fit all ten parameters to columns ``stroke_um`` and ``tip_um`` (n, 3) of a scan.
+
+    Raises ``InputError`` when the scan does not determine them."""
     config = start or ActuationConfig()
     stroke, tip = data["stroke_um"], data["tip_um"]
     if len(tip) < LEAST_POSITIONS:

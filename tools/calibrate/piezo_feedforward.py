@@ -20,7 +20,7 @@ Complex = NDArray[np.complex128]
 
 TAPS = 6
 BAND_HZ = 40.0
-ENOUGH = 0.002  # of the amplitude, at worst up to BAND_HZ
+ENOUGH = 0.002  # largest error up to BAND_HZ, as a fraction of the amplitude
 MORE_S = (0.0, 0.5e-3, 1.0e-3)
 
 

@@ -22,7 +22,7 @@ LARGEST_TURN_RESIDUAL = 0.15
 LEAST_TURN_STEPS = 20.0
 """Range of an axis over the rms change from sample to sample: 600 for a slow turn, 7 for noise."""
 FEW_TURN_SAMPLES = 1000
-"""With 300 readings of a simulated turn 73 % of the intervals of scale hold the truth; from 2000 on 99 % do."""
+"""Readings below which the intervals are too short: with 300, 73 % of them hold the truth; from 2000 on, 99 %."""
 LARGEST_FLAT_SPREAD_G = 0.05
 LARGEST_FLAT_BIAS_G = 0.5
 LEAST_REACH = 0.8
@@ -135,10 +135,10 @@ def _extremes(raw: Array) -> tuple[Rows, Rows]:
 def _missing_turns(raw: Array, low: Rows, high: Rows, bias: Array, scale: Array) -> tuple[str, ...]:
     """Return the poses that no axis reached. ``low`` and ``high`` are the samples of the extremes."""
     is_known = scale >= LEAST_REACH * scale.max()
-    force = (raw - bias) / np.where(is_known, scale, np.inf)  # an axis that is not told counts as zero
+    force = (raw - bias) / np.where(is_known, scale, np.inf)  # an unknown axis counts as zero
     missing: list[str] = []
     for i in np.flatnonzero(~is_known):
-        # where it stands up the others, which are known, read nothing; where one of them does, it reads nothing itself
+        # an upright axis leaves 0 g to the known others, and reads 0 g while one of them is upright
         upright = scale[i] >= LEAST_REACH / 2.0 * scale.max()
         words = [
             f"{'xyz'[i]} {word}"

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from tools.mismatch.new import NewRecording
     from tools.mismatch.recording import Recording
 
-# what a command needs is imported inside it: `micron --help` shall not wait for the engine
+# each command imports its modules itself, so that `micron --help` does not wait for the engine
 
 app = typer.Typer(help="Find where a simulation and a recording differ, and which physics the simulation lacks.")
 app.command()(watch)

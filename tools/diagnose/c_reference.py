@@ -45,7 +45,7 @@ class CReference:
     library: ctypes.CDLL
 
     def wake(self, late_ns: NDArray[np.int64], period_ns: int, due_ns: int) -> None:
-        """Do what ``wake_kernel.wake`` does. The GIL is not held."""
+        """Wake up n times as ``wake_kernel.wake`` does and fill ``late_ns`` (n,). The GIL is not held."""
         call = self.library.wake
         call.argtypes = [ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64]
         call.restype = None

@@ -36,12 +36,12 @@ class _Replay:
     def next(self) -> Entry | None:
         return self.entries[self.at] if self.at < len(self.entries) else None
 
-    def part(self, found: str) -> Disconnected:
+    def part(self, observed: str) -> Disconnected:
         """Note the divergence; the error ends the scenario."""
         entry = self.next()
         recorded = f"{entry.verb} {' '.join(entry.words)}" if entry is not None else "the end of the transcript"
-        self.log.append(Divergence(self.bus, self.at, recorded, found))
-        return Disconnected(f"{self.bus}: the driver parts from the transcript at entry {self.at}: {found}")
+        self.log.append(Divergence(self.bus, self.at, recorded, observed))
+        return Disconnected(f"{self.bus}: the driver parts from the transcript at entry {self.at}: {observed}")
 
     def info(self) -> PortInfo:
         return PortInfo(f"transcript://{self.bus}", "transcript", True)

@@ -1,4 +1,4 @@
-"""Faults on purpose, between a driver and its port: wrap any port, real or emulated, and count what was done.
+"""Injects faults between a driver and its port: it wraps any port, real or emulated, and counts its faults.
 
 What lives here: a wrapper per kind of port, and the plan that says what happens when.
 What must not: the catalogue of faults and their judgement (``tools.research.faults``), faults behind the wire

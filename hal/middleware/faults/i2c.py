@@ -11,7 +11,7 @@ from hal.types import I2cOp, I2cWrite, PortInfo
 
 
 class FaultI2c:
-    """I2cBus with faults. A silent bus acknowledges nothing; a lost transfer is an address NACK too.
+    """Injects faults into an I2cBus. A silent bus acknowledges nothing; a lost transfer is an address NACK, too.
 
     ``only`` restricts everything but disconnection to one device address.
     """
