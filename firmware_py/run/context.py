@@ -28,7 +28,8 @@ StatusSink = Callable[[dict[str, Any]], None]
 class Run:
     """Holds one run. The instrument and the loop share it; the loop fills the fields that are not arguments.
 
-    ``output`` is what moves, ``None`` for an instrument without outputs; ``guardian`` looks after its guardian process.
+    ``period_ns`` is the tick period. ``output`` moves the actuators, ``None`` for an instrument without outputs;
+    ``guardian`` looks after its guardian process. ``limits`` are ``[firmware.safety]`` of the bench file.
     ``on_status`` gets a small dict now and then and must not block. ``sense_only``: nothing is armed, and a reading
     that would end a run is only noticed. ``others_stalled_ms(now_ns, within_ms)`` returns how long another process of
     this host, which answers for devices, stands or stood still.
@@ -52,15 +53,17 @@ class Run:
     host_gaps: HostGaps = field(init=False)
     scheduler: Scheduler = field(init=False)
     ticks: Ticks | None = field(init=False, default=None)
-    """The ticks under way."""
+    """The ticks under way: number, due time (ns, device clock) and distance (ns) of the scans that have arrived."""
     started_ns: int = field(init=False, default=0)
     """Bench time at which a recording's time begins."""
     end_ns: int | None = field(init=False, default=None)
     """Bench time at which the run has lasted as long as it was asked to; ``None`` before it is armed."""
     armed_ns: int | None = field(init=False, default=None)
+    """Bench time of the first arming; ``None`` before it, and in a run that arms nothing."""
     asked_safe_ns: int | None = field(init=False, default=None)
     """Bench time at which the page asked for the safe state."""
     safe_reached_ns: int | None = field(init=False, default=None)
+    """Bench time at which the ramp to the safe state reached neutral; ``None`` when it has not."""
     ramp_given_up: bool = field(init=False, default=False)
     """The operator has interrupted a ramp that is retried."""
 

@@ -45,9 +45,9 @@ class Loop:
 
     def _background(self) -> list[BackgroundSpec]:
         live = self._run.live
-        background = [BackgroundSpec("status", self._report_status, 150.0)] if self._run.on_status else []
+        background = [BackgroundSpec("status", self._report_status, worst_step_us=150.0)] if self._run.on_status else []
         if live is not None:
-            background.append(BackgroundSpec("histograms", lambda: live.show(self.histograms), 30.0))
+            background.append(BackgroundSpec("histograms", lambda: live.show(self.histograms), worst_step_us=30.0))
         return background
 
     def histograms(self) -> dict[str, DurationHistogram]:
@@ -116,8 +116,10 @@ class Loop:
     # -- arming and holds ---------------------------------------------------------------------------------
 
     def _self_test_passed(self) -> bool:
-        """Return True once the sensors were good for ``watch_ms`` without interruption. Trips when that takes longer
-        than ``limit_ms`` since the start, or since the host last stood still, up to ``HOST_PATIENCE`` times as long.
+        """Return True once the sensors were good for ``watch_ms`` without interruption.
+
+        Trips when that takes longer than ``limit_ms`` since the start, or since the host last stood still, up to
+        ``HOST_PATIENCE`` times as long. Both limits are ``[firmware.self_test]`` of the bench file.
         ``Holds.waits_for`` names an interruption."""
         run, limits = self._run, self._instrument.self_test
         assert limits is not None
@@ -230,7 +232,11 @@ class Loop:
 
 
 def finish_ramp(run: Run) -> None:
-    """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle."""
+    """Finish the ramp on the host clock (the loop, or what drove it, may be gone) and let the outputs settle.
+
+    A ramp step that fails is tried again for ``[firmware.safety] neutral_retry_s``, with pauses that double up to
+    ``LONGEST_PAUSE_NS``. Another SIGINT or SIGTERM during the retries gives the ramp up; neutral is then not confirmed.
+    """
     supervisor, signals = run.supervisor, run.signals
     if run.output is None:
         run.safe_reached_ns = supervisor.trip_cause.t_ns if supervisor.trip_cause is not None else None
