@@ -12,10 +12,10 @@ from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero, 
 from tools.mismatch.engine.found import share_among
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import ParameterValue, Report
-from tools.mismatch.engine.revise import added
 from tools.mismatch.engine.screen import Candidate, places
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.vary import added
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 

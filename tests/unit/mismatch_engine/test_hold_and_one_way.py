@@ -13,9 +13,9 @@ from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, with_hold
 from tools.mismatch.engine.one_way import direction, one_way
 from tools.mismatch.engine.report import BaseShift
-from tools.mismatch.engine.revise import added
 from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
+from tools.mismatch.engine.vary import added
 from tools.mismatch.recording import Recording
 from tools.mismatch.report import wording
 from tools.mismatch.twins.linear import between_samples

@@ -35,7 +35,7 @@ from tools.mismatch.engine.report import (
 )
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import held_rms
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.unexplained import Leftover, about
 from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio, judge, within_tolerance
 from tools.mismatch.engine.workers import mapped

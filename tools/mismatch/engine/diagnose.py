@@ -29,7 +29,8 @@ from tools.mismatch.engine.report import Hold, Report, Withheld
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.screen import Candidate
-from tools.mismatch.engine.select import Selection, search
+from tools.mismatch.engine.select import search
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
 from tools.mismatch.engine.trust import broken, stayed
 from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger

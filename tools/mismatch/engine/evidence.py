@@ -20,10 +20,10 @@ from tools.mismatch.engine.found import human_values, parameters_of
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import ParameterValue, Withheld, WithheldReason
-from tools.mismatch.engine.revise import reduced, replaced, size
 from tools.mismatch.engine.score import held_rms, misfits
 from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
+from tools.mismatch.engine.vary import reduced, replaced, size
 from tools.mismatch.placed import Placed
 
 

@@ -11,10 +11,11 @@ from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.parsimony import freedom
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.residual import residuals
-from tools.mismatch.engine.revise import added, beyond_limits, reordered, size, total
+from tools.mismatch.engine.revise import reordered, total
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import CLEAR_P, Trial
+from tools.mismatch.engine.vary import added, beyond_limits, size
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model

@@ -12,11 +12,12 @@ from tools.mismatch.engine.families import FILTERS, LOOSE, beside_flexible, in_d
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.parsimony import Rule, choose, refine
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import pair_search, size
+from tools.mismatch.engine.revise import pair_search
 from tools.mismatch.engine.score import misfits
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import LEAST_FITS, MOST_FITS, Progress, Trial, try_all
 from tools.mismatch.engine.unexplained import SHAPELESS, Stranger, about, stranger
+from tools.mismatch.engine.vary import size
 from tools.mismatch.placed import Placed
 
 MOST_EXCUSED = 0.1  # of the samples: more is not short and isolated

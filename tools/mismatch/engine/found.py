@@ -15,10 +15,10 @@ from tools.mismatch.engine.intervals import Uncertainty
 from tools.mismatch.engine.parsimony import Rule, as_good, complexity
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Alternative, Equivalent, ParameterValue, PhysicsFound
-from tools.mismatch.engine.revise import reduced
 from tools.mismatch.engine.score import compare, misfits, paired_t
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.vary import reduced
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.ode import inside_of
 

@@ -19,7 +19,7 @@ from tools.mismatch.engine.intervals import jacobian, uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.score import misfits
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.make import make

@@ -9,9 +9,9 @@ import numpy as np
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import size
 from tools.mismatch.engine.score import block_energy, misfits, paired_t
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.vary import size
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
 

@@ -12,40 +12,14 @@ from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.score import block_energy, compare, misfits, paired_t
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.vary import added, beyond_limits, reduced, replaced, size
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_start import prepare, starts
 
 Array = np.ndarray
 
 INDISPENSABLE = 0.5  # share of the mean square that would come back: then few independent blocks are no reason
 OTHER = 0.02  # share of what an effect takes that the right name may cost where the fitted figures rule this one out
-
-
-def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
-    """The fit without one of its effects, everything else fitted again."""
-    placed = [p for j, p in enumerate(fitted.model.placed) if j != drop]
-    model = Model(problem.twin, placed)
-    theta = model.carry(fitted.model, fitted.theta, problem.recording)
-    return fit(
-        problem, model, [theta], stride=2, iterations=12, keep=fitted,
-        touched=fitted.model.together(fitted.model.placed[drop].outputs),
-    )  # fmt: skip
-
-
-def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
-    """The fit with one effect replaced by a rival, prepared and started from what the others leave."""
-    rest = reduced(problem, fitted, drop)
-    return added(problem, rest, rival)
-
-
-def added(problem: Problem, current: Fit, place: Placed) -> Fit:
-    """The fit with one more effect, from its own starting points."""
-    placed = prepare(current.model, problem.fit_view, current.theta, place)
-    model = Model(problem.twin, (*current.model.placed, placed))
-    theta = model.carry(current.model, current.theta, problem.recording)
-    begin = starts(model, len(model.placed) - 1, problem.fit_view, theta)
-    return fit(problem, model, begin, stride=2, iterations=12, keep=current, touched=placed.outputs)
 
 
 def total(problem: Problem, fitted: Fit) -> float:
@@ -169,23 +143,6 @@ def simplify_pass(
                 fitted = turned
                 changed.append(k)
     return fitted, changed
-
-
-def beyond_limits(fitted: Fit, placed: Placed) -> bool:
-    """Return whether a report figure of a fitted effect is beyond what its physics can be."""
-    limits, forbidden = placed.effect.limits, placed.effect.forbidden
-    if not limits and not forbidden:
-        return False
-    found = fitted.model.human(fitted.theta)[placed.label]
-    outside = any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
-    return outside or any(a <= h.value <= b for h in found for a, b in forbidden.get(h.name, ()))
-
-
-def size(placed: Placed) -> int:
-    """Return how many numbers an effect brings, events read off the data included."""
-    parts = placed.parts
-    events = sum(len(placed.settings.get(key, ())) for key in ("at", "shift", "times_s", "starts"))
-    return len(parts.nonlinear) + len(parts.weights) + events
 
 
 def reordered(problem: Problem, fitted: Fit, k: int) -> Fit:

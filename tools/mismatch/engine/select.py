@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -15,33 +15,17 @@ from tools.mismatch.engine.locate import follow
 from tools.mismatch.engine.other_way import other_pair
 from tools.mismatch.engine.parsimony import Rule, fewest
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import added, prune, reduced, simplify_pass, size, swap_pass, total
+from tools.mismatch.engine.revise import prune, simplify_pass, swap_pass, total
 from tools.mismatch.engine.score import block_energy, compare, misfits
 from tools.mismatch.engine.screen import bend, one_step, places
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.trial import Progress, Trial
-from tools.mismatch.engine.unexplained import Stranger
+from tools.mismatch.engine.vary import added, reduced, size
 
 WORTH_ANOTHER = 0.5  # noise variances that one way must leave before another is tried, and
 BEYOND = 1.5  # times what the form of its effects may leave;
 CROWDED = 0.25  # where more than two effects share an output, their number is suspect by itself
 LEAST_OF_A_WALK = 0.4  # of what is left, where its own test speaks for it and nothing else does
-
-
-@dataclass(frozen=True)
-class Selection:
-    """``problem`` with the noise floors as they were found on the way, ``fitted`` the model with everything accepted,
-    ``steps`` the accepted trials in order, ``rivals`` per step the other acceptable trials, best first; ``first`` all
-    trials against the recalibrated base.
-    """
-
-    problem: Problem
-    base: Fit
-    fitted: Fit
-    steps: tuple[Trial, ...]
-    rivals: tuple[tuple[Trial, ...], ...]
-    first: tuple[Trial, ...] = field(default=())
-    strange: Stranger | None = None
-    """A context signal whose free curve does better than the next effect would have done: the search ended there."""
 
 
 def search(

@@ -16,7 +16,7 @@ from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.engine.report import Meaning, Verdict
 from tools.mismatch.engine.score import compare, fit_rms, held_rms
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.unexplained import Leftover, lone_event
 from tools.mismatch.placed import Free
 

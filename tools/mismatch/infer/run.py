@@ -20,11 +20,11 @@ from tools.mismatch.engine.identifiability import experiment
 from tools.mismatch.engine.noise import floor_interval
 from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.report import Alternative, Equivalent, Hold, Report, Sealed
-from tools.mismatch.engine.revise import size
 from tools.mismatch.engine.score import block_energy, compare, held_rms, misfits
 from tools.mismatch.engine.screen import Candidate
-from tools.mismatch.engine.select import Selection
+from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.vary import size
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import Answer, decide, recalibrated

@@ -12,10 +12,10 @@ from scipy.stats import norm
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.revise import added, beyond_limits, size
 from tools.mismatch.engine.score import compare, winsorised
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
+from tools.mismatch.engine.vary import added, beyond_limits, size
 from tools.mismatch.infer.constants import Constants
 from tools.mismatch.infer.density import (
     LEAST,

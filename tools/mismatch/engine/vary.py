@@ -1,0 +1,52 @@
+"""A fitted set of effects with one left out, one more, or one replaced; and what an effect brings."""
+
+from __future__ import annotations
+
+from tools.mismatch.engine.fit import Fit, fit
+from tools.mismatch.engine.problem import Problem
+from tools.mismatch.placed import Placed
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_start import prepare, starts
+
+
+def reduced(problem: Problem, fitted: Fit, drop: int) -> Fit:
+    """The fit without one of its effects, everything else fitted again."""
+    placed = [p for j, p in enumerate(fitted.model.placed) if j != drop]
+    model = Model(problem.twin, placed)
+    theta = model.carry(fitted.model, fitted.theta, problem.recording)
+    return fit(
+        problem, model, [theta], stride=2, iterations=12, keep=fitted,
+        touched=fitted.model.together(fitted.model.placed[drop].outputs),
+    )  # fmt: skip
+
+
+def replaced(problem: Problem, fitted: Fit, drop: int, rival: Placed) -> Fit:
+    """The fit with one effect replaced by a rival, prepared and started from what the others leave."""
+    rest = reduced(problem, fitted, drop)
+    return added(problem, rest, rival)
+
+
+def added(problem: Problem, current: Fit, place: Placed) -> Fit:
+    """The fit with one more effect, from its own starting points."""
+    placed = prepare(current.model, problem.fit_view, current.theta, place)
+    model = Model(problem.twin, (*current.model.placed, placed))
+    theta = model.carry(current.model, current.theta, problem.recording)
+    begin = starts(model, len(model.placed) - 1, problem.fit_view, theta)
+    return fit(problem, model, begin, stride=2, iterations=12, keep=current, touched=placed.outputs)
+
+
+def beyond_limits(fitted: Fit, placed: Placed) -> bool:
+    """Return whether a report figure of a fitted effect is beyond what its physics can be."""
+    limits, forbidden = placed.effect.limits, placed.effect.forbidden
+    if not limits and not forbidden:
+        return False
+    found = fitted.model.human(fitted.theta)[placed.label]
+    outside = any(not limits[h.name][0] <= h.value <= limits[h.name][1] for h in found if h.name in limits)
+    return outside or any(a <= h.value <= b for h in found for a, b in forbidden.get(h.name, ()))
+
+
+def size(placed: Placed) -> int:
+    """Return how many numbers an effect brings, events read off the data included."""
+    parts = placed.parts
+    events = sum(len(placed.settings.get(key, ())) for key in ("at", "shift", "times_s", "starts"))
+    return len(parts.nonlinear) + len(parts.weights) + events
