@@ -17,9 +17,9 @@ import numpy as np
 
 from drivers.adc.ads1115 import EXCHANGE_NS, ORDER_NS, RATE_TOLERANCE, WAKE_UP_NS, Ads1115
 from drivers.options import AmplifierMonitorOptions
+from drivers.output_guard import OutputGuard
 from drivers.registry import Driver
 from hal.contracts import Clock, Float64Array
-from hal.output_guard import OutputGuard
 
 GROSS = 8.0
 """Deviation, as a multiple of the tolerance, that one reading proves: neither noise nor a model error is as large."""

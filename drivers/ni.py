@@ -8,8 +8,8 @@ from drivers.options import NiDaqOptions, NiOutputOptions
 from drivers.registry import Driver, Site
 
 if TYPE_CHECKING:
+    from drivers.ni_output import NidaqmxOutput
     from hal.backends.nidaqmx_ai import NidaqmxScan
-    from hal.backends.nidaqmx_ao import NidaqmxOutput
 
 
 def _open_input(site: Site) -> NidaqmxScan:
@@ -19,7 +19,7 @@ def _open_input(site: Site) -> NidaqmxScan:
 
 
 def _open_output(site: Site) -> NidaqmxOutput:
-    from hal.backends.nidaqmx_ao import NidaqmxOutput
+    from drivers.ni_output import NidaqmxOutput
 
     table = site.options.model_dump()
     return NidaqmxOutput(table.pop("device"), site.bench.clock, table.pop("channels"), name=site.name, **table)

@@ -15,10 +15,10 @@ from drivers.base import wait_s
 from drivers.can_frames import HostHeartbeat, crc8_j1850, host_heartbeat
 from drivers.dbc import load_database
 from drivers.options import CanAmplifierOptions
+from drivers.output_guard import OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import CanBus, Clock, Float64Array
 from hal.errors import BenchError, HalError, HalTimeout, ProtocolError, SafetyTrip
-from hal.output_guard import OutputGuard
 from hal.types import CanFrame, ChannelInfo, OutputLimit
 from hal.wire_bits import can_bits
 

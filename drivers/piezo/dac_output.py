@@ -13,10 +13,10 @@ import numpy as np
 
 from drivers.base import wait_s
 from drivers.options import OutputOptions
+from drivers.output_guard import OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, I2cBus
 from hal.errors import BenchError, HalError, ProtocolError
-from hal.output_guard import OutputGuard
 from hal.types import ChannelInfo, I2cOp, OutputLimit
 
 CHANNELS = 3

@@ -16,12 +16,12 @@ import numpy as np
 
 from drivers.base import next_due_ns, wait_s
 from drivers.options import E727Options
+from drivers.output_guard import OutputGuard
 from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, LATE, PERIOD_NS, SUPERSEDED, WORDS
 from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, SerialPort
 from hal.errors import BenchError, HalError, WrongDevice
-from hal.output_guard import OutputGuard
 from hal.types import ChannelInfo, OutputLimit
 from hal.wire_bits import serial_bits
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.base import next_due_ns
+from drivers.output_guard_steps import GuardState, admit, next_ramp_step, note_sent
 from drivers.piezo.e727_kernels import TEXT_BYTES, encode
 from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, PERIOD_NS, SUPERSEDED
 from drivers.piezo.gcs import (
@@ -28,7 +29,6 @@ from drivers.piezo.gcs import (
 )
 from hal.compiled import kernel
 from hal.fd_kernels import EAGAIN, read_fd, write_fd
-from hal.output_guard_steps import GuardState, admit, next_ramp_step, note_sent
 
 if TYPE_CHECKING:
     from drivers.piezo.e727 import E727

@@ -15,6 +15,7 @@ from drivers.can_telemetry import CanTelemetry
 from drivers.dbc import load_database
 from drivers.hmc2003 import Hmc2003
 from drivers.options import Ads1115Options, Adxl203Options, AmplifierMonitorOptions, DaqOptions, Hmc2003Options
+from drivers.output_guard import OutputGuard
 from drivers.piezo.dac_output import DacOutput
 from drivers.polling import Polling, polling_of
 from drivers.registry import Role, find_driver, open_device
@@ -24,7 +25,6 @@ from hal.bench import BenchDescription, DeviceSpec, OpenBench
 from hal.contracts import AnalogInputScan, AnalogOutput, CanBus
 from hal.errors import BenchError, HalError, name_device
 from hal.middleware.share import SharedCan
-from hal.output_guard import OutputGuard
 from hal.types import ScanConfig, ScanInfo
 
 ACCELEROMETERS = (("acc1", "x"), ("acc1", "z"), ("acc2", "y"), ("acc2", "z"), ("acc3", "x"), ("acc3", "y"))

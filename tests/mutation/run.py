@@ -40,7 +40,7 @@ GROUPS: dict[str, tuple[tuple[str, ...], tuple[str, ...]]] = {
         tuple(f"firmware_py/guardian/{name}.py" for name in ("amplifier", "care", "gate", "guardian", "heart")),
         ("tests/unit/guardian",),
     ),
-    "outputs": (("hal/output_guard.py",), ("tests/unit/backends/test_output_guard.py",)),
+    "outputs": (("drivers/output_guard.py",), ("tests/unit/drivers/test_output_guard.py",)),
     "daq": (
         ("drivers/daq/di4108.py",),
         ("tests/wire/drivers/test_di4108_wire.py", "tests/wire/drivers/test_di4108_edges.py"),

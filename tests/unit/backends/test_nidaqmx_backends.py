@@ -17,11 +17,11 @@ import pytest
 from nidaqmx.constants import AcquisitionType, OverwriteMode, TerminalConfiguration
 from nidaqmx.task import InStream, OutStream, Task, Timing
 
+from drivers.ni_output import NidaqmxOutput
+from drivers.output_guard import RAMP_STEPS
 from hal.backends.nidaqmx_ai import NidaqmxScan
-from hal.backends.nidaqmx_ao import NidaqmxOutput
 from hal.clock import VirtualClock
 from hal.errors import BenchError, BusError, DeviceNotFound, Disconnected, HalError, Overrun, SafetyTrip, WrongDevice
-from hal.output_guard import RAMP_STEPS
 from hal.types import ScanConfig, Status
 
 MS = 1_000_000

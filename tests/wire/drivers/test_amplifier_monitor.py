@@ -7,9 +7,9 @@ import pytest
 
 from drivers.adc.ads1115 import Ads1115
 from drivers.amplifier_monitor import AmplifierMonitor, Usual, Window
+from drivers.output_guard import OutputGuard
+from drivers.output_guard_steps import admit, note_sent
 from hal.clock import VirtualClock
-from hal.output_guard import OutputGuard
-from hal.output_guard_steps import admit, note_sent
 from hal.types import OutputLimit
 from sim_devices.devices.ads1115 import Ads1115 as EmulatedAds1115
 from sim_devices.transports.i2c_line import I2cLine

@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
+from drivers.output_guard import RAMP_STEPS
+from drivers.output_guard_steps import SLEW_LIMITED
 from drivers.piezo.dac_amplifier import DacAmplifier
 from hal.clock import VirtualClock
 from hal.errors import BenchError, I2cNack, ProtocolError, SafetyTrip, WrongDevice
-from hal.output_guard import RAMP_STEPS
-from hal.output_guard_steps import SLEW_LIMITED
 from tests.wire.drivers.scripted_ports import ScriptedI2c
 
 MS = 1_000_000

@@ -8,10 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from drivers.output_guard import RAMP_STEPS
 from drivers.piezo.e727 import E727
 from hal.clock import VirtualClock
 from hal.errors import BenchError, Disconnected, HalTimeout, ProtocolError, SafetyTrip, WrongDevice
-from hal.output_guard import RAMP_STEPS
 from tests.wire.drivers.scripted_ports import ScriptedSerial
 
 MS = 1_000_000

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from drivers.output_guard import RAMP_STEPS, TOLD, OutputGuard, Told
+from drivers.output_guard_steps import SLEW_LIMITED
 from hal.clock import VirtualClock
 from hal.errors import ErrorKind, SafetyTrip
-from hal.output_guard import RAMP_STEPS, TOLD, OutputGuard, Told
-from hal.output_guard_steps import SLEW_LIMITED
 from hal.types import OutputLimit
 
 LIMIT = OutputLimit(lo_V=5.0, hi_V=95.0, slew_V_per_s=2000.0, safe_V=50.0)

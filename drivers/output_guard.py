@@ -1,6 +1,6 @@
 """Protection that every analog output shares: clipping, slew limit, refusal of non-finite values, ramp to safe state.
 
-``OutputGuard`` runs the functions of ``hal.output_guard_steps`` in the interpreter; a compiled loop runs the same ones
+``OutputGuard`` runs the functions of ``output_guard_steps`` in the interpreter; a compiled loop runs the same ones
 over the same memory (``GuardState.view``).
 """
 
@@ -9,9 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from hal.contracts import Clock, Float64Array
-from hal.errors import ErrorKind, SafetyTrip
-from hal.output_guard_steps import (
+from drivers.output_guard_steps import (
     ARMED,
     CLIPPED,
     KEPT,
@@ -27,6 +25,8 @@ from hal.output_guard_steps import (
     next_ramp_step,
     note_sent,
 )
+from hal.contracts import Clock, Float64Array
+from hal.errors import ErrorKind, SafetyTrip
 from hal.types import OutputLimit
 
 __all__ = ["RAMP_STEPS", "TOLD", "OutputGuard", "Told"]

@@ -11,8 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hal.compiled import kernel
-from hal.output_guard_steps import (
+from drivers.output_guard_steps import (
     ARMED,
     NOT_ARMED,
     NOT_FINITE,
@@ -22,6 +21,7 @@ from hal.output_guard_steps import (
     next_ramp_step,
     note_sent,
 )
+from hal.compiled import kernel
 from hal.types import OutputLimit
 
 LIMITS = [OutputLimit(lo_V=5.0, hi_V=95.0, slew_V_per_s=2000.0, safe_V=50.0)] * 2

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from drivers.output_guard import OutputGuard
 from hal.backends import nidaqmx_package
 from hal.contracts import Clock, Float64Array
 from hal.errors import BenchError, HalError
-from hal.output_guard import OutputGuard
 from hal.types import OutputLimit
 
 TICK_NS = 1_000_000
