@@ -125,3 +125,7 @@ def test_why_an_effect_is_not_named_is_said_with_the_figures_that_show_it():
     said = wording.why_withheld(stuck, fit)
     assert said.startswith("half gap ended at a limit of the search")
     assert said.endswith("hysteresis is named instead")
+    doubtful = replace(held, reason="unlikely", shown_by=())
+    assert wording.why_withheld(doubtful, fit).startswith(
+        "beside what is left unexplained it is too likely to be wrong"
+    )
