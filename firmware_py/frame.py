@@ -21,7 +21,7 @@ PARITIES = ("1", "2")
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """One quantity of the frame: ``parts`` names its scalars (empty for a scalar quantity)."""
+    """Describes one quantity of the frame: ``parts`` names its scalars (empty for a scalar quantity)."""
 
     name: str
     unit: str
@@ -133,11 +133,11 @@ class Layout:
         return self._by_name[name].unit
 
     def scalar_names(self) -> tuple[str, ...]:
-        """One name per element of the frame, in order."""
+        """Return one name per element of the frame, in order."""
         return tuple(name for column in self.columns for name in column.scalar_names())
 
     def scalar_units(self) -> tuple[str, ...]:
-        """One unit per element of the frame, in order."""
+        """Return one unit per element of the frame, in order."""
         return tuple(column.unit for column in self.columns for _ in range(column.size))
 
     def new_frame(self) -> NDArray[np.float64]:

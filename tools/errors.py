@@ -20,5 +20,5 @@ class RecordingError(InputError):
 
 def missing_column(path: Path, name: str, have: Sequence[str]) -> RecordingError:
     """Return the error for a column that a file does not have."""
-    shown = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
-    return RecordingError(f"{path}: no column '{name}'; the file has: {shown or 'none'}")
+    text = ", ".join(have[:12]) + (" ..." if len(have) > 12 else "")
+    return RecordingError(f"{path}: no column '{name}'; the file has: {text or 'none'}")

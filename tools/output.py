@@ -20,7 +20,7 @@ from tools.interrupt import is_stopped
 
 
 def write_text_atomic(path: Path, text: str) -> None:
-    """All of the file or nothing of it. ``OutputError`` when it cannot be written."""
+    """Write the whole file or nothing. Raises ``OutputError`` when it cannot be written."""
     write_bytes_atomic(path, text.encode())
 
 
@@ -102,7 +102,7 @@ class Outputs:
 
     @contextmanager
     def part(self, name: str) -> Iterator[None]:
-        """One result. What goes wrong in it is remembered."""
+        """Write one result and remember its errors."""
         try:
             yield
         except OutputError as error:

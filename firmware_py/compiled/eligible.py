@@ -1,4 +1,4 @@
-"""Which benches can run in the compiled thread, from their description alone: before a device is touched."""
+"""Decides from the description alone if a bench can run in the compiled thread, before a device is touched."""
 
 from __future__ import annotations
 

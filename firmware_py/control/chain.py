@@ -52,7 +52,7 @@ def _the_one(dtype: np.dtype[Any]) -> np.dtype[Any]:
 
 @kernel
 def step_kernel(memory: Record) -> None:
-    """One tick: the frame's columns left of the volts and the ``GIVEN_BITS`` of its status are the input.
+    """Compute one tick: the frame's columns left of the volts and the ``GIVEN_BITS`` of its status are the input.
 
     COMMANDED: a command is computed. MANUAL: ``command`` is given and the actuation stage follows it. HELD: the same,
     and compensation begins where the outputs are then. None: the outputs are not free to move, or a newer scan is there

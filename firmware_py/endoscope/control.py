@@ -49,7 +49,7 @@ def filter_weight(response_s: float, dt_s: float) -> float:
 
 
 class EndoscopeControl:
-    """One card, one field of view. ``activations`` counts changes away from 0 or between 1 and 2."""
+    """Maps one card to one field of view. ``activations`` counts changes away from 0 or between 1 and 2."""
 
     def __init__(self, config: ControlConfig | None = None) -> None:
         self.config = config or ControlConfig()

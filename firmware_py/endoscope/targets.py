@@ -87,7 +87,7 @@ class GameState:
 
 
 class TargetGame:
-    """One run of the experiment. ``results`` has one entry per target reached."""
+    """Runs the experiment once. ``results`` has one entry per target reached."""
 
     def __init__(self, config: GameConfig | None = None) -> None:
         self.config = config or GameConfig()

@@ -135,7 +135,7 @@ class Guardian:
                 self._take(Why.SILENT, now_ns)
 
     def _take(self, why: Why, now_ns: int) -> None:
-        """From now on no command begins; the next step looks whether one had begun."""
+        """Let no command begin from now on. The next step checks if one had begun."""
         self._heart.take(why, now_ns)
         self._output.lose_position()
         self._pause_ns, self._next_try_ns = STEP_NS, 0

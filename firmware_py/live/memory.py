@@ -49,7 +49,8 @@ def announce(words: Any) -> None:
 
 
 class LiveMemory:
-    """Both ends: one process uses ``push`` and ``put_histogram``, any number of others ``read`` and ``histogram``."""
+    """Holds both ends: one process uses ``push`` and ``put_histogram``, any number of others ``read`` and
+    ``histogram``."""
 
     def __init__(self, fd: int) -> None:
         """Map the memory behind ``fd``, which then belongs to this object. ``ValueError`` when it is something else."""

@@ -23,7 +23,7 @@ RT_RUNTIME, RT_PERIOD = "proc/sys/kernel/sched_rt_runtime_us", "proc/sys/kernel/
 
 @dataclass(frozen=True)
 class Reading:
-    """One place of a setting. ``where``: a file below the root; ``what``: its name for people."""
+    """Describes one place of a setting. ``where``: a file below the root; ``what``: its name for people."""
 
     where: str
     what: str
@@ -33,9 +33,9 @@ class Reading:
 
 @dataclass(frozen=True)
 class MachineSetting:
-    """One row. ``read``: its readings, none where the machine has no such thing; ``explain``: why it matters;
-    ``remedy``: how a person sets it for good; ``set``: sets the place of one reading, raises ``OSError`` where that
-    is refused; ``absent``: what no readings mean.
+    """Describes one setting. ``read`` returns its readings, none where the machine lacks it; ``explain``: why it
+    matters; ``remedy``: how a person sets it for good; ``set``: sets the place of one reading, raises ``OSError`` where
+    that is refused; ``absent``: what no readings mean.
     """
 
     name: str

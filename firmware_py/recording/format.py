@@ -42,7 +42,7 @@ _HEADER = struct.Struct("<4sIIIQ")  # magic, columns, rows, CRC-32 of the layout
 
 
 class ColumnInfo(NamedTuple):
-    """One float64 column of a recording."""
+    """Describes one float64 column of a recording."""
 
     name: str
     unit: str

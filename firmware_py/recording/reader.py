@@ -118,7 +118,7 @@ class Recording:
         return self.columns[self._index(name)].unit
 
     def blocks(self) -> Iterator[Block]:
-        """All blocks in order of their rows; one chunk of memory at a time.
+        """Yield all blocks in the order of their rows, with one chunk in memory at a time.
 
         ``RecordingError`` when the rows are scattered over so many chunks that reading them in order would unpack the
         file many times, or when the file has changed since it was opened.
@@ -149,11 +149,11 @@ class Recording:
         return result
 
     def column(self, name: str) -> Float64Array:
-        """One column, ``[n_rows]``."""
+        """Return one column (n_rows,)."""
         return self.array([name])[:, 0]
 
     def arrays(self) -> dict[str, Float64Array]:
-        """All columns by name: ``8 * n_rows * n_columns`` bytes of memory."""
+        """Return all columns (n_rows,) by name; this takes ``8 * n_rows * n_columns`` bytes of memory."""
         everything = np.ascontiguousarray(self.array(self.names).T)
         return dict(zip(self.names, everything, strict=True))
 

@@ -55,7 +55,8 @@ class ChunkRecord:
 
 
 class ChunkMessage(NamedTuple):
-    """One message. ``at`` is the place of its record in the chunk's content; ``data`` is a view of that content."""
+    """Describes one message. ``at`` is the place of its record in the chunk's content; ``data`` is a view of that
+    content."""
 
     at: int
     channel_id: int
@@ -66,7 +67,7 @@ class ChunkMessage(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class MetadataRecord:
-    """One metadata record (its text is checked by its own CRC, see ``format.decode_metadata``)."""
+    """Describes one metadata record (its text is checked by its own CRC, see ``format.decode_metadata``)."""
 
     offset: int
     name: str
@@ -179,7 +180,7 @@ def message_at(content: bytes | memoryview, at: int) -> ChunkMessage:
 
 
 class Scanner:
-    """One pass over an open file. ``bytes_searched`` counts what false chunks cost, ``budget`` what was unpacked."""
+    """Passes once over an open file. ``bytes_searched`` counts what false chunks cost, ``budget`` what was unpacked."""
 
     def __init__(self, file: BinaryIO, path: Path) -> None:
         self._file = file

@@ -111,7 +111,7 @@ class _Output:
 
 
 class RecordingWriter:
-    """One recording being written. ``OSError`` of the file system passes through; then call ``give_up``.
+    """Writes one recording. ``OSError`` of the file system passes through; then call ``give_up``.
 
     ``metadata`` is stored at the start: texts as they are, other values as JSON. Times in the file are bench time
     since the start of the run, taken from the column ``t``.

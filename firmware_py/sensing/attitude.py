@@ -159,7 +159,7 @@ def step_attitude(
     fresh: bool,
     steps: int,
 ) -> None:
-    """One tick of the chosen method; arguments as ``propagate``.
+    """Compute one tick of the chosen method. The arguments are those of ``propagate``.
 
     A gyroscope drives the same filters: its samples' difference over dt stands in ``motion[3:6]``, with
     ``lead`` = 1 and no bias of alpha.
@@ -186,7 +186,7 @@ def propagate(
     fresh: bool,
     steps: int,
 ) -> None:
-    """One tick (``steps`` > 1 after lost scans): predict with alpha, correct with gravity and field.
+    """Compute one tick (``steps`` > 1 after lost scans): predict with alpha, correct with gravity and field.
 
     ``motion`` is (f, alpha); updates quaternion, rate, bias and the matrix C_WB in ``state``.
     """

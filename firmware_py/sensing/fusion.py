@@ -87,7 +87,7 @@ def _begin(state: NDArray[np.void], params: NDArray[np.void]) -> None:
 
 
 class Fusion:
-    """One sensor, live or batch: ``step`` and ``run`` are the same arithmetic and may be mixed.
+    """Filters one sensor, live or in batches: ``step`` and ``run`` use the same arithmetic and may be mixed.
 
     ``quaternion`` (4,) is body to world, z up, scalar first. Without a magnetometer the heading of the body's x axis
     is zero at the start. ``aligned`` is false while the start attitude is being averaged.
@@ -142,7 +142,8 @@ class Fusion:
             self._state["aligned"] = 1
 
     def step(self, rate: Array, force: Array, field: Array | None = None, dt_s: float | None = None) -> Array:
-        """One sample: rate rad/s, specific force and field of any unit, (3,) body frame; the attitude after it."""
+        """Filter one sample (3,) in the body frame: rate in rad/s, specific force and field in any unit. Return the
+        attitude."""
         self._rate[:] = rate
         self._force[:] = force
         self._field[:] = np.nan if field is None else field

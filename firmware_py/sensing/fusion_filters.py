@@ -62,7 +62,8 @@ def step_fusion(
     field: NDArray[np.float64],
     dt_s: float,
 ) -> None:
-    """One sample, ``dt_s`` after the last: rate rad/s, force and field (any unit; nan: none), all (3,), body frame."""
+    """Filter one sample, ``dt_s`` after the last: rate rad/s, force and field (any unit; nan: none), all (3,), body
+    frame."""
     if state.aligned == 0:
         _align(state, params, force, field)
         return

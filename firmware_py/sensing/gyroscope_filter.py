@@ -40,7 +40,7 @@ def begin_gyroscope(memory: Record) -> None:
 
 @kernel
 def step_gyroscope(memory: Record) -> None:
-    """One sample, ``dt_s`` after the last: rate rad/s, force m/s^2, field of any unit (nan: none), body frame.
+    """Filter one sample, ``dt_s`` after the last: rate rad/s, force m/s^2, field of any unit (nan: none), body frame.
 
     The difference of two samples of the rate stands for the angular acceleration. Without a field the heading of the
     body's x axis is zero at the start, and only rest keeps the rate about the vertical.

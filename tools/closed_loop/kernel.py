@@ -1,4 +1,4 @@
-"""One compiled loop: scan, the firmware's step, the command a constant delay later, the plant on to the next scan.
+"""Runs one compiled loop: scan, the firmware's step, the command a constant delay later, the plant on to the next scan.
 
 What is left out against a run over the wire: bytes, bus arbitration and its jitter, the scheduler, supervision. What
 is kept: every converter's resolution, the round robin of the magnetometer's converter, the instant in the plant's

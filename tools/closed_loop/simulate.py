@@ -171,7 +171,7 @@ def simulate(
 
 
 def sensing_table_of(bench: BenchFile) -> dict[str, Any]:
-    """What the wiring says of the sensors, as the opened bench would."""
+    """Return the sensing table of the wiring, as the opened bench has it."""
     options = check_devices(bench.description, str(bench.path))
     daq = next(o for o in options.values() if isinstance(o, Di4108Options))
     return sensing_table(options, daq.channels, daq.rate_hz, daq.range_V / 32768.0, str(bench.path))

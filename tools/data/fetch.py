@@ -1,4 +1,4 @@
-"""Downloads with a checksum: a file is in the cache whole and as it was listed, or it is not there."""
+"""Downloads files with a checksum: the cache holds a file whole and as listed, or not at all."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PART_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class Missing:
-    """A file that could not be had: where it should come from, where it belongs, and why it is not there."""
+    """Describes a missing file: its source, its place in the cache, and the cause."""
 
     url: str
     path: Path
@@ -49,12 +49,12 @@ def fetch(
     InputError without pooch, or where the cache cannot be written.
     """
     folder = cache / wanted.name
-    there: list[Path] = []
+    present: list[Path] = []
     missing: list[Missing] = []
     for file in wanted.files:
         path = folder / file.name
         if is_whole(path, file):
-            there.append(path)
+            present.append(path)
             continue
         url = wanted.url(file, mirror)
         # after one file could not be reached the others are not tried: each would wait as long
@@ -65,8 +65,8 @@ def fetch(
         if why:
             missing.append(Missing(url, path, why))
         else:
-            there.append(path)
-    return there, missing
+            present.append(path)
+    return present, missing
 
 
 _NO_WAY = "no way to the server"

@@ -16,7 +16,8 @@ HOST = "https://raw.githubusercontent.com"
 
 @dataclass(frozen=True)
 class PublicFile:
-    """One file of a set. ``path``: in its repository; ``sha256``: of the file at the set's commit."""
+    """Describes one file of a set: its ``path`` in the repository and the ``sha256`` of the file at the set's
+    commit."""
 
     path: str
     bytes: int
@@ -24,7 +25,7 @@ class PublicFile:
 
     @property
     def name(self) -> str:
-        """Its name in the cache."""
+        """Return its name in the cache."""
         return PurePosixPath(self.path).name
 
 
@@ -42,7 +43,7 @@ class PublicSet:
 
     @property
     def bytes(self) -> int:
-        """Size of all files."""
+        """Return the size of all files, in bytes."""
         return sum(file.bytes for file in self.files)
 
     def url(self, file: PublicFile, mirror: str = "") -> str:

@@ -12,7 +12,7 @@ from firmware_py.recording.reader import Recording
 
 
 def batches(recording: Recording, n_blocks: int) -> Iterator[tuple[int, Float64Array]]:
-    """Yield the index of the first row in the file, and ``n_blocks`` blocks at a time, [columns, rows]."""
+    """Yield the index of the first row in the file, and ``n_blocks`` blocks at a time (columns, rows)."""
     waiting: list[Float64Array] = []
     start = rows = 0
     for block in recording.blocks():

@@ -69,7 +69,7 @@ def export_folder(
     parameters: Mapping[str, object] | None = None,
     roles: Mapping[str, str] | None = None,
 ) -> ExportReport:
-    """The recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
+    """Write the recording folder of contracts/recordings-and-mismatch.md, section 1: ``recording.toml`` and its data.
 
     ``roles`` gives columns a role (input, output, context); without it the commands are inputs, the volts of the
     DAQ outputs, and the rest, computed from these volts with their noise, no channels. Flags, and columns that are
@@ -143,7 +143,7 @@ def _csv(recording: Recording, path: Path) -> None:
 
 
 def _npz(recording: Recording, path: Path) -> None:
-    """One array per column, without holding more than a block: each column goes through a file of its own."""
+    """Write one array per column while holding only one block: each column goes through a file of its own."""
     parts = path.parent / "columns"
     parts.mkdir()
     files = [(parts / str(i)).open("wb") for i in range(len(recording.columns))]

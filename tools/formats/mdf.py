@@ -1,4 +1,4 @@
-"""ASAM MDF 4 through asammdf: one channel group per time base, the unit of each channel in its unit block."""
+"""Writes ASAM MDF 4 through asammdf: one channel group per time base, the unit of each channel in its unit block."""
 
 from __future__ import annotations
 

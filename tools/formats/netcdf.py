@@ -1,4 +1,5 @@
-"""netCDF through xarray: one variable per column on the dimension ``t``, CF units, and where the file comes from.
+"""Writes netCDF through xarray: one variable per column on the dimension ``t``, CF units, and where the file comes
+from.
 
 A run as a dataset: variables (t,) with ``units`` and ``long_name``, the coordinate ``t`` in seconds since the start of
 the run, events as the variable ``event_text`` (JSON) on the coordinate ``event_t``, the texts of the recording as

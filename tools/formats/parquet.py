@@ -1,4 +1,4 @@
-"""Parquet: one column per signal, its unit in the metadata of the field (key ``unit``)."""
+"""Writes Parquet: one column per signal, its unit in the metadata of the field (key ``unit``)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""MCAP for viewers (Foxglove, PlotJuggler, rerun): protobuf messages, one topic per group of the frame.
+"""Writes MCAP for viewers (Foxglove, PlotJuggler, rerun): protobuf messages, one topic per group of the frame.
 
 Every message of a group has the same length, so that thousands of them are built at once as a table of bytes: tags stay
 where they are, only the values change. Numbers are double and exact. Events are ``foxglove.Log``, the attitude is a
@@ -87,7 +87,7 @@ class Topic:
 
 @dataclass(frozen=True)
 class View:
-    """What was written."""
+    """Describes the written view."""
 
     topics: tuple[str, ...]
     messages: int
@@ -206,7 +206,7 @@ class _Template:
         self.data += bytes(8)
 
     def rows(self, values: NDArray[np.float64]) -> NDArray[np.uint8]:
-        """Return one message per column of ``values`` [doubles, rows], as bytes [rows, length]."""
+        """Return one message per column of ``values`` (doubles, rows), as bytes (rows, length)."""
         n = values.shape[1]
         table = np.empty((n, len(self.data)), np.uint8)
         table[:] = np.frombuffer(bytes(self.data), np.uint8)
@@ -240,7 +240,8 @@ def _rows_of(topic: Topic) -> _Rows:
 
 
 def _pose_rows() -> _Rows:
-    """``foxglove.PoseInFrame``: timestamp 1, frame_id 2, pose 3 with position 1 (the origin) and orientation 2."""
+    """Encode ``foxglove.PoseInFrame``: timestamp 1, frame_id 2, pose 3 with position 1 (the origin) and orientation
+    2."""
     orientation = _Template()
     for number in range(1, 5):
         orientation.double(number)
@@ -303,7 +304,7 @@ def _file_set(descriptors: Any, file: Any) -> bytes:
 
 @dataclass(frozen=True)
 class _Part:
-    """Messages of one channel in a chunk: records as bytes [rows, length], times [rows]."""
+    """Holds the messages of one channel in a chunk: records as bytes (rows, length), times (rows,) in ns."""
 
     channel: int
     records: NDArray[np.uint8]
@@ -311,7 +312,7 @@ class _Part:
 
 
 class _Writer:
-    """Chunks of many messages at once, with their indexes and a summary."""
+    """Writes chunks of many messages at once, with their indexes and a summary."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file
@@ -345,7 +346,7 @@ class _Writer:
         self._metadata.append(MetadataIndex(offset=offset, length=self._file.tell() - offset, name=name))
 
     def rows(self, channel: int, data: NDArray[np.uint8], t_ns: NDArray[np.uint64], first: int) -> _Part:
-        """Return one message record per row of ``data`` [rows, length]."""
+        """Return one message record per row of ``data`` (rows, length)."""
         n, length = data.shape
         records = np.empty((n, _MESSAGE_HEAD + length), np.uint8)
         head = struct.pack("<BQH", Opcode.MESSAGE, _MESSAGE_HEAD - 9 + length, channel)

@@ -29,7 +29,7 @@ MOST_OPERATIONS = 2000
 
 
 class EquationError(ValueError):
-    """An equation that cannot be used. The message says which, and why."""
+    """Is raised for an equation that cannot be used. The message names the equation and the cause."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class Builder:
         return self.known[key]
 
     def program(self, results: Sequence[int]) -> Program:
-        """Everything collected so far, as arrays."""
+        """Return everything collected so far, as arrays."""
         operations = np.array(self.operations, np.int64).reshape(-1, 5)
         return Program(operations, np.array(self.values, np.float64), np.array(results, np.int64))
 

@@ -1,4 +1,5 @@
-"""An FMU in the process of a guest, through FMPy (an extra): co-simulation (FMI 2, 3) or model exchange (FMI 2)."""
+"""Runs an FMU in the process of a guest, through FMPy (an extra): co-simulation (FMI 2, 3) or model exchange (FMI
+2)."""
 
 from __future__ import annotations
 
@@ -24,7 +25,7 @@ class FmuError(ValueError):
 
 
 class OpenFmu:
-    """One free run per call. ``digest`` (sha256) says which content the user has trusted; no other is opened.
+    """Makes one free run per call. Only content whose ``digest`` (sha256) the user has trusted is opened.
 
     The parameter ``hold`` says what inputs do between their samples: "linear", else held. A co-simulation holds them
     over a step; in place of linear ones it takes two steps from sample to sample (``over_the_step``), or one with their
@@ -56,7 +57,7 @@ class OpenFmu:
             raise FmuError(f"cannot be opened as an FMU ({_line(error)})") from error
 
     def instantiated(self) -> Any:
-        """A new instance."""
+        """Return a new instance."""
         return _fmpy().instantiate_fmu(self.folder, self.description, self.kind)
 
     def names(self) -> set[str]:
@@ -96,7 +97,7 @@ class OpenFmu:
     def stepped(
         self, inputs: Mapping[str, Array], start: Mapping[str, Any], hold: str = "", parts: int = 1
     ) -> dict[str, Array]:
-        """FMI 2 with real variables alone: what FMPy's ``simulate_fmu`` does, at a third of its cost a step."""
+        """Simulate FMI 2 with real variables only, as FMPy's ``simulate_fmu`` does, at a third of its cost per step."""
         description, fmu = self.description, self.instance
         signals = _signals(inputs)
         number = {v.name: int(v.valueReference) for v in description.modelVariables}
@@ -134,7 +135,7 @@ class OpenFmu:
     def simulated(
         self, inputs: Mapping[str, Array], start: Mapping[str, Any], hold: str = "", parts: int = 1
     ) -> dict[str, Array]:
-        """Any other FMU, by FMPy itself."""
+        """Simulate any other FMU by FMPy itself."""
         fm = _fmpy()
         t, signals = inputs["t"], _signals(inputs)
         table = np.zeros(t.size * parts, [("time", float), *((s, float) for s in signals)])
@@ -156,8 +157,8 @@ class OpenFmu:
 
 
 def over_the_step(x: Array, parts: int = 1) -> Array:
-    """What a linear input (n, ...) is held at over each of 1 or 2 ``parts`` of the step behind each sample: (parts, n,
-    ...); behind the last sample it stays.
+    """Return the held values of a linear input (n, ...) over each of 1 or 2 ``parts`` of the step behind each sample:
+    (parts, n, ...); behind the last sample it stays.
 
     One part holds the mean. Two hold what has the mean and the first moment of the line, so that the first and the
     second integral of the input are exact at the samples: a mean alone leaves a motor's angle off by 1/12 of the

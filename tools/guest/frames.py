@@ -1,4 +1,4 @@
-"""Messages between a host and its guest: a JSON head and float64 arrays behind it. Nothing in them can run."""
+"""Encodes messages between a host and its guest: a JSON head with float64 arrays. Nothing in them can run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The host's side of a guest: it starts the process, asks it, and turns its death into one clear message."""
+"""Implements the host's side of a guest: it starts the process, asks it, and turns its death into one clear message."""
 
 from __future__ import annotations
 
@@ -55,12 +55,12 @@ class GuestProcess:
     def __init__(self, name: str, opening: Mapping[str, Any], limits: Limits = Limits()) -> None:
         self.name, self.opening, self.limits = name, dict(opening), limits
         self._process: subprocess.Popen[bytes] | None = None
-        self._said: Any = None
+        self._stderr: Any = None
         self._folder = ""
         self._opened: tuple[dict[str, Any], dict[str, Array]] | None = None
 
     def __getstate__(self) -> dict[str, object]:
-        return {**self.__dict__, "_process": None, "_said": None, "_folder": "", "_opened": None}
+        return {**self.__dict__, "_process": None, "_stderr": None, "_folder": "", "_opened": None}
 
     def opened(self) -> tuple[dict[str, Any], dict[str, Array]]:
         """Return the answer to the opening request. ``GuestError`` or ``GuestDied`` when it cannot be opened."""
@@ -85,14 +85,14 @@ class GuestProcess:
     def end(self) -> None:
         """End the process, if there is one."""
         if self._process is not None:
-            _end(self._process, self._said, self._folder)
+            _end(self._process, self._stderr, self._folder)
             self._process = None
             self._opened = None
 
     def _start(self) -> None:
         self.end()
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - it is read when the process has died
-        # what it unpacks goes with it: a guest is killed, and tidies nothing up
+        self._stderr = tempfile.TemporaryFile()  # noqa: SIM115 - it is read when the process has died
+        # its unpacked files are removed here: a guest is killed and cannot remove them
         self._folder = tempfile.mkdtemp(prefix="micron-guest-")
         environment = child_environment() | {"TMPDIR": self._folder}
         # one program needs one thread, and each thread of a linear algebra library takes memory from its limit
@@ -101,13 +101,13 @@ class GuestProcess:
             child_command("tools.guest.process", str(self.limits.memory_bytes)),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
-            stderr=self._said,
+            stderr=self._stderr,
             env=environment,
             start_new_session=True,  # Ctrl-C is for the host, which ends its guest
         )
         assert self._process.stdin is not None
         os.set_blocking(self._process.stdin.fileno(), False)  # a guest that never reads must not hold us
-        weakref.finalize(self, _end, self._process, self._said, self._folder)
+        weakref.finalize(self, _end, self._process, self._stderr, self._folder)
 
     def _ask(
         self, head: Mapping[str, Any], arrays: Mapping[str, Array], limit_s: float
@@ -122,16 +122,16 @@ class GuestProcess:
             # more than a guest may own cannot be an answer
             if body_bytes > self.limits.memory_bytes:
                 raise FrameError(f"an answer of {body_bytes} bytes")
-            said, found = read_parts(bytes(self._read(head_bytes, until_s)), self._read(body_bytes, until_s))
+            reply, found = read_parts(bytes(self._read(head_bytes, until_s)), self._read(body_bytes, until_s))
         except TimeoutError as error:
             raise self._dead(f"did not answer within {limit_s:.0f} s and was ended", "") from error
         except (BrokenPipeError, EOFError) as error:
             raise self._dead(*self._how_it_ended()) from error
         except FrameError as error:
             raise self._dead(f"sent {error}", "") from error
-        if "error" in said:
-            raise GuestError(str(said.get("message", "")), str(said["error"]))
-        return said, found
+        if "error" in reply:
+            raise GuestError(str(reply.get("message", "")), str(reply["error"]))
+        return reply, found
 
     def _write(self, data: memoryview, until_s: float) -> None:
         process = self._process
@@ -166,8 +166,8 @@ class GuestProcess:
             status = self._process.wait(timeout=5.0)
         except subprocess.TimeoutExpired:
             return "closed its pipe without an answer", ""
-        self._said.seek(0)
-        lines = self._said.read()[-2000:].decode("utf-8", "replace").strip().splitlines()
+        self._stderr.seek(0)
+        lines = self._stderr.read()[-2000:].decode("utf-8", "replace").strip().splitlines()
         last = lines[-1][:200] if lines else ""
         if status < 0:
             return f"crashed ({signal.Signals(-status).name})", last
@@ -179,7 +179,7 @@ class GuestProcess:
         return GuestDied(f"{self.name}: the program {what}{tail}; repair it, or leave it out")
 
 
-def _end(process: subprocess.Popen[bytes], said: IO[bytes], folder: str) -> None:
+def _end(process: subprocess.Popen[bytes], stderr: IO[bytes], folder: str) -> None:
     """Kill the process and all that it started; close what leads to it, and remove its temporary files."""
     if process.poll() is None:
         try:
@@ -187,7 +187,7 @@ def _end(process: subprocess.Popen[bytes], said: IO[bytes], folder: str) -> None
         except ProcessLookupError:
             process.kill()
     process.wait()
-    for pipe in (process.stdin, process.stdout, said):
+    for pipe in (process.stdin, process.stdout, stderr):
         if pipe is not None:
             try:
                 pipe.close()

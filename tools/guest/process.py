@@ -1,4 +1,4 @@
-"""The process of a guest: ``python -m tools.guest.process`` answers its host until standard input ends.
+"""Runs the process of a guest: ``python -m tools.guest.process`` answers its host until standard input ends.
 
 It limits itself before the guest's first line runs: memory, core dumps, death with the host. What the guest prints goes
 to standard error; only this file writes to the pipe.
@@ -127,12 +127,12 @@ def serve(requests: BinaryIO, answers: BinaryIO) -> None:
         head_bytes, body_bytes = read_sizes(_read_exactly(requests, SIZES_BYTES))
         head, arrays = read_parts(_read_exactly(requests, head_bytes), _read_exactly(requests, body_bytes))
         try:
-            said, out = guest.answer(head, arrays)
+            reply, out = guest.answer(head, arrays)
         except MemoryError:
-            said, out = {"error": "MemoryError", "message": "no memory is left below its limit"}, {}
+            reply, out = {"error": "MemoryError", "message": "no memory is left below its limit"}, {}
         except Exception as error:
-            said, out = {"error": type(error).__name__, "message": " ".join(str(error).split())[:500]}, {}
-        for part in frame_parts(said, out):
+            reply, out = {"error": type(error).__name__, "message": " ".join(str(error).split())[:500]}, {}
+        for part in frame_parts(reply, out):
             answers.write(part)
         answers.flush()
 
@@ -141,7 +141,7 @@ def main() -> None:
     """Set the limits and serve."""
     limit_process(int(sys.argv[1]))
     answers = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what a guest prints must not get between the answers
+    os.dup2(2, 1)  # output of a guest must not get between the answers
     serve(os.fdopen(os.dup(0), "rb"), answers)
 
 

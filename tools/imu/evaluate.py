@@ -1,4 +1,4 @@
-"""All that chapter 5 of Erat 2018 asks of a sensor, from one motionless recording and others made for a method."""
+"""Evaluates a sensor as chapter 5 of Erat 2018 does, from one motionless recording and others made for a method."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ SAME_POSE_G = 0.1
 
 
 def evaluate_parts(parts: list[Series]) -> dict[str, Any]:
-    """One recording, or several of the same sensor at different temperatures: the first is judged, all together give
-    the temperature dependence (of the accelerometer only if it lay in the same pose in all of them)."""
+    """Evaluate one recording, or several of the same sensor at different temperatures: the first is judged, all
+    together give the temperature dependence (of the accelerometer only if it lay in the same pose in all of them)."""
     result = evaluate_still(parts[0])
     if len(parts) == 1:
         return result
@@ -48,7 +48,7 @@ def _must_lie_still(series: Series) -> None:
 
 
 def evaluate_still(series: Series) -> dict[str, Any]:
-    """Offsets, Tables 5.4 to 5.8, thermal stability.
+    """Compute offsets, Tables 5.4 to 5.8 and thermal stability.
 
     Offsets come from the 10 s after the first 10 s (a third of a shorter recording each), the rest is judged with them.
     ``InputError`` for a recording that is too short or was moved.

@@ -1,4 +1,4 @@
-"""A sensor of a bench, measured now: recording at its rate, and auto-calibration (Erat 2018, section 5.4)."""
+"""Measures a sensor of a bench: it records at its rate and auto-calibrates (Erat 2018, section 5.4)."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def record(sensor: Sensor, clock: Clock, seconds: float, progress: Progress | No
 
 @dataclass(frozen=True)
 class AutoCalibration:
-    """What was found, written and left, per axis: g and deg/s.
+    """Holds, per axis, the measured, written and remaining offsets, in g and deg/s.
 
     ``step_g``, ``step_dps``: what the registers' own steps leave. ``verified``: beyond that no more than the limits is.
     """

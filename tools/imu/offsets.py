@@ -1,4 +1,5 @@
-"""Offsets by the four methods of Erat 2018: manual, free fall and simple (5.2.1), and the gyroscope's mean (5.3.1).
+"""Computes offsets by the four methods of Erat 2018: manual, free fall and simple (5.2.1), and the gyroscope's mean
+(5.3.1).
 
 An offset is what the sensor shows too much; its offset register takes the negative (erratum 115).
 """
@@ -38,7 +39,8 @@ class ManualOffset:
 
 
 def manual(series: Series) -> ManualOffset:
-    """From a recording in which every axis once pointed straight up and once straight down, led slowly.
+    """Compute offsets (3,) in g from a slow recording in which every axis pointed straight up once and straight down
+    once.
 
     Moments of fast motion are left out (they read more than gravity), the rest is averaged over 0.2 s.
     """
@@ -60,7 +62,7 @@ def manual(series: Series) -> ManualOffset:
 
 @dataclass(frozen=True)
 class FreeFall:
-    """``offset_g`` (3,): mean while falling; ``start_s`` and ``seconds`` of the fall."""
+    """Holds ``offset_g`` (3,), the mean while falling, and ``start_s`` and ``seconds`` of the fall."""
 
     offset_g: Array
     start_s: float
@@ -68,7 +70,7 @@ class FreeFall:
 
     @property
     def speed_m_s(self) -> float:
-        """At its end, from rest."""
+        """Return the speed at the end of the fall, from rest."""
         return STANDARD_GRAVITY * self.seconds
 
 
@@ -117,7 +119,8 @@ def _runs(here: NDArray[np.bool_], bridge: int) -> list[tuple[int, int]]:
 
 
 def simple(series: Series) -> Array:
-    """(3,) g: mean of a sensor that lies on a flat surface, minus 1 g on the axis that is vertical (erratum 115)."""
+    """Return offsets (3,) in g: the mean of a sensor that lies on a flat surface, minus 1 g on the axis that is
+    vertical (erratum 115)."""
     mean = series.accel_g.mean(axis=0)
     vertical = int(np.argmax(np.abs(mean)))
     mean[vertical] -= np.sign(mean[vertical])
@@ -125,7 +128,7 @@ def simple(series: Series) -> Array:
 
 
 def gyroscope_mean(series: Series) -> Array:
-    """(3,) deg/s: mean while motionless (5.3.1). ``InputError`` when there is no gyroscope."""
+    """Return the mean (3,) in deg/s while motionless (5.3.1). Raises ``InputError`` without a gyroscope."""
     if series.gyro_dps is None:
         raise InputError(f"{series.name}: no gyroscope columns gyro_x_UNIT ...")
     return series.gyro_dps.mean(axis=0)

@@ -1,4 +1,4 @@
-"""A sensor in one picture: accelerations and rates in time, and against temperature where that changed."""
+"""Draws a sensor in one picture: accelerations and rates in time, and against temperature where that changed."""
 
 from __future__ import annotations
 

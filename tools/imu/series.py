@@ -1,4 +1,5 @@
-"""Readings of one inertial sensor at an even rate, from a recording or a bench, in the units of Erat 2018's tables.
+"""Holds readings of one inertial sensor at an even rate, from a recording or a bench, in the units of Erat 2018's
+tables.
 
 Accelerations in g (specific force, +1 g on an axis that points up), rates in deg/s, temperature in degC.
 """
@@ -53,7 +54,7 @@ class Series:
 
 @dataclass(frozen=True)
 class Scales:
-    """What raw counts and badly scaled columns are worth. ``accel_factor`` repairs a range error of a logger."""
+    """Holds the scales of raw counts and badly scaled columns. ``accel_factor`` repairs a range error of a logger."""
 
     accel_lsb_per_g: float | None = None
     gyro_lsb_per_dps: float | None = None
@@ -61,7 +62,7 @@ class Scales:
 
 
 def load_series(path: Path, scales: Scales | None = None, rate_hz: float | None = None) -> Series:
-    """A recording as folder or .npz with columns ``acc_x_UNIT``, ``gyro_x_UNIT``, ``temperature_C``.
+    """Load a recording, a folder or .npz with columns ``acc_x_UNIT``, ``gyro_x_UNIT``, ``temperature_C``.
 
     Units: raw (counts), g, mg, m_s2; raw, deg_s, dps, rad_s. ``InputError`` says what is missing. ``rate_hz`` is
     for recordings without a time column: several recordings share it.
@@ -94,17 +95,17 @@ def _triad(log: SensorLog, stem: str, units: dict[str, float] | dict[str, float 
 
 
 def join_series(parts: list[Series]) -> Series:
-    """One after the other; all must have the same rate and the same columns."""
+    """Join series one after the other. All must have the same rate and the same columns."""
     first = parts[0]
     for other in parts[1:]:
         if other.rate_hz != first.rate_hz:
             raise InputError(f"{other.name}: {other.rate_hz:g} Hz, but {first.name} has {first.rate_hz:g} Hz")
 
     def stack(columns: list[Array | None]) -> Array | None:
-        there = [c for c in columns if c is not None]
-        if len(there) not in (0, len(parts)):
+        present = [c for c in columns if c is not None]
+        if len(present) not in (0, len(parts)):
             raise InputError(f"{', '.join(p.name for p in parts)}: not all of them have the same columns")
-        return np.concatenate(there) if there else None
+        return np.concatenate(present) if present else None
 
     return Series(
         "+".join(p.name for p in parts),

@@ -1,4 +1,4 @@
-"""Stability, drift and noise of a motionless sensor: Tables 5.4 to 5.8 of Erat 2018."""
+"""Computes stability, drift and noise of a motionless sensor: Tables 5.4 to 5.8 of Erat 2018."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ from tools.imu.series import Array, Series
 
 @dataclass(frozen=True)
 class Stability:
-    """All (3,), axes x, y, z. Accelerations in g after the offset was taken off (gravity stays), rates in deg/s.
+    """Holds figures (3,) for axes x, y, z. Accelerations in g after the offset was taken off (gravity stays), rates in
+    deg/s.
 
     ``drift_before`` and ``drift_after`` are the gyroscope's integral in deg per minute, without and with the offset
     taken off; ``noise_dps`` its rms about the offset.
@@ -30,7 +31,7 @@ class Stability:
 
 
 def stability(series: Series, accel_offset_g: Array, gyro_offset_dps: Array | None) -> Stability:
-    """From a motionless ``series`` and offsets that were found before it (not in it)."""
+    """Compute the figures from a motionless ``series`` and offsets that were measured before it."""
     accel = series.accel_g - accel_offset_g
     gyro = series.gyro_dps
     if gyro is None or gyro_offset_dps is None:

@@ -1,4 +1,4 @@
-"""How the offset of an axis follows the chip's own temperature (Erat 2018, 5.2.3 and 5.3.3), and what a line takes
+"""Measures how the offset of an axis follows the chip's temperature (Erat 2018, 5.2.3 and 5.3.3), and what a line takes
 away."""
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ LINEAR_SHARE = 0.1
 
 @dataclass(frozen=True)
 class Thermal:
-    """One axis. Slope per K with its 95 % interval; ``change`` is what the offset did over ``span_K``.
+    """Holds one axis: slope per K with its 95 % interval, and ``change`` of the offset over ``span_K``.
 
     ``misfit`` is the largest deviation of the binned offsets from the straight line. ``before`` and ``after`` are the
     rms of the slow part (5 s means) about its value at the mean temperature: after compensation by a line that was
@@ -40,12 +40,12 @@ class Thermal:
 
     @property
     def compensable(self) -> bool:
-        """Whether the straight line, on blocks it has not seen, takes at least half of the drift away."""
+        """Return True if the straight line removes at least half of the drift on held-out blocks."""
         return self.after < 0.5 * self.before
 
 
 def thermal(value: Array, temperature_C: Array, rate_hz: float, flat: float) -> Thermal | None:
-    """``value`` (n,) of a motionless axis against ``temperature_C`` (n,); None below a span of 5 K.
+    """Fit ``value`` (n,) of a motionless axis against ``temperature_C`` (n,). Return None below a span of 5 K.
 
     ``flat``: a change over the whole span that is too small to matter, in the unit of ``value``.
     """
@@ -97,6 +97,6 @@ def _line(t: Array, v: Array) -> tuple[float, float, float]:
 
 
 def _bins(t: Array, v: Array) -> Array:
-    """(m, 2): mean temperature and value of each kelvin that was visited."""
+    """Return the mean temperature and value (m, 2) of each kelvin that was visited."""
     index = np.floor((t - t.min()) / BIN_K).astype(int)
     return np.array([[t[index == i].mean(), v[index == i].mean()] for i in np.unique(index)])

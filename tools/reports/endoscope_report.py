@@ -1,4 +1,4 @@
-"""What a run of an endoscope bench did: samples, attitude against the emulated truth, experiment."""
+"""Reports a run of an endoscope bench: samples, attitude against the emulated truth, experiment."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def complete_run(outcome: dict[str, Any], truth: Mapping[str, Any] | None) -> di
 
 
 def print_run(result: dict[str, Any], console: Console) -> None:
-    """For people."""
+    """Print the report for people."""
     table = Table(
         title=f"{result['bench']}: {result['ran_s']:.1f} s, {result['clock']} time, steered by {result['steered_by']}",
         title_justify="left",
@@ -59,9 +59,9 @@ def print_run(result: dict[str, Any], console: Console) -> None:
     for name, s in result["sensors"].items():
         error = result["attitude"][name]
         figures = (error["inclination_rms_deg"], error["inclination_max_deg"])
-        shown = ["-" if v is None else f"{v:.2f}" for v in figures]
+        lines = ["-" if v is None else f"{v:.2f}" for v in figures]
         received = f"{s['received']} of {s['expected']}"
-        table.add_row(name, received, str(s["lost"]), str(s["masked"]), str(s["bad_frames"]), *shown)
+        table.add_row(name, received, str(s["lost"]), str(s["masked"]), str(s["bad_frames"]), *lines)
     console.print(table)
     view, game = result["view"], result["experiment"]
     console.print(f"view {view['x']:.0f}, {view['y']:.0f} px, side {view['size']:.0f} px, status {view['status']}")

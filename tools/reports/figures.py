@@ -1,4 +1,4 @@
-"""How much tremor is left at the tip: figures from the physical truth of a run.
+"""Computes the tremor that is left at the tip from the physical truth of a run.
 
 The truth is logged by the emulated world apart from anything that the firmware sees.
 """
@@ -22,7 +22,7 @@ BANDS_HZ = ((0.0, 2.0), (2.0, 8.0), TREMOR_BAND_HZ, (20.0, 500.0), (2.0, 500.0))
 
 @dataclass(frozen=True)
 class BandFigures:
-    """rms in um, with the manipulator resting and with it working."""
+    """Holds rms values in um, with the manipulator resting and working."""
 
     uncompensated_rms_um: float
     compensated_rms_um: float
@@ -31,8 +31,8 @@ class BandFigures:
 
 @dataclass(frozen=True)
 class TremorFigures:
-    """Tip tremor in ``band_hz`` as a vector and per axis; the error against the intended path in each of ``bands`` and
-    over all frequencies."""
+    """Holds the tip tremor in ``band_hz`` as a vector and per axis, and the error against the intended path in each of
+    ``bands`` and over all frequencies."""
 
     band_hz: tuple[float, float]
     evaluated_s: tuple[float, float]
@@ -84,7 +84,7 @@ def band_pass(x: Array, rate_hz: float, band_hz: tuple[float, float]) -> Array:
 
 
 def _compare(before: Array, after: Array) -> BandFigures:
-    """rms of vectors (n, k): the root of the summed axis variances."""
+    """Return the rms of vectors (n, k): the root of the summed axis variances."""
     rms_before, rms_after = (float(1e6 * np.sqrt(np.mean(np.sum(e**2, axis=1)))) for e in (before, after))
     reduction = 100.0 * (1.0 - rms_after / rms_before) if rms_before > 0 else float("nan")
     return BandFigures(rms_before, rms_after, reduction)

@@ -87,7 +87,7 @@ class TipWatch:
         clock.at(clock.now_ns() + LOOK_NS, look)
 
     def add(self, tips_m: NDArray[np.float64]) -> None:
-        """One look (6,): the tip with the manipulator at rest, the tip, in metres."""
+        """Add one sample (6,): the tip with the manipulator at rest, and the tip, in m."""
         if self._memory is None:
             self._memory = self._at_rest(tips_m)
         through = tips_m
@@ -101,7 +101,7 @@ class TipWatch:
         self._power += max(self._forget, 1.0 / self._n) * (power - self._power)
 
     def _at_rest(self, tips_m: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(sections, 2, 6): memory of the band-pass where the tip has always been at ``tips_m``."""
+        """Return the memory (sections, 2, 6) of the band-pass for a tip that was always at ``tips_m``."""
         memory, through = np.zeros((len(self._sos), 2, len(tips_m))), tips_m
         for (b0, b1, b2, _, a1, a2), kept in zip(self._sos, memory, strict=True):
             out = (b0 + b1 + b2) / (1.0 + a1 + a2) * through
@@ -111,7 +111,8 @@ class TipWatch:
         return memory
 
     def rms_um(self) -> tuple[float, float] | None:
-        """Tremor without and with compensation over the last second or so; None before there is any."""
+        """Return the tremor without and with compensation over about the last second, in um, or None before the
+        first."""
         if self._n * LOOK_NS < WINDOW_S * 1e9:
             return None
         without, with_ = np.sqrt(self._power)
@@ -119,7 +120,7 @@ class TipWatch:
 
 
 def live_line(status: Mapping[str, Any], seconds: float, watch: TipWatch) -> str:
-    """One line of at most 80 columns: time, state, tremor without and with compensation, holds, time left."""
+    """Return one line of at most 80 columns: time, state, tremor without and with compensation, holds, time left."""
     t_s = status["t_s"]
     if hold := status.get("hold"):
         key = "Enter resumes" if hold["rearm"] == "operator" else ""

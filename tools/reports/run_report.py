@@ -24,7 +24,7 @@ NOTHING_UM = 0.2
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """The main job in one sentence."""
+    """Return the main result in one sentence."""
     tremor = result["tremor"]
     if result["armed_ns"] is None:
         return "Nothing was armed, so there is nothing to compare."
@@ -52,7 +52,8 @@ def _compared(without_um: float | None, with_um: float | None) -> str:
 
 
 def tremor_table(result: Mapping[str, Any]) -> Table:
-    """Tremor without and with compensation, per axis and as a vector, then the error of the tip in each band."""
+    """Return a table of the tremor without and with compensation, per axis and as a vector, and of the tip's error in
+    each band."""
     table = Table(title="Motion of the tip, um rms (physical truth)", title_justify="left", box=box.SIMPLE_HEAD)
     for column in ("", "without", "with", "compensation"):
         table.add_column(column, justify="left" if not column else "right")
@@ -109,7 +110,7 @@ def task_legend(result: Mapping[str, Any]) -> str:
 
 
 def host_line(result: Mapping[str, Any]) -> str:
-    """How the host kept up; a pause of the host is no fault in emulated time."""
+    """Return how the host kept up. A pause of the host is no fault in emulated time."""
     host = result.get("host", {})
     if host.get("pace") != "paced":
         line = f"scheduling: {result['realtime']}" + machine_lines(result)
@@ -141,7 +142,7 @@ def machine_lines(result: Mapping[str, Any]) -> str:
 
 
 def summary_lines(result: Mapping[str, Any]) -> list[str]:
-    """What is not a table: latency, scans, holds, voluntary motion, safe state, recording."""
+    """Return the lines that are no table: latency, scans, holds, voluntary motion, safe state, recording."""
     latency = result["latency"]["sample_to_command_us"]
     samples, safe, voluntary = result["samples"], result["safe_state"], result["voluntary"]
     lines = [
@@ -208,7 +209,8 @@ def print_report(result: Mapping[str, Any], console: Console) -> None:
 
 
 def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
-    """PNG: three axes before and after in the tremor band, the last 3 s that were scored, and the spectra."""
+    """Return a PNG (bytes): three axes before and after in the tremor band, the last 3 s that were scored, and the
+    spectra."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -248,7 +250,7 @@ def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
 
 
 def html_page(result: Mapping[str, Any], image: bytes | None) -> str:
-    """One self-contained page."""
+    """Return one self-contained page."""
     from jinja2 import Environment
 
     page = Path(__file__).with_name("run_page.html.j2").read_text(encoding="utf-8")
@@ -273,7 +275,7 @@ def write_report(
     image: Path,
     more: Sequence[str] = (),
 ) -> None:
-    """Table, JSON, picture and page of a run, none of which depends on another one; then the lines ``more``.
+    """Write table, JSON, picture and page of a run, none of which depends on another one, then the lines ``more``.
 
     Raises ``OutputError`` at the end, with everything that could not be written.
     """
