@@ -23,7 +23,7 @@ MOST_TIE = 0.3  # noise variances, besides what the form of a model may cost
 
 @dataclass(frozen=True)
 class Rule:
-    """The margins of a decision; calibrated on null simulations (docs/mismatch-calibration.md).
+    """The margins of a decision; calibrated on null simulations (``tools/research/prove/nulls.py``).
 
     ``z`` whitened held-out correlation in standard deviations, over all candidates and places; ``gain`` least
     share of the mean square; ``excess`` least share of what stands above the noise; ``form`` times

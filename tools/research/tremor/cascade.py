@@ -1,4 +1,4 @@
-"""Runs, in the tick, the cascade neural network that tells voluntary from erroneous motion (Ang 2004, 5.3).
+"""Evaluates the cascade neural network that separates voluntary from erroneous motion (Ang 2004, sec. 5.3).
 
 Inputs are a bias and a window of the measured path, newest sample first, ``spacing`` samples apart; every hidden unit
 sees them and all hidden units before it; the output is linear in all of these. Trained by ``micron tremor train``.
