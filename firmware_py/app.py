@@ -20,7 +20,9 @@ from typing import Any
 import numpy as np
 
 from firmware_py.control.app import MicronPlan
+from firmware_py.control.instrument import Micron
 from firmware_py.control.plan import load_plan
+from firmware_py.control.program import check_program, load_program
 from firmware_py.control.stages import Stages
 from firmware_py.endoscope.wiring import is_endoscope
 from firmware_py.exit_codes import exit_code_of
@@ -70,11 +72,17 @@ def load_instrument(bench: BenchFile, request: RunRequest) -> InstrumentPlan:
 
         return load_endoscope(bench)
     plan = load_plan(bench, request.method)
+    program = None
+    if request.manual is not None:
+        program = load_program(request.manual)
+        check_program(request.manual, program, plan.stages.actuation)
     Stages(plan.stages).warm_up()
     if request.compiled:
         from firmware_py.compiled.loop import CompiledMicron
 
         return MicronPlan(plan, partial(CompiledMicron, spin_us=request.spin_us))
+    if program is not None:
+        return MicronPlan(plan, partial(Micron, program=program))
     return MicronPlan(plan)
 
 
@@ -104,12 +112,10 @@ def main(arguments: list[str]) -> int:
     _die_with_parent()
     table = json.loads(Path(arguments[0]).read_text())
     runtime_dir = Path(table.pop("runtime_dir"))
-    record = table.pop("record")
     live_fds = table.pop("live_fds")
-    request = RunRequest(
-        **{**table, "bench": Path(table["bench"]), "record": Path(record) if record is not None else None},
-        live_fds=tuple(live_fds) if live_fds is not None else None,
-    )
+    for name in ("bench", "record", "manual"):
+        table[name] = Path(table[name]) if table[name] is not None else None
+    request = RunRequest(**table, live_fds=tuple(live_fds) if live_fds is not None else None)
     try:
         outcome, truth = run_in_process(request, _status_pipe(), runtime_dir, own_process=True)
     except HalError as error:

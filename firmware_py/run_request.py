@@ -58,6 +58,8 @@ class RunRequest:
     """Start of the virtual clock. A late start crosses marks of time without waiting for them."""
     inject: tuple[str, ...] = ()
     """Faults on buses (``firmware_py.inject``)."""
+    manual: Path | None = None
+    """Program of voltages (``firmware_py.control.program``) that the outputs play in place of the compensation."""
     max_effect: int | None = None
     """Limit on how much the injected faults may disturb a real bench (scale of ``firmware_py.inject``)."""
 

@@ -18,6 +18,7 @@ from firmware_py.control.field_input import FieldInput
 from firmware_py.control.manual import ManualDrive
 from firmware_py.control.orders import HandOrders
 from firmware_py.control.plausibility import ScanCheck, turns_of_pairs
+from firmware_py.control.program import Program, ProgramDrive
 from firmware_py.control.redundancy import Redundancy
 from firmware_py.control.scan_input import ScanInput
 from firmware_py.control.stages import Stages
@@ -51,9 +52,13 @@ LATE_PART = 0.9  # latency of a late command, in periods; the prediction bridges
 
 
 class Micron:
-    """Runs the opened devices in ``run``: senses, estimates the tremor, and moves the tip against it."""
+    """Runs the opened devices in ``run``: senses, estimates the tremor, and moves the tip against it.
 
-    def __init__(self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run) -> None:
+    ``program``: voltages that the outputs play in place of the compensation."""
+
+    def __init__(
+        self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run, program: Program | None = None
+    ) -> None:
         assert run.output is not None  # a bench without a piezo output is refused
         self.run = run
         self.stages = stages
@@ -66,7 +71,8 @@ class Micron:
         self.closers: Sequence[Callable[[], object]] = (devices.daq.stop, run.output.close, self.scans.count_unread)
         self._warned = 0
         actuation = stages.configs.actuation
-        self.manual = ManualDrive(actuation.low_V, actuation.high_V, actuation.neutral_V)
+        limits_V = (actuation.low_V, actuation.high_V, actuation.neutral_V)
+        self.manual = ManualDrive(*limits_V) if program is None else ProgramDrive(*limits_V, program)
         self._orders = PageOrders(run, HandOrders(self.manual, stages, run).obey)
         self._field = None
         if devices.magnetometer is not None:

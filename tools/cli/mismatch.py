@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
+from tools.cli.mismatch_plan import plan, read_report
 from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(help="Find where a simulation and a recording differ, and which physics the simulation lacks.")
 app.command()(watch)
+app.command()(plan)
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")
@@ -352,7 +354,7 @@ def apply(
                 raise InputError(f"{copy}: is the bench itself; name another file with --bench-out")
         from tools.mismatch.apply import corrected_twin
 
-        body = _report(report)
+        body = read_report(report)
         twin = corrected_twin(recording, body)
         if original is not None and twin.kind != "piezo_stack":
             raise InputError(f"{bench}: an emulated bench runs twins of piezo_stack, this one is a {twin.kind}")
@@ -399,17 +401,3 @@ def simulate(
         for row in rows:
             say.print(f"{row.output}: residual {row.rms:.4g} {row.unit} rms{row.where}", highlight=False)
         write_json({"format": 1, "twin": str(twin), "outputs": [row.as_dict() for row in rows]}, json_file)
-
-
-def _report(path: Path) -> dict[str, Any]:
-    import json
-
-    try:
-        body = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}); give what diagnose --json wrote") from error
-    except (json.JSONDecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON ({error}); give what diagnose --json wrote") from error
-    if not isinstance(body, dict):
-        raise InputError(f"{path}: not a mismatch report; give what diagnose --json wrote")
-    return body

@@ -27,7 +27,7 @@ from firmware_py.inject import check_injections, parse_injection
 from firmware_py.machine.processors import format_processors
 from firmware_py.run_request import RunRequest
 from firmware_py.tremor.config import Method, all_methods
-from hal.bench import check_pace, load_bench
+from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
@@ -39,6 +39,8 @@ from tools.prepare import prepare
 if TYPE_CHECKING:
     from tools.reports.run_live import TipWatch
 
+FULL_EFFECT = 4
+"""Effect (scale of ``--max-effect``) of what moves the outputs."""
 SETTLE_S = 2.0
 """Time after arming within which the estimator locks and the soft start ends. Figures are taken after it."""
 
@@ -71,6 +73,10 @@ def run(
     sense_only: Annotated[
         bool, typer.Option("--sense-only", help="Arm nothing; use it to record poses turned by hand, or raw sensors.")
     ] = False,
+    manual: Annotated[
+        Path | None,
+        typer.Option(metavar="PROGRAM.toml", help="The outputs play it instead of compensating; runs to its end."),
+    ] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="Another tremor estimator than the bench file's.")
@@ -106,8 +112,8 @@ def run(
         check_writable(json_file, html, record)
         if scale is not None and hand is None:
             raise InputError("--scale belongs to --hand FILE; give both or neither")
-        if max_effect is not None and not inject:
-            raise InputError("--max-effect belongs to --inject; give both or neither")
+        if max_effect is not None and not inject and manual is None:
+            raise InputError("--max-effect belongs to --inject or --manual; give both or neither")
         if virtual and realtime:
             raise InputError("--virtual and --realtime exclude each other; give one of them")
         decide_on([bench_path(bench)], trust, allow_outside)
@@ -121,6 +127,8 @@ def run(
         if spin_us and not compiled:
             raise InputError("--spin-us belongs to --compiled; give both or neither")
         check_spin(file, spin_us)
+        if manual is not None:
+            seconds = max(seconds, _program_seconds(file, manual, max_effect, compiled, sense_only))
         request = RunRequest(
             bench=bench_path(bench),
             compiled=compiled,
@@ -135,6 +143,7 @@ def run(
             sense_only=sense_only,
             inject=tuple(inject or ()),
             max_effect=max_effect,
+            manual=manual,
             method=None if method is None else estimator_name(method),
         )
         check_injections(file, [parse_injection(text) for text in request.inject], max_effect)
@@ -171,6 +180,24 @@ def _check_processor(pace: str, cpu: int | None) -> None:
         raise InputError(
             f"--cpu {cpu}: this process may use processors {format_processors(available)}; name one of them"
         )
+
+
+def _program_seconds(file: BenchFile, manual: Path, max_effect: int | None, compiled: bool, sense_only: bool) -> float:
+    """How long a program of voltages lasts, after everything that speaks against playing it here was refused."""
+    from firmware_py.control.program import load_program
+
+    if is_endoscope(file.description):
+        raise InputError("--manual belongs to the instrument; an endoscope bench has no outputs that it could move")
+    if compiled or sense_only:
+        raise InputError("--manual plays voltages in the Python loop; leave --compiled and --sense-only out")
+    if not is_emulated(file) and (max_effect is None or max_effect < FULL_EFFECT):
+        raise InputError(f"--manual moves real outputs of {file.path}; allow it with --max-effect {FULL_EFFECT}")
+    return load_program(manual).seconds
+
+
+def is_emulated(file: BenchFile) -> bool:
+    """Return whether every bus of a bench is emulated."""
+    return all(bus.uri.startswith(SIM_SCHEME) for bus in file.description.bus.values())
 
 
 def exit_status(result: Mapping[str, Any]) -> Exit:

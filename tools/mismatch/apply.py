@@ -47,12 +47,12 @@ def corrected_twin(path: Path, report: Mapping[str, Any]) -> Corrected:
     """
     recording = with_equations(load(path))
     found = _physics(report)
-    _belongs(recording, report, found)
+    check_outputs(recording, report)
     base = dict(report["corrected_base"])
     before = list(base.pop("effects", []))
     kept = [p for p in found if p["name"] not in EVENTS]
     notes = [f"{p['name']} is an event of that recording and no part of the twin" for p in found if p["name"] in EVENTS]
-    effects = [*before, *(_entry(p) for p in kept)]
+    effects = [*before, *report_effects(kept)]
     with_effects = replace(recording, twin=TwinText(recording.twin.kind, base, tuple(effects)))
     try:
         model, theta = restore(with_effects)
@@ -95,7 +95,14 @@ def _physics(report: Mapping[str, Any]) -> list[Mapping[str, Any]]:
     return found
 
 
-def _belongs(recording: Recording, report: Mapping[str, Any], found: Sequence[Mapping[str, Any]]) -> None:
+def check_report(recording: Recording, report: Mapping[str, Any]) -> None:
+    """InputError for what is no report of a diagnosis, or one of another recording or twin."""
+    _physics(report)
+    check_outputs(recording, report)
+
+
+def check_outputs(recording: Recording, report: Mapping[str, Any]) -> None:
+    """InputError where twin or outputs of a report are not those of a recording."""
     if report["twin"] != recording.twin.kind:
         raise InputError(f"the report is of a {report['twin']}, {recording.path} of a {recording.twin.kind}")
     fit = report["fit"]
@@ -103,6 +110,11 @@ def _belongs(recording: Recording, report: Mapping[str, Any], found: Sequence[Ma
     if outputs != set(recording.outputs):
         said, have = ", ".join(sorted(outputs)) or "none", ", ".join(recording.outputs)
         raise InputError(f"the report's outputs ({said}) are not those of {recording.path} ({have})")
+
+
+def report_effects(found: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """The physics of a report as effects of a ``[twin]`` table."""
+    return [_entry(p) for p in found]
 
 
 def _entry(p: Mapping[str, Any]) -> dict[str, Any]:

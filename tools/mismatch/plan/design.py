@@ -1,0 +1,165 @@
+"""The input that best separates rival models: maximise the least distance between any two over families of waveforms.
+
+The criterion is expensive and has many optima, so the search is plain: described inputs and random points of every
+family on a thinned budget, then a (1 + 1) evolution strategy with the one-fifth rule (Rechenberg 1973) from the best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tools.mismatch.plan.limits import Limits
+from tools.mismatch.plan.models import Rival, smallest_distance
+from tools.mismatch.plan.situation import Situation
+from tools.mismatch.plan.waveforms import FAMILIES, LIBRARY, SIZE, draw, mean_square, random_multisine
+from tools.mismatch.recording import Array
+
+Progress = Callable[[str, int, int], None]
+
+RANDOM_PER_FAMILY = 3
+REFINED = 2
+QUICK, FULL = 3, 10
+"""Iterations of the rival's re-fit while candidates are compared, and for the figures that are printed."""
+COMPARED = 9
+"""Random multisines of equal energy whose median distance is printed beside the plan."""
+ENERGIES_SEED = 77
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A planned input: ``waves[signal]`` (n,), the least distance of any two rivals in standard deviations, and that of
+    random multisines of equal energy (median). ``description`` names the family.
+    """
+
+    waves: Mapping[str, Array]
+    limits: Mapping[str, Limits]
+    dt: float
+    description: str
+    separation: float
+    random_separation: float
+    pairs: Mapping[str, float]
+    evaluations: int
+
+
+@dataclass(frozen=True)
+class _Point:
+    family: str
+    z: NDArray[np.float64]
+    value: float
+    name: str = ""
+
+
+def design(
+    where: Situation,
+    rivals: Sequence[Rival],
+    limits: Mapping[str, Limits],
+    sigma: Mapping[str, float],
+    *,
+    evaluations: int = 80,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Plan:
+    """Design the inputs named in ``limits`` together (each is a waveform of the same family).
+
+    ``evaluations``: inputs that are tried. Same arguments: same plan.
+    """
+    rng = np.random.default_rng(seed)
+    done = 0
+    signals = tuple(limits)
+
+    def waves(family: str, z: NDArray[np.float64]) -> dict[str, Array]:
+        parts = np.split(z, len(signals))
+        return {s: draw(family, p, limits[s], where.dt) for s, p in zip(signals, parts, strict=True)}
+
+    def value(family: str, z: NDArray[np.float64], floor: float = -1.0) -> float:
+        nonlocal done
+        done += 1
+        if progress is not None:
+            progress("inputs", done, evaluations)
+        return smallest_distance(where.course(waves(family, z)), rivals, sigma, QUICK, floor)
+
+    points: list[_Point] = []
+    for name, (family, z) in LIBRARY.items():
+        whole = np.concatenate([np.asarray(z) for _ in signals])
+        points.append(_Point(family, whole, value(family, whole), name))
+    for family in FAMILIES:
+        for _ in range(RANDOM_PER_FAMILY):
+            z = rng.random(SIZE[family] * len(signals))
+            points.append(_Point(family, z, value(family, z)))
+    points.sort(key=lambda p: -p.value)
+    best = points[0]
+    share = max(0, evaluations - done) // REFINED
+    for start in _unlike(points, REFINED):
+        now, step = start, 0.2
+        for _ in range(share):
+            z = now.z + step * rng.standard_normal(now.z.size)
+            z = np.abs(z) % 2.0
+            z = np.where(z > 1.0, 2.0 - z, z)
+            found = value(now.family, z, now.value)
+            if found > now.value:
+                now, step = _Point(now.family, z, found, now.name), min(step * 1.5, 0.5)
+            else:
+                step = max(step * 1.5**-0.25, 0.01)
+        if now.value > best.value:
+            best = now
+    chosen = waves(best.family, best.z)
+    pairs = pair_distances(where, rivals, chosen, sigma)
+    return Plan(
+        chosen,
+        dict(limits),
+        where.dt,
+        best.name or best.family,
+        min(pairs.values()),
+        random_separation(where, rivals, chosen, limits, sigma, seed),
+        pairs,
+        done,
+    )
+
+
+def _unlike(points: Sequence[_Point], count: int) -> list[_Point]:
+    """The best points of different families."""
+    out: list[_Point] = []
+    for p in points:
+        if p.family not in {q.family for q in out}:
+            out.append(p)
+    return out[:count]
+
+
+def pair_distances(
+    where: Situation, rivals: Sequence[Rival], waves: Mapping[str, Array], sigma: Mapping[str, float]
+) -> dict[str, float]:
+    """The least distance of each unordered pair, by "one / other"."""
+    course = where.course(waves)
+    return {
+        f"{a.name} / {b.name}": smallest_distance(course, (a, b), sigma, FULL)
+        for i, a in enumerate(rivals)
+        for b in rivals[i + 1 :]
+    }
+
+
+def random_inputs(
+    waves: Mapping[str, Array], limits: Mapping[str, Limits], dt: float, rng: np.random.Generator
+) -> dict[str, Array]:
+    """A random multisine for each input, with the energy of the planned one."""
+    return {s: random_multisine(rng, limits[s], dt, mean_square(x, limits[s])) for s, x in waves.items()}
+
+
+def random_separation(
+    where: Situation,
+    rivals: Sequence[Rival],
+    waves: Mapping[str, Array],
+    limits: Mapping[str, Limits],
+    sigma: Mapping[str, float],
+    seed: int,
+) -> float:
+    """The median least distance on random multisines of equal energy."""
+    rng = np.random.default_rng([seed, ENERGIES_SEED])
+    found = [
+        smallest_distance(where.course(random_inputs(waves, limits, where.dt, rng)), rivals, sigma, FULL)
+        for _ in range(COMPARED)
+    ]
+    return float(np.median(found))

@@ -1,0 +1,215 @@
+"""Which effects a planned recording could tell apart, at which size, and what would split those that it cannot."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.identifiability import experiment
+from tools.mismatch.plan.limits import Limits
+from tools.mismatch.plan.responses import Response, ground, responses
+from tools.mismatch.plan.situation import Situation
+from tools.mismatch.plan.waveforms import LIBRARY, draw, random_multisine
+from tools.mismatch.recording import Array, Recording
+from tools.mismatch.simulate_sites import why_not
+from tools.mismatch.twins.vocabulary import CONTEXT_UNITS
+
+THRESHOLD = 5.0
+"""Standard deviations of the noise that a response, or a difference of responses, must have."""
+DEFAULT_INPUT = "a random multisine"
+
+
+@dataclass(frozen=True)
+class Shown:
+    """``smallest_rms``: of the effect on its output, in noise rms, that would be seen beside a re-fit."""
+
+    name: str
+    place: str
+    smallest_rms: float
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two effects. ``degrees``: the larger of the two angles between the response of one and what the other can do;
+    ``size``: the rms, in noise rms, from which one of them cannot pass for the other; ``sizes``: if the first, and if
+    the second is there.
+    """
+
+    names: tuple[str, str]
+    degrees: float
+    size: float
+    sizes: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Splitter:
+    """What would split a pair: ``what`` in words; ``size`` with it, in noise rms (None: not simulated)."""
+
+    names: tuple[str, str]
+    what: str
+    size: float | None
+
+
+@dataclass(frozen=True)
+class Separable:
+    """``groups``: effects of which each is too close to the next; ``not_moved``: effects that this input does not
+    show; ``not_here``: those that these channels cannot have, with the reason.
+    """
+
+    input: str
+    samples: int
+    size: float
+    shown: tuple[Shown, ...]
+    pairs: tuple[Pair, ...]
+    groups: tuple[tuple[str, ...], ...]
+    splitters: tuple[Splitter, ...]
+    not_moved: tuple[str, ...]
+    not_here: Mapping[str, str]
+
+
+def pair_of(a: Response, b: Response) -> Pair:
+    """How far two effects are apart."""
+    sines = (_sine(a, b), _sine(b, a))
+    sizes = tuple(THRESHOLD / max(s * r.norm_per_rms, 1e-300) for s, r in zip(sines, (a, b), strict=True))
+    degrees = float(np.degrees(np.arcsin(min(1.0, max(sines)))))
+    return Pair((a.effect.name, b.effect.name), degrees, min(sizes), (sizes[0], sizes[1]))
+
+
+def _sine(a: Response, b: Response) -> float:
+    """Sine of the angle between the response of ``a`` and the nearest space of ``b``."""
+    inside = max((float(np.sum((space.T @ a.move) ** 2)) for space in b.tangents), default=0.0)
+    return float(np.sqrt(max(0.0, 1.0 - inside)))
+
+
+def _strongest(found: Iterable[Response]) -> list[Response]:
+    """One response per effect: the place where it shows best."""
+    out: dict[str, Response] = {}
+    for r in found:
+        if r.effect.name not in out or r.norm_per_rms > out[r.effect.name].norm_per_rms:
+            out[r.effect.name] = r
+    return list(out.values())
+
+
+def groups_of(pairs: Sequence[Pair], size: float) -> tuple[tuple[str, ...], ...]:
+    """Effects that are joined by pairs that cannot be told apart at ``size``."""
+    groups: list[set[str]] = []
+    for p in pairs:
+        if p.size <= size:
+            continue
+        touched = [g for g in groups if g & set(p.names)]
+        joined = set(p.names).union(*touched)
+        groups = [g for g in groups if g not in touched] + [joined]
+    return tuple(tuple(sorted(g)) for g in sorted(groups, key=lambda g: sorted(g)))
+
+
+def separable(
+    where: Situation,
+    limits: Mapping[str, Limits],
+    sigma: Mapping[str, float],
+    *,
+    size: float,
+    given: Mapping[str, Array] | None = None,
+    seed: int = 0,
+    effects: Sequence[Effect] | None = None,
+) -> Separable:
+    """What the channels of a situation could tell apart with the ``given`` inputs (or a random multisine), for effects
+    of ``size`` noise rms; for each pair that is too close, the input or channel that would split it.
+    """
+    catalogue = tuple(effects if effects is not None else EFFECTS.values())
+    rng = np.random.default_rng([seed, 3])
+    waves = given or {s: random_multisine(rng, box, where.dt) for s, box in limits.items()}
+    course = where.course(waves)
+    on = ground(course, sigma, seed)
+    found = _strongest(responses(on, catalogue, size))
+    pairs = [pair_of(a, b) for i, a in enumerate(found) for b in found[i + 1 :]]
+    close = [p for p in pairs if p.size > size]
+    absent = {e.name: why for e in catalogue if (why := why_not(on.problem.twin, course, e))}
+    moved = {r.effect.name for r in found}
+    return Separable(
+        "as given" if given else DEFAULT_INPUT,
+        course.n,
+        size,
+        tuple(
+            Shown(r.effect.name, r.placed.target or r.placed.outputs[0], THRESHOLD / r.norm_per_rms)
+            for r in sorted(found, key=lambda r: -r.norm_per_rms)
+        ),
+        tuple(sorted(pairs, key=lambda p: -p.size)),
+        groups_of(pairs, size),
+        tuple(_splitters(where, limits, sigma, size, seed, close)),
+        tuple(sorted(e.name for e in catalogue if e.name not in moved and e.name not in absent)),
+        absent,
+    )
+
+
+def _splitters(
+    where: Situation, limits: Mapping[str, Limits], sigma: Mapping[str, float], size: float, seed: int,
+    close: Sequence[Pair],
+) -> list[Splitter]:  # fmt: skip
+    """The described input that tells each close pair apart at the smallest size; else the experiment in words."""
+    if not close:
+        return []
+    wanted = {n for p in close for n in p.names}
+    effects = [EFFECTS[n] for n in sorted(wanted) if n in EFFECTS]
+    best: dict[tuple[str, str], tuple[float, str]] = {}
+    for words, (family, z) in LIBRARY.items():
+        course = where.course({s: draw(family, np.asarray(z), box, where.dt) for s, box in limits.items()})
+        found = {r.effect.name: r for r in _strongest(responses(ground(course, sigma, seed), effects, size))}
+        for p in close:
+            a, b = (found.get(n) for n in p.names)
+            if a is not None and b is not None and (now := pair_of(a, b).size) < best.get(p.names, (np.inf, ""))[0]:
+                best[p.names] = (now, words)
+    out: list[Splitter] = []
+    for p in close:
+        value, words = best.get(p.names, (np.inf, ""))
+        if value <= size:
+            out.append(Splitter(p.names, words, value))
+            continue
+        a, b = (EFFECTS[n] for n in p.names)
+        out.append(Splitter(p.names, experiment(a, b), None))
+    return out
+
+
+def channel_gains(
+    where: Situation, limits: Mapping[str, Limits], sigma: Mapping[str, float], *, size: float, seed: int = 0
+) -> dict[str, tuple[str, ...]]:
+    """For each context channel that is not recorded: the effects that could be named with it, and told from all
+    others that the recording then shows. The channel's course is a random slow one of its own.
+    """
+    out: dict[str, tuple[str, ...]] = {}
+    rng = np.random.default_rng([seed, 11])
+    waves = {s: random_multisine(rng, box, where.dt) for s, box in limits.items()}
+    course = where.course(waves)
+    for signal in CONTEXT_UNITS:
+        if signal in course.signals:
+            continue
+        needing = [e for e in EFFECTS.values() if signal in e.needs]
+        if not needing:
+            continue
+        more = with_context(course, signal, rng)
+        found = _strongest(responses(ground(more, sigma, seed), EFFECTS.values(), size))
+        names = {e.name for e in needing}
+        apart = [
+            r.effect.name
+            for r in found
+            if r.effect.name in names and all(pair_of(r, o).size <= size for o in found if o is not r)
+        ]
+        if apart:
+            out[signal] = tuple(apart)
+    return out
+
+
+def with_context(course: Recording, signal: str, rng: np.random.Generator) -> Recording:
+    """The recording with a context channel that wanders slowly, one unit rms."""
+    x = np.cumsum(rng.standard_normal(course.n))
+    x = (x - x.mean()) / max(float(x.std()), 1e-300)
+    unit = CONTEXT_UNITS[signal][0]
+    return replace(
+        course,
+        context={**course.context, signal: x},
+        unit={**course.unit, signal: unit},
+        column={**course.column, signal: signal},
+    )
