@@ -183,7 +183,7 @@ def _check_processor(pace: str, cpu: int | None) -> None:
 
 
 def _program_seconds(file: BenchFile, manual: Path, max_effect: int | None, compiled: bool, sense_only: bool) -> float:
-    """How long a program of voltages lasts, after everything that speaks against playing it here was refused."""
+    """Return how long a program of voltages lasts; refuse it where it cannot be played."""
     from firmware_py.control.program import load_program
 
     if is_endoscope(file.description):

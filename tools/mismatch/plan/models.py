@@ -70,9 +70,14 @@ def smallest_distance(
 
 
 def log_ratio(recording: Recording, a: Rival, b: Rival, sigma: Mapping[str, float]) -> float:
-    """Log likelihood of ``a`` less that of ``b`` on a recording, both re-fitted (normal noise, its rms as stated)."""
-    left = [squares(refit(recording, r, sigma, iterations=25), sigma) for r in (a, b)]
-    return 0.5 * (left[1] - left[0])
+    """Log likelihood of ``a`` less that of ``b`` on a recording, both re-fitted (normal noise, its rms as stated), with
+    half the logarithm of the number of samples as the price of a parameter (Schwarz 1978): a model that contains the
+    other one must earn what it is free to follow.
+    """
+    found = [refit(recording, r, sigma, iterations=25) for r in (a, b)]
+    left = [squares(f, sigma) for f in found]
+    price = 0.5 * math.log(recording.n * len(recording.outputs))
+    return 0.5 * (left[1] - left[0]) + price * (found[1].theta.size - found[0].theta.size)
 
 
 def fitted_rival(problem: Problem, name: str, placed: Sequence[Placed], starts: Sequence[Array]) -> Rival | None:
