@@ -151,11 +151,11 @@ class AmplifierMonitor:
         shortest: list[tuple[float, float, float]] = []  # volts, least weight, further weight
         end_ns = window.latest_ns + window.longest_ns
         gone_late_ns = gone_early_ns = end_ns  # when the next command took over, at the latest and at the earliest
-        commands = self._guard.told
-        told_V = [command.volts[output] for command in commands]
+        commands = self._guard.sent_commands
+        commanded_V = [command.volts[output] for command in commands]
         tick_V = self._guard.limits[output].slew_V_per_s * 1e-3
         for k, command in reversed(list(enumerate(commands))):
-            ticks_worth = max(1.0, abs(told_V[k] - told_V[k - 1]) / tick_V) if k else 1.0  # after a gap
+            ticks_worth = max(1.0, abs(commanded_V[k] - commanded_V[k - 1]) / tick_V) if k else 1.0  # after a gap
             since_late_ns = command.sent_ns + round(self._settle_ns * ticks_worth)
             if command.offered_ns < end_ns:
                 least_ns = min(gone_early_ns, window.earliest_ns + window.shortest_ns) - max(

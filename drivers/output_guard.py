@@ -29,13 +29,13 @@ from hal.contracts import Clock, Float64Array
 from hal.errors import ErrorKind, SafetyTrip
 from hal.types import OutputLimit
 
-__all__ = ["RAMP_STEPS", "TOLD", "OutputGuard", "Told"]
+__all__ = ["LISTED", "RAMP_STEPS", "OutputGuard", "SentCommand"]
 
-TOLD = KEPT - 1
-"""Number of commands in ``OutputGuard.told``."""
+LISTED = KEPT - 1
+"""Number of commands in ``OutputGuard.sent_commands``."""
 
 
-class Told(NamedTuple):
+class SentCommand(NamedTuple):
     """Describes a sent command. It took effect between its two times (bench clock, ns) if the driver says no better."""
 
     offered_ns: int
@@ -90,17 +90,17 @@ class OutputGuard:
         return self.state.words[CLIPPED]
 
     @property
-    def told(self) -> list[Told]:
-        """Return the last ``TOLD`` commands, the newest last.
+    def sent_commands(self) -> list[SentCommand]:
+        """Return the last ``LISTED`` commands, the newest last.
 
         A compiled loop may send more in the meantime; what it could have overwritten is left out.
         """
         state, n = self.state, len(self.limits)
         newest = state.words[N_SENT]
         kept_ns, kept_V = state.kept_ns.tolist(), state.kept_V.tolist()
-        oldest = max(0, state.words[N_SENT] - TOLD)
+        oldest = max(0, state.words[N_SENT] - LISTED)
         places = (k % KEPT for k in range(oldest, newest))
-        return [Told(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n])) for p in places]
+        return [SentCommand(kept_ns[2 * p], kept_ns[2 * p + 1], tuple(kept_V[n * p : n * p + n])) for p in places]
 
     def admit(self, values_V: Float64Array) -> int:
         """Fill ``next_V`` (n,) from the wanted values. Return the mask of channels that were clipped or slew limited.

@@ -141,7 +141,7 @@ class AnalogOutput(Protocol):
         ...
 
     @property
-    def told_V(self) -> Sequence[float]:
+    def commanded_V(self) -> Sequence[float]:
         """Return the set points in V sent to the device last, by ``write`` or by the ramp to its safe state."""
         ...
 

@@ -57,7 +57,7 @@ class WiringFaults:
     _last_V: Volts = field(default_factory=lambda: np.zeros(8))
     _demand_V: list[float] = field(default_factory=lambda: [50.0, 50.0, 50.0])
     on_demand: Callable[[int, float], None] | None = None
-    """Told every demand that reaches the amplifier, before its own faults: who judges the commands listens here."""
+    """Is called with every demand that reaches the amplifier, before its own faults, to judge the commands."""
 
     def __post_init__(self) -> None:
         self._random = np.random.default_rng([self.seed, 77])

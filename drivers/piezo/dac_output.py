@@ -136,7 +136,7 @@ class DacOutput:
         return self.guard.writes
 
     @property
-    def told_V(self) -> Sequence[float]:
+    def commanded_V(self) -> Sequence[float]:
         return self.guard.last_V
 
     def write(self, values_V: Float64Array) -> int:
@@ -163,9 +163,9 @@ class DacOutput:
 
     def differences(self, codes: Sequence[int]) -> str:
         """Return what differs between ``codes`` and the last command; empty if nothing does."""
-        for i, (code, told_V) in enumerate(zip(codes, self.guard.last_V, strict=True)):
-            if code != self._code(told_V):
-                return f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {told_V:.3f} V"
+        for i, (code, commanded_V) in enumerate(zip(codes, self.guard.last_V, strict=True)):
+            if code != self._code(commanded_V):
+                return f"output {i + 1} holds {code * self.lsb_V:.3f} V and was told {commanded_V:.3f} V"
         return ""
 
     def readback_V(self) -> Float64Array:

@@ -130,7 +130,7 @@ class E727:
         return self.guard.writes
 
     @property
-    def told_V(self) -> Sequence[float]:
+    def commanded_V(self) -> Sequence[float]:
         return self.guard.last_V
 
     def write(self, values_V: Float64Array) -> int:

@@ -148,7 +148,7 @@ class Micron:
         if int(self.frame[STATUS]) & FrameStatus.STALE:
             return
         if supervisor.is_holding:
-            self.stages.hold(self.output.told_V)
+            self.stages.hold(self.output.commanded_V)
         elif supervisor.may_move and info.k == ticks.k0 + ticks.n - 1:
             if self.manual.active:
                 self.stages.follow(self.manual.step(self.run.clock.now_ns()))

@@ -108,9 +108,10 @@ class Stages:
         self.command_V[:] = command_V
         self.frame[STATUS] = int(self.frame[STATUS]) | MANUAL
 
-    def hold(self, told_V: Sequence[float]) -> None:
-        """Make the tick's step follow ``told_V`` (3,), the outputs of a hold on the way to neutral and at neutral."""
-        self.command_V[:] = told_V
+    def hold(self, commanded_V: Sequence[float]) -> None:
+        """Make the tick's step follow ``commanded_V`` (3,), the outputs of a hold on the way to neutral and at
+        neutral."""
+        self.command_V[:] = commanded_V
         self.frame[STATUS] = int(self.frame[STATUS]) | HELD
 
     def warm_up(self, *, batch: bool = False) -> None:

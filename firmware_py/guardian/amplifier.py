@@ -49,8 +49,8 @@ class GuardedAmplifier:
         inner.gate = self._gate
 
     @property
-    def told_V(self) -> Sequence[float]:
-        return self._inner.told_V
+    def commanded_V(self) -> Sequence[float]:
+        return self._inner.commanded_V
 
     def arm(self) -> None:
         """Raises ``SafetyTrip`` when nobody would take the outputs to neutral if this process died, or when they are

@@ -70,7 +70,7 @@ def test_a_quiet_run(tmp_path: Path):
 def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """Python's heartbeat counts as stopped for one entry: neutral without Python, a hold, and on."""
     feed = CompiledMicron._feed  # pyright: ignore[reportPrivateUsage]
-    told_V: list[list[float]] = []
+    commanded_V: list[list[float]] = []
 
     def feed_late(loop: CompiledMicron, last_due_ns: int) -> None:
         feed(loop, last_due_ns)
@@ -84,13 +84,13 @@ def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatc
         flush(loop)
         words = loop._words  # pyright: ignore[reportPrivateUsage]
         if words[BEAT_LIMIT_NS] < 0:
-            told_V.append(loop._output.guard.last_V)  # pyright: ignore[reportPrivateUsage]
+            commanded_V.append(loop._output.guard.last_V)  # pyright: ignore[reportPrivateUsage]
             words[BEAT_LIMIT_NS] = 100_000_000
 
     monkeypatch.setattr(CompiledMicron, "_feed", feed_late)
     monkeypatch.setattr(CompiledMicron, "_flush", flush_and_look)
     outcome, _, _ = run(tmp_path, {}, compiled=True)
-    assert told_V == [[50.0, 50.0, 50.0]], "neutral before Python knows"
+    assert commanded_V == [[50.0, 50.0, 50.0]], "neutral before Python knows"
     assert [hold["finding"] for hold in outcome["holds"]] == ["supervision_silent"]
     assert outcome["safe_state"]["normal"]
     assert outcome["loop"]["ticks"] > 220, "the thread went on after the hold"

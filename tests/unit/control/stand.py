@@ -37,21 +37,21 @@ class StandOutput:
         self.name = "piezo"
         self.limits: tuple[OutputLimit, ...] = ()
         self.commands_sent = 0
-        self.told_V: Sequence[float] = (50.0, 50.0, 50.0)
+        self.commanded_V: Sequence[float] = (50.0, 50.0, 50.0)
 
     def arm(self) -> None:
         pass
 
     def write(self, values_V: NDArray[np.float64]) -> int:
         self.commands_sent += 1
-        self.told_V = values_V.tolist()
+        self.commanded_V = values_V.tolist()
         return 0
 
     def safe_step(self) -> bool:
         return True
 
     def readback_V(self) -> NDArray[np.float64]:
-        return np.array(self.told_V)
+        return np.array(self.commanded_V)
 
     def close(self) -> None:
         pass

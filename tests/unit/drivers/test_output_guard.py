@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from drivers.output_guard import RAMP_STEPS, TOLD, OutputGuard, Told
+from drivers.output_guard import LISTED, RAMP_STEPS, OutputGuard, SentCommand
 from drivers.output_guard_steps import SLEW_LIMITED
 from hal.clock import VirtualClock
 from hal.errors import ErrorKind, SafetyTrip
@@ -127,7 +127,13 @@ def refused(out: OutputGuard, wish: list[float]) -> SafetyTrip:
 
 def test_a_new_guard_is_not_armed_and_has_done_nothing():
     out = OutputGuard("out", [LIMIT, LIMIT], VirtualClock())
-    assert (out.armed, out.writes, out.clipped, out.state.words[SLEW_LIMITED], list(out.told)) == (False, 0, 0, 0, [])
+    assert (out.armed, out.writes, out.clipped, out.state.words[SLEW_LIMITED], list(out.sent_commands)) == (
+        False,
+        0,
+        0,
+        0,
+        [],
+    )
     error = refused(out, [50.0, 50.0])
     assert (error.device, "not armed: call arm() first" in str(error)) == ("out", True)
     assert out.ramp()  # it is where a ramp ends
@@ -147,21 +153,21 @@ def test_what_was_sent_is_told_with_its_times_and_counted():
         offered_ns = clock.now_ns()
         clock.burn_ns(300_000)
         out.sent(ago_ns=100_000)
-    assert out.told[-1] == Told(offered_ns, offered_ns + 200_000, (51.0, 50.0))
+    assert out.sent_commands[-1] == SentCommand(offered_ns, offered_ns + 200_000, (51.0, 50.0))
     # the allowance grows from when it was sent: 0.1 ms ago and 0.4 ms more
     clock.burn_ns(400_000)
     out.admit(np.array([60.0, 50.0]))
     assert out.next_V[0] == pytest.approx(52.0)
     out.not_before(clock.now_ns() + 70_000)
     out.sent()
-    assert out.told[-1].offered_ns == clock.now_ns() + 70_000
+    assert out.sent_commands[-1].offered_ns == clock.now_ns() + 70_000
     assert out.writes == 3
     out.ramp()
     out.sent()
     assert out.writes == 3  # steps of a ramp are nobody's wish
-    for _ in range(TOLD):
+    for _ in range(LISTED):
         out.sent()
-    assert len(out.told) == TOLD
+    assert len(out.sent_commands) == LISTED
 
 
 def test_a_ramp_begins_where_the_last_wish_was():

@@ -93,7 +93,7 @@ def test_the_guardian_answers_to_the_mark_although_the_pipe_stays_open(owner: Ow
 
     amplifier = DacAmplifier(Immediate(), clock)  # type: ignore[arg-type]
     amplifier.arm()
-    while amplifier.told_V[0] < 60.0:
+    while amplifier.commanded_V[0] < 60.0:
         amplifier.write(np.array([70.0, 30.0, 50.0]))
     guardian = Guardian(owner.heart, DacAmplifier(Immediate(), clock), clock, notice_ms=1e6, limit_ms=1e6)  # type: ignore[arg-type]
     owner.heart.say(Phase.RUNNING)
