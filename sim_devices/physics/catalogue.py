@@ -32,7 +32,7 @@ from sim_devices.physics.rigid import CENTRIPETAL_ACCELERATION, SENSOR_POSITION_
 from sim_devices.physics.saturation import SATURATION
 from sim_devices.physics.slew import SLEW_LIMIT
 from sim_devices.physics.spikes import SPIKES
-from sim_devices.physics.spring import CLEARANCE, COGGING_FORCE, CUBIC_STIFFNESS
+from sim_devices.physics.spring import CLEARANCE, COGGING_FORCE, CUBIC_STIFFNESS, GRAVITY_LOAD
 from sim_devices.physics.step_shift import STEP_SHIFT
 from sim_devices.physics.warm_up import THERMAL_DRIFT
 
@@ -76,6 +76,7 @@ _ALL = (
     QUADRATIC_DRAG,
     AMPLITUDE_DAMPING,
     CLEARANCE,
+    GRAVITY_LOAD,
     SQUARE_ROOT_OUTFLOW,
     OVERFLOW,
     PARAMETER_VARIATION,

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, no_settings
 from sim_devices.physics.statistics import least_squares, thin, value_range
 
 KNOTS = 9
 
 
 def curve_basis(x: Array, lo: float, hi: float, shape: int) -> Array:
-    """Columns of a curve without its straight part. ``shape`` 1: the sign is lost, |x| - x (a sensor of magnitude);
-    2..5: Legendre polynomials up to that degree, continued
-    by their tangents outside [lo, hi]; 0: hinges |x - knot| on a uniform grid and at zero (piecewise linear)."""
+    """Columns of a curve without its straight part. ``shape`` 2..5: Legendre polynomials up to that degree, continued
+    by their tangents outside [lo, hi]; 0: hinges |x - knot| on a uniform grid and at zero (piecewise linear).
+    """
     half = 0.5 * (hi - lo)
-    if shape == 1:
-        return (np.abs(x) - x)[:, None]
     z = (x - 0.5 * (lo + hi)) / half
     if shape > 0:
         inside = np.clip(z, -1.0, 1.0)
@@ -45,7 +44,7 @@ def _curve_choose(x: Array, target: Array, ctx: Context) -> tuple[float, int, fl
     # effective samples: residuals are coloured, so one in ten counts
     n = max(k.size / 10.0, 20.0)
     best = (np.inf, 2)
-    for shape in (1, 2, 3, 5, 0) if lo < 0.0 < hi else (2, 3, 5, 0):
+    for shape in (2, 3, 5, 0):
         cols = curve_basis(x, lo, hi, shape)
         if ctx.through is not None:
             cols = np.stack([ctx.to_output(c) for c in cols.T], axis=1)
@@ -62,14 +61,12 @@ def _curve_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
             _, shape, lo, hi = other
     # behind a dynamic twin the curve needs a slope of its own: the base gain sets where on the curve one is
     behind = ctx.believed is not None
-    return {"range": (lo, hi), "shape": (float(shape),), "slope": (1.0 if behind and shape != 1 else 0.0,)}
+    return {"range": (lo, hi), "shape": (float(shape),), "slope": (1.0 if behind else 0.0,)}
 
 
 def _curve_parts(settings: Settings) -> Parts:
     shape = int(settings.get("shape", (3.0,))[0])
     n = max(shape - 1, 1) if shape > 0 else KNOTS
-    if shape == 1:
-        return Parts((), (Parameter("sign_lost", "{out}/{in}"),))
     names = [f"legendre{d}" for d in range(2, shape + 1)] if shape > 0 else [f"hinge{i + 1}" for i in range(n)]
     if settings.get("slope", (0.0,))[0]:
         names.append("slope")
@@ -100,7 +97,21 @@ def _curve_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]
     return out
 
 
-STATIC_NONLINEARITY = Effect(
+def _fold_parts(settings: Settings) -> Parts:
+    terms = (Parameter("sign_lost", "1"), Parameter("growth", "1/{out}"), Parameter("zero", "{out}"))
+    return Parts((), terms, np.diag([0.0, 0.02, 0.02]))
+
+
+def _fold_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    # an offset of the twin is one of what is folded
+    return np.stack([np.abs(x) - x, x * x, np.ones(x.size)], axis=1)
+
+
+def _fold_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (Human("sign_lost", float(p[0]), "1"), Human("growth", float(p[1]), "1/{out}"))
+
+
+_CURVE = Effect(
     name="static_nonlinearity",
     summary="memoryless curvature of one axis' own input-output line",
     kind="add",
@@ -115,3 +126,18 @@ STATIC_NONLINEARITY = Effect(
     report=_curve_report,
     vanishes_with=(("deviation_from_line",),),
 )
+_FOLD = replace(
+    _CURVE,
+    summary="the sign is lost: a sensor reads the magnitude, or a power of it",
+    stages=("sensor",),
+    parts=_fold_parts,
+    equation=r"y = x + s (|x| - x) + g x^2",
+    source="T. Wigren, M. Schoukens, Coupled Electric Drives Data Set and Reference Models, Uppsala University 2017-024",
+    excitation="both signs of the signal",
+    prepare=no_settings,
+    basis=_fold_basis,
+    report=_fold_report,
+    sites=("output",),
+    vanishes_with=(("sign_lost",),),
+)
+STATIC_NONLINEARITY = replace(_CURVE, variants=(_FOLD,))

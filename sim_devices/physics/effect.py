@@ -227,6 +227,8 @@ class Effect:
     acts_on: tuple[Literal["motion", "storage", "storages", "parameter"], ...] = ("motion",)
     """Feedback only: at a velocity, at any other state (a level, a current, a temperature), at all such at once, or on
     a parameter of differential equations."""
+    position_unit: str = ""
+    """Feedback only: the unit that the position must have which it depends on; empty: any."""
     twins: tuple[str, ...] = ()
     """Twin kinds that can have it; empty: all."""
     available: Callable[[Mapping[str, Array], str], str] | None = None

@@ -15,7 +15,7 @@ FRICTION = 7
 """Level, level difference, breakaway extra, Stribeck speed, viscous difference, bristle stiffness, lean of a loop."""
 SPRING = 9  # cubic, quadratic, linear, quintic, drag, damping with amplitude, stop stiffness, half gap, centre
 UNCENTRED = "uncentred"  # fact of a twin: its position counts from where the record begins, and nothing centres it
-COGGING = 5  # period, sin1, cos1, sin2, cos2
+COGGING = 7  # period, sin1, cos1, sin2, cos2; sine and cosine of the angle itself (gravity)
 FLOW = 5  # law, state it depends on, state whose derivative it is added to, strength, level
 ROOT, ABOVE, SQUARE, PLAIN = range(4)  # laws of a flow
 
@@ -94,7 +94,7 @@ def loop_along(x, yielding, lean, starts):
 
 @kernel
 def smooth_force(p, v, spring, cogging, friction, place):
-    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, viscosity.
+    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, gravity, viscosity.
 
     The rows of all places stand one behind the other; ``place`` says which of them is meant.
     """
@@ -110,6 +110,8 @@ def smooth_force(p, v, spring, cogging, friction, place):
         a = 2.0 * np.pi * p / cogging[c]
         f += cogging[c + 1] * np.sin(a) + cogging[c + 2] * np.cos(a)
         f += cogging[c + 3] * np.sin(2.0 * a) + cogging[c + 4] * np.cos(2.0 * a)
+    if cogging[c + 5] != 0.0 or cogging[c + 6] != 0.0:
+        f += cogging[c + 5] * np.sin(p) + cogging[c + 6] * np.cos(p)
     return f
 
 

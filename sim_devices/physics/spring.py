@@ -1,4 +1,4 @@
-"""Position-dependent forces: a spring that hardens or softens, and cogging."""
+"""Position-dependent forces: a spring that hardens or softens, cogging, gravity on a lever, and a joint with play."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.forces import COGGING, SPRING, UNCENTRED, base_moves
+from sim_devices.physics.friction import velocity_of
 from sim_devices.physics.statistics import least_squares, thin
 
 MOST_PERIOD = 0.8  # of the travel: what was not seen to come again is a spring
@@ -100,7 +101,41 @@ _QUINTIC = replace(
     fill=_quintic_fill,
     report=_quintic_report,
 )
-CUBIC_STIFFNESS = replace(_CUBIC, variants=(_QUINTIC,))
+
+
+def _lossy_parts(settings: Settings) -> Parts:
+    parts = _spring_parts(settings)
+    terms = (*parts.weights, Parameter("loss", "1/({out}^2 s)", 0.0))
+    return Parts((), terms, np.diag([0.0, 0.02, *[0.0] * (len(terms) - 2)]))
+
+
+def _lossy_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.column_stack([_spring_basis(x, ctx, q, settings), -x * x * velocity_of(x, ctx)])
+
+
+def _lossy_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = _spring_fill(q, w[:-1], settings)["spring"]
+    row[5] = w[-1]
+    return {"spring": row}
+
+
+def _lossy_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    time = Human("loss_time", float(p[-1] / (2.0 * p[0])) if p[0] else 0.0, "s")
+    return (*_spring_report(p[:-1], settings, scale), time)
+
+
+_LOSSY = replace(
+    _CUBIC,
+    summary="spring that hardens, of a material whose stress follows the rate of its strain, too",
+    parts=_lossy_parts,
+    equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 (x^3 + 2\tau x^2\dot x) = F",
+    source="S. Zaitsev, O. Shtempluck, E. Buks, O. Gottlieb, Nonlinear Dynamics 67 (2012) 859 (Kelvin-Voigt material under"
+    " the strain x^2 of large deflections)",
+    basis=_lossy_basis,
+    fill=_lossy_fill,
+    report=_lossy_report,
+)
+CUBIC_STIFFNESS = replace(_CUBIC, variants=(_QUINTIC, _LOSSY))
 
 
 def _cog_parts(settings: Settings) -> Parts:
@@ -152,7 +187,7 @@ def _cog_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> S
 def _cog_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     row = np.zeros(COGGING)
     row[0] = q[0]
-    row[1:] = w
+    row[1:5] = w
     return {"cogging": row}
 
 
@@ -182,6 +217,52 @@ COGGING_FORCE = Effect(
     report=_cog_report,
     vanishes_with=(("amplitude_*",),),
     essential=("period",),
+)
+
+
+LEAST_TURNED = 0.5
+"""Turns over which a load has to be seen: over less, its sine is a spring that softens."""
+
+
+def _lever_parts(settings: Settings) -> Parts:
+    return Parts((), (Parameter("sine", "{out}/s^2"), Parameter("cosine", "{out}/s^2")))
+
+
+def _lever_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    return np.stack([np.sin(x), np.cos(x)], axis=1)
+
+
+def _lever_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
+    row = np.zeros(COGGING)
+    row[5:] = w
+    return {"cogging": row}
+
+
+def _lever_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    return (
+        Human("largest_load", float(np.hypot(p[0], p[1])) / (scale or 1.0), "{in}"),
+        Human("angle_at_rest", float(np.arctan2(p[1], -p[0])), "rad"),
+        Human("turns_seen", settings["travel"][0] / (2.0 * np.pi), "1"),
+    )
+
+
+GRAVITY_LOAD = Effect(
+    name="gravity_load",
+    summary="weight on a lever that turns: a load that follows the sine of the angle",
+    kind="feedback",
+    stages=("mechanics",),
+    parts=_lever_parts,
+    equation=r"J\ddot\varphi = M - m g r \sin(\varphi - \varphi_0)",
+    source="M. W. Spong, S. Hutchinson, M. Vidyasagar, Robot Modeling and Control, Wiley 2006, chapter 7 (single link)",
+    excitation="at least half a turn, slowly",
+    confusable_with=("cogging", "cubic_stiffness"),
+    prepare=_travel,
+    basis=_lever_basis,
+    fill=_lever_fill,
+    report=_lever_report,
+    position_unit="rad",
+    limits={"turns_seen": (LEAST_TURNED, np.inf)},
+    vanishes_with=(("largest_load",),),
 )
 
 

@@ -42,6 +42,7 @@ NAMES = (
     "quadratic_drag",
     "amplitude_dependent_damping",
     "clearance",
+    "gravity_load",
     "square_root_outflow",
     "overflow",
     "parameter_variation",

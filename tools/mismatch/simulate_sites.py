@@ -44,8 +44,8 @@ def _why_not(twin: Twin, recording: Recording, effect: Effect) -> str:
         return f"no {' or '.join(effect.stages)} in the chain of this twin"
     if effect.kind == "feedback" and not twin.feedback_on:
         return "the twin has no equation of motion"
-    if effect.kind == "feedback" and not {p.kind for p in places_of(twin)} & set(effect.acts_on):
-        return "no state that it could act on"
+    if effect.kind == "feedback" and not _acts_at(twin, effect):
+        return f"no {effect.position_unit or 'state'} that it could act on"
     if effect.sites == ("between",) and not between_of(twin):
         return "no place between two filters"
     missing = [s for s in effect.needs if s not in recording.signals]
@@ -64,6 +64,19 @@ def places_of(twin: Twin) -> tuple[Place, ...]:
     that the other dynamic twins have.
     """
     return getattr(twin, "places", (AXIS,) if twin.feedback_on else ())
+
+
+def _acts_at(twin: Twin, effect: Effect) -> list[Place]:
+    """The places of a twin where a force or flow may act: of its kind, and of the unit that it asks for."""
+    return [
+        p
+        for p in places_of(twin)
+        if p.kind in effect.acts_on and effect.position_unit in ("", _position_unit(twin, p))
+    ]
+
+
+def _position_unit(twin: Twin, place: Place) -> str:
+    return twin.units.get(twin.feedback_on, "").removesuffix("/s") if place == AXIS else place.unit
 
 
 def _here(effect: Effect, recording: Recording, output: str) -> str:
@@ -96,9 +109,8 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     stage = _stage(twin, effect)
     if effect.kind == "feedback":
         # a force moves every output of its equation of motion
-        places = places_of(twin)
-        if places != (AXIS,):
-            return [Placed(effect, "feedback", p.name, stage, twin.outputs) for p in places if p.kind in effect.acts_on]
+        if places_of(twin) != (AXIS,):
+            return [Placed(effect, "feedback", p.name, stage, twin.outputs) for p in _acts_at(twin, effect)]
         others = tuple(o for o in twin.outputs if o != twin.feedback_on)
         return [Placed(effect, "feedback", twin.feedback_on, stage, (twin.feedback_on, *others))]
     usable = tuple(o for o in twin.outputs if not _here(effect, recording, o))

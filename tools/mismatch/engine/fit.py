@@ -247,7 +247,7 @@ OPENING = frozenset(
         "static_nonlinearity", "one_sided_conduction", "first_order_lag", "resonance", "dead_time", "channel_delay",
         "misalignment",
         "soft_iron", "cross_axis_nonlinearity", "scale_factor_variation", "coulomb_friction", "stribeck_friction",
-        "cubic_stiffness", "cogging", "centripetal_acceleration", "sensor_position_error",
+        "cubic_stiffness", "cogging", "gravity_load", "centripetal_acceleration", "sensor_position_error",
     )
 )  # fmt: skip
 """Effects that follow the inputs: where these are the same, so are they. What happens in time (drifts, steps, clocks,

@@ -263,13 +263,13 @@ def _dead_zone(s: Slot, x: str, d: str) -> str:
 
 
 def _curve(s: Slot, x: str, d: str) -> str:
+    if "sign_lost" in s.values:
+        return f"{x} + {s.at('sign_lost')} * (np.abs({d}) - {d}) + {s.at('growth')} * {d}**2"
     lo, hi = s.placed.settings["range"]
     shape = int(s.placed.settings.get("shape", (3.0,))[0])
     middle, half = 0.5 * (lo + hi), 0.5 * (hi - lo)
     z = f"({d} - {numbers(middle)}) / {numbers(half)}"
     straight = f" + {s.at('slope')} * {z}" if "slope" in s.values else ""
-    if shape == 1:
-        return f"{x} + {s.at('sign_lost')} * (np.abs({d}) - {d}){straight}"
     if shape > 1:
         s.writer.used.add("legendre")
         weights = s.group("legendre") if shape > 2 else f"[{s.at('legendre2')}]"
@@ -438,7 +438,7 @@ def _friction(s: Slot) -> ForceCode:
 
 
 def _spring(s: Slot) -> ForceCode:
-    powers = {"linear": "x", "quadratic": "x**2", "cubic": "x**3", "quintic": "x**5"}
+    powers = {"linear": "x", "quadratic": "x**2", "cubic": "x**3", "quintic": "x**5", "loss": "x**2 * v"}
     return ForceCode("".join(f" - {s.at(n)} * {powers[n]}" for n in s.values))
 
 
@@ -460,6 +460,10 @@ def _cogging(s: Slot) -> ForceCode:
     return ForceCode("".join(f" + {s.at(n)} * {wave}" for n, wave in waves))
 
 
+def _lever(s: Slot) -> ForceCode:
+    return ForceCode(f" + {s.at('sine')} * np.sin(x) + {s.at('cosine')} * np.cos(x)")
+
+
 def _force_memory(s: Slot) -> ForceCode:
     if "yield_distance" in s.values:
         return _friction(s)
@@ -472,6 +476,7 @@ FORCES: Mapping[str, Callable[[Slot], ForceCode]] = {
     "stribeck_friction": _friction,
     "cubic_stiffness": _spring,
     "cogging": _cogging,
+    "gravity_load": _lever,
     "quadratic_drag": _drag,
     "amplitude_dependent_damping": _amplitude_damping,
     "clearance": _clearance,

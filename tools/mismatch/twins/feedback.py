@@ -54,7 +54,7 @@ def pack(forces: Sequence[Force]) -> Rows:
                 case "spring":
                     spring += row
                 case "cogging":
-                    period = row[0]
+                    period = row[0] or cogging[0]
                     cogging += row
                     cogging[0] = period
                 case "thresholds":

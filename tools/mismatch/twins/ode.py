@@ -17,7 +17,17 @@ from tools.mismatch import units
 from tools.mismatch.recording import Recording
 from tools.mismatch.twins.base import Counted, Force, Run, Signal, fold, remember
 from tools.mismatch.twins.dynamic import shot_to_repeat
-from tools.mismatch.twins.equations import NOTHING, Equations, Inside, Linearised, Place, State, linearise, meet_start
+from tools.mismatch.twins.equations import (
+    LEAST_SHOWN,
+    NOTHING,
+    Equations,
+    Inside,
+    Linearised,
+    Place,
+    State,
+    linearise,
+    meet_start,
+)
 from tools.mismatch.twins.feedback import Rows, fastest_of, pack
 from tools.mismatch.twins.head import Head
 from tools.mismatch.twins.linear import discretise, run_output, start_state
@@ -293,7 +303,7 @@ class OdeTwin(Head):
             return go(given, starts[:1], end, u, run.t, sub, self.start_values, NOTHING)[starts]
 
         x0 = remember(run.memo, ("about", run.starts), plain)
-        x0 = np.where(np.isfinite(x0), x0, given)
+        x0 = self.as_read(np.where(np.isfinite(x0), x0, given), y[before], part[before], t[before], values)
         x0 = meet_start(x0, misses, rows, self.typical, limits)
         if run.setting is None or not self.integrates:
             return go(x0, starts, ends, u, run.t)
@@ -312,8 +322,17 @@ class OdeTwin(Head):
             x = go(with_some(some), starts, ends, u, run.t)
             return (y - self.equations.readings(x[seen], u[seen], run.t[seen], values)) * weight
 
-        found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
+        found = meet_start(x0[used], misses_all, rows, self.typical, limits)
         return go(with_some(found), starts, ends, u, run.t)
+
+    def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array) -> Array:
+        """States (k, s) moved as little as possible to where the outputs (k, q) read what was measured.
+
+        A run that has drifted away says nothing of where in a force that depends on position the next one begins.
+        """
+        reading = self.linearised(values).c * self.typical
+        gap = y - self.equations.readings(np.ascontiguousarray(x), np.ascontiguousarray(u), t, values)
+        return x + gap @ np.linalg.pinv(reading, rcond=LEAST_SHOWN).T * self.typical
 
     # -- linearised -----------------------------------------------------------------------------------
 

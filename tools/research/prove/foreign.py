@@ -33,7 +33,7 @@ TRUTH: Mapping[str, tuple[tuple[str, ...], ...]] = {
     "friction": (FRICTION,),
     "friction_and_backlash": (FRICTION, ("backlash",)),
     "delay": (("dead_time",),),
-    "gravity": (("cogging",),),
+    "gravity": (("gravity_load",),),
     "saturation": (("saturation",),),
     "stribeck": (FRICTION,),
 }
