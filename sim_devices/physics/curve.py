@@ -132,7 +132,7 @@ _FOLD = replace(
     stages=("sensor",),
     parts=_fold_parts,
     equation=r"y = x + s (|x| - x) + g x^2",
-    source="T. Wigren, M. Schoukens, Coupled Electric Drives Data Set and Reference Models, Uppsala University 2017-024",
+    source="T. Wigren, M. Schoukens, Coupled Electric Drives Data Set and Reference Models, Uppsala 2017-024",
     excitation="both signs of the signal",
     prepare=no_settings,
     basis=_fold_basis,

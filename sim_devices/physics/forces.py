@@ -94,7 +94,7 @@ def loop_along(x, yielding, lean, starts):
 
 @kernel
 def smooth_force(p, v, spring, cogging, friction, place):
-    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, gravity, viscosity.
+    """Forces that are continuous in position p and velocity v: spring curvature, drag, stops, cogging, gravity.
 
     The rows of all places stand one behind the other; ``place`` says which of them is meant.
     """

@@ -129,7 +129,7 @@ _LOSSY = replace(
     summary="spring that hardens, of a material whose stress follows the rate of its strain, too",
     parts=_lossy_parts,
     equation=r"m\ddot x + c\dot x + k x + k_2 x^2 + k_3 (x^3 + 2\tau x^2\dot x) = F",
-    source="S. Zaitsev, O. Shtempluck, E. Buks, O. Gottlieb, Nonlinear Dynamics 67 (2012) 859 (Kelvin-Voigt material under"
+    source="S. Zaitsev, O. Shtempluck, E. Buks, O. Gottlieb, Nonlinear Dynamics 67 (2012) 859 (Kelvin-Voigt under"
     " the strain x^2 of large deflections)",
     basis=_lossy_basis,
     fill=_lossy_fill,

@@ -69,9 +69,7 @@ def places_of(twin: Twin) -> tuple[Place, ...]:
 def _acts_at(twin: Twin, effect: Effect) -> list[Place]:
     """The places of a twin where a force or flow may act: of its kind, and of the unit that it asks for."""
     return [
-        p
-        for p in places_of(twin)
-        if p.kind in effect.acts_on and effect.position_unit in ("", _position_unit(twin, p))
+        p for p in places_of(twin) if p.kind in effect.acts_on and effect.position_unit in ("", _position_unit(twin, p))
     ]
 
 

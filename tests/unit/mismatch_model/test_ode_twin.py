@@ -239,6 +239,8 @@ k = 30.0
     one = recorded(tmp_path / "equations", equations, u, 0.1 * u[::-1], channels)
     for name, weights, searched in (
         ("cubic_stiffness", (400.0, 3.0), ()),
+        ("cubic_stiffness", (400.0, 3.0, 60.0), ()),
+        ("gravity_load", (-40.0, 9.0), ()),
         ("coulomb_friction", (0.6, 0.1, 0.05), ()),
         ("quadratic_drag", (6.0,), ()),
         ("amplitude_dependent_damping", (300.0,), ()),
@@ -249,7 +251,8 @@ k = 30.0
         for recording in (one, None):
             recording = recording or recorded(tmp_path / name, axis, u, moved[0], channels)
             every = sites(make(recording), recording, EFFECTS[name])
-            place = [p for p in every if p.site == "feedback"][-1 if name == "hysteresis" else 0]
+            forces = [p for p in every if p.site == "feedback"]
+            place = next(p for p in reversed(forces) if len(p.effect.parts({}).weights) == len(weights))
             model = Model(make(recording), [place])
             theta = model.start(recording)
             a, b = model.slices(0)
@@ -258,6 +261,60 @@ k = 30.0
         plain = Model(make(one)).simulate(View.whole(one), np.array([0.4, 30.0]))
         assert np.std(moved[0] - plain["position"]) > 0.1 * np.std(moved[0]), name
         assert np.std(moved[0] - moved[1]) < 0.02 * np.std(moved[0]), name
+
+
+PENDULUM = """
+[twin]
+kind = "ode"
+[twin.states]
+angle = "rad"
+speed = "rad/s"
+[twin.equations]
+angle = "speed"
+speed = "(20.0 * command - speed) / tau"
+[twin.parameters]
+tau = 0.09
+"""
+
+
+def pendulum(folder: Path) -> tuple[Recording, np.ndarray]:
+    """A motor that lifts a weight on a lever over the top, integrated by SciPy; its twin has no weight."""
+    u = 1.1 * command(900)
+    t = np.arange(u.size) / RATE_HZ
+    exact = solve_ivp(
+        lambda now, x: [x[1], (20 * np.interp(now, t, u) - x[1]) / 0.09 - 160.0 * math.sin(x[0] - 0.3)],
+        (0, t[-1]), [0.0, 0.0], t_eval=t, rtol=1e-10, atol=1e-10, max_step=0.5 / RATE_HZ,
+    ).y[0]  # fmt: skip
+    return recorded(folder, PENDULUM, u, exact), exact
+
+
+def test_a_weight_on_a_lever_is_a_force_at_an_angle_alone(tmp_path: Path) -> None:
+    recording, exact = pendulum(tmp_path / "angle")
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    place = replace(place, settings={"travel": (float(np.ptp(exact)),)})
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    theta[model.slices(0)[1]] = -160.0 * math.cos(0.3), 160.0 * math.sin(0.3)
+    assert np.max(np.abs(model.residual(View.whole(recording), theta)["angle"])) < 1e-3
+    found = {h.name: h.value for h in model.human(theta)[place.label]}
+    assert found["largest_load"] == pytest.approx(160.0 * 0.09 / 20.0)  # in volts of the command
+    assert found["angle_at_rest"] == pytest.approx(0.3)
+    metres = PENDULUM.replace('"rad"', '"m"').replace('"rad/s"', '"m/s"')
+    line = recorded(tmp_path / "line", metres, recording.inputs["command"], exact, CHANNELS.replace('"rad"', '"m"'))
+    assert sites(make(line), line, EFFECTS["gravity_load"]) == []
+
+
+def test_a_stretch_begins_where_it_was_read_and_not_where_a_drifted_run_has_come_to(tmp_path: Path) -> None:
+    """Without the weight the twin is turns away by then, and the sine has the wrong phase there."""
+    recording, _ = pendulum(tmp_path)
+    (place,) = sites(make(recording), recording, EFFECTS["gravity_load"])
+    model = Model(make(recording), [place])
+    theta = model.start(recording)
+    plain = Model(make(recording)).simulate(View.whole(recording), theta[:1])["angle"]
+    assert np.max(np.abs(plain - recording.outputs["angle"])) > math.pi
+    theta[model.slices(0)[1]] = -160.0 * math.cos(0.3), 160.0 * math.sin(0.3)
+    view = View(recording, ((40, 262), (501, 700), (760, 900)), 40, afresh=True)
+    assert np.max(np.abs(model.residual(view, theta)["angle"])) < 0.02
 
 
 def test_flows_of_two_tanks_are_those_of_the_source(tmp_path: Path) -> None:
