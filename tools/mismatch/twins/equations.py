@@ -166,6 +166,7 @@ def rates_at(equations: Equations, x: Array, u: Array, values: Array) -> Array:
     return np.stack([equations.rates(x[k], u[k], values) for k in range(x.shape[0])])
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a trial that runs away is no better
 def meet_start(
     x0: Array,
     misses: Callable[[Array], Array],
