@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -18,6 +19,37 @@ from hal.errors import HalTimeout
 from tests.unit.control.stand import StandRun
 
 WIDTH = max(column.start + column.size for column in LAYOUT)
+
+
+def tick(due_ns: int = 0) -> TickInfo:
+    return TickInfo(0, due_ns, due_ns, 0)
+
+
+class FakeMonitor:
+    """An amplifier's monitor whose ``poll`` answers as it is told."""
+
+    name = "monitor"
+
+    def __init__(self, poll: Callable[[], str]) -> None:
+        self.poll = poll
+
+    def forget(self) -> None:
+        pass
+
+
+class FakeButton:
+    """A stop button on the CAN bus."""
+
+    name = "telemetry"
+
+    def __init__(self, pressed: bool, silent: bool) -> None:
+        self._pressed, self._silent = pressed, silent
+
+    def poll(self) -> bool:
+        return self._pressed
+
+    def button_silent(self) -> bool:
+        return self._silent
 
 
 @pytest.mark.parametrize(
@@ -38,10 +70,10 @@ def test_an_output_that_the_guardian_has_moved_is_not_the_amplifiers_fault(taken
     devices = SimpleNamespace(
         amplifier=SimpleNamespace(name="piezo"),
         verify_output=lambda: "output 1 holds 50 V and was told 29 V",
-        monitor=SimpleNamespace(poll=lambda: "output 1 is at 50 V", forget=lambda: None, name="monitor"),
+        monitor=FakeMonitor(lambda: "output 1 is at 50 V"),
     )
     watch = Watch(cast(Any, devices), np.zeros(WIDTH), cast(Any, None), run)
-    getattr(watch, look)(cast(TickInfo, SimpleNamespace(due_ns=0, k=0)))
+    getattr(watch, look)(tick())
     if taken:  # the guardian gives them back
         assert supervisor.holds[0].reason.startswith(says)
         assert supervisor.holds[0].cause is CauseClass.HOST
@@ -68,7 +100,7 @@ class Watched:
 
     def supervise(self, at_ms: float = 0.0) -> str:
         """Reason of the hold or trip at the end of it, empty while there is none."""
-        self.watch.supervise(cast(TickInfo, SimpleNamespace(due_ns=round(at_ms * 1e6), k=0)))
+        self.watch.supervise(tick(round(at_ms * 1e6)))
         return self.tripped
 
     @property
@@ -77,7 +109,7 @@ class Watched:
 
 
 def button(pressed: bool = False, silent: bool = False) -> Any:
-    return SimpleNamespace(name="telemetry", poll=lambda: pressed, button_silent=lambda: silent)
+    return FakeButton(pressed, silent)
 
 
 def test_a_number_that_is_none_ends_the_run_at_once() -> None:
@@ -133,12 +165,12 @@ def broken() -> str:
 
 def test_an_amplifier_that_does_not_answer_holds_and_a_deaf_monitor_after_its_limit() -> None:
     bench = Watched(verify_output=broken)
-    bench.watch.verify_output(cast(TickInfo, SimpleNamespace(due_ns=0)))
+    bench.watch.verify_output(tick())
     assert bench.tripped == "piezo: no answer"
-    bench = Watched(monitor=SimpleNamespace(poll=broken, forget=lambda: None, name="monitor"))
+    bench = Watched(monitor=FakeMonitor(broken))
     limit_ns = round(SafetyLimits().monitor_ms * 1e6)
     for due_ns, trips in ((0, False), (limit_ns - 1, False), (limit_ns, True)):
-        bench.watch.monitor_output(cast(TickInfo, SimpleNamespace(due_ns=due_ns)))
+        bench.watch.monitor_output(tick(due_ns))
         assert bool(bench.tripped) is trips
     assert list(bench.counts.noticed) == ["amplifier monitor does not answer"]
 
@@ -147,10 +179,10 @@ def test_outputs_that_may_not_move_are_not_looked_at() -> None:
     bench = Watched(
         State.SAFE,
         verify_output=broken,
-        monitor=SimpleNamespace(poll=broken, forget=lambda: None, name="monitor"),
+        monitor=FakeMonitor(broken),
     )
-    bench.watch.verify_output(cast(TickInfo, SimpleNamespace(due_ns=0)))
-    bench.watch.monitor_output(cast(TickInfo, SimpleNamespace(due_ns=0)))
+    bench.watch.verify_output(tick())
+    bench.watch.monitor_output(tick())
     assert not bench.tripped
     assert not bench.counts.noticed
 
