@@ -17,6 +17,7 @@ from scipy.stats import t as student
 
 from tools.calibrate.multi_position import Estimate, missing_poses
 from tools.errors import InputError
+from tools.numbers import rms
 
 Array = NDArray[np.float64]
 NAMES = ("bias_V", "s_x", "s_y", "s_z", "in_plane_2", "out_of_plane_2", "scale_1", "scale_2")
@@ -147,18 +148,14 @@ def fit_composite(
         axes.append(
             AxisFit(
                 intervals,
-                _rms(volts[:, i] - _forward(x, force, y, z, when)),
-                _rms(linear),
-                _rms(held_out),
+                rms(volts[:, i] - _forward(x, force, y, z, when)),
+                rms(linear),
+                rms(held_out),
                 condition,
                 drift,
             )
         )
     return CompositeFit(tuple(axes), n, missing)
-
-
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def _intervals(x: Array, jacobian: Array, residual: Array, free: list[int]) -> tuple[dict[str, Estimate], float]:

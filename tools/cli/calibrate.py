@@ -40,7 +40,7 @@ def sensors(
     ] = OnDrift.REFUSE,
     json_file: JsonOption = None,
 ) -> None:
-    """Bias, scale, direction and cross-axis terms of every sensor axis from a resting instrument in many attitudes.
+    """Fit bias, scale, direction and cross-axis terms of every sensor axis from a resting instrument in many attitudes.
 
     Example: micron calibrate sensors out/tumble --out out/sensors.toml
     """

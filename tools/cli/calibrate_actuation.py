@@ -42,7 +42,7 @@ def piezo(
     together: Annotated[bool, typer.Option("--together", help="All recordings are of one and the same stack.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Hysteresis model of each stack from drive and displacement, checked on recordings that no fit saw.
+    """Fit a hysteresis model of each stack to drive and displacement, and check it on recordings that no fit saw.
 
     Example: micron calibrate piezo out/stack0 out/stack1 out/stack2 --out out/piezo.toml
     """
@@ -153,7 +153,7 @@ def manipulator(
     out: Out,
     json_file: JsonOption = None,
 ) -> None:
-    """Circle, shaft, levers, lean at rest and mounting of the manipulator from a scan of its workspace.
+    """Fit circle, shaft, levers, lean at rest and mounting of the manipulator to a scan of its workspace.
 
     Example: micron calibrate manipulator out/scan --out out/manipulator.toml
     """

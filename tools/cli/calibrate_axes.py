@@ -88,7 +88,7 @@ def accelerometer(
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Bias, scale and misalignment of a three-axis accelerometer, with intervals, condition and missing poses.
+    """Fit bias, scale and misalignment of a three-axis accelerometer, with intervals, condition and missing poses.
 
     Example: micron calibrate accelerometer log.npz --gravity 9.81744
 

@@ -26,7 +26,7 @@ def gyroscope(
     out: Annotated[Path | None, typer.Option("--out", metavar="FILE", help="Result as TOML.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Scale, misalignment and bias of a gyroscope from still poses and the turns between them (Tedaldi).
+    """Fit scale, misalignment and bias of a gyroscope from still poses and the turns between them (Tedaldi).
 
     Example: micron calibrate gyroscope log.npz --gravity 9.81744
     """

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_devices.physics.periods import period_of
+from tools.numbers import rms
 
 Array = NDArray[np.float64]
 
@@ -45,19 +46,15 @@ def steady_period(inputs: Mapping[str, Array], outputs: Mapping[str, Array], sta
 
 
 def _difference(x: Array, lag: int) -> float:
-    return _rms(x[lag:] - x[:-lag])
+    return rms(x[lag:] - x[:-lag])
 
 
 def _settled(y: Array, lag: int) -> bool:
     d = y[lag:] - y[:-lag]
-    size, all_of_it = float(np.std(y)), _rms(d)
+    size, all_of_it = float(np.std(y)), rms(d)
     early = max(8, lag // 8)
     if all_of_it > OUTPUT_REPEATS * np.sqrt(2.0) * size:
         return False
-    if _rms(d[:early]) <= EXACT * size:
+    if rms(d[:early]) <= EXACT * size:
         return True
-    return _rms(d[:early]) <= LOUDER_AT_FIRST * _rms(d[early:]) and abs(float(np.mean(d))) <= DRIFTS * all_of_it
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x * x))) if x.size else 0.0
+    return rms(d[:early]) <= LOUDER_AT_FIRST * rms(d[early:]) and abs(float(np.mean(d))) <= DRIFTS * all_of_it

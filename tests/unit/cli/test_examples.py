@@ -122,6 +122,19 @@ def test_the_wheel_has_about_twenty_commands_in_panels():
     assert places == sorted(places)
 
 
+VERBS = (
+    "Break", "Check", "Compute", "Download", "Draw", "Find", "Fit", "Identify", "Inspect", "Keep", "Learn", "Let",
+    "List", "Locate", "Make", "Measure", "Print", "Record", "Run", "Say", "Score", "Serve", "Show",
+    "Simulate", "Step", "Take", "Train", "Write",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [*ALL, *GROUPS])
+def test_the_help_begins_with_what_the_command_does(name: str):
+    command = ALL[name][1] if name in ALL else micron.commands[name]
+    assert (command.help or "").split()[0] in VERBS
+
+
 @pytest.mark.parametrize("name", GROUPS)
 def test_no_group_of_one(name: str):
     assert len(getattr(micron.commands[name], "commands", {})) > 1

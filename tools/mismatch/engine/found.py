@@ -21,6 +21,7 @@ from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.vary import reduced
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.ode import inside_of
+from tools.numbers import rms
 
 Array = NDArray[np.float64]
 
@@ -60,10 +61,6 @@ def human_values(problem: Problem, fitted: Fit, unsure: Uncertainty) -> dict[str
             out[label][h.name] = ParameterValue(h.value, h.unit, ends)
             i += 1
     return out
-
-
-def _rms(r: Array) -> float:
-    return float(np.sqrt(np.mean(r**2)))
 
 
 def _units(problem: Problem, trial_unit: str, target: str, output: str, placed: Placed) -> str:
@@ -132,8 +129,8 @@ def physics_found(
                 parameters,
                 placed.effect.equation,
                 placed.effect.source,
-                _rms(small.residual[worst][rows]),
-                _rms(fitted.residual[worst][rows]),
+                rms(small.residual[worst][rows]),
+                rms(fitted.residual[worst][rows]),
                 placed.site,
                 placed.target,
                 placed.outputs,
@@ -195,8 +192,8 @@ def alternatives(
             if t.fitted is None or t.name in named:
                 continue
             o = next(q for q in t.placed.outputs if q in step.placed.outputs)
-            rms = _rms(t.fitted.residual[o][rows])
-            same = as_good(t, step, rule, o, before[o]) and rms <= AS_WELL * _rms(theirs[o][rows])
+            left = rms(t.fitted.residual[o][rows])
+            same = as_good(t, step, rule, o, before[o]) and left <= AS_WELL * rms(theirs[o][rows])
             if same:
                 why = f"fits as well; {step.name} is simpler" if t.parameters > step.parameters else "fits as well"
                 if t.name not in (a.name for a in alike):
@@ -204,7 +201,7 @@ def alternatives(
             else:
                 mine, best = (np.mean([v.misfits.get(q, np.inf) for q in t.placed.outputs]) for v in (t, step))
                 why = f"leaves {np.sqrt(mine / max(best, 1e-12)):.2f} times the residual of {step.name}"
-            out.append(Alternative(t.name, o, rms, why))
+            out.append(Alternative(t.name, o, left, why))
         if alike:
             names = (step.name, *(t.name for t in alike))
             groups.append(Equivalent(names, experiment(step.placed.effect, alike[0].placed.effect)))

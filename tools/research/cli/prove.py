@@ -38,7 +38,7 @@ def prove(
     ] = None,
     first: Annotated[int, typer.Option(min=0, help="With --corpus: the number of the first case.")] = 0,
 ) -> None:
-    """Blind self-proof: draw recordings with sealed answers, diagnose them, open the seal, print the table.
+    """Draw recordings with sealed answers, diagnose them, open the seal and print the table: a blind self-proof.
 
     Example: micron mismatch prove --cases 40 --seed 1
     """

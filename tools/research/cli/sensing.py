@@ -21,7 +21,7 @@ def budget(
     seconds: Annotated[float, typer.Option(min=20.0, max=600.0, help="Length of each run.")] = 40.0,
     json_file: JsonOption = None,
 ) -> None:
-    """Error of the tip displacement in 8 to 12 Hz after calibration, and the share of each error source.
+    """Compute the error of the tip displacement in 8 to 12 Hz after calibration, and the share of each error source.
 
     Example: micron sensing budget --json out/budget.json
     """

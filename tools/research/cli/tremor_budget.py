@@ -29,7 +29,7 @@ def budget(
     ] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """The closed loop in virtual time with one source of error taken away at a time; with --ideal, with all of them
+    """Simulate the closed loop with one source of error taken away at a time; with --ideal, with all of them
     away, beside the bound of the very hand.
 
     Example: micron tremor budget --seconds 20

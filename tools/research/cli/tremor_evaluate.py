@@ -50,7 +50,7 @@ def evaluate(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Residual, band, delay, frequency error and time per sample of each method at each horizon, beside the limit.
+    """Score each method at each horizon: residual, band, delay, frequency error and time per sample, beside the limit.
 
     Example: micron tremor evaluate ../shared/data/tremor_mouse_lsm9ds1#23/gyro hand:1 hand:2 --method adaptive
 

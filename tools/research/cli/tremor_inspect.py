@@ -29,7 +29,7 @@ def inspect(
     html: Annotated[Path | None, typer.Option(metavar="FILE", help="Page with every signal.")] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Spectrum over time, peak frequency with its interval, amplitude, harmonics, tremor or not per window of 4 s.
+    """Show spectrum over time, peak frequency with its interval, amplitude, harmonics, tremor or not per window of 4 s.
 
     Says so when the stated sampling rate is not the real one. Example:
     micron tremor inspect ../shared/data/tremor_mouse_lsm9ds1#23/gyro --png out/23.png

@@ -25,7 +25,7 @@ def report(
         typer.Option(help="Make this section of --out again and keep the others."),
     ] = None,
 ) -> None:
-    """Everything that is measured on recorded hands, as one page; minutes of computing.
+    """Make one page of everything that is measured on recorded hands, in minutes of computing.
 
     Example: micron tremor report --out docs/results/tremor-on-real-hands.json
 

@@ -33,6 +33,7 @@ from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import command
 from tools.calibrate.piezo_regression import Piece, Shape, axes_of, fit, residual, stack_of
 from tools.mismatch.recording import Recording, Split, TwinText
+from tools.numbers import rms
 
 Array = NDArray[np.float64]
 
@@ -205,11 +206,7 @@ def track(config: EmulationConfig, axis: int, controller: Controller, path_um: A
     noise = INTERFEROMETER_RMS_UM * np.random.default_rng(seed).standard_normal(len(z))
     e = (z - z[0] + noise - wanted)[APPROACH:]
     free = e - e.mean()
-    return Tracking(_rms(e), float(np.max(np.abs(e))), _rms(free), float(np.max(np.abs(free))), limited)
-
-
-def _rms(e: Array) -> float:
-    return float(np.sqrt(np.mean(e**2)))
+    return Tracking(rms(e), float(np.max(np.abs(e))), rms(free), float(np.max(np.abs(free))), limited)
 
 
 def stationary(frequency_hz: float) -> Array:

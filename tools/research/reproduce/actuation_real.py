@@ -16,6 +16,7 @@ from tools.calibrate.piezo_fit import PiezoFit
 from tools.calibrate.piezo_prediction import command, simulate
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
+from tools.numbers import rms
 from tools.research.reproduce.real_sensors import data_folder
 from tools.research.reproduce.rows import Row
 from tools.research.reproduce.stack_plants import Plant, narx, preisach
@@ -33,10 +34,6 @@ PATH_UM, PATH_HZ, RISE_S = 20.0, 1.0, 5.0
 """Amplitude and frequency of the authors' path; it rises from rest within this time."""
 GOAL_UM = 0.25
 SCORED_S = (10.0, 15.0)
-
-
-def _rms(e: Array) -> float:
-    return float(np.sqrt(np.mean(e**2)))
 
 
 def prediction(fit: PiezoFit, drive: Array, dt: float, high_V: float) -> Array:
@@ -90,7 +87,7 @@ def real_stack() -> list[Row]:
     slope, offset = np.polyfit(drive[SKIP:], z[SKIP:], 1)
     line = float(np.std(z[SKIP:] - slope * drive[SKIP:] - offset))
     condition = "PREDICTION: model of the training file, free run over the test file after the first second, mean off"
-    with_mean = f"a prediction, no control; with its mean {_rms(e):.2f}; the test file was in view of the development"
+    with_mean = f"a prediction, no control; with its mean {rms(e):.2f}; the test file was in view of the development"
     predicted = [
         Row(
             source,

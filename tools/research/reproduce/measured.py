@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from firmware_py.recording.revision import git_revision
 from tools.errors import InputError
 from tools.mismatch.engines import diagnose
+from tools.numbers import rms
 from tools.research.prove.disk import toml_text
 from tools.research.prove.runner import as_plain
 from tools.research.reproduce.measured_page import document
@@ -176,8 +177,8 @@ def sealed(
     for text in texts:
         simulated = free_run(replace(test, twin=text))
         away = {o: test.outputs[o] - simulated[o] for o in outputs}
-        figures.append(s.factor * _together([_rms(away[o][rows]) for o in outputs]))
-    worst = max(outputs, key=lambda o: _rms(away[o][rows]))
+        figures.append(s.factor * _together([rms(away[o][rows]) for o in outputs]))
+    worst = max(outputs, key=lambda o: rms(away[o][rows]))
     signals = {name: x[rows] for name, x in test.signals.items()}
     return figures, follows(away[worst][rows], signals, worst, simulated[worst][rows], test.dt)
 
@@ -200,10 +201,6 @@ def follows(
     found = dependences(mean(residual), features_of(thin, dt * k, drive=drive, motion=output))
     real = [d for d in found if d.p_value < 1e-3 and d.strength > 0.01]
     return tuple((d.signal, d.feature, float(d.strength)) for d in real[:3])
-
-
-def _rms(x: Array) -> float:
-    return float(np.sqrt(np.mean(x**2)))
 
 
 def _together(values: Sequence[float]) -> float:

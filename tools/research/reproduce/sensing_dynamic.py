@@ -17,6 +17,7 @@ from sim_devices.config import EmulationConfig, InstrumentConfig, SensorConfig
 from sim_devices.plant.hand import SyntheticHand
 from tools.calibrate.stage_log import stage_attitude
 from tools.mismatch.twins.instrument import GivenHand
+from tools.numbers import rms
 from tools.research.placement.configurations import Placement
 from tools.research.placement.variance import motion_covariance
 from tools.research.reproduce.rows import Row
@@ -71,10 +72,6 @@ def _true(result: SceneResult) -> Rotation:
     return Rotation.from_quat(np.roll(result["true_quaternion"], -1, axis=1))
 
 
-def _rms(values: Array) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
 def _sensed_x(sensing: SensingConfig, result: SceneResult) -> Array:
     """(n,) sensed acceleration along x, m/s^2, phase and attenuation of the RC filter undone, 20 Hz zero phase.
 
@@ -108,7 +105,7 @@ def translation_rmse(large: bool) -> tuple[float, float, float]:
             true = -30e-6 * (2.0 * np.pi * 10.0) ** 2 * np.sin(2.0 * np.pi * 10.0 * (t + 1e-3))
             wanted = sosfiltfilt(butter(2, 20.0, fs=RATE_HZ, output="sos"), true)
             found[line].append((_sensed_x(sensing, result) - wanted)[2000:12_000])
-    return 1e3 * _rms(np.concatenate(found[True])), 1e3 * _rms(np.concatenate(found[False])), translation_noise_limit()
+    return 1e3 * rms(np.concatenate(found[True])), 1e3 * rms(np.concatenate(found[False])), translation_noise_limit()
 
 
 def translation_noise_limit() -> float:
@@ -195,7 +192,7 @@ def arm_rows(both: Calibrated | None = None) -> list[Row]:
     undone = ours + np.gradient(ours, 1.0 / RATE_HZ) / placement.cutoff_rad_s
     true, seen = (np.asarray(sosfiltfilt(band, x))[2000:18_000] for x in (alpha, undone))
     gain = float(seen @ true / (true @ true))
-    leftover = _rms(seen - gain * true)
+    leftover = rms(seen - gain * true)
     f = np.linspace(0.0, 100.0, 10_001)
     squared = np.abs(sosfreqz(band, f, fs=RATE_HZ)[1]) ** 4
     geometry = Placement("Micron", placement.axis_positions(), np.array(placement.axes))
@@ -207,7 +204,7 @@ def arm_rows(both: Calibrated | None = None) -> list[Row]:
             "Latt 2011, (31) with the data sheet's noise",
             "rms of what is left of alpha_x, against the propagated noise",
             "rad/s^2",
-            f"{condition}; rms of alpha_x {_rms(true):.2f}",
+            f"{condition}; rms of alpha_x {rms(true):.2f}",
             noise,
             leftover,
             "lower",
@@ -277,7 +274,7 @@ def orientation_rows() -> list[Row]:
                     "deg",
                     condition,
                     limit,
-                    _rms(error[late]),
+                    rms(error[late]),
                     "lower",
                     "emulated",
                     why=_why_tilt(result, late) if (kind, name) == ("all", "tilt") else "",
@@ -290,7 +287,7 @@ def orientation_rows() -> list[Row]:
                     "1",
                     condition,
                     1.2,
-                    _rms(error[last]) / _rms(error[first]),
+                    rms(error[last]) / rms(error[first]),
                     "lower",
                     "emulated",
                 )
@@ -302,9 +299,9 @@ def orientation_rows() -> list[Row]:
                     "Ang 2004, sec. 4.3.2",
                     f"{name}: rms of TRIAD alone over that of the filter",
                     "1",
-                    f"{condition}; TRIAD {_rms(theirs[late]):.3f} deg",
+                    f"{condition}; TRIAD {rms(theirs[late]):.3f} deg",
                     1.0,
-                    _rms(theirs[late]) / _rms(ours[late]),
+                    rms(theirs[late]) / rms(ours[late]),
                     "higher",
                     "emulated",
                     why=WHY_HEADING if name == "heading" else "",
