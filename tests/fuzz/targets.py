@@ -39,7 +39,7 @@ from tests.conftest import DEFAULT_BENCH
 from tools.bench.collect import quick_look
 from tools.bench.viewer import Nonsense
 from tools.bench.viewer import _parse as parse_message
-from tools.cli.mismatch import _report as read_report
+from tools.cli.mismatch_plan import read_report
 from tools.errors import InputError
 from tools.errors import RecordingError as TwinRecordingError
 from tools.mismatch.recording_columns import column_names, read_columns
