@@ -170,6 +170,7 @@ def decide(
         return "unexplained", selection.strange.p_value
     if selection.steps:
         p = min(float(np.exp(s.comparison.log_p)) for s in selection.steps if s.comparison)
+        p = min(1.0, p * max(len(selection.first), 1))  # every candidate that was looked at (Bonferroni)
         worst = max(left.values(), key=lambda v: v.ratio)
         before = max(compare_ratio(problem, base, o) for o in left)
         left_over = (worst.ratio - 1) / max(before - 1, 1e-9)
