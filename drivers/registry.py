@@ -126,6 +126,7 @@ class Driver:
     one. ``addresses`` lists the 7-bit I2C addresses that the pins of the part select; empty means that it has none.
     ``max_bus_hz`` is the fastest I2C clock of the part, in Hz. ``leased`` is the class of an output (``DacOutput``)
     that a guardian can hold as well. ``verifies`` is True for an output that can be read back.
+    ``has_kernels`` is True for a device that a compiled loop can read or command.
     """
 
     options: type[Options]
@@ -139,6 +140,7 @@ class Driver:
     max_bus_hz: int | None = None
     leased: Callable[..., Any] | None = None
     verifies: bool = False
+    has_kernels: bool = False
 
     def repeated(self, load: Load) -> Iterable[Traffic]:
         """Return all that the driver repeats on its bus."""

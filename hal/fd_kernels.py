@@ -42,7 +42,8 @@ _errno_location = types.ExternalFunction("__errno_location", types.CPointer(type
 
 
 @kernel
-def _errno() -> int:
+def last_errno() -> int:
+    """Return the errno of the last call of this thread that failed."""
     return numba.carray(  # pyright: ignore[reportPrivateImportUsage]
         _errno_location(), 1
     )[0]
@@ -73,7 +74,7 @@ def read_fd(fd: int, buffer: NDArray[np.uint8], begin: int, end: int) -> int:
         n = _read(fd, buffer.ctypes.data + begin, end - begin)
         if n >= 0:
             return n
-        failed = _errno()
+        failed = last_errno()
         if failed != EINTR:
             return -failed
 
@@ -90,20 +91,29 @@ def wait_fds(polls: NDArray[np.int64], until_ns: int) -> int:
         n = _ppoll(polls.ctypes.data, len(polls), t.ctypes.data, 0)
         if n >= 0:
             return n
-        failed = _errno()
+        failed = last_errno()
         if failed != EINTR:
             return -failed
+
+
+def _fence(ordering: str) -> Any:
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        builder.fence(ordering)
+        return context.get_dummy_value()
+
+    return types.none(), generate
 
 
 @intrinsic
 def release_fence(typing_context: Any) -> Any:
     """Keep what was stored before in front of what is stored after, for the compiler and the processor."""
+    return _fence("release")
 
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        builder.fence("release")
-        return context.get_dummy_value()
 
-    return types.none(), generate
+@intrinsic
+def full_fence(typing_context: Any) -> Any:
+    """Keep all that was loaded and stored before in front of what comes after, for the compiler and the processor."""
+    return _fence("seq_cst")
 
 
 @kernel
@@ -130,7 +140,7 @@ def write_fd(fd: int, data: NDArray[np.uint8], n: int, until_ns: int) -> int:
         if written >= 0:
             done += written
             continue
-        failed = _errno()
+        failed = last_errno()
         if failed == EAGAIN:
             polls = stack_index(1)  # pyright: ignore[reportCallIssue]
             polls[0] = poll_word(fd, POLLOUT)

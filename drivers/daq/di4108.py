@@ -344,5 +344,5 @@ def _open(site: Site) -> Di4108:
     return Di4108(site.bench.serial(site.spec.bus or ""), site.bench.clock, name=site.name)
 
 
-DRIVER = Driver(Di4108Options, _open, "daq", bits_per_s=lambda options: 0.0)
+DRIVER = Driver(Di4108Options, _open, "daq", bits_per_s=lambda options: 0.0, has_kernels=True)
 """It streams over USB, whose capacity is far beyond its scans."""

@@ -44,6 +44,9 @@ class DacAmplifier(DacOutput):
     TRANSFER_NS = 365_000  # 4 segments of 4 bytes at 400 kHz, the fastest that the part allows, less a bit each
     READ_BACK_NS = 200_000  # pointer and six bytes at 400 kHz: the update has been in force for at least so long
     READ_CODES = _READ_ABC
+    VERIFY = _READ_ALL
+    CODE_AT = ((0, 1), (1, 1), (2, 1))
+    FIXED_WORDS = (PATTERNS[-1],)
     WIRE_BITS = WIRE_BITS
 
     def identify(self) -> None:
@@ -82,7 +85,7 @@ class DacAmplifier(DacOutput):
 
         DAC D holds a pattern since the probe; a part that has restarted has lost it.
         """
-        answer = self.transfer(_READ_ALL)
+        answer = self.answer_to_verify()
         spare = int.from_bytes(answer[2 * CHANNELS :], "big")
         if spare != PATTERNS[-1]:
             return f"the DAC has restarted (register D holds 0x{spare:04X} instead of 0x{PATTERNS[-1]:04X})"

@@ -52,6 +52,13 @@ class DacOutput:
     """Shortest time for which a command that is read back has been in force at the end of its transfer."""
     READ_CODES: ClassVar[tuple[I2cOp, ...]]
     """Segments that read the three codes."""
+    VERIFY: ClassVar[tuple[I2cOp, ...]] = ()
+    """Segments that ``verify`` sends; the answer is words of 16 bits, high byte first, the three codes first."""
+    CODE_AT: ClassVar[tuple[tuple[int, int], ...]] = ()
+    """Segment, and byte in it, where the 16 bits of each code stand in ``segments``, for a compiled loop. Empty: the
+    part has no such loop."""
+    FIXED_WORDS: ClassVar[tuple[int, ...]] = ()
+    """Words of the answer to ``VERIFY`` that follow the codes and never change."""
     WIRE_BITS: ClassVar[Mapping[str, int]]
     """Bits of what the loop repeats: "command", "command with read-back" and "verify". Retries are left out."""
 
@@ -85,11 +92,13 @@ class DacOutput:
         self.limits = (OutputLimit(lo_V, top_V, slew_V_per_s, neutral_V),) * CHANNELS
         self.guard = OutputGuard(name, self.limits, clock)
         self.gate: OutputGate | None = None
-        self._bus = bus
+        self.pending: bytes | HalError | None = None
+        """Answer, or failure, of a transfer that a compiled loop has made and leaves to ``write`` or ``verify``."""
+        self.bus = bus
         self._clock = clock
-        self._address = address
-        self._codes_per_V = self.CODES / full_V
-        self._read_back = read_back
+        self.address = address
+        self.codes_per_V = self.CODES / full_V
+        self.read_back = read_back
         self._probed = False
         self._position_known = False
 
@@ -97,7 +106,7 @@ class DacOutput:
         """Identify the part and prepare it for commands; nothing moves. Raises ``WrongDevice`` or ``I2cNack``."""
         self.identify()
         self._probed = True
-        return f"{self.PART} at 0x{self._address:02X}, {self.limits[0].lo_V:.0f} .. {self.limits[0].hi_V:.0f} V"
+        return f"{self.PART} at 0x{self.address:02X}, {self.limits[0].lo_V:.0f} .. {self.limits[0].hi_V:.0f} V"
 
     def identify(self) -> None:
         """Exchange what shows that this is the part. Raises ``WrongDevice``."""
@@ -117,7 +126,23 @@ class DacOutput:
 
     def transfer(self, ops: Sequence[I2cOp]) -> bytes:
         """Make one transfer to the part."""
-        return self._bus.transfer(self._address, ops)
+        return self.bus.transfer(self.address, ops)
+
+    @property
+    def is_ready(self) -> bool:
+        """True while nothing is odd: a compiled loop may command the part."""
+        return self._position_known and self.guard.armed and self.pending is None
+
+    def answer_to_verify(self) -> bytes:
+        """Return the answer to ``VERIFY``, the pending one if there is one."""
+        return self.transfer(self.VERIFY) if self.pending is None else self._take_pending()
+
+    def _take_pending(self) -> bytes:
+        pending, self.pending = self.pending, None
+        if isinstance(pending, HalError):
+            raise pending
+        assert pending is not None
+        return pending
 
     def arm(self) -> None:
         """Self-test, ramp to neutral, verify it by readback; then ``write`` is allowed.
@@ -141,8 +166,11 @@ class DacOutput:
 
     def write(self, values_V: Float64Array) -> int:
         """Write ``values_V`` (3,). With ``read_back``, raises ``ProtocolError`` when the DAC holds another command."""
+        if self.pending is not None:
+            a, b, c = (self._code(value_V) for value_V in self.guard.next_V)
+            self._compare(self._take_pending(), (a, b, c))
         mask = self.guard.admit(values_V)
-        self._send(self.READ_CODES if self._read_back else ())
+        self._send(self.READ_CODES if self.read_back else ())
         return mask
 
     def safe_step(self) -> bool:
@@ -189,20 +217,20 @@ class DacOutput:
         return [ChannelInfo(f"{self.name}.{i + 1}", "V", limit.lo_V, limit.hi_V, self.lsb_V) for i in range(CHANNELS)]
 
     def _code(self, value_V: float) -> int:
-        return int(value_V * self._codes_per_V + 0.5)
+        return int(value_V * self.codes_per_V + 0.5)
 
     def _send(self, read_back: tuple[I2cOp, ...] = ()) -> None:
-        k = self._codes_per_V
+        k = self.codes_per_V
         a, b, c = self.guard.next_V
         a, b, c = int(a * k + 0.5), int(b * k + 0.5), int(c * k + 0.5)
         segments = (*self.segments(a, b, c), *read_back)
         self.guard.not_before(self._clock.now_ns() + self.TRANSFER_NS)
         if self.gate is None:
-            answer = self._bus.transfer(self._address, segments)
+            answer = self.bus.transfer(self.address, segments)
         else:
             self.gate.enter((a, b, c))
             try:
-                answer = self._bus.transfer(self._address, segments)
+                answer = self.bus.transfer(self.address, segments)
             finally:
                 self.gate.leave()
         self.guard.sent(self.READ_BACK_NS if read_back else 0)
@@ -239,5 +267,5 @@ def output_driver(part: type[DacOutput], options: type[OutputOptions]) -> Driver
 
     return Driver(
         options, open_part, "output", traffic=traffic, addresses=part.ADDRESSES, max_bus_hz=part.MAX_BUS_HZ,
-        leased=part, verifies=True,
+        leased=part, verifies=True, has_kernels=bool(part.CODE_AT and part.VERIFY),
     )  # fmt: skip

@@ -225,4 +225,4 @@ def _traffic(load: Load) -> Iterator[Traffic]:
     yield Traffic("ERR?", serial_bits(ERROR_BYTES), rate_hz / ASK_ERROR_EVERY)
 
 
-DRIVER = Driver(E727Options, _open, "output", traffic=_traffic)
+DRIVER = Driver(E727Options, _open, "output", traffic=_traffic, has_kernels=True)

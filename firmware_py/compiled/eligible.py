@@ -12,7 +12,6 @@ from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import BenchFile, Pace
 from hal.errors import BenchError
 
-WITH_KERNELS = ("di4108", "e727")
 IN_TICK = ("daq", "output")
 """Roles of the devices that every tick reads or writes. Others are polled by Python beside the thread."""
 AXES = 6
@@ -28,7 +27,8 @@ def reasons_against_bench(bench: BenchFile, pace: Pace, *, injected: bool = Fals
     if platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux":
         reasons.append(f"the thread needs Linux on x86-64, this is {sys.platform} on {platform.machine()}")
     for name, spec in bench.description.device.items():
-        if find_driver(spec.driver).role in IN_TICK and spec.driver not in WITH_KERNELS:
+        driver = find_driver(spec.driver)
+        if driver.role in IN_TICK and not driver.has_kernels:
             reasons.append(f"device.{name}: its driver {spec.driver} has no kernels on bytes")
     n_axes = sum(len(o.channels) for o in options.values() if isinstance(o, Adxl203Options))
     if n_axes > AXES:

@@ -16,27 +16,29 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from typing import Any, Protocol, runtime_checkable
+from typing import Any
 
 import numpy as np
 
 from drivers.daq.di4108 import Di4108
-from drivers.piezo.e727 import E727
 from firmware_py.compiled import memory as at
 from firmware_py.compiled.memory import Memory, Sinks, Timing
+from firmware_py.compiled.ports import Descriptor, Fed, lacks_descriptor
+from firmware_py.compiled.sides import side_of
 from firmware_py.control.config import FirmwareConfig
 from firmware_py.control.instrument import LATE_PART, Micron
 from firmware_py.control.stages import Stages
-from firmware_py.control.wiring import Devices
+from firmware_py.control.wiring import Daq, Devices
 from firmware_py.recording.recorder import RecorderProcess
 from firmware_py.recording.ring import RowsView
 from firmware_py.run.context import Run
 from firmware_py.run.findings import Finding
 from firmware_py.run.safety import State
+from firmware_py.scheduler.histogram import DurationHistogram
 from firmware_py.scheduler.task import TickInfo
 from firmware_py.scheduler.ticker import Ticks, silent_at_ns
 from hal.clock import VirtualClock
-from hal.contracts import Clock, Float64Array
+from hal.contracts import AnalogOutput, Clock, Float64Array
 from hal.errors import BenchError
 from hal.types import ScanBlock, TimeSource
 
@@ -49,37 +51,19 @@ SWITCH_S = 0.0005
 """How long a Python thread may keep another one from running, instead of Python's 5 ms: a hand-over is not to wait."""
 
 
-@runtime_checkable
-class Descriptor(Protocol):
-    """A port with a non-blocking file descriptor."""
-
-    def fileno(self) -> int: ...
-
-
-@runtime_checkable
-class Fed(Descriptor, Protocol):
-    """A port of virtual time. ``feed`` lets time pass until bytes are there, at most ``timeout_s``, and puts them where
-    the descriptor reads them; ``flush`` takes to the device what was written to the descriptor."""
-
-    def feed(self, timeout_s: float) -> None: ...
-    def flush(self) -> None: ...
-
-
-def reasons_against(devices: Devices, clock: Clock, n_axes: int) -> list[str]:
+def reasons_against(daq: Daq, amplifier: AnalogOutput, clock: Clock, n_axes: int) -> list[str]:
     """Return why the devices of a bench cannot run compiled, each with the device's name; an empty list if they can."""
-    needed = Fed if isinstance(clock, VirtualClock) else Descriptor
     reasons: list[str] = []
     if platform.machine() not in ("x86_64", "AMD64") or sys.platform != "linux":
         reasons.append(f"this machine is {sys.platform} on {platform.machine()}; the thread needs Linux on x86-64")
-    for device, kind, words in ((devices.daq, Di4108, "DI-4108"), (devices.amplifier, E727, "E-727")):
-        name = device.name
-        if not isinstance(device, kind):
-            reasons.append(f"{name}: {type(device).__name__} has no kernels for it, only the {words} has")
-        elif not isinstance(device.port, needed):
-            if isinstance(clock, VirtualClock):
-                reasons.append(f"{name}: emulated time has no descriptors; add --realtime")
-            else:
-                reasons.append(f"{name}: its port ({type(device.port).__name__}) has no file descriptor")
+    if not isinstance(daq, Di4108):
+        reasons.append(f"{daq.name}: {type(daq).__name__} has no kernels for it, only the DI-4108 has")
+    elif why := lacks_descriptor(daq.port, clock):
+        reasons.append(f"{daq.name}: {why}")
+    side = side_of(amplifier, clock)
+    why = "its driver has no kernels on bytes" if side is None else side.lacks()
+    if why:
+        reasons.append(f"{amplifier.name}: {why}")
     if n_axes > 6:
         reasons.append(f"{n_axes} accelerometer axes: what tells which of more than six is wrong is Python")
     return reasons
@@ -96,15 +80,17 @@ class CompiledMicron(Micron):
         self, devices: Devices, stages: Stages, config: FirmwareConfig, run: Run, *, spin_us: float = 0.0
     ) -> None:
         super().__init__(devices, stages, config, run)
-        reasons = reasons_against(devices, run.clock, len(devices.sensing_table["channels"]))
+        assert run.output is not None
+        reasons = reasons_against(devices.daq, run.output, run.clock, len(devices.sensing_table["channels"]))
         if reasons:
             raise BenchError("; ".join(reasons))
+        output = side_of(run.output, run.clock)
         assert isinstance(devices.daq, Di4108)
-        assert isinstance(devices.amplifier, E727)
+        assert output is not None
         from firmware_py.compiled import thread  # numba
 
         self._thread = thread
-        self._daq, self._output = devices.daq, devices.amplifier
+        self._daq, self._output = devices.daq, output
         self._is_virtual = isinstance(self.run.clock, VirtualClock)
         self.entries = self.ticks_compiled = 0
         self._done: tuple[int, int, int] | None = None
@@ -118,7 +104,7 @@ class CompiledMicron(Micron):
         self._processors = os.sched_getaffinity(0)
         self._inside_ns = 0
         self._told = self._words.copy()
-        self._tasks_told = np.zeros((3, len(at.STAGES)), np.int64)
+        self._tasks_told = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
         self._memory: Memory | None = None
 
     def prepare(self) -> None:
@@ -134,8 +120,10 @@ class CompiledMicron(Micron):
         words[at.STALE_NS], words[at.STALLED_NS] = round(safety.stale_ms * 1e6), math.floor(safety.stalled_ms * 1e6)
         words[at.LATE_LIMIT_NS] = math.floor(LATE_PART * period_ns)
         words[at.WAKE_FD] = self._wake_read
-        from drivers.piezo.e727_loop import memory_of
-
+        if verify := self.run.scheduler.find("verify"):
+            words[at.VERIFY_DIVIDER], words[at.VERIFY_PHASE] = verify.divider, verify.phase
+            words[at.VERIFY_PATIENCE] = verify.may_wait
+            words[at.VERIFY_END_NS] = self.run.scheduler.latest_end_ns
         stream, buffer = self._daq.memory
         field = self._field
         volts, fresh = (field.volts, field.fresh) if field is not None else (np.zeros(3), np.zeros(1, np.int64))
@@ -143,15 +131,19 @@ class CompiledMicron(Micron):
         saved = np.zeros(4 * len(check.last) + len(check.together) + 1, np.int64)
         return Memory(
             words, self.stages.memory, stream, buffer, self.scans.rows, check, saved, volts, fresh,
-            memory_of(self._output), self._timing(), self._sinks(), np.zeros((at.NOTE_ROOM, 2), np.int64),
+            self._output.memory(words[at.FIXED_NS : at.FIXED_NS + 1]), self._timing(), self._sinks(),
+            np.zeros((at.NOTE_ROOM, 2), np.int64),
         )  # fmt: skip
 
     def _timing(self) -> Timing:
         def words(histogram: Any) -> at.Words:
             return np.frombuffer(histogram.words, np.int64)
 
-        parts = [self.run.scheduler.task_memory(name) for name in at.STAGES]
-        tasks = np.zeros((5, len(at.STAGES)), np.int64)
+        unused = DurationHistogram(), DurationHistogram(), 0, 0
+        parts = [
+            self.run.scheduler.task_memory(name) if self.run.scheduler.find(name) else unused for name in at.STAGES
+        ]
+        tasks = np.zeros((at.DEADLINE_NS + 1, len(at.STAGES)), np.int64)
         tasks[at.BUDGET_NS], tasks[at.DEADLINE_NS] = [p[2] for p in parts], [p[3] for p in parts]
         duration, lateness = self.run.scheduler.tick_memory
         return Timing(
@@ -193,6 +185,7 @@ class CompiledMicron(Micron):
 
     def _close(self) -> None:
         self._memory = None  # lets go of the rings, which their owners close
+        self._output.close()
         os.close(self._wake_read)
         os.close(self._wake_write)
 
@@ -234,14 +227,15 @@ class CompiledMicron(Micron):
             and not (self.manual.active or self.run.signals.interrupted or self.run.signals.rearm_asked)
             and self.scans.are_well
             and not self.run.scheduler.is_announced
-            and self._output.link.is_well
+            and not self.run.scheduler.is_deferred("verify")
+            and self._output.is_well
         )
         return self._ticker.place if is_free else None
 
     def _enter(self, seq_of_tick0: int, last_k: int, last_due_ns: int) -> int:
         words, memory = self._words, self._memory
         assert memory is not None
-        words[at.DAQ_FD], words[at.OUTPUT_FD] = _fd_of(self._daq.port), _fd_of(self._output.port)
+        words[at.DAQ_FD], words[at.OUTPUT_FD] = _fd_of(self._daq.port), self._output.fileno()
         words[at.STARTED_NS] = self.run.started_ns
         words[at.END_NS] = at.NO_END if self.run.end_ns is None else self.run.end_ns
         words[at.SEQ_OF_TICK0], words[at.LAST_K], words[at.LAST_DUE_NS] = seq_of_tick0, last_k, last_due_ns
@@ -262,7 +256,7 @@ class CompiledMicron(Micron):
             self._is_inside.clear()
             words[at.ORDER] = at.CALLED_BACK
             if self._is_virtual:
-                self._flush()
+                self._output.flush()
             self._take_over(result)
         if self._beside_error is not None:
             raise self._beside_error
@@ -278,6 +272,9 @@ class CompiledMicron(Micron):
         ticker.go_on_from(int(words[at.LAST_K]), int(words[at.LAST_DUE_NS]))
         if words[at.SILENT_OF_NS] == words[at.LAST_DUE_NS]:  # Python goes on with the same wait
             ticker.silent_at_ns = int(words[at.SILENT_AT_NS])
+        if words[at.VERIFY_WAITED]:
+            self.run.scheduler.defer("verify", int(words[at.VERIFY_WAITED]))
+            words[at.VERIFY_WAITED] = 0
         match result:
             case at.CALLED:
                 with contextlib.suppress(BlockingIOError):
@@ -287,8 +284,11 @@ class CompiledMicron(Micron):
             case at.SCANS | at.REST:
                 self.scans.hand_over(self._block)
                 if result == at.REST:
-                    k = int(words[at.LAST_K]) + 1 + int(words[at.DONE_ROW])
-                    self._done = k, int(words[at.DONE_STAGE]), int(words[at.FOUND])
+                    k, stage = int(words[at.LAST_K]) + 1 + int(words[at.DONE_ROW]), int(words[at.DONE_STAGE])
+                    self._done = k, stage, int(words[at.FOUND])
+                    self._output.take_over(stage == at.VERIFY)
+                    if stage == at.VERIFY and k % words[at.VERIFY_DIVIDER] != words[at.VERIFY_PHASE]:
+                        self.run.scheduler.defer("verify", int(words[at.VERIFY_PATIENCE]))
             case at.STREAM:
                 self.scans.hand_over(self._failed_block)
             case at.GAP:
@@ -326,11 +326,10 @@ class CompiledMicron(Micron):
         for place, what in ((at.LATE_NS, "commands were late"), (at.SCANS_LATE_NS, "scans came late")):
             if words[place]:
                 counts.noticed.setdefault(what, int(words[place]))
-        tasks = memory.timing.tasks[:3].copy()
-        each = (tasks - self._tasks_told).T.tolist()
+        tasks = memory.timing.tasks[: at.N_COUNTERS].copy()
+        each: dict[str, list[int]] = dict(zip(at.STAGES, (tasks - self._tasks_told).T.tolist(), strict=True))
         self._tasks_told = tasks
-        by_name = {name: (runs, overruns, slips) for name, (runs, overruns, slips) in zip(at.STAGES, each, strict=True)}
-        self.run.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), by_name)
+        self.run.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), each)
         if words[at.PAIR_TOLD]:
             self._check.judge_pairs(-int(words[at.PAIR_TOLD]))
             self._words[at.PAIR_TOLD] = 0
@@ -430,23 +429,17 @@ class CompiledMicron(Micron):
 
     def _feed(self, last_due_ns: int) -> None:
         """Let virtual time pass until the next bytes are there, then fix the time for one read."""
-        daq, output = self._daq.port, self._output.port
+        daq = self._daq.port
         assert isinstance(daq, Fed)
-        assert isinstance(output, Fed)
         words, now_ns = self._words, self.run.clock.now_ns()
         if words[at.SILENT_OF_NS] != last_due_ns:
             words[at.SILENT_AT_NS] = silent_at_ns(last_due_ns, int(words[at.STALE_NS]), now_ns)
             words[at.SILENT_OF_NS] = last_due_ns
         silent_ns = int(words[at.SILENT_AT_NS])
         daq.feed(max(0, silent_ns - now_ns) * 1e-9)
-        output.feed(0.0)
+        self._output.feed()
         words[at.FIXED_NS] = self.run.clock.now_ns()
         words[at.READS_LEFT] = 1
-
-    def _flush(self) -> None:
-        output = self._output.port
-        assert isinstance(output, Fed)
-        output.flush()
 
 
 def _fd_of(port: object) -> int:

@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from drivers.daq.di4108_kernels import READY, WAIT, accept, decode
-from drivers.piezo.e727_loop import HANDED_OVER, SENT, step_ramp, write
-from drivers.piezo.gcs import UNSENT
+from drivers.piezo.e727_loop import HANDED_OVER, SENT
 from firmware_py.compiled.memory import (
     ACTUATE,
     ARRIVAL_NS,
@@ -57,6 +56,7 @@ from firmware_py.compiled.memory import (
     PAIR_TOLD,
     PERIOD_NS,
     PUBLISH,
+    PUT_OFF,
     READ_FAILED,
     READS_LEFT,
     REAL_TIME,
@@ -70,6 +70,7 @@ from firmware_py.compiled.memory import (
     SILENT,
     SILENT_AT_NS,
     SILENT_OF_NS,
+    SKIPPED,
     SLIPS,
     SPENT,
     SPIN_NS,
@@ -82,12 +83,19 @@ from firmware_py.compiled.memory import (
     SUPERSEDED,
     TICKS,
     VERDICT,
+    VERIFY,
+    VERIFY_DIVIDER,
+    VERIFY_END_NS,
+    VERIFY_PATIENCE,
+    VERIFY_PHASE,
+    VERIFY_WAITED,
     WAKE_FD,
     WARNED,
     Memory,
     Timing,
     Words,
 )
+from firmware_py.compiled.outputs import is_stuck, step_ramp, verify, write
 from firmware_py.control.chain import COMMANDED, step_kernel
 from firmware_py.control.fresh_field import fill_field
 from firmware_py.control.plausibility import TICK as CHECK_TICK
@@ -223,6 +231,27 @@ def publish(m: Memory, frame: NDArray[np.float64]) -> None:
 
 
 @kernel
+def is_verify_due(m: Memory, k: int, due_ns: int) -> bool:
+    """Decide, as ``Scheduler`` does, whether the output is read back in tick ``k``; a read-back that would end too late
+    is deferred."""
+    words, tasks = m.words, m.timing.tasks
+    if words[VERIFY_DIVIDER] == 0:
+        return False
+    is_due = k % words[VERIFY_DIVIDER] == words[VERIFY_PHASE]
+    if words[VERIFY_WAITED] == 0 and not is_due:
+        return False
+    if is_due and words[VERIFY_WAITED] > 0:
+        tasks[SKIPPED, VERIFY] += 1
+    is_late = clock_ns(words) + tasks[BUDGET_NS, VERIFY] > due_ns + words[VERIFY_END_NS]
+    if is_late and words[VERIFY_WAITED] < words[VERIFY_PATIENCE]:
+        words[VERIFY_WAITED] += 1
+        tasks[PUT_OFF, VERIFY] += 1
+        return False
+    words[VERIFY_WAITED] = 0
+    return True
+
+
+@kernel
 def count_task(timing: Timing, stage: int, started_ns: int, ended_ns: int, due_ns: int, k: int) -> None:
     """Count one run of a task, as ``Scheduler`` does."""
     tasks = timing.tasks
@@ -261,12 +290,17 @@ def run_block(m: Memory) -> int:
             return hand_over(words, row, ACTUATE, 0)
         actuated_ns = clock_ns(words)
         publish(m, frame)
-        ended_ns = clock_ns(words)
+        published_ns = ended_ns = clock_ns(words)
+        if newest and is_verify_due(m, k, due_ns):
+            if not verify(m.output, words[OUTPUT_FD]):
+                return hand_over(words, row, VERIFY, 0)
+            ended_ns = clock_ns(words)
+            count_task(timing, VERIFY, published_ns, ended_ns, due_ns, k)
         count_task(timing, SENSE, began_ns, sensed_ns, due_ns, k)
         count_task(timing, ESTIMATE, sensed_ns, estimated_ns, due_ns, k)
         if newest:
             count_task(timing, ACTUATE, estimated_ns, actuated_ns, due_ns, k)
-        count_task(timing, PUBLISH, actuated_ns, ended_ns, due_ns, k)
+        count_task(timing, PUBLISH, actuated_ns, published_ns, due_ns, k)
         count_duration(timing.tick_duration, ended_ns - began_ns, k)
         count_duration(timing.tick_lateness, began_ns - due_ns, k)
     return GO
@@ -288,6 +322,17 @@ def is_ordinary(words: Words) -> bool:
     )
 
 
+@kernel
+def count_skipped(m: Memory, n: int) -> None:
+    """Count what the older ticks of a block of ``n`` passed over."""
+    words, skipped = m.words, m.timing.tasks[SKIPPED]
+    skipped[ACTUATE] += n - 1
+    if words[VERIFY_DIVIDER] > 0:
+        for k in range(words[LAST_K] + 1, words[LAST_K] + n):
+            if k % words[VERIFY_DIVIDER] == words[VERIFY_PHASE]:
+                skipped[VERIFY] += 1
+
+
 @inlined_kernel
 def take_block(m: Memory) -> int:
     """Run the block that was decoded, and count it. Return GO, GAP, or why Python must go on."""
@@ -300,6 +345,7 @@ def take_block(m: Memory) -> int:
     result = run_block(m)
     if result != GO:
         return result
+    count_skipped(m, n)
     words[RECEIVED] += n
     words[TICKS] += 1
     words[CAUGHT_UP] += n - 1
@@ -363,7 +409,7 @@ def serve(m: Memory) -> int:
     while True:
         if words[ORDER] != GO:
             return CALLED
-        if m.output.link.sizes[UNSENT] > 0:
+        if is_stuck(m.output):
             return STUCK
         if words[READS_LEFT] == 0:
             return SPENT

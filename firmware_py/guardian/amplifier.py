@@ -37,20 +37,20 @@ class GuardedAmplifier:
         heart = keeper.heart
         self.name = inner.name
         self.limits: tuple[OutputLimit, ...] = inner.limits
-        self._inner = inner
+        self.inner = inner
         self._heart = heart
         self._clock = clock
         self._keeper = keeper
-        self._gate = LeaseGate(heart, clock, inner.name, lease_ms)
+        self.gate = LeaseGate(heart, clock, inner.name, lease_ms)
         self._lost_ns = 0
         self._asked = False
         self._bus_fails = False
         self._codes: list[int] | None = None
-        inner.gate = self._gate
+        inner.gate = self.gate
 
     @property
     def commanded_V(self) -> Sequence[float]:
-        return self._inner.commanded_V
+        return self.inner.commanded_V
 
     def arm(self) -> None:
         """Raises ``SafetyTrip`` when nobody would take the outputs to neutral if this process died, or when they are
@@ -58,41 +58,41 @@ class GuardedAmplifier:
         self._require_guardian()
         self._take_up_again()
         self._heart.say(Phase.ARMING)
-        self._inner.arm()
+        self.inner.arm()
         self._heart.beat(self._clock.now_ns())
         self._heart.say(Phase.RUNNING)
 
     @property
     def commands_sent(self) -> int:
-        return self._inner.commands_sent
+        return self.inner.commands_sent
 
     def write(self, values_V: Float64Array) -> int:
         """Raises ``LeaseLost`` when the guardian has the outputs, or will have them because the lease is over."""
-        return self._inner.write(values_V)
+        return self.inner.write(values_V)
 
     def safe_step(self) -> bool:
         self._take_up_if_given_back()
-        if (self._gate.lost or self._heart.taken_ns) and not self._is_ours_again():
+        if (self.gate.lost or self._heart.taken_ns) and not self._is_ours_again():
             return self._asked
-        done = self._inner.safe_step()
+        done = self.inner.safe_step()
         if done:
             self._heart.say(Phase.IDLE)
         return done
 
     def readback_V(self) -> Float64Array:
-        return self._inner.readback_V()
+        return self.inner.readback_V()
 
     def close(self) -> None:
         """Bring the outputs to neutral unless they are there. Raises ``HalError`` when that cannot be confirmed; the
         guardian is not ended then, and goes on trying."""
-        while self._gate.lost or self._heart.taken_ns:
+        while self.gate.lost or self._heart.taken_ns:
             if self._is_ours_again():
-                self._inner.safe_step()
+                self.inner.safe_step()
             elif self._asked:
                 break  # the guardian has read neutral back
             else:
                 wait_s(self._clock, STEP_S)
-        self._inner.close()
+        self.inner.close()
         self._heart.say(Phase.IDLE)
 
     def _require_guardian(self) -> None:
@@ -101,7 +101,7 @@ class GuardedAmplifier:
         seen_ns, now_ns = heart.watched_ns, begin_ns
         while self._keeper.is_alive() and now_ns - begin_ns <= GIVE_BACK_NS:
             if heart.watched_ns != seen_ns or 0 < seen_ns >= now_ns - FRESH_NS:
-                self._gate.join()
+                self.gate.join()
                 return
             wait_s(self._clock, STEP_S)
             now_ns = self._clock.now_ns()
@@ -122,28 +122,28 @@ class GuardedAmplifier:
     def _take_up_if_given_back(self) -> None:
         if self._asked and not self._heart.taken_ns:
             self._asked, self._lost_ns, self._codes = False, 0, None
-            self._gate.take_up()
+            self.gate.take_up()
 
     def _is_ours_again(self) -> bool:
         """After the guardian has taken the outputs: only when it has not reached neutral in time and is gone."""
         heart, now_ns = self._heart, self._clock.now_ns()
         if heart.reached_ns:
-            self._inner.guard.brought_to_safe_state()
-            self._inner.lose_position()
+            self.inner.guard.brought_to_safe_state()
+            self.inner.lose_position()
             heart.ask_back(now_ns)  # before IDLE: a guardian that sees IDLE without a wish takes its leave
             heart.say(Phase.IDLE)
             self._asked = True
             return False
-        self._gate.lost = True
+        self.gate.lost = True
         heart.say(Phase.YIELDED)
         self._lost_ns = self._lost_ns or now_ns
         if self._keeper.is_alive() and self._is_guardian_at_work(now_ns):
             return False  # two ramps at once would not be one
         self._keeper.evict()
         heart.forget_guardian()
-        self._gate.regain()
+        self.gate.regain()
         self._lost_ns, self._codes = 0, None
-        self._inner.lose_position()
+        self.inner.lose_position()
         return True
 
     def _is_guardian_at_work(self, now_ns: int) -> bool:
@@ -156,7 +156,7 @@ class GuardedAmplifier:
             return True
         before, failed = self._codes, self._bus_fails
         self._codes, self._bus_fails = None, True
-        codes = self._inner.read_codes()
+        codes = self.inner.read_codes()
         read_ns = self._clock.now_ns()
         self._codes, self._bus_fails = codes, False
         if failed or read_ns - now_ns > SLOW_NS:

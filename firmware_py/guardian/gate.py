@@ -14,37 +14,66 @@ No command of the firmware goes out after the guardian has the outputs:
 
 from __future__ import annotations
 
-from firmware_py.guardian.heart import Heart, Order, Phase
+from array import array
+from typing import Any
+
+from firmware_py.guardian.heart import BEAT, INSIDE, PHASE, REPEATS, SOMEBODY, TAKEN, Heart, Phase
 from hal.contracts import Clock
 from hal.errors import LeaseLost
 
 LEASE_MARGIN_MS = 1.0
 """The guardian waits so much longer than the firmware's lease lasts."""
+LOST, IS_ALONE, LEASE_NS, LAST, WORDS = range(5)
+"""Places in ``LeaseGate.words``. ``LAST``: the three codes of the last command, 16 bits each; -1 before the first."""
+RUNNING = int(Phase.RUNNING)
+
+
+def announce(heart: Any, gate: Any, a: int, b: int, c: int) -> None:
+    """Say in the heart that a command with these codes is going out. Runs in the interpreter and compiled."""
+    codes = a << 32 | b << 16 | c
+    heart[INSIDE] = SOMEBODY | (REPEATS if codes == gate[LAST] else 0) | codes
+    gate[LAST] = codes
+
+
+def silence_ns(heart: Any, now_ns: int) -> int:
+    """Return for how long the lease has not been renewed, 0 while none is running."""
+    return now_ns - heart[BEAT] if heart[PHASE] == RUNNING else 0
+
+
+def has_lease(heart: Any, gate: Any, silent_ns: int) -> bool:
+    """Return True if the outputs are the firmware's. Comes after ``announce``: see above."""
+    return gate[LOST] == 0 and heart[TAKEN] == 0 and silent_ns <= gate[LEASE_NS]
 
 
 class LeaseGate:
-    """``drivers.piezo.dac_amplifier.OutputGate`` of the firmware."""
+    """``drivers.piezo.dac_output.OutputGate`` of the firmware."""
 
     def __init__(self, heart: Heart, clock: Clock, name: str, lease_ms: float) -> None:
-        self.lost = False
-        """The lease is over or the guardian has the outputs: until it has given them back or is gone."""
-        self._heart = heart
+        self.words = array("q", bytes(8 * WORDS))
+        """What the gate knows, for a compiled loop as well."""
+        self.words[LEASE_NS], self.words[LAST] = round(lease_ms * 1e6), -1
+        self.heart = heart
         self._clock = clock
         self._name = name
-        self._lease_ns = round(lease_ms * 1e6)
-        self._alone = False
-        self._last = (-1, -1, -1)
+
+    @property
+    def lost(self) -> bool:
+        """The lease is over or the guardian has the outputs: until it has given them back or is gone."""
+        return bool(self.words[LOST])
+
+    @lost.setter
+    def lost(self, is_lost: bool) -> None:
+        self.words[LOST] = is_lost
 
     def enter(self, codes: tuple[int, int, int]) -> None:
         """Raises ``LeaseLost`` when the outputs are not the firmware's any more: then nothing may be sent."""
-        heart = self._heart
-        heart.enter(Order(codes, codes == self._last))
-        self._last = codes
+        heart = self.heart
+        announce(heart.words, self.words, *codes)
         now_ns = self._clock.now_ns()
-        if self._alone:
+        if self.words[IS_ALONE]:
             return
-        silent_ns = now_ns - heart.beat_ns if heart.phase is Phase.RUNNING else 0
-        if self.lost or heart.taken_ns or silent_ns > self._lease_ns:
+        silent_ns = silence_ns(heart.words, now_ns)
+        if not has_lease(heart.words, self.words, silent_ns):
             heart.leave()
             self.lost = True
             heart.say(Phase.YIELDED)
@@ -57,12 +86,12 @@ class LeaseGate:
 
     def leave(self) -> None:
         """The transfer is over, well or not."""
-        self._heart.leave()
+        self.heart.leave()
 
     @property
     def alone(self) -> bool:
         """There is no guardian any more."""
-        return self._alone
+        return bool(self.words[IS_ALONE])
 
     def take_up(self) -> None:
         """The guardian has given the outputs back: the lease begins anew."""
@@ -70,9 +99,9 @@ class LeaseGate:
 
     def join(self) -> None:
         """A new guardian watches: leases count again."""
-        self._alone = False
+        self.words[IS_ALONE] = False
 
     def regain(self) -> None:
         """There is no guardian any more: nobody else commands."""
-        self._alone = True
+        self.words[IS_ALONE] = True
         self.lost = False

@@ -9,10 +9,12 @@ from typing import NamedTuple
 
 from firmware_py.guardian.mark import MARK_BYTES, DeathMark
 
-_PHASE, _BEAT, _NOTICED, _TAKEN, _REACHED, _WHY, _INSIDE, _WATCHED, _ASKED = range(9)
+PHASE, BEAT, _NOTICED, TAKEN, _REACHED, _WHY, INSIDE, _WATCHED, _ASKED = range(9)
+"""Places in ``Heart.words``."""
+SOMEBODY, REPEATS = 1 << 48, 1 << 49
+"""Bits of the word ``INSIDE`` above the three codes: a command is going out; it repeats the one before it."""
 _MARK = 128
 _BYTES = _MARK + MARK_BYTES
-_SOMEBODY, _REPEATS = 1 << 48, 1 << 49
 
 
 class Phase(IntEnum):
@@ -50,7 +52,8 @@ class Heart:
     def __init__(self, fd: int | None = None) -> None:
         self.fd = fd
         memory = memoryview(bytearray(_BYTES) if fd is None else mmap.mmap(fd, _BYTES))
-        self._words = memory[:_MARK].cast("q")
+        self.words = memory[:_MARK].cast("q")
+        """The words themselves, for a compiled loop, which is the firmware's side of them."""
         self.mark = DeathMark(memory[_MARK:])
         """Held by the firmware's loop: the kernel says here that it is dead."""
 
@@ -64,92 +67,92 @@ class Heart:
     # -- the firmware's side
 
     def beat(self, t_ns: int) -> None:
-        self._words[_BEAT] = t_ns
+        self.words[BEAT] = t_ns
 
     def say(self, phase: Phase) -> None:
-        self._words[_PHASE] = phase
+        self.words[PHASE] = phase
 
     def enter(self, order: Order) -> None:
         """A command is about to go out."""
         a, b, c = order.codes
-        self._words[_INSIDE] = _SOMEBODY | _REPEATS * order.repeats | a << 32 | b << 16 | c
+        self.words[INSIDE] = SOMEBODY | REPEATS * order.repeats | a << 32 | b << 16 | c
 
     def leave(self) -> None:
         """It has gone out, or will not."""
-        self._words[_INSIDE] = 0
+        self.words[INSIDE] = 0
 
     def ask_back(self, t_ns: int) -> None:
         """The outputs are wanted back once the guardian has done with them; no command is going out."""
-        self._words[_ASKED] = t_ns
+        self.words[_ASKED] = t_ns
 
     def forget_guardian(self) -> None:
         """The guardian is gone: what it said is void. Its first ``notice`` is kept, for the run's report."""
-        for word in (_TAKEN, _REACHED, _WHY, _WATCHED, _ASKED):
-            self._words[word] = 0
+        for word in (TAKEN, _REACHED, _WHY, _WATCHED, _ASKED):
+            self.words[word] = 0
 
     # -- the guardian's side
 
     def watch(self, t_ns: int) -> None:
         """The guardian is there."""
-        self._words[_WATCHED] = t_ns
+        self.words[_WATCHED] = t_ns
 
     def notice(self, t_ns: int) -> None:
         """The beat is late; the first time is kept."""
-        if not self._words[_NOTICED]:
-            self._words[_NOTICED] = t_ns
+        if not self.words[_NOTICED]:
+            self.words[_NOTICED] = t_ns
 
     def take(self, why: Why, t_ns: int) -> None:
-        self._words[_WHY] = why
-        self._words[_TAKEN] = t_ns
+        self.words[_WHY] = why
+        self.words[TAKEN] = t_ns
 
     def reach(self, t_ns: int) -> None:
         """Neutral, read back."""
-        self._words[_REACHED] = t_ns
+        self.words[_REACHED] = t_ns
 
     def give_back(self) -> None:
         """The outputs are the firmware's again; ``taken`` is cleared last, because it is what the firmware looks at."""
-        self._words[_WHY] = Why.NOTHING
-        self._words[_REACHED] = 0
-        self._words[_TAKEN] = 0
+        self.words[_WHY] = Why.NOTHING
+        self.words[_REACHED] = 0
+        self.words[TAKEN] = 0
 
     # -- for both
 
     @property
     def phase(self) -> Phase:
-        return Phase(self._words[_PHASE])
+        return Phase(self.words[PHASE])
 
     @property
     def beat_ns(self) -> int:
-        return self._words[_BEAT]
+        return self.words[BEAT]
 
     @property
     def inside(self) -> Order | None:
         """The command that is going out just now."""
-        word = self._words[_INSIDE]
+        word = self.words[INSIDE]
         if not word:
             return None
-        return Order((word >> 32 & 0xFFFF, word >> 16 & 0xFFFF, word & 0xFFFF), bool(word & _REPEATS))
+        return Order((word >> 32 & 0xFFFF, word >> 16 & 0xFFFF, word & 0xFFFF), bool(word & REPEATS))
 
     @property
     def asked_ns(self) -> int:
-        return self._words[_ASKED]
+        return self.words[_ASKED]
 
     @property
     def watched_ns(self) -> int:
-        return self._words[_WATCHED]
+        return self.words[_WATCHED]
 
     @property
     def noticed_ns(self) -> int:
-        return self._words[_NOTICED]
+        return self.words[_NOTICED]
 
     @property
     def taken_ns(self) -> int:
-        return self._words[_TAKEN]
+        return self.words[TAKEN]
 
     @property
     def reached_ns(self) -> int:
-        return self._words[_REACHED]
+        return self.words[_REACHED]
 
     @property
     def why(self) -> Why:
-        return Why(self._words[_WHY])
+        return Why(self.words[_WHY])

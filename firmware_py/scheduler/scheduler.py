@@ -196,24 +196,45 @@ class Scheduler:
         ticks = range(k + 1, k + 1 + self._hyperperiod)
         return next((t for t in ticks if any(task.releases(t, t + 1) for task in tasks)), ticks.stop)
 
-    def adopt(self, k: int, ticks: int, caught_up: int, tasks: Mapping[str, tuple[int, int, int]]) -> None:
+    def adopt(self, k: int, ticks: int, caught_up: int, tasks: Mapping[str, Sequence[int]]) -> None:
         """Count what a compiled loop has run since the last call, up to tick ``k``: ticks, scans that came late, and of
-        each task its runs, overruns and slips. Durations it has counted in ``task_memory`` itself."""
+        each task its runs, overruns, slips, deferrals and skips. Durations it has counted in ``task_memory`` itself."""
         self._last_scan = self._last_full = k
         self._ticks += ticks
         self._caught_up += caught_up
         for task in self._tasks:
             if task.spec.name in tasks:
-                runs, overruns, slips = tasks[task.spec.name]
+                runs, overruns, slips, put_off, skipped = tasks[task.spec.name]
                 task.runs += runs
                 task.overruns += overruns
                 task.slips += slips
-                task.skipped += 0 if task.catch_up else caught_up
+                task.put_off += put_off
+                task.skipped += skipped
 
     def task_memory(self, name: str) -> tuple[DurationHistogram, DurationHistogram, int, int]:
         """Return the histograms of duration and lateness of the task ``name``, its budget and its deadline (ns)."""
         task = next(task for task in self._tasks if task.spec.name == name)
         return task.duration, task.lateness, task.budget_ns, task.deadline_ns
+
+    @property
+    def latest_end_ns(self) -> int:
+        """Return how long after its tick was due a task may end before it is deferred."""
+        return self._done_by_ns
+
+    def find(self, name: str) -> TaskSpec | None:
+        """Return the task ``name`` of the table, if it is there."""
+        return next((task.spec for task in self._tasks if task.spec.name == name), None)
+
+    def is_deferred(self, name: str) -> bool:
+        """Return True while the task ``name`` waits for a later tick than its own."""
+        return any(task.spec.name == name for task in self._waiting)
+
+    def defer(self, name: str, ticks: int) -> None:
+        """Let the task ``name`` run in the next tick: a compiled loop has deferred it for ``ticks``."""
+        for task in self._tasks:
+            if task.spec.name == name and task not in self._waiting:
+                task.waited = ticks
+                self._waiting.append(task)
 
     @property
     def tick_memory(self) -> tuple[DurationHistogram, DurationHistogram]:

@@ -10,11 +10,13 @@ import contextlib
 import errno
 import fcntl
 import importlib
+import os
 from collections.abc import Sequence
 from typing import Any
 
 from hal.backends.i2c_checks import check_address
 from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, HalError, HalTimeout, I2cNack
+from hal.i2c_carrier import LINUX
 from hal.types import I2cOp, I2cWrite, PortInfo
 
 
@@ -25,6 +27,8 @@ class Smbus2I2c:
     command one amplifier would undo each other's outputs. The lock ends with the process. Programs of others that do
     not ask for it (i2c-tools) are not kept away.
     """
+
+    CARRIER = LINUX
 
     def __init__(self, bus: int | str, speed_hz: int = 400_000, *, exclusive: bool = True) -> None:
         smbus2: Any = importlib.import_module("smbus2")
@@ -70,6 +74,18 @@ class Smbus2I2c:
         except OSError as error:
             raise _error(error, address, self._device) from error
         return b"".join(bytes(m) for m in reads)
+
+    def for_thread(self) -> Smbus2I2c:
+        """See ``I2cCarrier``: the kernel lets transfers take turns."""
+        return self
+
+    def fileno(self) -> int:
+        """Return the descriptor of the adapter."""
+        return self._bus.fd
+
+    def failure(self, code: int, address: int) -> HalError:
+        """See ``I2cCarrier``."""
+        return _error(OSError(-code, os.strerror(-code)), address, self._device)
 
     def info(self) -> PortInfo:
         return PortInfo(

@@ -8,18 +8,31 @@ asked; the time is there so that an emulated one need not charge for the wake-up
 
 from __future__ import annotations
 
+import errno
+import os
 import socket
 import struct
 import time
 from collections.abc import Sequence
 
 from hal.backends.i2c_checks import check_address
-from hal.errors import BusError, Closed, DeviceNotFound, Disconnected, ErrorKind, HalTimeout, I2cNack, ProtocolError
+from hal.errors import (
+    BusError,
+    Closed,
+    DeviceNotFound,
+    Disconnected,
+    ErrorKind,
+    HalError,
+    HalTimeout,
+    I2cNack,
+    ProtocolError,
+)
+from hal.i2c_carrier import SOCKET
 from hal.types import I2cOp, I2cWrite, PortInfo
 
-_HEAD = struct.Struct("<BBq")
-_SEGMENT = struct.Struct("<BH")
-_REPLY = struct.Struct("<BH")
+HEAD = struct.Struct("<BBq")
+SEGMENT = struct.Struct("<BH")
+REPLY = struct.Struct("<BH")
 
 
 class UnixI2c:
@@ -28,6 +41,8 @@ class UnixI2c:
     A transfer without an answer raises ``HalTimeout``, a server that is gone raises ``Disconnected``. Both close the
     connection, because half an answer may still be under way: the next transfer connects again.
     """
+
+    CARRIER = SOCKET
 
     def __init__(self, path: str, speed_hz: int = 400_000, timeout_s: float = 0.5) -> None:
         self._path = path
@@ -65,33 +80,48 @@ class UnixI2c:
         check_address(address, self._path)
         if not self._open:
             raise Closed("the bus is closed", device=self._path)
-        parts = [_HEAD.pack(address, len(ops), time.monotonic_ns())]
+        parts = [HEAD.pack(address, len(ops), time.monotonic_ns())]
         for op in ops:
             if isinstance(op, I2cWrite):
-                parts.append(_SEGMENT.pack(0, len(op.data)))
+                parts.append(SEGMENT.pack(0, len(op.data)))
                 parts.append(op.data)
             else:
-                parts.append(_SEGMENT.pack(1, op.n))
+                parts.append(SEGMENT.pack(1, op.n))
         try:
             connection = self._connect()
             connection.sendall(b"".join(parts))
-            n = self._receive_at_least(connection, _REPLY.size, 0)
-            status, length = _REPLY.unpack_from(self._reply)
-            n = self._receive_at_least(connection, _REPLY.size + length, n)
-        except BlockingIOError as error:
-            self._disconnect()
-            raise HalTimeout(
-                f"the emulated bus gave no answer within {self._timeout_s} s", device=self._path
-            ) from error
+            n = self._receive_at_least(connection, REPLY.size, 0)
+            status, length = REPLY.unpack_from(self._reply)
+            n = self._receive_at_least(connection, REPLY.size + length, n)
         except OSError as error:
+            raise self._spoilt(error) from error
+        if n != REPLY.size + length:
             self._disconnect()
-            raise Disconnected(f"the emulated bus has gone: {error}", device=self._path) from error
-        if n != _REPLY.size + length:
-            self._disconnect()
-            raise ProtocolError(f"{n} bytes in a reply of {_REPLY.size + length}", device=self._path)
+            raise ProtocolError(f"{n} bytes in a reply of {REPLY.size + length}", device=self._path)
         if status:
             raise _error(status, address, self._path)
-        return self._reply[_REPLY.size : n].tobytes()
+        return self._reply[REPLY.size : n].tobytes()
+
+    def _spoilt(self, error: OSError) -> HalError:
+        self._disconnect()
+        if error.errno == errno.EAGAIN:
+            return HalTimeout(f"the emulated bus gave no answer within {self._timeout_s} s", device=self._path)
+        return Disconnected(f"the emulated bus has gone: {error}", device=self._path)
+
+    def for_thread(self) -> UnixI2c:
+        """See ``I2cCarrier``: a connection of its own, since requests and replies of one take turns."""
+        return UnixI2c(self._path, self._speed_hz, self._timeout_s)
+
+    def fileno(self) -> int:
+        """Return the descriptor of the connection, -1 if there is none."""
+        try:
+            return self._connect().fileno()
+        except OSError:
+            return -1
+
+    def failure(self, code: int, address: int) -> HalError:
+        """See ``I2cCarrier``."""
+        return _error(code, address, self._path) if code > 0 else self._spoilt(OSError(-code, os.strerror(-code)))
 
     def _receive_at_least(self, connection: socket.socket, wanted: int, have: int) -> int:
         while have < wanted:

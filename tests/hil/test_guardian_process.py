@@ -37,9 +37,17 @@ def wait_for(condition: Callable[[], Any], what: str, limit_s: float = 120.0) ->
     return found
 
 
+LOOPS = [pytest.param(False, id="python"), pytest.param(True, id="compiled", marks=pytest.mark.slow)]
+
+
 @pytest.fixture
-def run(tmp_path: Path) -> Iterator[Run]:
-    made = Run(tmp_path)
+def is_compiled() -> bool:
+    return False
+
+
+@pytest.fixture
+def run(tmp_path: Path, is_compiled: bool) -> Iterator[Run]:
+    made = Run(tmp_path, is_compiled=is_compiled)
     yield made
     made.end()
 
@@ -47,12 +55,13 @@ def run(tmp_path: Path) -> Iterator[Run]:
 class Run:
     """The firmware as ``micron run`` starts it, and what it leaves behind."""
 
-    def __init__(self, folder: Path, safety: str = "") -> None:
+    def __init__(self, folder: Path, safety: str = "", *, is_compiled: bool = False) -> None:
         self.folder = folder
         request = folder / "request.json"
         bench = copy_of_default_bench(folder, f"\n[firmware.safety]\nholds_per_minute = 60\n{safety}")
         # limits of a busy test machine for scans; the guardian's are then twice that for silence, none for death
-        request.write_text(RunRequest(bench, 60.0, pace="realtime", stale_ms=300.0).to_json(folder))
+        wanted = RunRequest(bench, 60.0, pace="realtime", stale_ms=300.0, compiled=is_compiled)
+        request.write_text(wanted.to_json(folder))
         self.process = subprocess.Popen(
             [sys.executable, "-m", "firmware_py.app", str(request)],
             stdout=subprocess.PIPE,
@@ -137,14 +146,17 @@ def kill_and_wait_for_neutral(run: Run) -> float:
     return float(t_ns[away].max() - killed_ns) * 1e-6
 
 
-def test_a_killed_firmware_leaves_neutral_outputs_as_soon_as_a_pipe_could_tell(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_compiled", LOOPS)
+def test_a_killed_firmware_leaves_neutral_outputs_as_soon_as_a_pipe_could_tell(
+    tmp_path: Path, is_compiled: bool
+) -> None:
     """The answer waits neither for a heartbeat to be missed nor for the memory of the dead to be freed. A machine that
     is busy with something else just then may be slow once; the cause that is looked for made every answer slow."""
     answers: list[tuple[float, float]] = []
     for attempt in range(3):
         folder = tmp_path / str(attempt)
         folder.mkdir()
-        run = Run(folder)
+        run = Run(folder, is_compiled=is_compiled)
         try:
             run.wait_until_moving(0.137 * attempt)
             limit_ms = RAMP_MS + SAMPLE_MS + RATIO * bare_pipe_ms()
@@ -156,6 +168,7 @@ def test_a_killed_firmware_leaves_neutral_outputs_as_soon_as_a_pipe_could_tell(t
     raise AssertionError(f"neutral so many ms after the kill, and the limit of the moment: {answers}")
 
 
+@pytest.mark.parametrize("is_compiled", LOOPS)
 def test_a_firmware_that_stands_still_is_taken_over_and_holds_when_it_wakes(run: Run, tmp_path: Path) -> None:
     run.wait_until_moving(0.1)
     os.kill(run.process.pid, signal.SIGSTOP)
@@ -184,6 +197,7 @@ def guardians_of(run: Run) -> list[int]:
     return children_of(run.process.pid, b"guardian.process")
 
 
+@pytest.mark.parametrize("is_compiled", LOOPS)
 @pytest.mark.parametrize("blow", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=pytest.mark.slow)])
 def test_a_guardian_that_is_lost_is_replaced_and_the_new_one_guards(run: Run, blow: signal.Signals) -> None:
     """The run holds and resumes; then the firmware is killed as well, and the new guardian takes the outputs."""

@@ -19,25 +19,28 @@ from firmware_py.compiled.memory import BEAT_LIMIT_NS
 from firmware_py.recording.reader import Recording
 from firmware_py.run_request import RunRequest
 from hal.contracts import Clock
-from hal.middleware.faults import FaultPlan, FaultSerial
+from hal.middleware.faults import FaultI2c, FaultPlan, FaultSerial
 from tools.research.faults.carriers import SocketPort
 
-BENCH = Path(__file__).parents[3] / "benches" / "micron-e727.toml"
+BENCHES = Path(__file__).parents[3] / "benches"
+SERIAL, DEFAULT = (BENCHES / f"{name}.toml" for name in ("micron-e727", "micron"))
 SECONDS = 0.6
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
 
 
-def run(folder: Path, plans: dict[str, FaultPlan], *, compiled: bool) -> tuple[dict[str, Any], bytes, list[Any]]:
+def run(
+    folder: Path, plans: dict[str, FaultPlan], *, compiled: bool, bench: Path = SERIAL
+) -> tuple[dict[str, Any], bytes, list[Any]]:
     """Return the outcome, the truth's bytes, and the recorded events and rows."""
 
     def wrap(bus: str, port: Any, clock: Clock) -> Any:
         if not hasattr(port, "drain_input"):
-            return port
+            return FaultI2c(port, clock, plans[bus]) if bus in plans else port
         return SocketPort(FaultSerial(port, clock, plans[bus]) if bus in plans else port)
 
     file = folder / f"{compiled}.mcap"
     file.unlink(missing_ok=True)
-    request = RunRequest(BENCH, SECONDS, pace="virtual", record=file, compiled=compiled)
+    request = RunRequest(bench, SECONDS, pace="virtual", record=file, compiled=compiled)
     outcome, truth = run_in_process(request, wrap=wrap)
     assert truth is not None
     recording = Recording(file)
@@ -45,9 +48,9 @@ def run(folder: Path, plans: dict[str, FaultPlan], *, compiled: bool) -> tuple[d
     return outcome, b"".join(np.ascontiguousarray(truth[name]).tobytes() for name in sorted(truth)), recorded
 
 
-def compare(folder: Path, plans: dict[str, FaultPlan]) -> dict[str, Any]:
+def compare(folder: Path, plans: dict[str, FaultPlan], bench: Path = SERIAL) -> dict[str, Any]:
     """Run both; return the compiled one's outcome."""
-    python, compiled = (run(folder, plans, compiled=c) for c in (False, True))
+    python, compiled = (run(folder, plans, compiled=c, bench=bench) for c in (False, True))
     assert compiled[1] == python[1]
     assert compiled[2] == python[2]
     for key in ("armed_ns", "safe_ns", "samples", "noticed", "commands", "holds", "warnings", "safe_state", "latency"):
@@ -60,14 +63,16 @@ def compare(folder: Path, plans: dict[str, FaultPlan]) -> dict[str, Any]:
     return compiled[0]
 
 
-def test_a_quiet_run(tmp_path: Path):
-    outcome = compare(tmp_path, {})
+@pytest.mark.parametrize("bench", [SERIAL, DEFAULT], ids=lambda bench: bench.stem)
+def test_a_quiet_run(tmp_path: Path, bench: Path):
+    outcome = compare(tmp_path, {}, bench)
     assert outcome["loop"]["kind"] == "compiled"
     assert outcome["loop"]["ticks"] > 0.9 * 1000 * SECONDS
     assert outcome["safe_state"]["normal"]
 
 
-def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+@pytest.mark.parametrize("bench", [SERIAL, DEFAULT], ids=lambda bench: bench.stem)
+def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bench: Path):
     """Python's heartbeat counts as stopped for one entry: neutral without Python, a hold, and on."""
     feed = CompiledMicron._feed  # pyright: ignore[reportPrivateUsage]
     commanded_V: list[list[float]] = []
@@ -78,18 +83,18 @@ def test_the_thread_ramps_alone_when_python_is_silent(tmp_path: Path, monkeypatc
         if loop.entries == 200:
             words[BEAT_LIMIT_NS] = -1
 
-    flush = CompiledMicron._flush  # pyright: ignore[reportPrivateUsage]
+    sync = CompiledMicron._sync  # pyright: ignore[reportPrivateUsage]
 
-    def flush_and_look(loop: CompiledMicron) -> None:
-        flush(loop)
+    def sync_and_look(loop: CompiledMicron) -> None:
+        sync(loop)
         words = loop._words  # pyright: ignore[reportPrivateUsage]
         if words[BEAT_LIMIT_NS] < 0:
-            commanded_V.append(loop._output.guard.last_V)  # pyright: ignore[reportPrivateUsage]
+            commanded_V.append(list(loop.run.output.commanded_V))  # pyright: ignore[reportPrivateUsage]
             words[BEAT_LIMIT_NS] = 100_000_000
 
     monkeypatch.setattr(CompiledMicron, "_feed", feed_late)
-    monkeypatch.setattr(CompiledMicron, "_flush", flush_and_look)
-    outcome, _, _ = run(tmp_path, {}, compiled=True)
+    monkeypatch.setattr(CompiledMicron, "_sync", sync_and_look)
+    outcome, _, _ = run(tmp_path, {}, compiled=True, bench=bench)
     assert commanded_V == [[50.0, 50.0, 50.0]], "neutral before Python knows"
     assert [hold["finding"] for hold in outcome["holds"]] == ["supervision_silent"]
     assert outcome["safe_state"]["normal"]
@@ -124,3 +129,17 @@ def test_losses_splits_and_damage_of_scans(tmp_path: Path, plan: FaultPlan):
 )
 def test_ports_that_fail(tmp_path: Path, bus: str, plan: FaultPlan):
     compare(tmp_path, {bus: plan})
+
+
+@pytest.mark.parametrize(
+    "plan",
+    [
+        FaultPlan(seed=3, loss=0.02, from_s=0.7),
+        FaultPlan(seed=3, corruption=0.02, from_s=0.7),
+        FaultPlan(seed=3, delay=0.05, delay_s=0.001, from_s=0.7),
+        FaultPlan(silent_after_s=0.9, silent_for_s=0.1),
+        FaultPlan(disconnect_after_s=0.9),
+    ],
+)
+def test_transfers_that_fail(tmp_path: Path, plan: FaultPlan):
+    compare(tmp_path, {"i2c0": plan}, DEFAULT)

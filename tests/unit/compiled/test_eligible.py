@@ -19,15 +19,15 @@ def reasons(name: str) -> str:
     return "; ".join(reasons_against_bench(load_bench(BENCHES / f"{name}.toml"), "realtime"))
 
 
-def test_the_serial_bench_can():
-    assert reasons("micron-e727") == ""
-    check_compiled(load_bench(BENCHES / "micron-e727.toml"), "realtime")
+@pytest.mark.parametrize("bench", ["micron", "micron-e727"])
+def test_these_benches_can(bench: str):
+    assert reasons(bench) == ""
+    check_compiled(load_bench(BENCHES / f"{bench}.toml"), "realtime")
 
 
 @pytest.mark.parametrize(
     ("bench", "what"),
     [
-        ("micron", "device.piezo: its driver dac_amplifier has no kernels"),
         ("micron-can", "device.piezo: its driver can_amplifier has no kernels"),
         ("micron-eight", "8 accelerometer axes"),
         ("endoscope", "an endoscope's loop is Python"),
@@ -44,7 +44,7 @@ def test_emulated_time_and_injected_faults_are_python():
 
 def test_asked_for_it_is_bad_input(tmp_path: Path):
     record = tmp_path / "run.mcap"
-    bench = str(BENCHES / "micron.toml")
+    bench = str(BENCHES / "micron-can.toml")
     result = CliRunner().invoke(app, ["run", "--bench", bench, "--realtime", "--compiled", "--record", str(record)])
     assert result.exit_code == 2
     assert not record.exists()

@@ -158,7 +158,7 @@ def test_a_command_that_was_under_way_is_undone():
     stand.moving()
     while not stand.heart.reached_ns:
         stand.tick(alive=False)
-    late = DacAmplifier(stand.guardian._output._bus, stand.clock)  # type: ignore[attr-defined]
+    late = DacAmplifier(stand.guardian._output.bus, stand.clock)  # type: ignore[attr-defined]
     late.arm()
     stand.clock.burn_ns(5 * MS)
     late.write(np.array([60.0, 50.0, 50.0]))

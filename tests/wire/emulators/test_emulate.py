@@ -125,6 +125,13 @@ def test_smbus2_uses_the_chips_without_knowing(emulated: Emulated) -> None:
     assert seen["no_bus"] == errno.ENOENT
 
 
+def test_compiled_transfers_use_the_chips(emulated: Emulated) -> None:
+    seen = json.loads(emulated.run(sys.executable, str(HERE / "use_i2c_compiled.py")))
+    assert seen["read"] == ["1234", "fedc"]
+    assert seen["absent"][0] == "I2cNack"
+    assert "nobody acknowledges at address 0x33" in seen["absent"][1]
+
+
 def test_faults_reach_a_program_as_the_kernel_s_errors(emulated: Emulated) -> None:
     program = "import smbus2, sys\ntry: smbus2.SMBus(1).write_byte(0x0C, 0x31)\nexcept OSError as e: print(e.errno)"
     for fault, target, code in (

@@ -1,0 +1,216 @@
+"""The outputs that the compiled thread can command, as ``CompiledLoop`` sees them: memory, descriptor, hand-over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from drivers.piezo.dac_output import DacOutput
+from drivers.piezo.e727 import E727
+from firmware_py.compiled.ports import Descriptor, Fed, lacks_descriptor
+from firmware_py.guardian.amplifier import GuardedAmplifier
+from hal.clock import VirtualClock
+from hal.contracts import AnalogOutput, Clock, I2cBus
+from hal.errors import BusError, HalError
+from hal.i2c_carrier import PYTHON, I2cCarrier
+from hal.types import I2cOp
+
+
+class Side(Protocol):
+    """The Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes."""
+
+    def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
+        """Return what ``firmware_py.compiled.outputs`` works on. ``fixed_ns`` (1,): the time in virtual time."""
+        ...
+
+    def lacks(self) -> str:
+        """Return why the thread cannot reach the output; empty if it can."""
+        ...
+
+    @property
+    def is_well(self) -> bool:
+        """False while Python has to talk to the output."""
+        ...
+
+    def fileno(self) -> int: ...
+    def take_over(self, is_read_back: bool) -> None:
+        """Hand to the driver what the thread has left to it. ``is_read_back``: it came from reading back."""
+        ...
+
+    def feed(self) -> None: ...
+    def flush(self) -> None: ...
+    def close(self) -> None: ...
+
+
+class E727Side:
+    """An E-727 on a serial line."""
+
+    def __init__(self, driver: E727, clock: Clock) -> None:
+        self._driver = driver
+        self._clock = clock
+
+    def lacks(self) -> str:
+        return lacks_descriptor(self._driver.port, self._clock)
+
+    def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
+        from drivers.piezo.e727_loop import memory_of  # numba
+
+        return memory_of(self._driver)
+
+    @property
+    def is_well(self) -> bool:
+        return self._driver.link.is_well
+
+    def fileno(self) -> int:
+        port = self._driver.port
+        assert isinstance(port, Descriptor)
+        return port.fileno()
+
+    def take_over(self, is_read_back: bool) -> None:
+        """The driver's memory is as it needs it."""
+
+    def feed(self) -> None:
+        port = self._driver.port
+        assert isinstance(port, Fed)
+        port.feed(0.0)
+
+    def flush(self) -> None:
+        port = self._driver.port
+        assert isinstance(port, Fed)
+        port.flush()
+
+    def close(self) -> None:
+        """The port is the bench's."""
+
+
+class VirtualBus:
+    """Makes the thread's transfers on any bus of virtual time, as functions that compiled code calls."""
+
+    CARRIER = PYTHON
+
+    def __init__(self, bus: I2cBus, clock: Clock, address: int, fixed_ns: NDArray[np.int64]) -> None:
+        self._bus, self._clock, self._address, self._fixed_ns = bus, clock, address, fixed_ns
+        self._error: HalError = BusError("no transfer has failed")
+        self._transfers: list[Any] = []
+        self._kept: list[object] = []
+
+    def add_call(self) -> int:
+        """Return the address of the function for the transfer that ``serve`` will be given next."""
+        from hal.i2c_kernels import ops_of, python_call  # numba
+
+        number = len(self._kept)
+        address, kept = python_call(lambda: self._transfer(self._transfers[number], ops_of))
+        self._kept.append(kept)
+        return address
+
+    def serve(self, transfers: list[Any]) -> None:
+        """Make ``transfers``, in the order of ``add_call``."""
+        self._transfers = transfers
+
+    def _transfer(self, transfer: Any, ops_of: Callable[[Any], list[I2cOp]]) -> int:
+        self._clock.sleep_until_ns(int(self._fixed_ns[0]))
+        try:
+            answer = self._bus.transfer(self._address, ops_of(transfer))
+        except HalError as error:
+            self._error = error
+            return 1
+        finally:
+            self._fixed_ns[0] = self._clock.now_ns()
+        if answer:
+            transfer.reply[-len(answer) :] = np.frombuffer(answer, np.uint8)
+        return 0
+
+    def for_thread(self) -> VirtualBus:
+        return self
+
+    def fileno(self) -> int:
+        return -1
+
+    def failure(self, code: int, address: int) -> HalError:
+        return self._error
+
+    def close(self) -> None:
+        """The bus is the bench's."""
+
+
+class DacSide:
+    """A DAC on an I2C bus, with or without a guardian."""
+
+    def __init__(self, amplifier: GuardedAmplifier | DacOutput, clock: Clock) -> None:
+        self._gate = amplifier.gate if isinstance(amplifier, GuardedAmplifier) else None
+        self._driver = amplifier.inner if isinstance(amplifier, GuardedAmplifier) else amplifier
+        self._clock = clock
+        self._carrier: I2cCarrier | None = None
+        self._memory: Any = None
+
+    def lacks(self) -> str:
+        if isinstance(self._clock, VirtualClock) or isinstance(self._driver.bus, I2cCarrier):
+            return ""
+        return f"its bus ({type(self._driver.bus).__name__}) has no file descriptor"
+
+    def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
+        from drivers.piezo.dac_loop import memory_of  # numba
+        from firmware_py.compiled.outputs import GatedDac
+
+        driver, gate, calls = self._driver, self._gate, (0, 0)
+        virtual = None
+        if isinstance(self._clock, VirtualClock):
+            self._carrier = virtual = VirtualBus(driver.bus, self._clock, driver.address, fixed_ns)
+            calls = virtual.add_call(), virtual.add_call()
+        else:
+            assert isinstance(driver.bus, I2cCarrier)
+            self._carrier = driver.bus.for_thread()
+        dac = memory_of(driver, self._carrier.CARRIER, fixed_ns, calls)
+        if virtual is not None:
+            virtual.serve([dac.command, dac.check])
+        none = np.zeros(0, np.int64)
+        heart = np.frombuffer(gate.heart.words, np.int64) if gate is not None else none
+        self._memory = GatedDac(dac, heart, np.frombuffer(gate.words, np.int64) if gate is not None else none)
+        return self._memory
+
+    @property
+    def is_well(self) -> bool:
+        return self._driver.is_ready and (self._gate is None or not self._gate.lost)
+
+    def fileno(self) -> int:
+        assert self._carrier is not None
+        return self._carrier.fileno()
+
+    def take_over(self, is_read_back: bool) -> None:
+        from drivers.piezo.dac_loop import DIFFERS, FAILED
+        from hal.i2c_kernels import REPLY_SIZE
+
+        dac = self._memory.dac
+        if not (failed := int(dac.words[FAILED])):
+            return
+        dac.words[FAILED] = 0
+        if failed == DIFFERS:
+            reply = dac.check.reply if is_read_back else dac.command.reply
+            self._driver.pending = reply[REPLY_SIZE:].tobytes()
+        else:
+            assert self._carrier is not None
+            self._driver.pending = self._carrier.failure(failed, self._driver.address)
+
+    def feed(self) -> None:
+        """Transfers are made as the thread asks for them."""
+
+    def flush(self) -> None:
+        """See ``feed``."""
+
+    def close(self) -> None:
+        self._memory = None
+        if self._carrier is not None and self._carrier is not self._driver.bus:
+            self._carrier.close()
+
+
+def side_of(amplifier: AnalogOutput, clock: Clock) -> Side | None:
+    """Return the side of ``amplifier``, None if it has no kernels."""
+    inner = amplifier.inner if isinstance(amplifier, GuardedAmplifier) else amplifier
+    if isinstance(inner, E727):
+        return E727Side(inner, clock)
+    if isinstance(inner, DacOutput) and inner.CODE_AT and inner.VERIFY:
+        return DacSide(amplifier if isinstance(amplifier, GuardedAmplifier) else inner, clock)
+    return None
