@@ -131,9 +131,11 @@ def _check_kind(description: BenchDescription, injection: Injection, kind: str) 
             )
     if injection.only is None:
         return
-    there = sorted({d.address for d in description.device.values() if d.bus == injection.bus and d.address is not None})
-    if injection.only not in there:
-        known = ", ".join(f"0x{address:02X}" for address in there) or "none, it is no I2C bus"
+    addresses = sorted(
+        {d.address for d in description.device.values() if d.bus == injection.bus and d.address is not None}
+    )
+    if injection.only not in addresses:
+        known = ", ".join(f"0x{address:02X}" for address in addresses) or "none, it is no I2C bus"
         raise BenchError(
             f"--inject: there is no device 0x{injection.only:02X} on bus '{injection.bus}'; addresses are {known}"
         )

@@ -103,8 +103,8 @@ class CompiledMicron(Micron):
         self._words[at.SPIN_NS] = round(spin_us * 1e3)
         self._processors = os.sched_getaffinity(0)
         self._inside_ns = 0
-        self._told = self._words.copy()
-        self._tasks_told = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
+        self._counted = self._words.copy()
+        self._tasks_counted = np.zeros((at.N_COUNTERS, len(at.STAGES)), np.int64)
         self._memory: Memory | None = None
 
     def prepare(self) -> None:
@@ -240,7 +240,7 @@ class CompiledMicron(Micron):
         words[at.END_NS] = at.NO_END if self.run.end_ns is None else self.run.end_ns
         words[at.SEQ_OF_TICK0], words[at.LAST_K], words[at.LAST_DUE_NS] = seq_of_tick0, last_k, last_due_ns
         words[at.WARNED], words[at.READS_LEFT] = self._warned, -1
-        memory.sinks.shown[:] = self.frame
+        memory.sinks.page_frame[:] = self.frame
         if self._is_virtual:
             self._feed(last_due_ns)
         words[at.BEAT_NS] = self.run.clock.now_ns()
@@ -314,8 +314,8 @@ class CompiledMicron(Micron):
         """Count what the thread has done since the last time."""
         words, memory, counts = self._words.copy(), self._memory, self.run.counts
         assert memory is not None
-        new = words - self._told
-        self._told = words
+        new = words - self._counted
+        self._counted = words
         if new[at.RECEIVED]:
             self.scans.note_run(int(new[at.RECEIVED]), int(words[at.LAST_DUE_NS]))
             self._daq.scans += int(new[at.RECEIVED])
@@ -327,8 +327,8 @@ class CompiledMicron(Micron):
             if words[place]:
                 counts.noticed.setdefault(what, int(words[place]))
         tasks = memory.timing.tasks[: at.N_COUNTERS].copy()
-        each: dict[str, list[int]] = dict(zip(at.STAGES, (tasks - self._tasks_told).T.tolist(), strict=True))
-        self._tasks_told = tasks
+        each: dict[str, list[int]] = dict(zip(at.STAGES, (tasks - self._tasks_counted).T.tolist(), strict=True))
+        self._tasks_counted = tasks
         self.run.scheduler.adopt(int(words[at.LAST_K]), int(new[at.TICKS]), int(new[at.CAUGHT_UP]), each)
         if words[at.PAIR_TOLD]:
             self._check.judge_pairs(-int(words[at.PAIR_TOLD]))
@@ -377,7 +377,7 @@ class CompiledMicron(Micron):
         self.run.incidents.tick = k
         self.run.ticks = Ticks(k, 1, due_ns, self.run.period_ns, TimeSource.DEVICE_CLOCK)
         if not self._is_virtual:
-            self._show(memory.sinks.shown)
+            self._show(memory.sinks.page_frame)
         try:
             self.run.scheduler.run_beside(due_ns, first, k, at.STAGES, in_tick=self._is_virtual)
             self.run.scheduler.run_slack(due_ns + self._daq.dt_ns + self.run.period_ns)

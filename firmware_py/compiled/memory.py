@@ -75,12 +75,12 @@ class Timing(NamedTuple):
 
 class Sinks(NamedTuple):
     """Holds where frames go: the page's memory and the recorder's ring; (0,) and (0, 0) arrays where there is none.
-    ``shown`` is the last whole frame, for Python."""
+    ``page_frame`` is the last whole frame, for Python."""
 
     live_words: Words
     live_rows: NDArray[np.float64]
     ring: Any
-    shown: NDArray[np.float64]
+    page_frame: NDArray[np.float64]
 
 
 class Memory(NamedTuple):

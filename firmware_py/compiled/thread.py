@@ -227,7 +227,7 @@ def publish(m: Memory, frame: NDArray[np.float64]) -> None:
     if len(sinks.ring.words) > 0 and ring_put(sinks.ring, frame):
         release_fence()  # pyright: ignore[reportCallIssue]
         ring_announce(sinks.ring.words)
-    sinks.shown[:] = frame
+    sinks.page_frame[:] = frame
 
 
 @kernel

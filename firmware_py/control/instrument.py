@@ -162,7 +162,7 @@ class Micron:
         bits = int(self.frame[STATUS])
         incidents = self.run.incidents
         # check before the command goes out: a sensor that contradicts its twin must not move anything
-        if self._redundancy.there:
+        if self._redundancy.has_spare_axes:
             if unclear := self._redundancy.agree(self.frame):
                 incidents.doubt(Finding.AXES_CONTRADICT, what=unclear)
         elif not bits & (FrameStatus.INVALID | FrameStatus.STALE) and (

@@ -144,18 +144,18 @@ def _follow_output(table: dict[str, Any], options: Mapping[str, Any], where: str
         return
     ((name, option),) = outputs
     limit = option.limit
-    for key, mine, theirs, narrows in (
+    for key, of_output, output_key, narrows in (
         ("low_V", limit.lo_V, "lo_V", lambda given: given >= limit.lo_V),
         ("high_V", limit.hi_V, "hi_V", lambda given: given <= limit.hi_V),
         ("slew_V_per_s", limit.slew_V_per_s, "slew_V_per_s", lambda given: given <= limit.slew_V_per_s),
         ("neutral_V", limit.safe_V, "neutral_V", lambda given: given == limit.safe_V),
     ):
-        given = table.setdefault(key, mine)
+        given = table.setdefault(key, of_output)
         if isinstance(given, int | float) and not narrows(given):
             what = "the ramp to neutral ends at" if key == "neutral_V" else "the output allows"
             raise BenchError(
-                f"{where}: firmware.actuation: {key} = {given:g}, but {what} {theirs} = {mine:g} of [device.{name}]: "
-                f"leave {key} out here, or change it there"
+                f"{where}: firmware.actuation: {key} = {given:g}, but {what} {output_key} = {of_output:g} of "
+                f"[device.{name}]: leave {key} out here, or change it there"
             )
 
 

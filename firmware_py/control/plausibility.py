@@ -163,9 +163,9 @@ def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) 
     short = int(np.linalg.norm(lever, axis=1).argmin())
     long = [k for k in range(len(PAIRS)) if k != short]
     if abs(np.linalg.det(lever[long])) > SQUARE * float(np.linalg.norm(lever[long], axis=1).prod()):
-        told = np.linalg.solve(lever[long].T, lever[short])
-        if float(np.abs(told).max()) < 1.0:  # else the others' noise is more than is gained
-            mix[short, long] = -told
+        weights = np.linalg.solve(lever[long].T, lever[short])
+        if float(np.abs(weights).max()) < 1.0:  # else the others' noise is more than is gained
+            mix[short, long] = -weights
     return mix
 
 
@@ -301,7 +301,7 @@ class ScanCheck:
         self.limits = limits
         self._labels = tuple(labels)
         n = len(columns)
-        self._told = 0
+        self._seen_total = 0
         volts = (limits.jump_V, limits.outlier_V, limits.supply_step_V, *limits.rail_V)
         self.memory = CheckMemory(
             np.array([-1, 0]), np.array(columns, dtype=np.int64), np.zeros(n, dtype=np.int16),
@@ -316,7 +316,7 @@ class ScanCheck:
         )  # fmt: skip
         # handed over one by one, because a tuple of arrays costs each call 10 us
         self._limits, self._pair_limits = self.memory.limits.tolist(), self.memory.pair_limits.tolist()
-        self._pair_told = 0
+        self._pair_code = 0
         self._load_kernels()
 
     def _load_kernels(self) -> None:
@@ -369,14 +369,14 @@ class ScanCheck:
     def odd(self) -> str:
         """Return a message about an input that was out of line since the last call, or an empty string. Such a reading
         does not end a run."""
-        if self._pair_told:
-            i, j, axis = PAIRS[self._pair_told - 1]
-            self._pair_told = 0
+        if self._pair_code:
+            i, j, axis = PAIRS[self._pair_code - 1]
+            self._pair_code = 0
             return f"{self._labels[i]} and {self._labels[j]} came apart along {axis}"
         total = int(self.memory.odd.sum())
-        if total == self._told:
+        if total == self._seen_total:
             return ""
-        self._told = total
+        self._seen_total = total
         worst = int(self.memory.odd.argmax())
         if worst == self._supply:
             return f"{self._labels[worst]} stepped"
@@ -403,7 +403,7 @@ class ScanCheck:
         if found == 0:
             return ""
         if found < 0:
-            self._pair_told = -found
+            self._pair_code = -found
             return ""
         i, j, axis = PAIRS[found - 1]
         pairs = self.memory.pairs

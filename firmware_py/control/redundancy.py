@@ -24,7 +24,7 @@ class Redundancy:
 
     def __init__(self, stages: Stages, check: ScanCheck, run: Run, labels: tuple[str, ...]) -> None:
         self._sensing = stages.sensing
-        self._told = stages.frame[PARITY : PARITY + len(PARITIES)]
+        self._parity_columns = stages.frame[PARITY : PARITY + len(PARITIES)]
         self._check = check
         self._supervisor = run.supervisor
         self._incidents = run.incidents
@@ -32,8 +32,8 @@ class Redundancy:
         self._parity = Parity(self._null()) if self._parities() else None
 
     @property
-    def there(self) -> bool:
-        """True if there were more than six axes to begin with."""
+    def has_spare_axes(self) -> bool:
+        """Return True if the bench has more than six axes."""
         return self._parity is not None
 
     def _parities(self) -> int:
@@ -77,7 +77,7 @@ class Redundancy:
         louder = self._sensing.leave_out(axis, parity.usual)
         self._check.ignore(axis)
         parity.restart(self._null())
-        self._told[self._parities() :] = 0.0
+        self._parity_columns[self._parities() :] = 0.0
         text = f"{why}: left out, sensing goes on without it; noise of the tip's acceleration times {louder:.2f}"
         self._incidents.notice(text)
         self._incidents.note({"event": "axis left out", "reason": text})

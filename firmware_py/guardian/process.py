@@ -64,21 +64,21 @@ class GuardianProcess:
 
     def _start(self) -> tuple[subprocess.Popen[bytes], int]:
         assert self.heart.fd is not None
-        theirs, ours = os.pipe()
+        guardian_end, own_end = os.pipe()
         ourselves = os.pidfd_open(os.getpid()) if self._may_end_us else -1
-        order = {**self._order, "heart": self.heart.fd, "pipe": theirs, "firmware": ourselves}
+        order = {**self._order, "heart": self.heart.fd, "pipe": guardian_end, "firmware": ourselves}
         process = subprocess.Popen(
             child_command("firmware_py.guardian.process", json.dumps({**order, "report": str(self._report)})),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
-            pass_fds=(self.heart.fd, theirs, *((ourselves,) if self._may_end_us else ())),
+            pass_fds=(self.heart.fd, guardian_end, *((ourselves,) if self._may_end_us else ())),
             env=child_environment(),
             start_new_session=True,  # Ctrl-C is for the firmware
         )
-        os.close(theirs)
+        os.close(guardian_end)
         if self._may_end_us:
             os.close(ourselves)
-        return process, ours
+        return process, own_end
 
     @property
     def pid(self) -> int:

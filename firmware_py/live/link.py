@@ -49,9 +49,9 @@ class LiveLink:
 
     def show(self, histograms: Callable[[], dict[str, DurationHistogram]]) -> Generator[bool, None, None]:
         """Run the background task that copies one histogram per step, in turn, in the order of ``histograms()``."""
-        shown = list(histograms().values())[:HISTOGRAMS]
+        selected = list(histograms().values())[:HISTOGRAMS]
         while True:
-            for index, histogram in enumerate(shown):
+            for index, histogram in enumerate(selected):
                 self._memory.put_histogram(index, histogram)
                 yield False
 

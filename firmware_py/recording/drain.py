@@ -99,13 +99,13 @@ class Drain:
 
     def step(self, now_s: float) -> int:
         """Take what is there; write blocks that are due. Returns how many rows and events were taken."""
-        taken = self._take_events(now_s) + self._take_rows(now_s)
+        n_taken = self._take_events(now_s) + self._take_rows(now_s)
         if self._filled and now_s - self._opened_s >= OPEN_BLOCK_S:
             self._close_block()
         if self._event_since_s is not None and now_s - self._event_since_s >= OPEN_BLOCK_S:
             self._writer.flush()
             self._event_since_s = None
-        return taken
+        return n_taken
 
     def drain(self) -> None:
         """Take and write everything that is left."""
@@ -134,14 +134,14 @@ class Drain:
         return len(numbers)
 
     def _take_events(self, now_s: float) -> int:
-        taken = 0
+        n_taken = 0
         while (item := self._events.pop()) is not None:
             number, text = item
             self._writer.write_event(number, json.loads(text))
             if self._event_since_s is None:
                 self._event_since_s = now_s
-            taken += 1
-        return taken
+            n_taken += 1
+        return n_taken
 
     def _close_block(self) -> None:
         self._writer.write_block(self._row0, self._buffer[: self._filled])

@@ -105,9 +105,9 @@ class Recording:
     @property
     def tick_hz(self) -> float:
         """Ticks per second of the run; 1000 where the recording does not say. ``RecordingError`` for no rate."""
-        said: Any = self.metadata.get("tick_hz", 1000.0)
+        stated: Any = self.metadata.get("tick_hz", 1000.0)
         try:
-            rate_hz = float(said) if isinstance(said, int | float | str) else float("nan")
+            rate_hz = float(stated) if isinstance(stated, int | float | str) else float("nan")
         except ValueError:
             rate_hz = float("nan")
         if not 0.0 < rate_hz < 1e9:

@@ -73,11 +73,11 @@ class _Output:
         """Raise ``FileDisturbed`` when another program has deleted, replaced, cut or written the file."""
         ours = os.fstat(self._fd)
         try:
-            there = os.stat(self._path)
+            on_disk = os.stat(self._path)
         except OSError:
-            there = None
+            on_disk = None
         if ours.st_nlink == 0:
-            raise FileDisturbed("deleted" if there is None else "replaced by another file", lost=True)
+            raise FileDisturbed("deleted" if on_disk is None else "replaced by another file", lost=True)
         if ours.st_size < self._position:
             raise FileDisturbed(f"cut to {ours.st_size} of {self._position} bytes")
         if ours.st_size > self._position:
@@ -87,11 +87,11 @@ class _Output:
     def moved(self) -> bool:
         """True if the file is no longer under its name; ``check`` tells whether it is whole."""
         try:
-            there = os.stat(self._path)
+            on_disk = os.stat(self._path)
         except OSError:
             return True
         ours = os.fstat(self._fd)
-        return (there.st_dev, there.st_ino) != (ours.st_dev, ours.st_ino)
+        return (on_disk.st_dev, on_disk.st_ino) != (ours.st_dev, ours.st_ino)
 
     def keep(self) -> None:
         """Mark what has been written so far as whole."""

@@ -130,13 +130,13 @@ class DurationHistogram:
 
     def add_histogram(self, other: DurationHistogram) -> None:
         """Count what ``other`` has counted; its ticks come after those of this one."""
-        ours, theirs, before = self.words, other.words, self.n
-        if theirs[_MAX] > ours[_MAX]:
-            ours[_MAX], ours[_MAX_TICK] = theirs[_MAX], before + theirs[_MAX_TICK]
-        ours[_MIN] = min(ours[_MIN], theirs[_MIN])
-        ours[_TOTAL] += theirs[_TOTAL]
+        own_words, other_words, before = self.words, other.words, self.n
+        if other_words[_MAX] > own_words[_MAX]:
+            own_words[_MAX], own_words[_MAX_TICK] = other_words[_MAX], before + other_words[_MAX_TICK]
+        own_words[_MIN] = min(own_words[_MIN], other_words[_MIN])
+        own_words[_TOTAL] += other_words[_TOTAL]
         for i in range(_FIRST, self.STATE_WORDS):
-            ours[i] += theirs[i]
+            own_words[i] += other_words[i]
 
     def count_beyond(self, limit_ns: int) -> int:
         """Return the number of values above ``limit_ns``. Those in the limit's own bucket, 6 % wide, are left out."""

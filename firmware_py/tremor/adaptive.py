@@ -212,7 +212,7 @@ def adaptive_output(state: Record, axis: int, output: int) -> float:
 
 @kernel
 def biquad_step(sample: float, memory: Array, c: Array) -> float:
-    """One sample through b0 b1 b2 a1 a2; ``memory`` (2,), transposed direct form II."""
+    """Filter one sample through b0 b1 b2 a1 a2; ``memory`` (2,), transposed direct form II."""
     out = c[0] * sample + memory[0]
     memory[0] = c[1] * sample - c[3] * out + memory[1]
     memory[1] = c[2] * sample - c[4] * out
@@ -267,7 +267,7 @@ def _ease(state: Record, params: Record) -> None:
 
 @kernel
 def _regress(state: Record, axis: int, at: int, params: Record) -> None:
-    """One row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
+    """Fill one row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
     n_taps = state.blocks.shape[1]
     lag = n_taps // 2
     target = state.target

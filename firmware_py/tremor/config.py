@@ -181,7 +181,7 @@ class AdaptiveConfig(_Table):
 
 
 class LeverConfig(_Table):
-    """What the instrument knows of its own turning (``firmware_py.sensing.quiet_point``).
+    """Holds what the instrument knows of its own turning (``firmware_py.sensing.quiet_point``).
 
     Accelerometers know the acceleration of one point best; from there to the tip the noise of the angular acceleration
     counts with the arm. The adaptive method sees that part by itself and trusts it as far as this hand turns.

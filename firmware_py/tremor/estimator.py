@@ -84,7 +84,8 @@ ROWS = 6
 
 
 def estimator_params(config: TremorConfig) -> Record:
-    """All numbers of all methods; ``config.method`` says which one answers. ``fresh`` is the state at the start."""
+    """Return the parameters of all methods; ``config.method`` selects the one that answers. ``fresh`` is the state at
+    the start."""
     design = design_adaptive(config)
     comb = bmflc_params(config)
     fresh = _fresh_state(config, design)

@@ -12,7 +12,7 @@ from hal.compiled import kernel
 
 @kernel
 def flc_step(signal: float, phase: float, weights: NDArray[np.float64], weight_gain: float, bias_gain: float) -> None:
-    """One LMS step of ``weights`` (sine, cosine, bias) on ``signal``, in the signal's unit.
+    """Make one LMS step of ``weights`` (sine, cosine, bias) on ``signal``, in the signal's unit.
 
     The weights settle with 1 / weight_gain samples (erratum 52).
     """

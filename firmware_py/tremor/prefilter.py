@@ -44,7 +44,7 @@ def prefilter_response(
 
 @kernel
 def prefilter_step(x: float, memory: NDArray[np.float64], sections: NDArray[np.float64]) -> float:
-    """One sample through the sections; ``memory`` (n, 2), direct form II transposed."""
+    """Filter one sample through the sections; ``memory`` (n, 2), direct form II transposed."""
     for j in range(len(sections)):
         y = sections[j, 0] * x + memory[j, 0]
         memory[j, 0] = sections[j, 1] * x - sections[j, 3] * y + memory[j, 1]

@@ -115,7 +115,7 @@ def test_a_tick_that_is_not_believed_says_nothing_of_the_axes(status: FrameStatu
 
 def test_an_impossible_reading_of_an_axis_is_left_out_and_of_another_input_trips() -> None:
     bench = Bench().learnt()
-    assert bench.redundancy.there
+    assert bench.redundancy.has_spare_axes
     assert bench.redundancy.impossible(8, "the supply is gone") == "the supply is gone"
     assert bench.redundancy.impossible(5, "acc5 is at its rail") == ""
     assert bench.left_out == [5]
@@ -124,6 +124,6 @@ def test_an_impossible_reading_of_an_axis_is_left_out_and_of_another_input_trips
 
 def test_six_axes_have_none_to_spare() -> None:
     bench = Bench(axes=6)
-    assert not bench.redundancy.there
+    assert not bench.redundancy.has_spare_axes
     assert bench.redundancy.impossible(3, "acc3 is at its rail") == "acc3 is at its rail"
     assert not bench.agree((50.0, 50.0), 2 * PATIENCE_TICKS)

@@ -14,7 +14,7 @@ ROOMS = (
     "hal",
     "drivers",
     "sim_devices",
-    "firmware_py/run",
+    "firmware_py",
     "tools/bench",
     "tools/calibrate",
     "tools/cli",
