@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from drivers.output_guard import OutputGuard
+from drivers.output_guard import GuardedOutput, OutputGuard
 from hal.backends import nidaqmx_package
 from hal.contracts import Clock, Float64Array
-from hal.errors import BenchError, HalError
+from hal.errors import BenchError
 from hal.types import OutputLimit
 
 TICK_NS = 1_000_000
@@ -23,7 +23,7 @@ READ_TIMEOUT_S = 0.5
 TOLERANCE_V = 0.02  # at the converter
 
 
-class NidaqmxOutput:
+class NidaqmxOutput(GuardedOutput):
     """Drives outputs ``ao0`` ... of ``device``. All values are volts behind the amplifier (``gain``)."""
 
     def __init__(
@@ -86,14 +86,6 @@ class NidaqmxOutput:
         )
         self.guard.armed = True
 
-    @property
-    def commands_sent(self) -> int:
-        return self.guard.writes
-
-    @property
-    def commanded_V(self) -> Sequence[float]:
-        return self.guard.last_V
-
     def write(self, values_V: Float64Array) -> int:
         mask = self.guard.admit(values_V)
         self._send()
@@ -119,13 +111,9 @@ class NidaqmxOutput:
         if self._out is None:
             return
         try:
-            if self._known:
-                while not self.guard.at_safe_state() and not self.safe_step():
+            with self.bringing_to_neutral():
+                while self._known and not self.guard.at_safe_state() and not self.safe_step():
                     self._clock.sleep_until_ns(self._clock.now_ns() + TICK_NS)
-        except HalError as error:
-            raise type(error)(
-                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
-            ) from error
         finally:
             self._out.close()
             self._back.close()

@@ -6,7 +6,8 @@ over the same memory (``GuardState.view``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
+from contextlib import contextmanager
 from typing import NamedTuple
 
 from drivers.output_guard_steps import (
@@ -26,7 +27,7 @@ from drivers.output_guard_steps import (
     note_sent,
 )
 from hal.contracts import Clock, Float64Array
-from hal.errors import ErrorKind, SafetyTrip
+from hal.errors import ErrorKind, HalError, SafetyTrip
 from hal.types import OutputLimit
 
 __all__ = ["LISTED", "RAMP_STEPS", "OutputGuard", "SentCommand"]
@@ -169,3 +170,26 @@ class OutputGuard:
         if not good:
             self.armed = False
             raise SafetyTrip(f"self-test failed: {why}", kind=ErrorKind.SAFETY, device=self.device)
+
+
+class GuardedOutput:
+    """Base of the drivers whose commands pass an ``OutputGuard``; each sets ``name`` and ``guard``."""
+
+    name: str
+    guard: OutputGuard
+
+    @property
+    def commands_sent(self) -> int:
+        return self.guard.writes
+
+    @property
+    def commanded_V(self) -> Sequence[float]:
+        return self.guard.last_V
+
+    @contextmanager
+    def bringing_to_neutral(self, failed: str = "were NOT brought to neutral") -> Generator[None]:
+        """Let an error of the block, which brings the outputs to neutral, say that they may not be there."""
+        try:
+            yield
+        except HalError as error:
+            raise type(error)(f"{error}; the outputs {failed}", kind=error.kind, device=self.name) from error

@@ -15,10 +15,10 @@ from drivers.base import wait_s
 from drivers.can_frames import HostHeartbeat, crc8_j1850, host_heartbeat
 from drivers.dbc import load_database
 from drivers.options import CanAmplifierOptions
-from drivers.output_guard import OutputGuard
+from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import CanBus, Clock, Float64Array
-from hal.errors import BenchError, HalError, HalTimeout, ProtocolError, SafetyTrip
+from hal.errors import BenchError, HalTimeout, ProtocolError, SafetyTrip
 from hal.types import CanFrame, ChannelInfo, OutputLimit
 from hal.wire_bits import can_bits
 
@@ -42,7 +42,7 @@ _SETPOINT = struct.Struct("<HHHB")
 _STATUS = struct.Struct("<HHHBB")
 
 
-class CanAmplifier:
+class CanAmplifier(GuardedOutput):
     """Implements ``AnalogOutput`` for three stacks, in V at the stack."""
 
     def __init__(
@@ -125,14 +125,6 @@ class CanAmplifier:
         self._safe_steps = 0
         self.guard.armed = True
 
-    @property
-    def commands_sent(self) -> int:
-        return self.guard.writes
-
-    @property
-    def commanded_V(self) -> Sequence[float]:
-        return self.guard.last_V
-
     def write(self, values_V: Float64Array) -> int:
         """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Raises also when the node is not armed or is
         silent."""
@@ -181,13 +173,9 @@ class CanAmplifier:
         """Bring the node to its safe state unless it is there; the bus belongs to the bench."""
         if self.state in (DISARMED, FAULT):
             return
-        try:
+        with self.bringing_to_neutral("were NOT seen to reach neutral"):
             while not self.safe_step():
                 wait_s(self._clock, TICK_S)
-        except HalError as error:
-            raise type(error)(
-                f"{error}; the outputs were NOT seen to reach neutral", kind=error.kind, device=self.name
-            ) from error
 
     def channels(self) -> Sequence[ChannelInfo]:
         return [ChannelInfo(f"{self.name}.{i + 1}", "V", 0.0, FULL_V, 1.0 / CODES_PER_V) for i in range(CHANNELS)]

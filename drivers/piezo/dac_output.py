@@ -13,7 +13,7 @@ import numpy as np
 
 from drivers.base import wait_s
 from drivers.options import OutputOptions
-from drivers.output_guard import OutputGuard
+from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, I2cBus
 from hal.errors import BenchError, HalError, ProtocolError
@@ -33,7 +33,7 @@ class OutputGate(Protocol):
     def leave(self) -> None: ...
 
 
-class DacOutput:
+class DacOutput(GuardedOutput):
     """Implements ``AnalogOutput`` for three stacks, in V at the stack: ``arm``, then ``write``, at last ``safe_step``.
 
     A subclass sets the constants of its part and defines ``identify``, ``segments``, ``codes_of`` and ``verify``.
@@ -156,14 +156,6 @@ class DacOutput:
             wait_s(self._clock, RAMP_TICK_S)
         self.guard.armed = True
 
-    @property
-    def commands_sent(self) -> int:
-        return self.guard.writes
-
-    @property
-    def commanded_V(self) -> Sequence[float]:
-        return self.guard.last_V
-
     def write(self, values_V: Float64Array) -> int:
         """Write ``values_V`` (3,). With ``read_back``, raises ``ProtocolError`` when the DAC holds another command."""
         if self.pending is not None:
@@ -204,13 +196,9 @@ class DacOutput:
         """Ramp to neutral unless there; the bus belongs to the bench and stays open."""
         if not self._position_known:
             return  # nothing was ever moved
-        try:
+        with self.bringing_to_neutral():
             while not self.guard.at_safe_state() and not self.safe_step():
                 wait_s(self._clock, RAMP_TICK_S)
-        except HalError as error:
-            raise type(error)(
-                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
-            ) from error
 
     def channels(self) -> Sequence[ChannelInfo]:
         limit = self.limits[0]

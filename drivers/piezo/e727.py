@@ -16,12 +16,12 @@ import numpy as np
 
 from drivers.base import next_due_ns, wait_s
 from drivers.options import E727Options
-from drivers.output_guard import OutputGuard
+from drivers.output_guard import GuardedOutput, OutputGuard
 from drivers.piezo.e727_words import ASK_ERROR_EVERY, COMMANDS, DUE_NS, LATE, PERIOD_NS, SUPERSEDED, WORDS
 from drivers.piezo.gcs import GcsLink
 from drivers.registry import Driver, Load, Site, Traffic
 from hal.contracts import Clock, Float64Array, SerialPort
-from hal.errors import BenchError, HalError, WrongDevice
+from hal.errors import BenchError, WrongDevice
 from hal.types import ChannelInfo, OutputLimit
 from hal.wire_bits import serial_bits
 
@@ -35,7 +35,7 @@ ERROR_BYTES = len("ERR?\n")
 """Bytes that ``ask_error`` sends after every ``ASK_ERROR_EVERY`` commands; the answer travels on the other wire."""
 
 
-class E727:
+class E727(GuardedOutput):
     """Implements ``AnalogOutput`` for three stacks, in V at the stack.
 
     ``mode`` "open loop" sends SVA with volts. "servo" sends MOV with micrometres; ``um_per_V`` converts, so the
@@ -125,14 +125,6 @@ class E727:
         """Return the number of values that were given up, because the line was slower than asked for."""
         return self.words[LATE]
 
-    @property
-    def commands_sent(self) -> int:
-        return self.guard.writes
-
-    @property
-    def commanded_V(self) -> Sequence[float]:
-        return self.guard.last_V
-
     def write(self, values_V: Float64Array) -> int:
         """Write ``values_V`` (3,) as ``AnalogOutput.write`` does. Between two command times only the newest values
         count, the others are ``superseded``. Raises errors of the controller some commands later."""
@@ -175,13 +167,9 @@ class E727:
     def close(self) -> None:
         """Ramp to neutral unless there, then close the port."""
         try:
-            if self._position_known:
-                while not self.guard.at_safe_state() and not self.safe_step():
+            with self.bringing_to_neutral():
+                while self._position_known and not self.guard.at_safe_state() and not self.safe_step():
                     wait_s(self._clock, TICK_S)
-        except HalError as error:
-            raise type(error)(
-                f"{error}; the outputs were NOT brought to neutral", kind=error.kind, device=self.name
-            ) from error
         finally:
             self._position_known = False
             self.link.close()
