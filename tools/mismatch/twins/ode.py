@@ -322,7 +322,7 @@ class OdeTwin(Head):
             x = go(with_some(some), starts, ends, u, run.t)
             return (y - self.equations.readings(x[seen], u[seen], run.t[seen], values)) * weight
 
-        found = meet_start(x0[used], misses_all, rows, self.typical, limits)
+        found = meet_start(x0[used], misses_all, rows, self.typical, limits, rounds=1)
         return go(with_some(found), starts, ends, u, run.t)
 
     def as_read(self, x: Array, y: Array, u: Array, t: Array, values: Array) -> Array:
