@@ -73,6 +73,23 @@ def test_a_figure_that_is_missed_says_what_is_left_by_the_engine() -> None:
     assert "Not run for this page: silverbox multisine" in page
 
 
+def test_sets_that_were_not_run_keep_the_rows_and_sections_of_the_page_before() -> None:
+    both = [scored("emps", 5.0, ("coulomb_friction",)), scored("silverbox multisine", 0.25, ("cubic_stiffness",))]
+    before = document(both)
+    again = document([scored("emps", 2.0, ("coulomb_friction",))], before)
+
+    def kept(page: str) -> str:
+        return page[page.index("## second-order circuit") :]
+
+    assert kept(again) == kept(before)
+    (row,) = (line for line in before.splitlines() if line.startswith("| silverbox multisine |"))
+    assert row in again.splitlines()
+    assert "| emps | mm | 9 | 8 | 2 | 0.1 |" in again
+    assert "| emps | mm | 9 | 8 | 5 | 0.1 |" not in again
+    assert "2 of 2 goals are met" in again
+    assert "Run anew for this page: emps." in again
+
+
 @pytest.fixture
 def made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder of one set: a stack with a dead zone, fit and test in files of their own."""
@@ -129,7 +146,7 @@ def test_a_run_goes_on_where_it_was_stopped(made: Path, monkeypatch: pytest.Monk
     """The command, its JSON, its page; a set that the rows hold is not run again."""
     asked: list[str] = []
 
-    def quick(s: MeasuredSet, folder: Path, diagnosed: object) -> Scored:
+    def quick(s: MeasuredSet, folder: Path, diagnosed: object, engine: str | None) -> Scored:
         asked.append(s.name)
         return scored(s.name, 5.0, ("coulomb_friction",))
 

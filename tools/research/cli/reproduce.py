@@ -27,7 +27,11 @@ def reproduce(
     json_file: JsonOption = None,
     sets: Annotated[
         list[str] | None,
-        typer.Option("--set", metavar="NAME", help="Only sets of section measured with this in their name."),
+        typer.Option(
+            "--set",
+            metavar="NAME",
+            help="Only sets of section measured with this in their name; --out keeps the rows of the others.",
+        ),
     ] = None,
     rows: Annotated[
         Path | None,
@@ -100,6 +104,8 @@ def reproduce(
             options = {"only": tuple(sets or ()), "rows_file": rows, "engine": engine}
         if options and wanted != ["measured"]:
             raise InputError("--set, --rows and --engine belong to 'micron reproduce measured' alone")
+        if sets and out is not None and out.exists():
+            options["before"] = out
         tables: list[Table] = []
         with keep_what_is_there():
             for name in ready(wanted):

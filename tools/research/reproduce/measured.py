@@ -30,6 +30,7 @@ from tools.research.reproduce.measured_rows import Scored, rows_of
 from tools.research.reproduce.measured_sets import SETS, MeasuredSet
 from tools.research.reproduce.recordings import data_folder
 from tools.research.reproduce.rows import Table
+from tools.research.results.artefact import read_page
 
 Array = NDArray[np.float64]
 LEAST_WINDOW = 20  # samples that the engine takes to set a state, where any may
@@ -53,8 +54,12 @@ def chosen(only: Sequence[str]) -> list[MeasuredSet]:
     return [s for s in SETS if not only or any(o in s.name for o in only)]
 
 
-def table(only: Sequence[str] = (), rows_file: Path | None = None, engine: str | None = None) -> Table:
-    """Run the sets and compare. ``rows_file`` (JSON) keeps each that is done; what it holds is not run again."""
+def table(
+    only: Sequence[str] = (), rows_file: Path | None = None, engine: str | None = None, before: Path | None = None
+) -> Table:
+    """Run the sets and compare. ``rows_file`` (JSON) keeps each that is done; what it holds is not run again.
+    ``before``: a result of an earlier run, whose rows stand for the other sets.
+    """
     begin = time.perf_counter()
     wanted = chosen(only)
     check()
@@ -74,7 +79,9 @@ def table(only: Sequence[str] = (), rows_file: Path | None = None, engine: str |
             rows_file.write_text(json.dumps(kept, default=float))
     shown = [found[s.name] for s in SETS if s.name in found and (not only or s in wanted)]
     rows = tuple(row for done in shown for row in rows_of(done))
-    return Table("measured", rows, time.perf_counter() - begin, page=document(shown))
+    return Table(
+        "measured", rows, time.perf_counter() - begin, page=document(shown, read_page(before) if before else "")
+    )
 
 
 def _scored(name: str, kept: Mapping[str, Any]) -> Scored:
