@@ -98,6 +98,11 @@ class ActuationConfig(BaseModel):
     overdrive: Annotated[float, Field(ge=0.0, le=100.0)] = 1.4
     """Most that tremor beyond the stroke may swing, in strokes: a clipped swing still cancels more than one that just
     fits, and shakes the tip above the band with its corners. 0: every swing is clipped."""
+    overdrive_tilts: bool = True
+    """False: only the swing along the shaft is limited so; a tilt beyond the stroke is clipped."""
+    centring: Annotated[float, Field(ge=0.0, le=1.0)] = 0.0
+    """Share of the way from neutral to the middle of what the strokes reach; compensation works about that point.
+    Stacks shrink less from neutral than they grow, so at 0 the shorter side is all that a swing may use."""
 
     low_V: float = 0.0
     high_V: float = 100.0

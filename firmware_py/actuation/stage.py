@@ -60,6 +60,8 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("tick_hz", "f8"),
             ("yield_keep", "f8"),
             ("overdrive", "f8"),
+            ("tilts", "?"),
+            ("centre", "f8"),  # m of every stroke, where compensation works about
             ("mounting", "f8", (3, 3)),
             ("geometry", GEOMETRY),
             ("low_V", "f8"),
@@ -68,6 +70,8 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("slew_step_V", "f8"),
             ("stroke_low", "f8", (3,)),  # m from neutral
             ("stroke_high", "f8", (3,)),
+            ("swing_low", "f8", (3,)),  # m from ``centre``
+            ("swing_high", "f8", (3,)),
             ("neutral_stroke", "f8", (3,)),  # m
             ("taps", "f8", (3, TAPS)),
             ("stacks", operator_dtype(n_plays, n_zones, n_creep), (3,)),
@@ -118,6 +122,7 @@ def actuate_params(config: ActuationConfig) -> Record:
         tick_hz=config.tick_hz,
         yield_keep=exp(-1.0 / (config.yield_s * config.tick_hz)),
         overdrive=config.overdrive,
+        tilts=config.overdrive_tilts,
         mounting=config.mounting,
         geometry=geometry_of(config),
         low_V=config.low_V,
@@ -143,6 +148,10 @@ def actuate_params(config: ActuationConfig) -> Record:
         param.stroke_low[i] = low - rest
         record["creep_reference"] = rest
         param.stacks[i] = record[0]
+    # the same for all stacks: it moves the tip along the shaft alone
+    param.centre = config.centring * 0.5 * float(np.max(param.stroke_low) + np.min(param.stroke_high))
+    param.swing_low[:] = param.stroke_low - param.centre
+    param.swing_high[:] = param.stroke_high - param.centre
     return params
 
 
@@ -209,14 +218,19 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
     clip = 0
     strokes_from_tip(tip, param.geometry, state.tilt, stroke)
     strokes_from_tip(core_tip, param.geometry, state.yielding.tilt, core_stroke)
-    low, high, keep = param.stroke_low, param.stroke_high, param.yield_keep
-    shrunk = shrink_core(stroke, core_stroke, low, high, param.overdrive, keep, state.yielding)
+    low, high, keep = param.swing_low, param.swing_high, param.yield_keep
+    shrunk = shrink_core(stroke, core_stroke, low, high, param.overdrive, param.tilts, keep, state.yielding)
     if yield_rest(stroke, core_stroke, low, high, keep, state.yielding) or shrunk:
         clip |= CLIP_YIELD
         tip_from_strokes(stroke, param.geometry, tip)
-    if not inside(stroke, param.stroke_low, param.stroke_high):
+    if not inside(stroke, low, high):
         clip |= CLIP_WORKSPACE
-        nearest_reachable(tip, param.geometry, param.stroke_low, param.stroke_high, stroke)
+        nearest_reachable(tip, param.geometry, low, high, stroke)
+    if param.centre != 0.0:
+        on = min(state.on[0], state.on[1], state.on[2])
+        for i in range(3):
+            stroke[i] += on * param.centre
+        tip_from_strokes(stroke, param.geometry, tip)
     for i in range(3):
         past = state.strokes[i]
         for k in range(len(past) - 1, 0, -1):

@@ -7,7 +7,7 @@ peaks stay inside. A peak is followed at once and forgotten slowly, so the scale
 itself. The part of the rest that tilts the shaft has room before the part along it: it costs an eighth of the stroke.
 
 A core that is itself beyond the stroke has corners where it is clipped, and these shake the tip above the band. So its
-swing along the shaft is kept within ``overdrive`` strokes, by a scale that follows the swing and not its phase.
+swing is kept within ``overdrive`` strokes, by a scale that follows the swing and not its phase.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ YIELD_STATE = np.dtype(
         ("core_power", "f8"),  # m^2, recent mean square of the core
         ("core_change", "f8"),  # m^2, that of its change in a tick
         ("core_over", "f8"),  # recent peak of the core's swing over what is let through
+        ("tilt_over", "f8"),  # the same of the swing's tilt
         ("core_peak", "f8", (3,)),  # m of stroke
         ("side_peak", "f8", (3,)),  # m of stroke, as let through
         ("side_over", "f8"),  # recent peak of the tilting rest over its room
@@ -40,14 +41,15 @@ LEAST_ROOM = 0.1  # of a stroke's half range whatever the core takes, of that ro
 
 @kernel
 def shrink_core(
-    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, keep: float, state: Record
+    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, tilts: bool, keep: float, state: Record
 ) -> bool:
-    """Shrink the swing of ``core`` (3,) m along the shaft to ``overdrive`` times the stroke at most, and ``stroke``
-    (3,) by as much. Return True if anything was shrunk.
+    """Shrink the swing of ``core`` (3,) m to ``overdrive`` times the stroke at most, and ``stroke`` (3,) by as much.
+    Return True if anything was shrunk.
 
     A swing is x and its quadrature: the change in a tick over the angle that the core turns in a tick (the root of the
     ratio of their mean squares, remembered by ``keep`` per tick). The scale falls at once and recovers within half a
-    turn. What the tilt takes of each stroke is added as a phasor. ``overdrive`` 0 shrinks nothing.
+    turn. With ``tilts`` the tilt is shrunk first, as far as it is beyond the limit by itself; the swing along the shaft
+    gets what the tilt leaves of each stroke, added as phasors. ``overdrive`` 0 shrinks nothing.
     """
     mean = turned = power = change = 0.0
     for i in range(3):
@@ -62,10 +64,21 @@ def shrink_core(
     state.core_change = keep * state.core_change + (1.0 - keep) * change
     ticks = np.sqrt(state.core_power / state.core_change) if state.core_change > 0.0 else 0.0  # for one radian
     turned *= ticks
+    forget = np.exp(-1.0 / (np.pi * ticks)) if ticks > 0.0 else 0.0
+    tilt = 1.0
+    if tilts and overdrive > 0.0:
+        for i in range(3):
+            side, across = core[i] - mean, ticks * (core[i] - state.core_last[i]) - turned
+            swing = np.sqrt(side * side + across * across)
+            most = overdrive * min(high[i], -low[i])
+            if swing > most:
+                tilt = min(tilt, most / swing)
+        state.tilt_over = _remembered(state.tilt_over, tilt, forget)
+        tilt = 1.0 / state.tilt_over
     along = mean * mean + turned * turned
     share = 1.0
     for i in range(3):
-        side, across = core[i] - mean, ticks * (core[i] - state.core_last[i]) - turned
+        side, across = tilt * (core[i] - mean), tilt * (ticks * (core[i] - state.core_last[i]) - turned)
         state.core_last[i] = core[i]
         most = overdrive * min(high[i], -low[i])
         # the largest share for which |side phasor + share * axial phasor| <= most
@@ -73,16 +86,23 @@ def shrink_core(
         room = most * most - side * side - across * across
         if most > 0.0 and along + 2.0 * both > room:
             share = min(share, (np.sqrt(both * both + along * room) - both) / along if room > 0.0 else 0.0)
-    forget = np.exp(-1.0 / (np.pi * ticks)) if ticks > 0.0 else 0.0
-    recent = 1.0 + forget * (max(1.0, state.core_over) - 1.0)
-    state.core_over = max(recent, 1.0 / max(share, LEAST_ROOM))
-    if state.core_over <= 1.0 + LEAST_SHRINK:
+    state.core_over = _remembered(state.core_over, share, forget)
+    if state.core_over <= 1.0 + LEAST_SHRINK and tilt >= 1.0 - LEAST_SHRINK:
         return False
     for i in range(3):
         excess = (1.0 - 1.0 / state.core_over) * mean
+        if tilt < 1.0:
+            excess += (1.0 - tilt) * (core[i] - mean)
         core[i] -= excess
         stroke[i] -= excess
     return True
+
+
+@kernel
+def _remembered(over: float, share: float, forget: float) -> float:
+    """Return by how much a swing is over: it follows 1 / ``share`` at once and forgets by ``forget`` per tick."""
+    recent = 1.0 + forget * (max(1.0, over) - 1.0)
+    return max(recent, 1.0 / max(share, LEAST_ROOM))
 
 
 @kernel

@@ -34,7 +34,11 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     adaptive = tables.setdefault("tremor", {}).setdefault("adaptive", {})
     adaptive.setdefault("quiet", 0.0)
     adaptive.setdefault("ease_s", 0.0)
-    tables.setdefault("actuation", {}).setdefault("overdrive", 0.0)
+    adaptive.setdefault("relative", 0.0)
+    actuation = tables.setdefault("actuation", {})
+    actuation.setdefault("overdrive", 0.0)
+    actuation.setdefault("overdrive_tilts", False)
+    actuation.setdefault("centring", 0.0)
     tables.setdefault("sensing", {}).setdefault("kinematics_guard", False)
     return StageConfigs.from_dict(tables, str(recording.path))
 

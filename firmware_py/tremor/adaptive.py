@@ -59,6 +59,16 @@ def adaptive_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("share", "f8", (AXES, AXES)),  # what the first axis takes from the second
             ("outlier", "f8"),
             ("ease", "f8"),  # share of the way to the solved filter in one tick
+            # through the tremor band's filter, where errors are counted relative to the motion
+            ("relative", "f8"),
+            ("core_weight", "f8", (5,)),
+            ("core_tremor", "f8", (LEVELS, m, m)),
+            ("core_rest", "f8", (AXES, m, m)),
+            ("core_cross", "f8", (LEVELS, OUTPUTS, m)),
+            ("core_noise_cross", "f8", (AXES, OUTPUTS, m)),
+            ("core_noise_power", "f8", (AXES,)),
+            ("core_weighted_power", "f8", (LEVELS,)),
+            ("core_least_power", "f8"),
         ]
     )
 
@@ -91,6 +101,16 @@ def adaptive_state_dtype(design: AdaptiveDesign) -> np.dtype[Any]:
             ("scale", "f8", (m,)),
             ("target", "f8", (OUTPUTS,)),
             ("solution", "f8", (OUTPUTS, m)),
+            # the regression's sums through the tremor band's filter
+            ("core_weigh", "f8", (AXES, channels, 2)),
+            ("core_weighted", "f8", (AXES, m)),
+            ("core_sum", "f8", (AXES,)),
+            ("core_blocks", "f8", (AXES, taps)),
+            ("core_snapshots", "f8", (AXES, taps // 2 + 1, m)),
+            ("core_normal", "f8", (AXES, LEVELS, m, m)),
+            ("core_right", "f8", (AXES, LEVELS, OUTPUTS, m)),
+            ("core_power", "f8", (AXES, LEVELS)),
+            ("row_weight", "f8", (LEVELS,)),
         ]
     )
 
@@ -127,6 +147,8 @@ def adaptive_params(config: TremorConfig, design: AdaptiveDesign | None = None) 
         share=_shares(config),
         outlier=a.outlier,
         ease=1.0 - exp(-1.0 / (a.ease_s * config.tick_hz)) if a.ease_s > 0.0 else 1.0,
+        relative=a.relative,
+        **{f"core_{name}": value for name, value in vars(d.core).items()},
     )
 
 
@@ -230,6 +252,13 @@ def _learn(state: Record, params: Record) -> None:
             bank_add(state.weighted[i], c, lifted, params)
             if c == 0:
                 state.sum[i] += lifted
+        if params.relative > 0.0:
+            bank_turn(state.core_weighted[i], params)
+            for c in range(params.onward.shape[1]):
+                core = biquad_step(state.pending[i, c], state.core_weigh[i, c], params.core_weight)
+                bank_add(state.core_weighted[i], c, core, params)
+                if c == 0:
+                    state.core_sum[i] += core
         gated = biquad_step(sample, state.gate[i], params.gate)
         state.gate_power[i] += params.gate_smoothing * (gated * gated - state.gate_power[i])
         state.burst[i] = state.gate_power[i] / (state.gate_power[i] + params.gate_power[i])
@@ -246,6 +275,10 @@ def _learn(state: Record, params: Record) -> None:
         state.sum[i] = 0.0
         state.snapshots[i, at % (lag + 1), :] = state.weighted[i]
         state.bursts[i, at % (lag + 1)] = state.burst[i]
+        if params.relative > 0.0:
+            state.core_blocks[i, at % n_taps] = state.core_sum[i] / params.block_ticks
+            state.core_sum[i] = 0.0
+            state.core_snapshots[i, at % (lag + 1), :] = state.core_weighted[i]
         # the bank must have forgotten its start: a target's length more than the target itself
         if at >= 2 * n_taps:
             _regress(state, i, at, params)
@@ -266,56 +299,99 @@ def _ease(state: Record, params: Record) -> None:
 
 
 @kernel
-def _regress(state: Record, axis: int, at: int, params: Record) -> None:
-    """Fill one row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
-    n_taps = state.blocks.shape[1]
-    lag = n_taps // 2
-    target = state.target
+def _aim(blocks: Array, at: int, taps: Array, target: Array) -> None:
+    """Set ``target`` (outputs,) to the tremor of ``lag`` blocks ago and of a loop delay later."""
+    n_taps = len(blocks)
     for o in range(OUTPUTS):
         target[o] = 0.0
     for j in range(n_taps):
-        block = state.blocks[axis, (at - j) % n_taps]
+        block = blocks[(at - j) % n_taps]
         for o in range(OUTPUTS):
-            target[o] += params.taps[o, j] * block
-    now2 = target[0] * target[0]
-    phi = state.snapshots[axis, (at - lag) % (lag + 1)]
-    burst = state.bursts[axis, (at - lag) % (lag + 1)]
-    keep = params.keep
-    for level in range(LEVELS):
-        n0 = params.prior_blocks[level]
-        known = n0 * params.weighted_power[level] + state.power[axis, level]
-        typical = known / (n0 + state.count[axis, level])
-        weight = burst if level else 1.0 - burst
-        weight *= min(1.0, params.outlier * typical / max(now2, 1e-300))  # a jerk must not outvote the tremor
-        state.count[axis, level] = keep * state.count[axis, level] + weight
-        state.power[axis, level] = keep * state.power[axis, level] + weight * now2
-        normal = state.normal[axis, level]
-        right = state.right[axis, level]
-        for i in range(len(phi)):
-            scaled = weight * phi[i]
-            for j in range(i + 1):
-                normal[i, j] = keep * normal[i, j] + scaled * phi[j]
-            for o in range(OUTPUTS):
-                right[o, i] = keep * right[o, i] + scaled * target[o]
+            target[o] += taps[o, j] * block
 
 
 @kernel
-def _take(state: Record, axis: int, level: int, share: float, own: float, params: Record) -> None:
-    """Add ``share`` of the rows of (``axis``, ``level``) to the system, scaled down to the power ``own`` (m^2) a row.
+def _add_row(normal: Array, right: Array, phi: Array, target: Array, weight: float, keep: float) -> None:
+    """Add a row of features ``phi`` (m,) to one system, which forgets by ``keep``."""
+    for i in range(len(phi)):
+        scaled = weight * phi[i]
+        for j in range(i + 1):
+            normal[i, j] = keep * normal[i, j] + scaled * phi[j]
+        for o in range(OUTPUTS):
+            right[o, i] = keep * right[o, i] + scaled * target[o]
+
+
+@kernel
+def _regress(state: Record, axis: int, at: int, params: Record) -> None:
+    """Fill one row: bank of ``lag`` blocks ago, tremor of then and of a loop delay later."""
+    lag = state.blocks.shape[1] // 2
+    target = state.target
+    burst = state.bursts[axis, (at - lag) % (lag + 1)]
+    keep = params.keep
+    _aim(state.blocks[axis], at, params.taps, target)
+    now2 = target[0] * target[0]
+    phi = state.snapshots[axis, (at - lag) % (lag + 1)]
+    for level in range(LEVELS):
+        weight = _row_weight(state, axis, level, now2, burst, params)
+        state.count[axis, level] = keep * state.count[axis, level] + weight
+        state.power[axis, level] = keep * state.power[axis, level] + weight * now2
+        _add_row(state.normal[axis, level], state.right[axis, level], phi, target, weight, keep)
+        state.row_weight[level] = weight
+    if params.relative > 0.0:
+        _aim(state.core_blocks[axis], at, params.taps, target)
+        phi = state.core_snapshots[axis, (at - lag) % (lag + 1)]
+        for level in range(LEVELS):
+            weight = state.row_weight[level]
+            state.core_power[axis, level] = keep * state.core_power[axis, level] + weight * target[0] * target[0]
+            _add_row(state.core_normal[axis, level], state.core_right[axis, level], phi, target, weight, keep)
+
+
+@kernel
+def _row_weight(state: Record, axis: int, level: int, now2: float, burst: float, params: Record) -> float:
+    """Return how much a row counts for ``level``: a jerk must not outvote the tremor."""
+    n0 = params.prior_blocks[level]
+    known = n0 * params.weighted_power[level] + state.power[axis, level]
+    typical = known / (n0 + state.count[axis, level])
+    weight = burst if level else 1.0 - burst
+    return weight * min(1.0, params.outlier * typical / max(now2, 1e-300))
+
+
+@kernel
+def _take(
+    state: Record, normal: Array, right: Array, rest: Array, noise: Array, count: float, power: float, share: float,
+    own: float,
+) -> None:  # fmt: skip
+    """Add ``share`` of an axis' rows to the system, scaled down to the power ``own`` (m^2) a row.
 
     What is scaled down has too little noise in it for the smaller tremor: the rest is put back.
     """
-    count, power = state.count[axis, level], state.power[axis, level]
     if count <= 0.0 or power <= 0.0:
         return
     ratio = min(1.0, own * count / power)
-    normal, right = state.normal[axis, level], state.right[axis, level]
     factor, back = share * ratio, share * (1.0 - ratio) * count
     for i in range(state.work.shape[0]):
         for j in range(i + 1):
-            state.work[i, j] += factor * normal[i, j] + back * params.rest[axis, i, j]
+            state.work[i, j] += factor * normal[i, j] + back * rest[i, j]
         for o in range(OUTPUTS):
-            state.solution[o, i] += factor * (right[o, i] - count * params.noise_cross[axis, o, i])
+            state.solution[o, i] += factor * (right[o, i] - count * noise[o, i])
+
+
+@kernel
+def _mean_power(state: Record, axis: int, level: int, params: Record) -> float:
+    """Return the mean square of the tremor, m^2, as the regression weighs it, noise taken off."""
+    count, n0 = state.count[axis, level], params.prior_blocks[level]
+    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power[axis] * count
+    return max(known / (count + n0), params.least_power)
+
+
+@kernel
+def _mean_core_power(state: Record, axis: int, level: int, params: Record) -> float:
+    """Return the same behind the tremor band's filter."""
+    count, n0 = state.count[axis, level], params.prior_blocks[level]
+    known = (
+        state.core_power[axis, level] + n0 * params.core_weighted_power[level] - params.core_noise_power[axis] * count
+    )
+    return max(known / (count + n0), params.core_least_power)
 
 
 @kernel
@@ -323,13 +399,19 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
     """(data + prior) filter = (data + prior) cross: Cholesky of the scaled matrix, in place."""
     a, right = state.work, state.solution
     m = len(a)
-    count = state.count[axis, level]
     n0 = params.prior_blocks[level]
     rows = n0
     for other in range(AXES):
         rows += params.share[axis, other] * state.count[other, level]
-    known = state.power[axis, level] + n0 * params.weighted_power[level] - params.noise_power[axis] * count
-    power = max(known / (count + n0), params.least_power)
+    power = _mean_power(state, axis, level, params)
+    wider = 1.0  # power of all motion over that of the tremor
+    if params.relative > 0.0:
+        whole, core = 0.0, 0.0
+        for other in range(AXES):
+            whole += _mean_power(state, other, level, params)
+            core += _mean_core_power(state, other, level, params)
+        wider = whole / core
+        rows *= sqrt(wider)  # the penalty counts between one in metres and one relative to the tremor
     for i in range(m):
         for j in range(i + 1):
             a[i, j] = n0 * (power * params.tremor[level, i, j] + params.rest[axis, i, j])
@@ -337,8 +419,29 @@ def _solve(state: Record, axis: int, level: int, params: Record) -> None:
         for o in range(OUTPUTS):
             right[o, i] = n0 * power * params.cross[level, o, i]
     for other in range(AXES):
-        if params.share[axis, other] > 0.0:
-            _take(state, other, level, params.share[axis, other], 1e300 if other == axis else power, params)
+        share = params.share[axis, other]
+        if share > 0.0:
+            _take(
+                state, state.normal[other, level], state.right[other, level], params.rest[other],
+                params.noise_cross[other], state.count[other, level], state.power[other, level], share,
+                1e300 if other == axis else power,
+            )  # fmt: skip
+    if params.relative > 0.0:
+        counts = params.relative * wider
+        power = _mean_core_power(state, axis, level, params)
+        for i in range(m):
+            for j in range(i + 1):
+                a[i, j] += counts * n0 * (power * params.core_tremor[level, i, j] + params.core_rest[axis, i, j])
+            for o in range(OUTPUTS):
+                right[o, i] += counts * n0 * power * params.core_cross[level, o, i]
+        for other in range(AXES):
+            share = counts * params.share[axis, other]
+            if share > 0.0:
+                _take(
+                    state, state.core_normal[other, level], state.core_right[other, level], params.core_rest[other],
+                    params.core_noise_cross[other], state.count[other, level], state.core_power[other, level], share,
+                    1e300 if other == axis else power,
+                )  # fmt: skip
     scale = state.scale
     for i in range(m):
         scale[i] = 1.0 / sqrt(a[i, i])

@@ -63,6 +63,20 @@ class Bank:
 
 
 @dataclass(frozen=True)
+class CoreDesign:
+    """The same as the fields of ``AdaptiveDesign`` of these names, of signals that pass ``weight``: the tremor band."""
+
+    weight: Array
+    tremor: Array
+    rest: Array
+    cross: Array
+    noise_cross: Array
+    noise_power: Array
+    weighted_power: Array
+    least_power: float
+
+
+@dataclass(frozen=True)
 class AdaptiveDesign:
     """``taps`` (3, L) on block means: the outputs' targets ``L // 2`` blocks ago. ``weight``, ``gate``: b0 b1 b2 a1 a2.
 
@@ -89,6 +103,7 @@ class AdaptiveDesign:
     least_power: float
     start: Array
     onward: Array
+    core: CoreDesign
 
 
 @dataclass(frozen=True)
@@ -330,8 +345,11 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
 
     first = of_axis(0)
     axes = [first, *(first if config.lever is None else of_axis(axis) for axis in range(1, AXES))]
+    core_b, core_a = _peak(a.emphasis_hz, a.core_q, config.tick_hz)
+    core = _core_design(config, s, (core_b, core_a), plain, target, wanted, moving)
     found = AdaptiveDesign(
         bank=bank,
+        core=core,
         block_ticks=block,
         taps=taps,
         weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
@@ -347,10 +365,49 @@ def design_adaptive(config: TremorConfig) -> AdaptiveDesign:
         least_power=a.least_rms_m**2 * float(unit[0]),
         **{name: np.stack([each[name] for each in axes]) for name in first},
     )
-    for array in vars(found).values():
+    for array in (*vars(found).values(), *vars(core).values()):
         if isinstance(array, np.ndarray):
             array.flags.writeable = False
     return found
+
+
+def _core_design(
+    config: TremorConfig,
+    s: _Spectra,
+    peak: tuple[Array, Array],
+    plain: Complex,
+    target: Complex,
+    wanted: list[Array],
+    moving: Array,
+) -> CoreDesign:
+    """Return the prior as it is seen through ``peak`` (numerator and denominator): the tremor band alone."""
+    a = config.adaptive
+    numerator, denominator = peak
+    back = _complex(np.exp(-2j * pi * s.hz / config.tick_hz))
+    weight = _polynomial(numerator, back) / _polynomial(denominator, back)
+    phi = plain * weight
+    unit = np.array([np.sum(t * np.abs(wanted[0] * weight) ** 2) * GRID_STEP_HZ for t in s.tremor])
+    moved = _covariance(phi, s.rest - s.noise, moving)
+    noises = [(sensor_noise(config, s.hz, axis), noise_in_channels(config, axis)) for axis in range(AXES)]
+    return CoreDesign(
+        weight=np.array([*numerator, *denominator[1:]]) / denominator[0],
+        tremor=np.stack(
+            [_covariance(phi, np.abs(s.seen) ** 2 * t, moving) / u for t, u in zip(s.tremor, unit, strict=True)]
+        ),
+        rest=np.stack([moved + _covariance(phi, noise, noisy) for noise, noisy in noises]),
+        cross=np.stack(
+            [
+                np.stack([_cross(phi * s.seen, weight * t * e, moving[0]) for e in wanted]) / u
+                for t, u in zip(s.tremor, unit, strict=True)
+            ]
+        ),
+        noise_cross=np.stack(
+            [np.stack([_cross(phi, noise * weight * t, noisy[0]) for t in target]) for noise, noisy in noises]
+        ),
+        noise_power=np.array([np.sum(noise * np.abs(weight * target[0]) ** 2) * GRID_STEP_HZ for noise, _ in noises]),
+        weighted_power=np.array([a.tremor_rms_m**2, a.burst_rms_m**2]) * unit,
+        least_power=a.least_rms_m**2 * float(unit[0]),
+    )
 
 
 def _covariance(features: Complex, density: Array, channels: Array) -> Array:

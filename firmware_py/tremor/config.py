@@ -118,7 +118,10 @@ class AdaptiveConfig(_Table):
     for so many times its power, so that the filter does not shake the tip there. ``shaken_hz``: lowest and highest
     resonance of the actuators, with ``shaken_damping``; the penalty is as much larger as a held command shakes them
     more. Empty: the penalty is flat. ``ease_s``: time constant with which a filter in use approaches the one that was
-    solved last.
+    solved last. ``relative``: the error is counted twice, relative to the hand's motion in all that is cancelled and,
+    ``relative`` times, in the tremor band (a peak at ``emphasis_hz`` with ``core_q``); so a hand whose slow motion is
+    larger does not get less of its tremor cancelled. The penalty above the band is then relative to the tremor, too.
+    0: the error is counted in metres.
     """
 
     centres_hz: tuple[Positive, ...] = (2.2, 3.7, 5.2, 6.7, 8.1, 9.3, 10.5, 11.8, 14.0, 18.5)
@@ -130,6 +133,8 @@ class AdaptiveConfig(_Table):
     emphasis: Annotated[float, Field(ge=1.0, le=20.0)] = 4.0
     emphasis_hz: Positive = 9.8
     emphasis_q: Positive = 1.5
+    relative: NotNegative = 0.0
+    core_q: Positive = 2.5
     block_s: Positive = 0.01
     half_width_s: Positive = 0.5
     memory_s: Positive = 15.0

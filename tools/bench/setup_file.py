@@ -129,9 +129,10 @@ def _inputs(given: Any) -> dict[str, int]:
 
 
 STILL_TIP = (
-    "adaptive = { cancel_from_hz = [3.0, 6.0], cancel_to_hz = [14.0, 18.0], emphasis = 3.0, quiet = 220.0, "
-    "shaken_hz = [600.0, 700.0] }"
-)
+    "[firmware.tremor.adaptive]", "cancel_from_hz = [3.0, 6.0]", "cancel_to_hz = [13.0, 16.0]", "emphasis = 1.0",
+    "relative = 12.0", "core_q = 4.0", "prior_s = 0.2", "burst_prior_s = 0.5", "share = 0.4", "quiet = 130.0",
+    "shaken_hz = [600.0, 700.0]", "", "[firmware.actuation]", "centring = 1.0",
+)  # fmt: skip
 """The project's own benches have these where the output takes a command a tick (``AdaptiveConfig.cancel_from_hz``)."""
 
 
@@ -202,7 +203,7 @@ def bench_text(draft: Draft, calibrations: list[str]) -> str:
         "positions_m = [[0.0101, -0.0101, 0.0], [-0.0101, 0.0101, 0.0], [0.0042, 0.0042, 0.116]]",
         "tip_m = [0.0, 0.0, 0.155]", "",
         "[firmware.tremor]", f"loop_delay_s = {delay_s} # sample to what the command does, on the emulated bench",
-        *(() if draft.output == "e727" else (STILL_TIP,)),
+        *(() if draft.output == "e727" else STILL_TIP),
     ]  # fmt: skip
     return "\n".join(lines) + "\n"
 

@@ -95,6 +95,28 @@ def test_compensation_fades_in_and_out_with_trust() -> None:
     assert wish[-1, 0] == 1.0
 
 
+def test_centred_strokes_reach_as_far_up_as_down() -> None:
+    """A swing along the shaft that the shorter side cannot hold fits about the middle; the tip is off by a constant."""
+    centred, plain = ActuationConfig(centring=1.0), ActuationConfig()
+    param = attributes(Actuation(centred).params)[0]
+    half = float(np.min(param.swing_high))
+    np.testing.assert_allclose(-param.swing_low, param.swing_high, rtol=1e-12)
+    assert half > 1.05 * min(float(param.stroke_high[0]), -float(param.stroke_low[0]))
+    size = 0.97 * half * centred.lever_gain[2]
+    frames, others = trembling(3000, size), trembling(3000, size)
+    for each in (frames, others):
+        each[:, LAYOUT["tremor_ahead"]][:, :2] = each[:, LAYOUT["tremor_core"]][:, :2] = 0.0
+    actuation = run(centred, frames)
+    run(plain, others)
+    assert not np.any(frames[:, CLIP].astype(int) & CLIP_WORKSPACE)
+    assert np.any(others[:, CLIP].astype(int) & CLIP_WORKSPACE)
+    asked = -frames[1000:, LAYOUT["tremor_ahead"]]
+    offset = [0.0, 0.0, float(param.centre) * centred.lever_gain[2]]
+    np.testing.assert_allclose(frames[1000:, LAYOUT["desired_tip"]] - asked, [offset] * 2000, atol=1e-9)
+    wanted = frames[::25, LAYOUT["desired_tip"]]
+    np.testing.assert_allclose(tip_of(actuation, frames), wanted, atol=1e-9)
+
+
 def test_out_of_reach_is_the_nearest_point_flagged_and_without_a_jump() -> None:
     frames = trembling(1500, size=400e-6)
     actuation = run(ActuationConfig(overdrive=0.0), frames)

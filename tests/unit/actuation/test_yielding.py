@@ -99,12 +99,12 @@ def test_what_has_no_inverse_is_left_alone_and_not_remembered() -> None:
 TIMES = np.arange(4000) / 1000.0
 
 
-def shrunk(cores: np.ndarray, overdrive: float) -> np.ndarray:
+def shrunk(cores: np.ndarray, overdrive: float, tilts: bool = True) -> np.ndarray:
     """What is let through of ``cores`` (n, 3), m of stroke; what is wanted beside them stays."""
     state, out = np.zeros(1, YIELD_STATE), cores.copy()
     for core in out:
         stroke = core + 1e-6
-        shrink_core(stroke, core, LOW, HIGH, overdrive, KEEP, state[0])
+        shrink_core(stroke, core, LOW, HIGH, overdrive, tilts, KEEP, state[0])
         np.testing.assert_allclose(stroke - core, 1e-6, atol=1e-18)
     return out
 
@@ -138,6 +138,15 @@ def test_the_tilt_keeps_what_it_needs_and_each_stack_ends_at_its_stroke() -> Non
     assert np.max(peaks) == pytest.approx(7e-6, rel=0.01)
 
 
+@pytest.mark.parametrize("tilts", [True, False])
+def test_a_tilt_beyond_the_stroke_is_a_smaller_sine_unless_it_may_be_clipped(tilts: bool) -> None:
+    tilt = np.array([20e-6, -10e-6, -10e-6]) * np.sin(2 * np.pi * 10.0 * TIMES)[:, None]
+    through = shrunk(tilt, 1.0, tilts)[2500:]
+    share = through[:, 0] @ tilt[2500:, 0] / (tilt[2500:, 0] @ tilt[2500:, 0])
+    assert share == pytest.approx(7e-6 / 20e-6 if tilts else 1.0, rel=0.01)
+    assert np.std(through - share * tilt[2500:]) < 0.01 * np.std(through)
+
+
 def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     rng = np.random.default_rng(5)
     rows = [(c + rng.standard_normal(3) * 1e-5, c) for c in rng.uniform(-3e-6, 3e-6, (50, 3))]
@@ -152,7 +161,7 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     for k, core in enumerate(rng.uniform(-9e-6, 9e-6, (50, 3))):
         found, stroke = core.copy(), core + 1e-6
         monkeypatch.undo()
-        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, KEEP, fast[0])
+        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, True, KEEP, fast[0])
         without_compiler(monkeypatch)
-        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, KEEP, attributes(slow)[0]) == flag, k
+        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, True, KEEP, attributes(slow)[0]) == flag, k
         np.testing.assert_allclose(core, found, atol=1e-18)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy.signal import cont2discrete, lfilter
@@ -218,6 +220,36 @@ def test_learning_is_least_squares_with_the_prior() -> None:
         found = np.array(state.solved[0, level])
         # the last solution is a few blocks old
         np.testing.assert_allclose(found @ matrix, direct @ matrix, rtol=0.05, atol=0.02 * np.abs(right).max())
+
+
+def _system(state: Any, param: Any, level: int, part: str) -> tuple[np.ndarray, np.ndarray, float]:
+    """Matrix and right side of the first axis' regression with its prior, and the mean power of a row."""
+    count, n0 = state.count[0, level], param.prior_blocks[level]
+    known = getattr(state, f"{part}power")[0, level] - count * getattr(param, f"{part}noise_power")[0]
+    power = (known + n0 * getattr(param, f"{part}weighted_power")[level]) / (count + n0)
+    below = getattr(state, f"{part}normal")[0, level]
+    prior = power * getattr(param, f"{part}tremor")[level] + getattr(param, f"{part}rest")[0]
+    right = getattr(state, f"{part}right")[0, level] - count * getattr(param, f"{part}noise_cross")[0]
+    right = right + n0 * power * getattr(param, f"{part}cross")[level]
+    return np.tril(below) + np.tril(below, -1).T + n0 * prior, right, power
+
+
+def test_relative_errors_add_up_over_the_whole_band_and_the_tremor() -> None:
+    """The learned filter solves the sum of two systems, each over its own motion's power, with the prior in both."""
+    relative = 12.0
+    config = TremorConfig(adaptive=AdaptiveConfig(share=0.0, emphasis=1.0, relative=relative))
+    record = make_record(3, "one tone", 6.0)
+    estimator = Estimator(config)
+    estimator.run(np.repeat(record.acceleration[:, None], 3, axis=1))
+    state, param = peek(estimator.state).adaptive, peek(estimator.params).adaptive
+    for level in range(2):
+        whole, right, all_power = _system(state, param, level, "")
+        core, core_right, tremor_power = _system(state, param, level, "core_")
+        rows, wider = state.count[0, level] + param.prior_blocks[level], all_power / tremor_power
+        matrix = whole + relative * wider * core + np.sqrt(wider) * rows * param.quiet[0]
+        right = right + relative * wider * core_right
+        found = np.array(state.solved[0, level])
+        np.testing.assert_allclose(found @ matrix, right, rtol=0.05, atol=0.02 * np.abs(right).max())
 
 
 def test_edges_out_of_order_are_refused() -> None:

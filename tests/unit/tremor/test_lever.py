@@ -116,7 +116,8 @@ def test_a_bench_gives_the_lever_unless_the_hand_shall_not_be_split(tmp_path: Pa
     assert design_adaptive(configs.tremor.model_copy(deep=True)) is design
     assert not any(array.flags.writeable for array in (design.taps, design.start, design.onward, design.quiet))
     assert design_adaptive(configs.tremor.model_copy(update={"loop_delay_s": 0.002})) is not design
-    text = DEFAULT_BENCH.read_text().replace("adaptive = { ", "adaptive = { lever_share = 0.0, ")
+    table = "[firmware.tremor.adaptive]"
+    text = DEFAULT_BENCH.read_text().replace(table, f"{table}\nlever_share = 0.0")
     other = tmp_path / "bench.toml"
     other.write_text(text.replace('"calibration/', f'"{DEFAULT_BENCH.parent}/calibration/'))
     assert load_plan(load_bench(other)).stages.tremor.lever is None
