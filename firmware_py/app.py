@@ -110,12 +110,13 @@ def _status_pipe() -> StatusSink:
 def main(arguments: list[str]) -> int:
     """Run ``python -m firmware_py.app REQUEST.json``, which writes ``outcome.json`` beside the request."""
     _die_with_parent()
-    table = json.loads(Path(arguments[0]).read_text())
+    table: dict[str, Any] = json.loads(Path(arguments[0]).read_text())
     runtime_dir = Path(table.pop("runtime_dir"))
     live_fds = table.pop("live_fds")
     for name in ("bench", "record", "manual"):
         table[name] = Path(table[name]) if table[name] is not None else None
-    request = RunRequest(**table, live_fds=tuple(live_fds) if live_fds is not None else None)
+    table["live_fds"] = tuple(live_fds) if live_fds is not None else None
+    request = RunRequest(**table)
     try:
         outcome, truth = run_in_process(request, _status_pipe(), runtime_dir, own_process=True)
     except HalError as error:

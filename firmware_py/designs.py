@@ -14,7 +14,7 @@ from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,9 @@ def design(function: str, *arguments: Any, **options: Any) -> tuple[Array, ...]:
     known = _read(file, asked)
     if known is not None:
         return known
-    found = getattr(importlib.import_module("scipy.signal"), function)(*arguments, **options)
-    arrays = tuple(np.asarray(part) for part in (found if isinstance(found, tuple) else (found,)))
+    found: Any = getattr(importlib.import_module("scipy.signal"), function)(*arguments, **options)
+    parts = cast("tuple[Any, ...]", found) if isinstance(found, tuple) else (found,)
+    arrays: tuple[Array, ...] = tuple(np.asarray(part) for part in parts)
     _write(file, asked, arrays)
     return arrays
 
@@ -46,7 +47,7 @@ def _scipy_version() -> str:
 
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | list | tuple):
-        numbers: Any = np.asarray(value)
+        numbers: Any = np.asarray(cast("Any", value))
         if np.iscomplexobj(numbers):
             return {"real": numbers.real.tolist(), "imag": numbers.imag.tolist()}
         return numbers.tolist()

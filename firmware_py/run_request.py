@@ -6,7 +6,7 @@ import contextlib
 import json
 import signal
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -75,7 +75,7 @@ def open_requested(
     bench: BenchFile,
     runtime_dir: Path | None,
     wrap: Callable[[str, Port, Clock], Port] | None = None,
-) -> Iterator[OpenBench]:
+) -> Generator[OpenBench]:
     """Open the bench as the request says; without ``runtime_dir`` in a folder of its own.
 
     Raises ``BenchError`` for devices that cannot be together, before an emulated world is started or a port touched.
@@ -109,7 +109,7 @@ def truth_of(opened: OpenBench) -> dict[str, Any] | None:
 
 
 @contextlib.contextmanager
-def scheduling(request: RunRequest, opened: OpenBench) -> Iterator[RealtimeReport]:
+def scheduling(request: RunRequest, opened: OpenBench) -> Generator[RealtimeReport]:
     """Apply real-time settings for the length of the block, in real time and unless the request does without."""
     if isinstance(opened.clock, PacedClock):
         opened.clock.begin()
@@ -134,7 +134,7 @@ def describe_machine(opened: OpenBench) -> list[dict[str, object]]:
 
 
 @contextlib.contextmanager
-def count_interrupts() -> Iterator[Callable[[], int]]:
+def count_interrupts() -> Generator[Callable[[], int]]:
     """Count SIGINT and SIGTERM beside the loop, which has handlers of its own, and ignore them after the block.
 
     For a process that is the firmware and nothing else: a run that ends is told to the end, with an outcome file.

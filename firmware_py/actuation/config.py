@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -124,8 +124,10 @@ class ActuationConfig(BaseModel):
     @field_validator("feedforward", mode="before")
     @classmethod
     def _same_taps(cls, value: Any) -> Any:
-        alike = isinstance(value, list | tuple) and all(isinstance(v, int | float) for v in value)
-        return (value,) * 3 if alike else value
+        if not isinstance(value, list | tuple):
+            return value
+        taps = cast("list[Any]", value)
+        return (taps,) * 3 if all(isinstance(tap, int | float) for tap in taps) else taps
 
     @model_validator(mode="after")
     def _check(self) -> ActuationConfig:

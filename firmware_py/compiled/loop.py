@@ -15,7 +15,7 @@ import platform
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Any
 
 import numpy as np
@@ -175,7 +175,7 @@ class CompiledMicron(Micron):
     # -- running -----------------------------------------------------------------------------------------
 
     @contextlib.contextmanager
-    def running(self) -> Iterator[None]:
+    def running(self) -> Generator[None]:
         """See ``Micron.running``: the thread of the passes lives within the block."""
         with contextlib.ExitStack() as stack:
             stack.callback(self._close)
@@ -190,7 +190,7 @@ class CompiledMicron(Micron):
         os.close(self._wake_write)
 
     @contextlib.contextmanager
-    def _python_beside(self) -> Iterator[None]:
+    def _python_beside(self) -> Generator[None]:
         """Run the thread of the passes, let signals wake the compiled thread, and let hand-overs be quick."""
         beside = threading.Thread(target=self._run_beside, name="beside the compiled loop", daemon=True)
         interval_s = sys.getswitchinterval()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -202,7 +202,8 @@ class DacSide:
 
     def close(self) -> None:
         self._memory = None
-        if self._carrier is not None and self._carrier is not self._driver.bus:
+        is_own = cast("object", self._carrier) is not self._driver.bus
+        if self._carrier is not None and is_own:
             self._carrier.close()
 
 

@@ -17,6 +17,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from math import isclose
+from operator import eq, ge, le
 from typing import Any
 
 from drivers.options import OutputOptions
@@ -145,13 +146,13 @@ def _follow_output(table: dict[str, Any], options: Mapping[str, Any], where: str
     ((name, option),) = outputs
     limit = option.limit
     for key, of_output, output_key, narrows in (
-        ("low_V", limit.lo_V, "lo_V", lambda given: given >= limit.lo_V),
-        ("high_V", limit.hi_V, "hi_V", lambda given: given <= limit.hi_V),
-        ("slew_V_per_s", limit.slew_V_per_s, "slew_V_per_s", lambda given: given <= limit.slew_V_per_s),
-        ("neutral_V", limit.safe_V, "neutral_V", lambda given: given == limit.safe_V),
+        ("low_V", limit.lo_V, "lo_V", ge),
+        ("high_V", limit.hi_V, "hi_V", le),
+        ("slew_V_per_s", limit.slew_V_per_s, "slew_V_per_s", le),
+        ("neutral_V", limit.safe_V, "neutral_V", eq),
     ):
         given = table.setdefault(key, of_output)
-        if isinstance(given, int | float) and not narrows(given):
+        if isinstance(given, int | float) and not narrows(given, of_output):
             what = "the ramp to neutral ends at" if key == "neutral_V" else "the output allows"
             raise BenchError(
                 f"{where}: firmware.actuation: {key} = {given:g}, but {what} {output_key} = {of_output:g} of "

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from enum import IntEnum
-from typing import Annotated, NamedTuple
+from typing import Annotated, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,7 @@ def turns_of_pairs(positions_m: NDArray[np.float64], axes: NDArray[np.float64]) 
     short = int(np.linalg.norm(lever, axis=1).argmin())
     long = [k for k in range(len(PAIRS)) if k != short]
     if abs(np.linalg.det(lever[long])) > SQUARE * float(np.linalg.norm(lever[long], axis=1).prod()):
-        weights = np.linalg.solve(lever[long].T, lever[short])
+        weights = cast("NDArray[np.float64]", np.linalg.solve(lever[long].T, lever[short]))
         if float(np.abs(weights).max()) < 1.0:  # else the others' noise is more than is gained
             mix[short, long] = -weights
     return mix

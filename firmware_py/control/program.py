@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,11 +47,12 @@ def load_program(path: Path) -> Program:
     missing = [k for k in ("format", "rate_hz", "stacks", "volts") if k not in table]
     if missing or table["format"] != 1:
         raise BenchError(f"{path}: not a program (format = 1, rate_hz, stacks, volts); missing: {', '.join(missing)}")
-    rate, stacks = table["rate_hz"], table["stacks"]
+    rate, listed = table["rate_hz"], table["stacks"]
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1.0 <= rate <= 10_000.0:
         raise BenchError(f"{path}: rate_hz = {rate!r} must be a number from 1 to 10000")
-    if not isinstance(stacks, list) or not stacks or not all(type(s) is int and 1 <= s <= 3 for s in stacks):
-        raise BenchError(f"{path}: stacks = {stacks!r} must list some of 1, 2 and 3")
+    stacks = cast("list[int]", listed)
+    if not isinstance(listed, list) or not stacks or not all(type(s) is int and 1 <= s <= 3 for s in stacks):
+        raise BenchError(f"{path}: stacks = {listed!r} must list some of 1, 2 and 3")
     try:
         volts = np.asarray(table["volts"], np.float64)
     except (TypeError, ValueError):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -25,13 +27,14 @@ def recorded_configs(recording: Recording) -> StageConfigs:
     if not isinstance(text, str):
         raise RecordingError(f"{recording.path}: no stage configuration in its metadata; only runs can be replayed")
     try:
-        tables = load_json(text)
+        loaded: object = load_json(text)
     except RecordingError as error:
         raise RecordingError(f"{recording.path}: its stage configuration cannot be read: {error}") from error
-    if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
+    tables = cast("dict[str, Any]", loaded)
+    if not isinstance(loaded, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise RecordingError(f"{recording.path}: its stage configuration is not a table for every stage")
     # a recording that does not name one of these was made before there was such a thing
-    adaptive = tables.setdefault("tremor", {}).setdefault("adaptive", {})
+    adaptive: dict[str, Any] = tables.setdefault("tremor", {}).setdefault("adaptive", {})
     adaptive.setdefault("quiet", 0.0)
     adaptive.setdefault("ease_s", 0.0)
     adaptive.setdefault("relative", 0.0)

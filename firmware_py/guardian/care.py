@@ -50,7 +50,7 @@ class GuardianCare:
     def __init__(self, keeper: Keeper) -> None:
         self.replaced = 0
         self._keeper = keeper
-        self._seen_ns = 0
+        self._seen_ns: int = 0
         self._silent = 0
         self._lost = ""
         self._starting_ns: int | None = None

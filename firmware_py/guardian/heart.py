@@ -139,7 +139,7 @@ class Heart:
 
     @property
     def watched_ns(self) -> int:
-        return self.words[_WATCHED]
+        return int(self.words[_WATCHED])
 
     @property
     def noticed_ns(self) -> int:

@@ -55,7 +55,7 @@ class GuardianProcess:
         self.heart = Heart.shared()
         self.heart.mark.hold()
         # the loop may be pinned to a processor when a guardian is replaced, which is not to be its guardian's
-        self._order = {**order, "processors": sorted(os.sched_getaffinity(0))}
+        self._order: dict[str, Any] = {**order, "processors": sorted(os.sched_getaffinity(0))}
         self._report = runtime_dir / REPORT
         self._may_end_us = may_end_us
         self._is_ready = False

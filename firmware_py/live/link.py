@@ -7,7 +7,7 @@ import json
 import socket
 from collections.abc import Callable, Generator, Iterator
 from contextlib import suppress
-from typing import Any
+from typing import Any, cast
 
 from firmware_py.live.memory import HISTOGRAMS, LiveMemory
 from firmware_py.scheduler.histogram import DurationHistogram
@@ -43,8 +43,8 @@ class LiveLink:
                 self._hung_up = True
                 return
             with suppress(ValueError):
-                order = json.loads(data)
-                if isinstance(order, dict) and isinstance(order.get("order"), str):
+                order = cast("dict[str, Any]", json.loads(data))
+                if isinstance(order, dict) and isinstance(order.get("order"), str):  # pyright: ignore[reportUnnecessaryIsInstance]
                     yield order
 
     def show(self, histograms: Callable[[], dict[str, DurationHistogram]]) -> Generator[bool, None, None]:

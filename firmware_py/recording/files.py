@@ -7,7 +7,7 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -17,7 +17,7 @@ _LOCK_TRIES = 20
 
 
 @contextmanager
-def new_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
+def new_file(path: Path, *, overwrite: bool) -> Generator[Path]:
     """A temporary path beside ``path`` that becomes ``path`` at the end of the block, unless it raises."""
     refuse_existing(path, overwrite=overwrite)
     with _temporary_folder(path) as folder:
@@ -27,7 +27,7 @@ def new_file(path: Path, *, overwrite: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def new_folder(path: Path) -> Iterator[Path]:
+def new_folder(path: Path) -> Generator[Path]:
     """The same for a folder; an existing one is refused."""
     refuse_existing(path, overwrite=False)
     with _temporary_folder(path) as folder:
@@ -82,7 +82,7 @@ def is_being_recorded(path: Path) -> bool:
 
 
 @contextmanager
-def _temporary_folder(path: Path) -> Iterator[Path]:
+def _temporary_folder(path: Path) -> Generator[Path]:
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{path.name}.", dir=path.absolute().parent))
     except OSError as error:

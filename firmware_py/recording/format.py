@@ -11,7 +11,7 @@ import re
 import struct
 import zlib
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,14 +83,12 @@ def layout_of_text(text: str) -> tuple[ColumnInfo, ...]:
 def layout_of(entries: object) -> tuple[ColumnInfo, ...]:
     """The layout in a list of ``{"name", "unit"}``, as stored. ``RecordingError`` when it is no layout."""
     columns: list[tuple[str, str]] = []
-    for entry in entries if isinstance(entries, list) else [None]:
-        if (
-            not isinstance(entry, dict)
-            or not isinstance(entry.get("name"), str)
-            or not isinstance(entry.get("unit"), str)
-        ):
-            raise RecordingError("the layout is not a list of columns with a name and a unit")
-        columns.append((entry["name"], entry["unit"]))
+    for entry in cast("list[object]", entries) if isinstance(entries, list) else [None]:
+        match entry:
+            case {"name": str(name), "unit": str(unit)}:
+                columns.append((name, unit))
+            case _:
+                raise RecordingError("the layout is not a list of columns with a name and a unit")
     return check_columns(columns)
 
 

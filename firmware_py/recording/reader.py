@@ -8,7 +8,7 @@ from array import array
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from mcap.records import Channel, Schema
@@ -250,8 +250,9 @@ class Recording:
         if self._layout is not None:
             return  # a block of another layout is refused by its CRC
         try:
-            content = fmt.load_json(schema.data)
-            self._take_layout(fmt.layout_of(content.get("x-layout") if isinstance(content, dict) else None))
+            content: object = fmt.load_json(schema.data)
+            table = cast("dict[str, object]", content) if isinstance(content, dict) else {}
+            self._take_layout(fmt.layout_of(table.get("x-layout")))
         except RecordingError as error:
             raise RecordingError(f"{self.path}: the schema of the ticks is not one of ours: {error}") from error
 
@@ -320,17 +321,18 @@ class Recording:
 
 def _check_end(value: object) -> dict[str, Any]:
     """Return the recorder's ``end`` record. Raises ``RecordingError`` when it is not what a recorder writes."""
-    if not isinstance(value, dict) or not isinstance(value.get("ended", ""), str):
+    table = cast("dict[str, Any]", value)
+    if not isinstance(value, dict) or not isinstance(table.get("ended", ""), str):
         raise RecordingError("the record is not the last words of a recorder")
     for key in ("rows_pushed", "rows_dropped", "rows_written", "events_pushed", "events_dropped"):
-        count = value.get(key, 0)
+        count = table.get(key, 0)
         may_be_unknown = key == "rows_pushed" and count is None
         if not may_be_unknown and (type(count) is not int or not 0 <= count < fmt.MOST_ROW):
             raise RecordingError(f"{key} is not a count")
-    names = value.get("metadata", [])
-    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+    names = table.get("metadata", [])
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in cast("list[object]", names)):
         raise RecordingError("the names of the metadata are not a list of names")
-    return value
+    return table
 
 
 class _DamageList:
@@ -427,7 +429,7 @@ class _TickCheck:
         self._tick_row: int | None = None
         self._time_row: int | None = None
         self._edges = array("q")  # first and last tick of every block, scans missing inside it; -1 without ticks
-        self._last_t_s = array("d")
+        self._last_t_s: array[float] = array("d")
         self._inside: list[TickGap] = []
 
     def use(self, names: Sequence[str]) -> None:
@@ -462,7 +464,7 @@ class _TickCheck:
         return _Ticks(
             first=int(first[ticks[0]]) if len(ticks) else None,
             last=int(last[ticks[-1]]) if len(ticks) else None,
-            last_time_s=float(self._last_t_s[order[-1]]) if len(order) and self._time_row is not None else None,
+            last_time_s=self._last_t_s[int(order[-1])] if len(order) and self._time_row is not None else None,
             gaps=tuple(sorted([*self._inside, *between], key=lambda gap: gap.after)[:_MAX_LISTED]),
             missing=int(inside.sum() + jumps[at].sum()),
         )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import Any
 
-import lz4.frame
+import lz4.frame  # pyright: ignore[reportMissingTypeStubs]
 import zstandard
 
 from firmware_py.recording.errors import RecordingError
@@ -70,8 +70,8 @@ def _zstd(packed: bytes | memoryview, size: int) -> bytes:
 
 
 def _lz4(packed: bytes | memoryview, size: int) -> bytes:
-    decompressor = lz4.frame.LZ4FrameDecompressor()
-    content = decompressor.decompress(packed, max_length=size + 1)
+    decompressor: Any = lz4.frame.LZ4FrameDecompressor()
+    content: bytes = decompressor.decompress(packed, max_length=size + 1)
     while len(content) <= size and not decompressor.eof and not decompressor.needs_input:
         more = decompressor.decompress(b"", max_length=size + 1 - len(content))
         if not more:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +36,7 @@ class Guarded:
 @contextlib.contextmanager
 def guarded(
     opened: OpenBench, output: AnalogOutput | None, limits: SafetyLimits, *, may_end_us: bool = False
-) -> Iterator[Guarded]:
+) -> Generator[Guarded]:
     """Puts a guardian beside ``output`` where that is a DAC without a watchdog of its own.
 
     ``may_end_us``: the guardian may kill this process when it stands still in the middle of a command.

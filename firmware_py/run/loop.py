@@ -89,7 +89,7 @@ class Loop:
 
     def _run_ticks(self, seconds: float) -> None:
         run, instrument, supervisor = self._run, self._instrument, self._run.supervisor
-        while supervisor.state is not State.SAFE and not supervisor.must_not_wait:
+        while not supervisor.is_safe and not supervisor.must_not_wait:
             if (ticks := instrument.wait()) is None:
                 continue
             awake_ns = run.clock.now_ns()
@@ -103,7 +103,7 @@ class Loop:
                 run.incidents.report(Finding.FINISHED)
             elif run.end_ns is None and run.sense_only:
                 run.end_ns = newest_ns + round(seconds * 1e9)
-            if supervisor.state is State.SAFE:  # there are no outputs whose ramp the tasks would run
+            if supervisor.is_safe:  # there are no outputs whose ramp the tasks would run
                 break
             run.scheduler.run(ticks)
             run.host_gaps.look(awake_ns + run.period_ns, run.clock.now_ns())

@@ -158,6 +158,11 @@ class Supervisor:
         return self.state is State.RUNNING
 
     @property
+    def is_safe(self) -> bool:
+        """True once the run is over: neutral was reached or had to be given up."""
+        return self.state is State.SAFE
+
+    @property
     def must_not_wait(self) -> bool:
         """True if the ramp must run on the host clock: the loop would wait for scans, and they may be what broke. Only
         the planned end of a run waits for scans, so that it is recorded to its last step."""

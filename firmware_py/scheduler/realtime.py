@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 
@@ -50,7 +50,7 @@ class Setting:
 class RealtimeReport:
     """Holds all settings asked for, in order."""
 
-    settings: list[Setting] = field(default_factory=list)
+    settings: list[Setting] = field(default_factory=list[Setting])
 
     def __getitem__(self, name: str) -> Setting:
         return next(s for s in self.settings if s.name == name)
@@ -60,7 +60,7 @@ class RealtimeReport:
 
 
 @contextmanager
-def realtime(config: RealtimeConfig, tree: Tree = MACHINE) -> Iterator[RealtimeReport]:
+def realtime(config: RealtimeConfig, tree: Tree = MACHINE) -> Generator[RealtimeReport]:
     """Apply ``config`` to the calling thread's process for the length of the ``with`` block. Never raises
     because something is not permitted or not there; undoes in reverse order what it did. ``tree``: of /dev."""
     report = RealtimeReport()

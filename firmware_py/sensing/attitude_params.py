@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from math import radians
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,7 +36,7 @@ def motion_densities(config: SensingConfig) -> NDArray[np.float64]:
     The RC filter leaves the density at low frequency as it is, which is the factor 21.1 of errata 21, 44.
     """
     sigma = np.array(config.noise_ug_per_rtHz) * 1e-6 * STANDARD_GRAVITY / np.sqrt(2.0)
-    solve = np.linalg.pinv(config.observation() / sigma[:, None])
+    solve = cast("NDArray[np.float64]", np.linalg.pinv(config.observation() / sigma[:, None]))
     return solve @ solve.T
 
 

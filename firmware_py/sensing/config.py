@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,16 +125,17 @@ class SensingConfig(BaseModel):
     @classmethod
     def _fill(cls, data: Any) -> Any:
         """Per-axis keys that are absent, for another number of axes than six."""
-        if not isinstance(data, Mapping) or not isinstance(data.get("channels"), list | tuple):
-            return data
-        n = len(data["channels"])
+        table = dict(cast("Mapping[str, Any]", data)) if isinstance(data, Mapping) else {}
+        channels = table.get("channels")
+        if not isinstance(channels, list | tuple):
+            return cast("Any", data)
+        n = len(cast("Sequence[object]", channels))
         if n == LEAST_AXES or not LEAST_AXES <= n <= MOST_AXES:
-            return data
-        table = dict(data)
+            return table
         for name in PER_AXIS:
             table.setdefault(name, (cls.model_fields[name].default[0],) * n)
         for name in ("supply_channel", "temperature_channel"):
-            if cls.model_fields[name].default in data["channels"]:  # an axis has that input
+            if cls.model_fields[name].default in channels:  # an axis has that input
                 table.setdefault(name, None)
         more = range(LEAST_AXES, n)
         table.setdefault("in_plane", cls.model_fields["in_plane"].default + tuple(i - 1 for i in more))

@@ -7,6 +7,9 @@ itself is added (erratum 47). Joseph form, q normalised after each step, sign of
 Measurements while the specific force is not g, or the field not the learned one, are left out.
 """
 
+# numpy does not state the type of what np.linalg.solve returns, and a kernel cannot cast
+# pyright: reportUnknownMemberType=false, reportUnknownVariableType=false
+
 from __future__ import annotations
 
 from math import sqrt

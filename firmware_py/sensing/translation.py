@@ -38,7 +38,7 @@ def integrator_sections(tick_hz: float, corner_hz: float = CORNER_HZ) -> NDArray
     """Return two biquads (2, 5) from m/s^2 to m: the first takes out bias, the second integrates twice."""
     w = 2.0 * pi * corner_hz
     poles = w * np.array([-DAMPING + 1j * (1 - DAMPING**2) ** 0.5, -DAMPING - 1j * (1 - DAMPING**2) ** 0.5])
-    rows = []
+    rows: list[list[float]] = []
     for zeros in (np.zeros(2), np.zeros(0)):
         z, p, k = design("bilinear_zpk", zeros, poles, 1.0, tick_hz)
         b, a = np.real(float(k) * np.poly(z)), np.real(np.poly(p))

@@ -19,13 +19,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_continuous_lyapunov, solve_discrete_are, solve_discrete_lyapunov
+from scipy import linalg as scipy_linalg  # pyright: ignore[reportMissingTypeStubs]
 
 from firmware_py.records import Record, new_record
 from firmware_py.tremor.config import TremorConfig
 from hal.compiled import kernel
 
 Matrix = NDArray[np.float64]
+linalg: Any = scipy_linalg  # without type stubs
 ORDER = 4  # states of a mode: x, v, u, du/dt
 
 
@@ -55,7 +56,7 @@ def _mode(frequency_hz: float, bandwidth_hz: float, variance: float) -> tuple[Ma
     a[2:, 2:] = single
     q = np.zeros((ORDER, ORDER))
     q[3, 3] = 1.0
-    covariance = solve_continuous_lyapunov(a, -q)
+    covariance = linalg.solve_continuous_lyapunov(a, -q)
     return a, q * (variance / covariance[0, 0])
 
 
@@ -66,7 +67,7 @@ def _discretise(a: Matrix, q: Matrix, dt: float) -> tuple[Matrix, Matrix]:
     block[:n, :n] = -a
     block[:n, n:] = q
     block[n:, n:] = a.T
-    e = expm(block * dt)
+    e = linalg.expm(block * dt)
     transition: Matrix = np.asarray(e[n:, n:].T, dtype=np.float64)
     return transition, np.asarray(transition @ e[:n, n:], dtype=np.float64)
 
@@ -95,18 +96,18 @@ def design_oscillators(config: TremorConfig) -> OscillatorModel:
     q[rc, rc] = cutoff**2 * k.sensor_noise_m_s2_rtHz**2 / 2.0  # two-sided density is half the one-sided square
     transition, noise = _discretise(a, q, 1.0 / config.tick_hz)
     # states differ by 1e6 in size: balance by their stationary deviations before the Riccati equation
-    scale = np.sqrt(np.diag(solve_discrete_lyapunov(transition, noise)))
+    scale = np.sqrt(np.diag(linalg.solve_discrete_lyapunov(transition, noise)))
     f = transition * scale[None, :] / scale[:, None]
     w = noise / scale[:, None] / scale[None, :]
     c = np.zeros((1, n))
     c[0, rc] = scale[rc]
     r = np.array([[k.reading_noise_m_s2**2]])
-    prior = solve_discrete_are(f.T, c.T, 0.5 * (w + w.T), r)
+    prior = linalg.solve_discrete_are(f.T, c.T, 0.5 * (w + w.T), r)
     innovation = (c @ prior @ c.T + r)[0, 0]
     gain = prior @ c[0] / innovation
     posterior = prior - np.outer(gain, c[0] @ prior)
     now = displacement * scale
-    ahead = displacement @ expm(a * config.loop_delay_s) * scale
+    ahead = displacement @ linalg.expm(a * config.loop_delay_s) * scale
     return OscillatorModel(f, gain, c[0], now, ahead, float(np.sqrt(now @ posterior @ now)), m)
 
 
