@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 from typer.testing import CliRunner
 
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.research.reproduce import broad, real_sensors
+from tools.research.reproduce import broad, broad_trials, real_sensors
 from tools.research.reproduce.names import MODULES, expand
 from tools.research.reproduce.orientation_error import east_north_up, rms_errors_deg
 from tools.research.reproduce.page import markdown
@@ -113,3 +114,17 @@ def test_settings_are_the_fixed_one_and_its_neighbours() -> None:
     ratios = {round(float(s["heading_density"][0] / fixed["heading_density"][0]), 6) for s in all_of_them}
     assert ratios == {0.25, 1.0, 4.0}  # an amplitude's square
     assert len({s.tobytes() for s in all_of_them}) == 27
+
+
+def test_trials_that_are_not_given_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(2)
+    arrays = {name: rng.standard_normal((5, 3)) for name in ("imu_gyr", "imu_acc", "imu_mag")}
+    arrays |= {"opt_quat": rng.standard_normal((5, 4)), "movement": np.array([0, 1, 1, 0, 1], dtype=np.uint8)}
+    for name in ("02_undisturbed_slow_rotation_B", "35_disturbed_attached_magnet_4cm"):
+        savemat(tmp_path / f"{name}.mat", arrays)
+    given = {"files": [{"name": "02_undisturbed_slow_rotation_B.npz"}]}
+    monkeypatch.setattr(broad_trials, "meta", {"broad": given}.get)
+    (trial,) = broad_trials.trials_not_given(tmp_path)
+    assert (trial.name, trial.disturbed, trial.counts.tolist()) == ("35", True, [False, True, True, False, True])
+    np.testing.assert_array_equal(trial.rate, arrays["imu_gyr"])
+    np.testing.assert_array_equal(trial.truth, arrays["opt_quat"])

@@ -16,12 +16,15 @@ import numpy as np
 
 from firmware_py.records import Record
 from firmware_py.sensing.attitude_params import gyroscope_error_state
-from tools.research.reproduce.broad_trials import BROAD_HZ, Trial, trials, vqf_errors_deg
+from tools.research.reproduce.broad_trials import BROAD_HZ, Trial, trials, trials_not_given, vqf_errors_deg
 from tools.research.reproduce.gyroscope_attitude import gyroscope_attitude
+from tools.research.reproduce.recordings import data_folder
 from tools.research.reproduce.rows import Row
 
 GOAL, GOAL_MEAN, GOAL_DISTURBED = 1.1, 0.9, 0.7
 """Share of vqf's error that is the project's goal: for one trial, for the mean, for the mean of disturbed trials."""
+NOT_GIVEN = "broad_public"
+"""Folder among the recordings for ``data_mat`` of https://github.com/dlaidig/broad."""
 CHOSEN = {"heading_density": 2, "turn_per_rate": 2, "disturbance_rad": 1}
 """Fields of the filter that are chosen, with the power of the noise's amplitude that they are."""
 FACTORS = (2.0, 10.0**0.5)
@@ -62,8 +65,36 @@ def rows() -> list[Row]:
     return found
 
 
+def rows_not_given() -> list[Row]:
+    """The fixed setting on trials that no setting was chosen with (``trials_not_given``)."""
+    every = trials_not_given(data_folder() / NOT_GIVEN)
+    theirs = [vqf_errors_deg(trial) for trial in every]
+    ours = [trial.errors_deg(attitude(trial)) for trial in every]
+    single = [
+        Row(
+            "BROAD, 1.1 x vqf 2.1.2, run side by side",
+            f"total error, trial {trial.name}, which no setting was chosen with",
+            "deg",
+            "gyroscope as rate source, error-state filter, one setting for all trials",
+            GOAL * vqf[0],
+            errors[0],
+            "lower",
+            "recording",
+            why=f"{errors[0] / vqf[0]:.2f} x vqf",
+        )
+        for trial, errors, vqf in zip(every, ours, theirs, strict=True)
+        if vqf is not None
+    ]
+    totals = [errors[0] for errors in ours]
+    return [*_means(every, totals, theirs, "one setting", "not in view of the development"), *single]
+
+
 def _means(
-    every: list[Trial], ours: list[float], theirs: list[tuple[float, float, float] | None], condition: str
+    every: list[Trial],
+    ours: list[float],
+    theirs: list[tuple[float, float, float] | None],
+    condition: str,
+    view: str = "all in view of the development",
 ) -> list[Row]:
     """Mean error of all trials and of the disturbed ones against the goals; nothing without vqf."""
     found: list[Row] = []
@@ -80,7 +111,7 @@ def _means(
                 f"BROAD, {goal} x vqf 2.1.2, run side by side",
                 f"mean total error of the {what}, {condition}",
                 "deg",
-                f"{len(peers)} trials are here, all in view of the development",
+                f"{len(peers)} trials are here, {view}",
                 goal * float(np.mean(peers)),
                 mean,
                 "lower",

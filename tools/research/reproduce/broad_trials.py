@@ -60,6 +60,23 @@ def read_trial(path: Path, entry: dict[str, Any]) -> Trial:
         return Trial(path.name[:2], rate, force, field, truth, data["movement"].astype(bool), entry)
 
 
+def trials_not_given(folder: Path) -> list[Trial]:
+    """Return the trials of the public repository's ``data_mat`` in ``folder`` that are not in the set ``broad``."""
+    from scipy.io import loadmat
+
+    given = {entry["name"][:2] for entry in meta("broad")["files"]}
+    found = []
+    for path in sorted(folder.glob("*.mat")):
+        if path.name[:2] in given:
+            continue
+        data = loadmat(path, variable_names=("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement"))
+        arrays = (
+            np.ascontiguousarray(data[name], dtype=np.float64) for name in ("imu_gyr", "imu_acc", "imu_mag", "opt_quat")
+        )
+        found.append(Trial(path.name[:2], *arrays, np.ravel(data["movement"]).astype(bool), {"name": path.stem}))
+    return found
+
+
 def vqf_errors_deg(trial: Trial) -> tuple[float, float, float] | None:
     """The vqf package (its defaults) on the same samples; None when it is not installed (development extra)."""
     try:

@@ -236,6 +236,7 @@ SETS = {
     "adis16405_static": adis16405,
     "mag_qmc5883l_tomisuarez": qmc5883l,
     "broad": broad.rows,
+    broad.NOT_GIVEN: broad.rows_not_given,
 }
 
 
