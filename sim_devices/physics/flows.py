@@ -14,17 +14,49 @@ PAIRS = "pairs"
 of each storage first, then what goes from it into others."""
 
 
+RANGES = "ranges"
+"""Fact of a place: of each of its storages, in the order of ``storages_of``, lowest level, highest level, rms rate and
+how high a rim may be, flattened. A level that was recorded shows its rim; one that was simulated moves with the fit."""
+
+
 def _settings(x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
     low, high = float(np.min(x[k])), float(np.max(x[k]))
-    rate = float(np.sqrt(np.mean(np.gradient(x, ctx.dt)[k] ** 2))) or 1.0
-    pairs = ctx.facts.get(PAIRS, (0.0, 0.0))
-    return {"range": (low, high if high > low else low + 1.0), "rate": (rate,), PAIRS: pairs}
+    alone = (low, high, float(np.sqrt(np.mean(np.gradient(x, ctx.dt)[k] ** 2))), high)
+    found = _by(4, ctx.facts.get(RANGES, alone))
+    return {
+        "range": tuple(v for low, high, *_ in found for v in (low, high if high > low else low + 1.0)),
+        "rate": tuple(rate or 1.0 for _, _, rate, _ in found),
+        "top": tuple(top if top > low else low + 1.0 for low, _, _, top in found),
+        PAIRS: ctx.facts.get(PAIRS, (0.0, 0.0)),
+    }
+
+
+def _by(count: int, flat: Sequence[float]) -> list[tuple[float, ...]]:
+    return [tuple(flat[i : i + count]) for i in range(0, len(flat), count)]
 
 
 def flow_pairs(settings: Settings) -> list[tuple[int, int]]:
     flat = settings.get(PAIRS, (0.0, 0.0))
     return [(int(a), int(b)) for a, b in zip(flat[::2], flat[1::2], strict=True)]
+
+
+def storages_of(settings: Settings) -> list[int]:
+    """States that the flows depend on, each once."""
+    return list(dict.fromkeys(a for a, _ in flow_pairs(settings)))
+
+
+def _spans(settings: Settings) -> list[tuple[float, float, float]]:
+    """Lowest level, highest level and rate of each storage. A twin file of one range holds it for all."""
+    stores = storages_of(settings)
+    ranges, rates = _by(2, settings.get("range", (0.0, 1.0))), settings.get("rate", (1.0,))
+    return [(*ranges[min(i, len(ranges) - 1)], rates[min(i, len(rates) - 1)]) for i in range(len(stores))]  # pyright: ignore[reportReturnType]
+
+
+def level_names(name: str, settings: Settings) -> list[str]:
+    """The parameter of the level of each storage; states count from one where there are several."""
+    stores = storages_of(settings)
+    return [name] if len(stores) == 1 else [f"{name}_{a + 1}" for a in stores]
 
 
 def _names(settings: Settings) -> list[str]:
@@ -33,38 +65,54 @@ def _names(settings: Settings) -> list[str]:
 
 
 def _root_parts(settings: Settings) -> Parts:
-    low, high = settings.get("range", (0.0, 1.0))
-    rate, span = settings.get("rate", (1.0,))[0], high - low
-    strength = [Parameter(n, "{out}^0.5/s", 0.0, scale=rate / np.sqrt(span)) for n in _names(settings)]
-    empty = Parameter("empty_level", "{out}", low - 2.0 * span, low + 0.1 * span, scale=0.05 * span)
-    return Parts((empty,), tuple(strength))
+    spans = _spans(settings)
+    size = dict(zip(storages_of(settings), (r / np.sqrt(high - low) for low, high, r in spans), strict=True))
+    levels = [
+        Parameter(n, "{out}", low - 2.0 * (high - low), low + 0.1 * (high - low), scale=0.05 * (high - low))
+        for n, (low, high, _) in zip(level_names("empty_level", settings), spans, strict=True)
+    ]
+    return Parts(tuple(levels), _strengths(settings, size, "{out}^0.5/s"))
+
+
+def _strengths(settings: Settings, size: dict[int, float], unit: str) -> tuple[Parameter, ...]:
+    return tuple(
+        Parameter(n, unit, 0.0, scale=float(size[a]))
+        for n, (a, _) in zip(_names(settings), flow_pairs(settings), strict=True)
+    )
 
 
 def _root_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    low, high = settings["range"]
-    span = high - low
-    return ((float(np.clip(0.0, low - 2.0 * span, low)),), (low - 0.1 * span,))
+    spans = _spans(settings)
+    return (
+        tuple(float(np.clip(0.0, low - 2.0 * (high - low), low)) for low, high, _ in spans),
+        tuple(low - 0.1 * (high - low) for low, high, _ in spans),
+    )
+
+
+def _level_by_flow(q: Array, settings: Settings) -> list[tuple[int, int, float]]:
+    """(state it depends on, state it changes, level) of each flow."""
+    level = dict(zip(storages_of(settings), (float(v) for v in q), strict=True))
+    return [(a, b, level[a]) for a, b in flow_pairs(settings)]
 
 
 def _root_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    root = np.sqrt(np.maximum(x - q[0], 0.0))
-    return np.stack([-root if a == b else root for a, b in flow_pairs(settings)], axis=1)
+    rows = [(1.0 if a != b else -1.0) * np.sqrt(np.maximum(x - q0, 0.0)) for a, b, q0 in _level_by_flow(q, settings)]
+    return np.stack(rows, axis=1)
 
 
-def _fill(law: int, level: float, w: Array, settings: Settings) -> dict[str, Array]:
+def _fill(law: int, q: Array, w: Array, settings: Settings) -> dict[str, Array]:
     rows = np.zeros((w.size, FLOW))
-    for row, (a, b), strength in zip(rows, flow_pairs(settings), w, strict=True):
+    for row, (a, b, level), strength in zip(rows, _level_by_flow(q, settings), w, strict=True):
         row[:] = law, a, b, -strength if a == b else strength, level
     return {"flows": rows.ravel()}
 
 
-def _root_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    return _fill(ROOT, float(q[0]), w, settings)
-
-
 def _report(level: str, unit: str, p: Array, settings: Settings) -> Sequence[Human]:
-    flows = [Human(n, float(v), unit) for n, v in zip(_names(settings), p[1:], strict=True)]
-    return (*flows, Human(level, float(p[0]), "{out}"))
+    levels, flows = level_names(level, settings), _names(settings)
+    return (
+        *(Human(n, float(v), unit) for n, v in zip(flows, p[len(levels) :], strict=True)),
+        *(Human(n, float(v), "{out}") for n, v in zip(levels, p, strict=False)),
+    )
 
 
 SQUARE_ROOT_OUTFLOW = Effect(
@@ -73,7 +121,7 @@ SQUARE_ROOT_OUTFLOW = Effect(
     kind="feedback",
     stages=("mechanics", "actuator"),
     parts=_root_parts,
-    equation=r"\dot h_i = \dots - a_i \sqrt{h_i - h_0},\; \dot h_j = \dots + a_{ij} \sqrt{h_i - h_0}",
+    equation=r"\dot h_i = \dots - a_i \sqrt{h_i - e_i},\; \dot h_j = \dots + a_{ij} \sqrt{h_i - e_i}",
     source="M. Schoukens, J. P. Noel, Three Benchmarks Addressing Open Challenges in Nonlinear System Identification,"
     " IFAC-PapersOnLine 50-1 (2017) 446, eqs. 1-3 (Bernoulli, Torricelli)",
     excitation="high and low levels",
@@ -81,31 +129,30 @@ SQUARE_ROOT_OUTFLOW = Effect(
     prepare=_settings,
     guess=_root_guess,
     basis=_root_basis,
-    fill=_root_fill,
+    fill=lambda q, w, s: _fill(ROOT, q, w, s),
     report=lambda p, s, g: _report("empty_level", "{out}^0.5/s", p, s),
     acts_on=("storage", "storages"),
 )
 
 
 def _over_parts(settings: Settings) -> Parts:
-    low, high = settings.get("range", (0.0, 1.0))
-    rate, span = settings.get("rate", (1.0,))[0], high - low
-    level = Parameter("level", "{out}", low + 0.4 * span, high, scale=0.02 * span)
-    return Parts((level,), tuple(Parameter(n, "1/s", 0.0, scale=rate / (0.1 * span)) for n in _names(settings)))
+    spans = _spans(settings)
+    size = dict(zip(storages_of(settings), (r / (0.1 * (high - low)) for low, high, r in spans), strict=True))
+    tops = settings.get("top", tuple(high for _, high, _ in spans))
+    levels = [
+        Parameter(n, "{out}", low + 0.4 * (high - low), top, scale=0.02 * (high - low))
+        for n, (low, high, _), top in zip(level_names("level", settings), spans, tops, strict=True)
+    ]
+    return Parts(tuple(levels), _strengths(settings, size, "1/s"))
 
 
 def _over_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
-    low, high = settings["range"]
-    return tuple((low + f * (high - low),) for f in (0.75, 0.9))
+    return tuple(tuple(low + f * (high - low) for low, high, _ in _spans(settings)) for f in (0.75, 0.9))
 
 
 def _over_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
-    over = np.maximum(x - q[0], 0.0)
-    return np.stack([-over if a == b else over for a, b in flow_pairs(settings)], axis=1)
-
-
-def _over_fill(q: Array, w: Array, settings: Settings) -> dict[str, Array]:
-    return _fill(ABOVE, float(q[0]), w, settings)
+    rows = [(1.0 if a != b else -1.0) * np.maximum(x - level, 0.0) for a, b, level in _level_by_flow(q, settings)]
+    return np.stack(rows, axis=1)
 
 
 OVERFLOW = Effect(
@@ -114,7 +161,7 @@ OVERFLOW = Effect(
     kind="feedback",
     stages=("mechanics", "actuator"),
     parts=_over_parts,
-    equation=r"\dot h_i = \dots - b_i \max(h_i - L, 0),\; \dot h_j = \dots + b_{ij} \max(h_i - L, 0)",
+    equation=r"\dot h_i = \dots - b_i \max(h_i - L_i, 0),\; \dot h_j = \dots + b_{ij} \max(h_i - L_i, 0)",
     source="M. Schoukens, J. P. Noel, IFAC-PapersOnLine 50-1 (2017) 446, section 2: overflow of the upper tank, part"
     " of it into the lower",
     excitation="levels up to the rim and well below it",
@@ -122,7 +169,7 @@ OVERFLOW = Effect(
     prepare=_settings,
     guess=_over_guess,
     basis=_over_basis,
-    fill=_over_fill,
+    fill=lambda q, w, s: _fill(ABOVE, q, w, s),
     report=lambda p, s, g: _report("level", "1/s", p, s),
-    acts_on=("storage",),
+    acts_on=("storage", "storages"),
 )

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hal.compiled import kernel
+from sim_devices.physics.curve import curve_basis
 from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
-from sim_devices.physics.statistics import least_squares, runs, thin
+from sim_devices.physics.statistics import runs, signed_least_squares, thin
 
 N_PLAYS = 10
-FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays")
+FORMS = ("stops", "dahl", "dahl_stops", "dahl_skewed", "stops_bent", "relays", "stops_curved")
 """Bases from few to many columns; the data choose (``choose``). Each meets what the others meet badly:
 
 stops        Prandtl-Ishlinskii, Maxwell-slip, Iwan
@@ -21,6 +23,8 @@ dahl_stops   both
 dahl_skewed  dz = dx - (|dx| z + g dx |z|) / r as well: Bouc-Wen at large, loops whose branches differ in bend
 stops_bent   stops whose weight varies along the range: Preisach densities, generalised Prandtl-Ishlinskii
 relays       smooth relays on a triangular grid (Krasnosel'skii-Pokrovskii): any Preisach operator
+stops_curved stops and a curve without memory behind them: modified Prandtl-Ishlinskii (Kuhnen 2003, section 4), loops
+             whose middle line is bent
 """
 
 
@@ -130,8 +134,15 @@ def relays(x, lo, hi, count, starts):
 WIDE = (1.3, 1.65)  # half ranges
 N_DAHL = 7
 N_GRID = 8
-MASING = ("stops", "dahl", "dahl_stops")
-"""Forms in which one outer loop says what every minor loop is (Masing's rule)."""
+ONE_WAY_ROUND = ("stops", "dahl", "dahl_stops", "relays", "stops_curved")
+"""Forms whose elements all have weights of one sign: every loop, a minor one too, is run through the same way round,
+because each takes energy and none gives any (Kuhnen 2003, section 2.2: weights of plays that are not negative)."""
+OF_ONE_LOOP = ("stops", "dahl", "dahl_stops", "stops_curved")
+"""Forms in which one outer loop says what every minor loop is (Masing's rule, about a middle line that may be bent)."""
+MASING = OF_ONE_LOOP[:3]
+SEVERAL_LOOPS = FORMS[:6]
+CURVES = 2
+"""Legendre polynomials of second degree and up in a curve beside stops."""
 
 
 def one_loop(x: Array, keep: NDArray[np.bool_]) -> bool:
@@ -169,6 +180,20 @@ def turning_points(x: Array, least: float) -> list[float]:
     return out
 
 
+@dataclass(frozen=True)
+class Bent:
+    """The loop x + sum of ``weights`` times elements that a curve behind them acts on, and its range. It is read off
+    the data once, so that the curve stays linear in its coefficients."""
+
+    low: float
+    high: float
+    weights: tuple[float, ...] = ()
+
+    def along(self, x: Array, elements: Array) -> Array:
+        """The loop (n,) for elements (n, k)."""
+        return x + elements @ np.array(self.weights) if self.weights else x
+
+
 def columns(
     x: Array,
     form: str,
@@ -178,12 +203,14 @@ def columns(
     starts: tuple[int, ...],
     wide_too: bool = False,
     before: float | None = None,
+    bent: Bent | None = None,
 ) -> Array:
     """Columns of one form (n, k), every one without memory of what lies before a start, but for one way from ``rest``
-    to ``before`` and back. ``wide_too``: with elements of more than half the range.
+    to ``before`` and back. ``wide_too``: with elements of more than half the range. ``bent``: what a curve behind the
+    elements acts on.
     """
     if before is not None:
-        return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too)[2:]
+        return columns(np.concatenate([[rest, before], x]), form, lo, hi, rest, (0,), wide_too, None, bent)[2:]
     at = np.array(starts, np.int64)
     half = 0.5 * (hi - lo)
     # beyond half the range nothing slips once the extremes were seen, but a record may start at one of them
@@ -204,6 +231,10 @@ def columns(
             z = np.clip((x - 0.5 * (lo + hi)) / half, -1.1, 1.1)[:, None]
             some = e[:, 1:N_PLAYS:2]
             return np.concatenate([e, some * z, some * z * z], axis=1)
+        case "stops_curved":
+            e = stops(x, radii, rest, at)
+            loop = Bent(lo, hi) if bent is None else bent
+            return np.concatenate([e, curve_basis(loop.along(x, e), loop.low, loop.high, CURVES + 1)], axis=1)
         case _:
             return relays(x, lo, hi, N_GRID, at)
 
@@ -223,7 +254,16 @@ def width_of(form: str, wide_too: bool = False) -> int:
         "dahl_skewed": 3 * N_DAHL,
         "stops_bent": 2 * N_PLAYS + more,
         "relays": N_GRID * (N_GRID + 1) // 2,
+        "stops_curved": N_PLAYS + more + CURVES,
     }[form]
+
+
+def signs_of(form: str, sign: float, count: int) -> Array:
+    """Signs (count,) of the weights of a form whose elements have the sign ``sign``; 0 where it may be either."""
+    signs = np.full(count, sign if form in ONE_WAY_ROUND else 0.0)
+    if form == "stops_curved":
+        signs[-CURVES:] = 0.0
+    return signs
 
 
 NEED = 0.93
@@ -232,61 +272,109 @@ BEFORE = (0.25, -0.25, 0.5, -0.5, 1.0, -1.0)
 """Ways before a record that are tried, in its range."""
 
 
+@dataclass(frozen=True)
+class Chosen:
+    """A form of memory: ``left`` the sum of squares on left-out blocks of what it predicts; ``before`` how far x went
+    before the record, if memory of that is in it; ``sign`` that of all weights, 0 where they may differ."""
+
+    left: float
+    form: str
+    before: float | None
+    sign: float
+    bent: Bent | None = None
+
+
 def left_out(
     x: Array, residual: Array, ctx: Context, form: str, lo: float, hi: float, before: float | None = None
-) -> float:
-    """Sum of squares on left-out blocks of what a form predicts."""
+) -> Chosen:
+    """One form tried on left-out blocks."""
     index = thin(ctx.keep, 6000)
     fold = (np.arange(index.size) * 8 // max(index.size, 1)) % 2
     straight = ctx.line(x, index)
     first = float(x[0])
     wide = slips_once(lo, hi, first if before is None else before)
-    e = columns(x, form, lo, hi, first, ctx.starts, wide, before).T
+    bent = loop_of(x, residual, ctx, lo, hi, wide, before) if form == "stops_curved" else None
+    e = columns(x, form, lo, hi, first, ctx.starts, wide, before, bent).T
     a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
-    left = 0.0
-    for out in (0, 1):
-        w = least_squares(a[fold != out], residual[index][fold != out], 1e-6)[0]
-        left += float(np.sum((residual[index][fold == out] - a[fold == out] @ w) ** 2))
-    return left
+
+    def left(sign: float) -> float:
+        total = 0.0
+        for out in (0, 1):
+            some, y = a[fold != out], residual[index][fold != out]
+            w = signed_least_squares(
+                some, y, np.concatenate([np.zeros(straight.shape[1]), signs_of(form, sign, len(e))]), 1e-6
+            )
+            total += float(np.sum((residual[index][fold == out] - a[fold == out] @ w) ** 2))
+        return total
+
+    signs = (-1.0, 1.0) if form in ONE_WAY_ROUND else (0.0,)
+    return min((Chosen(left(sign), form, before, sign, bent) for sign in signs), key=lambda c: c.left)
 
 
-def choose(
-    x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS
-) -> tuple[str, float | None]:
-    """The form that predicts left-out blocks best, a larger one only where it is clearly better; and how far x went
-    before the record, if memory of that is in it: a record of several starts begins each without.
+def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, wide: bool, before: float | None) -> Bent:
+    """The loop of stops that meets the output best."""
+    index = thin(ctx.keep, 6000)
+    e = columns(x, "stops", lo, hi, float(x[0]), ctx.starts, wide, before)
+    through = [ctx.to_output(np.ascontiguousarray(c))[index] for c in (x, *e.T)]
+    a, y = np.column_stack([np.ones(index.size), *through]), ctx.wanted(x, residual)[index]
+    found = [signed_least_squares(a, y, np.r_[0.0, 0.0, np.full(e.shape[1], sign)], 1e-6) for sign in (-1.0, 1.0)]
+    w = min(found, key=lambda w: float(np.sum((y - a @ w) ** 2)))
+    if w[1] == 0.0:
+        return Bent(lo, hi)
+    loop = x + e @ (w[2:] / w[1])
+    return Bent(float(loop.min()), float(loop.max()), tuple(float(v) for v in w[2:] / w[1]))
+
+
+def choose(x: Array, residual: Array, ctx: Context, lo: float, hi: float, forms: Sequence[str] = FORMS) -> Chosen:
+    """The form that predicts left-out blocks best, a larger one only where it is clearly better; with a way before the
+    record only where that is clearly better: a record of several starts begins each without.
     """
 
-    def best_of(forms: Sequence[str], before: float | None) -> tuple[float, str]:
-        best = (left_out(x, residual, ctx, forms[0], lo, hi, before), forms[0])
+    def best_of(forms: Sequence[str], before: float | None) -> Chosen:
+        best = left_out(x, residual, ctx, forms[0], lo, hi, before)
         for form in forms[1:]:
-            left = left_out(x, residual, ctx, form, lo, hi, before)
-            if left < NEED * best[0]:
-                best = (left, form)
+            other = left_out(x, residual, ctx, form, lo, hi, before)
+            if other.left < NEED * best.left:
+                best = other
         return best
 
-    left, form = best_of(forms, None)
+    plain = best_of(forms, None)
     if len(ctx.starts) > 1:
-        return form, None
+        return plain
     ways = [float(x[0]) + share * (hi - lo) for share in BEFORE]
-    found, before = min((best_of(forms[:2], way)[0], way) for way in ways)
-    return (best_of(forms, before)[1], before) if found < NEED * left else (form, None)
+    found = min((best_of(forms[:2], way) for way in ways), key=lambda c: c.left)
+    return best_of(forms, found.before) if found.left < NEED * plain.left else plain
 
 
 def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     lo, hi = float(x.min()), float(x.max())
     if hi <= lo:
         lo, hi = lo - 0.5, hi + 0.5
-    form, before = choose(x, residual, ctx, lo, hi, MASING if one_loop(x, ctx.keep) else FORMS)
+    found = choose(x, residual, ctx, lo, hi, OF_ONE_LOOP if one_loop(x, ctx.keep) else SEVERAL_LOOPS)
     first = float(x[0])
-    wide = float(slips_once(lo, hi, first if before is None else before))
-    settings = {"range": (lo, hi), "rest": (first,), "form": (float(FORMS.index(form)),), "wide": (wide,)}
-    return settings if before is None else settings | {"before": (before,)}
+    settings = {
+        "range": (lo, hi),
+        "rest": (first,),
+        "form": (float(FORMS.index(found.form)),),
+        "wide": (float(slips_once(lo, hi, first if found.before is None else found.before)),),
+        "sign": (found.sign,),
+    }
+    if found.bent is not None:
+        settings["bent"] = (found.bent.low, found.bent.high, *found.bent.weights)
+    return settings if found.before is None else settings | {"before": (found.before,)}
 
 
 def way_before(settings: Settings) -> float | None:
     """Return the value that x had before the record, or ``None`` if the memory of the hysteresis does not show it."""
     return settings["before"][0] if "before" in settings else None
+
+
+def bent_of(settings: Settings) -> Bent | None:
+    """Return what a curve behind the elements acts on."""
+    if "bent" not in settings:
+        return None
+    low, high, *weights = settings["bent"]
+    return Bent(low, high, tuple(weights))
 
 
 def _wide(settings: Settings) -> bool:
@@ -300,13 +388,18 @@ def _form(settings: Settings) -> str:
 def _parts(settings: Settings) -> Parts:
     n = width_of(_form(settings), _wide(settings))
     unit = "{out}" if _form(settings) == "relays" else "{out}/{in}"
-    return Parts((), tuple(Parameter(f"w{i + 1}", unit, scale=0.1) for i in range(n)), 0.05 * np.eye(n))
+    signs = signs_of(_form(settings), settings.get("sign", (0.0,))[0], n)
+    weights = tuple(
+        Parameter(f"w{i + 1}", unit, 0.0 if s > 0.0 else -np.inf, 0.0 if s < 0.0 else np.inf, scale=0.1)
+        for i, s in enumerate(signs)
+    )
+    return Parts((), weights, 0.05 * np.eye(n))
 
 
 def _basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
     lo, hi = settings.get("range", (-1.0, 1.0))
     rest, before = settings.get("rest", (0.0,))[0], way_before(settings)
-    return columns(x, _form(settings), lo, hi, rest, ctx.starts, _wide(settings), before)
+    return columns(x, _form(settings), lo, hi, rest, ctx.starts, _wide(settings), before, bent_of(settings))
 
 
 def loop_width(y_of: Array, turns: int) -> float:
@@ -331,7 +424,7 @@ def test_cycle(lo: float, hi: float) -> Array:
 def _report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
     lo, hi = settings["range"]
     x = test_cycle(lo, hi)
-    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,), _wide(settings)) @ p
+    y = scale * x + columns(x, _form(settings), lo, hi, lo, (0,), _wide(settings), None, bent_of(settings)) @ p
     return (Human("loop_width_share", loop_width(y, 3), "1"),)
 
 

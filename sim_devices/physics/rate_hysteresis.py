@@ -58,7 +58,7 @@ def _prepare(x: Array, residual: Array, ctx: Context) -> Settings:
     k = ctx.keep
     slope = np.abs(smooth(np.gradient(x, ctx.dt), 3))
     lo, hi = float(x.min()), float(x.max())
-    before = choose(x, residual, ctx, lo, hi, MASING)[1] if hi > lo else None
+    before = choose(x, residual, ctx, lo, hi, MASING).before if hi > lo else None
     settings = {
         "usual_slope": (float(np.sqrt(np.mean(slope[k] ** 2))) or 1.0,),
         "rest": (float(x[0]),),

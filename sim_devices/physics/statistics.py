@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_toeplitz
+from scipy.optimize import lsq_linear
 from scipy.signal import lfilter
 
 from sim_devices.physics.effect import Array
@@ -81,15 +82,25 @@ def after_jumps(signals: Iterable[Array], n: int, most: float = 0.2) -> Bool:
     return out
 
 
-def long_run_rms(x: Array, blocks: int = 64) -> float:
+BLOCKS = (64, 32, 16)
+"""Numbers of blocks in which a long-run variance is looked for."""
+
+
+def long_run_rms(x: Array) -> float:
     """Square root of the spectral density at zero, per sample, from differences of neighbouring block means.
 
-    Steps and drifts hardly change it, since one of many differences is robustly ignored.
+    Steps and drifts hardly change it, since one of many differences is robustly ignored. Blocks that are shorter than
+    the memory of ``x`` say too little, so the largest of several lengths counts (blocking: H. Flyvbjerg, H. G.
+    Petersen, J. Chem. Phys. 91, 1989, 461).
     """
-    length = max(1, x.size // blocks)
+    found = [_by_blocks(x, max(1, x.size // blocks)) for blocks in BLOCKS]
+    return max((f for f in found if f is not None), default=float(np.std(x)))
+
+
+def _by_blocks(x: Array, length: int) -> float | None:
     m = x[: (x.size // length) * length].reshape(-1, length).mean(axis=1)
     d = np.diff(m)
-    return robust_rms(d) / np.sqrt(2.0) * np.sqrt(length) if d.size > 3 else float(np.std(x))
+    return robust_rms(d) / np.sqrt(2.0) * np.sqrt(length) if d.size > 3 else None
 
 
 def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array, float]:
@@ -102,6 +113,32 @@ def least_squares(columns: Array, y: Array, ridge: float = 1e-10) -> tuple[Array
     w = np.linalg.solve(gram, q.T @ y)
     r = y - q @ w
     return w / size, float(r @ r)
+
+
+def signed_least_squares(columns: Array, y: Array, signs: Array, ridge: float = 1e-10) -> Array:
+    """Coefficients of least squares that have the signs ``signs`` (k,), or are zero; 0 leaves a coefficient free (C. L.
+    Lawson, R. J. Hanson, Solving Least Squares Problems, 1974, chapter 23).
+    """
+    size = np.sqrt(np.sum(columns * columns, axis=0))
+    size[size == 0] = 1.0
+    q = columns / size
+    gram = q.T @ q
+    gram[np.diag_indices_from(gram)] += ridge
+    low, high = np.where(signs > 0.0, 0.0, -np.inf), np.where(signs < 0.0, 0.0, np.inf)
+    return bounded_solution(gram, q.T @ y, low, high) / size
+
+
+def bounded_solution(gram: Array, cross: Array, low: Array, high: Array) -> Array:
+    """The ``w`` between ``low`` and ``high`` with the least ``w gram w - 2 w cross``; ``gram`` is positive definite.
+
+    Coefficients that leave the bounds are held there and the rest is solved again, until none wants to come back
+    (bounded-variable least squares: P. B. Stark, R. L. Parker, Computational Statistics 10, 1995, 129).
+    """
+    w = np.linalg.solve(gram, cross)
+    if np.all((w >= low) & (w <= high)):
+        return w
+    factor = np.linalg.cholesky(gram)
+    return np.asarray(lsq_linear(factor.T, np.linalg.solve(factor, cross), (low, high), method="bvls").x, np.float64)
 
 
 def thin(ctx_keep: Bool, at_most: int = 20_000) -> NDArray[np.int64]:

@@ -159,6 +159,10 @@ def _step_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> 
     return ((0.5 * ctx.dt,), (float(np.sqrt(ctx.dt * p.hi)),))
 
 
+def _edge_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return ((0.5 * ctx.dt,),)
+
+
 def _step_test(x: Array, residual: Array, ctx: Context) -> Signature:
     """Largest CUSUM against the Brownian bridge (Kolmogorov's distribution)."""
     e = residual[ctx.keep]
@@ -212,7 +216,8 @@ def edges(residual: Array, ctx: Context) -> tuple[list[int], float]:
     """(samples where the residual jumps at once and stays, least innovation there over the largest elsewhere). Empty
     when there are many: then it is no rare change of level.
 
-    Levels say where slow changes are, too, of which a base that is off has many; an edge is nothing slow.
+    Levels say where slow changes are, too, of which a base that is off has many; an edge is nothing slow: the level
+    changes by as much as it jumps.
     """
     whole = ctx.everywhere if ctx.everywhere is not None else residual
     keep = np.ones(whole.size, np.bool_) if ctx.everywhere is not None else ctx.keep
@@ -227,7 +232,7 @@ def edges(residual: Array, ctx: Context) -> tuple[list[int], float]:
             continue
         jump = whole[k] - whole[k - 1]
         stays = np.median(whole[k + 4 : k + STAYS]) - np.median(whole[k - STAYS + 4 : k])
-        if np.sign(jump) * stays > 0.5 * abs(jump):
+        if 0.5 * abs(jump) < np.sign(jump) * stays < 2.0 * abs(jump):
             found.append((abs(float(w[k])) / scale, int(k)))
     if not 0 < len(found) <= 2 * MOST_STEPS:
         return [], 0.0
@@ -246,7 +251,10 @@ def _edge_prepare(x: Array, residual: Array, ctx: Context) -> Settings:
 def _edge_parts(settings: Settings) -> Parts:
     # a name of its own: twin files tell forms by their parameters
     parts = _step_parts(settings)
-    return Parts((replace(parts.nonlinear[0], name=_EDGE),), parts.weights)
+    rise = parts.nonlinear[0]
+    return Parts(
+        (replace(rise, name=_EDGE, hi=min(rise.hi, 2.0 * settings.get("time", (1e-3, 1.0))[0])),), parts.weights
+    )
 
 
 def _edge_test(x: Array, residual: Array, ctx: Context) -> Signature:
@@ -270,6 +278,7 @@ _EDGES = replace(
     parts=_edge_parts,
     equation=r"y = x + \sum_i h_i\,\theta(t - t_i),\; t_i \text{ at sharp edges}",
     prepare=_edge_prepare,
+    guess=_edge_guess,
     test=_edge_test,
 )
 STEP_SHIFT = replace(_LEVELS, variants=(_EDGES,))

@@ -343,7 +343,7 @@ class Model:
                 if pl.target == BETWEEN and BETWEEN not in inputs and isinstance(self.twin, CascadeTwin):
                     inputs[BETWEEN] = self.twin.between(run, inputs[self.twin.inputs[0]], theta)
                 inputs[pl.target] = self._pass(run, k, inputs[pl.target], None, pl.outputs[0], theta, join, folded)
-        return inputs, [self._force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
+        return inputs, [self.force(k, theta) for k in self.order if self.placed[k].site == "feedback"]
 
     def start_states(self, view: View, theta: Array) -> Array:
         """States (s,) at the first sample of a free run of differential equations."""
@@ -361,7 +361,8 @@ class Model:
             run = before_effects(recorded, behind)
         return inside.states(run, used, theta, forces)[0][0]
 
-    def _force(self, k: int, theta: Array) -> Force:
+    def force(self, k: int, theta: Array) -> Force:
+        """The placed effect ``k`` as a force inside the equations."""
         pl = self.placed[k]
         a, b = self._slices[k]
         return Force(pl.effect, pl.settings, theta[a], theta[b], b.start, pl.target)

@@ -8,11 +8,12 @@ from dataclasses import replace
 import numpy as np
 
 from sim_devices.physics.effect import Array, Context, Settings
-from sim_devices.physics.flows import PAIRS
+from sim_devices.physics.flows import PAIRS, RANGES
 from sim_devices.physics.forces import base_moves
 from sim_devices.physics.statistics import least_squares, runs, thin
 from tools.mismatch.placed import Placed
 from tools.mismatch.simulate import Model, make_context
+from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_view import View, view_run
 from tools.mismatch.twins.base import Signal, remember, travelled
 from tools.mismatch.twins.cascade import BETWEEN, CascadeTwin
@@ -55,15 +56,20 @@ def starts(model: Model, k: int, view: View, theta: Array) -> list[Array]:
     a, b = model.slices(k)
     searched = b.stop > b.start and b.start not in model.linear
     inside = inside_of(twin) if pl.site == "feedback" else None
+    flows = inside is not None and inside.place(pl.target).kind != "motion"
     for q in pl.effect.guess(x, residual, ctx, pl.settings):
         th = theta.copy()
         th[a] = q
+        if searched and flows:
+            out += flow_starts(model, k, view, th, output)
+            continue
         if searched:
-            several = inside is not None and inside.place(pl.target).kind != "motion"
-            th[b] = tried_weights(model, k, view, th, output) if several else first_weights(pl, x, residual, ctx, th[a])
+            th[b] = first_weights(pl, x, residual, ctx, th[a])
             out.append(th.copy())
             th[b] *= 0.3
         out.append(th)
+    if flows:
+        return out
     out = [*bent_back(model, k, theta, [th[a] for th in out][:2], x, residual, ctx), *out]
     if not twin.static:
         # an effect that the re-fitted base has bent itself around: start from what the engineer believes too
@@ -147,31 +153,6 @@ def first_weights(pl: Placed, x: Array, residual: Array, ctx: Context, q: Array)
     free = [line] if ctx.bends is None else [line, ctx.bends[k]]
     w, _ = least_squares(np.column_stack([columns[k], *free]), residual[k], 1e-5)
     return w[: columns.shape[1]]
-
-
-def tried_weights(model: Model, k: int, view: View, theta: Array, output: str) -> Array:
-    """Weights of effect ``k`` that meet the residual best to first order, beside the base parameters, by simulating
-    each with a small change: its columns act on several states, so no one way to the output carries them.
-    """
-    _, b = model.slices(k)
-    at = theta.copy()
-    at[b] = 0.0
-    now = model.residual(view, at, (output,))[output]
-    columns: list[Array] = []
-    moved = [*range(b.start, b.stop), *range(model.n_base)]
-    steps = [1e-2 * (model.parameters[j].scale or 1.0) for j in moved]
-    for j, step in zip(moved, steps, strict=True):
-        other = at.copy()
-        other[j] += step
-        columns.append(now - model.residual(view, other, (output,))[output])
-    design = np.column_stack([*columns, np.ones(now.size)])
-    if not np.all(np.isfinite(design)) or not np.all(np.isfinite(now)):
-        return np.array([0.1 * model.parameters[j].scale for j in range(b.start, b.stop)])
-    found, _ = least_squares(design, now, 1e-5)
-    size = [(model.parameters[j], float(w) * s) for j, w, s in zip(moved, found, steps, strict=False)]
-    return np.array(
-        [min(max(w, p.lo, 0.05 * p.scale if p.lo == 0.0 else p.lo), p.hi) for p, w in size[: b.stop - b.start]]
-    )
 
 
 def full_residual(model: Model, view: View, theta: Array, output: str) -> Array:
@@ -274,6 +255,8 @@ def probe_signals(model: Model, view: View, theta: Array, pl: Placed, output: st
         position, velocity = inside.course(run, base, pl.target)
         through = inside.through(run, pl.target, base, output)
         facts = {**ctx.facts, PAIRS: inside.place(pl.target).pairs}
+        if inside.place(pl.target).kind in ("storage", "storages"):
+            facts[RANGES] = inside.storage_ranges(run, base, pl.target, view.mask)
         return position, replace(ctx, signals={**signals, "velocity": velocity}, through=through, facts=facts)
     if pl.site == "input" or pl.site == "feedback":
         through = twin.through(run, pl.target if pl.site == "input" else "", base, output)

@@ -356,7 +356,7 @@ b = 0.1
     over = replace(over, settings={**settings, "pairs": pairs["upper"]})
     model = Model(tanks, [root, over])
     theta = model.start(recording)
-    for k, values in enumerate([(0.0, 0.8, 0.8, 0.7), (0.9, 3.0, 1.2)]):
+    for k, values in enumerate([(0.0, 0.0, 0.8, 0.8, 0.7), (0.9, 3.0, 1.2)]):
         a, b = model.slices(k)
         theta[a.start : b.stop] = values
     residual = model.residual(View.whole(recording), theta)["level"]

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_devices.physics.statistics import bounded_solution
 from tools.mismatch.engine.problem import Problem, spread
 from tools.mismatch.engine.trust import belief, to_search
 from tools.mismatch.simulate import Model
@@ -131,9 +132,8 @@ class Projected:
         scaled[np.diag_indices(k)] += 1e-11
         target = cross / size + 1e-11 * size * centre
         try:
-            solution = np.linalg.solve(scaled, target) / size
+            solution = bounded_solution(scaled, target, self.lo * size, self.hi * size) / size
         except np.linalg.LinAlgError:
-            solution = np.linalg.lstsq(scaled, target, rcond=1e-10)[0] / size
-        solution = np.clip(solution, self.lo, self.hi)
+            solution = np.clip(np.linalg.lstsq(scaled, target, rcond=1e-10)[0] / size, self.lo, self.hi)
         theta[self.linear] = solution
         return np.concatenate([*(b - a @ solution[at] for a, b, at in kept), self._from_belief(theta)]), theta

@@ -215,6 +215,11 @@ def _elements(s: Slot, d: str) -> str:
             z = f"np.clip(({d} - {numbers(0.5 * (lo + hi))}) / {numbers(half)}, -1.1, 1.1)[:, None]"
             s.writer.used.add("bent")
             return f"bent({plain()}, {z})"
+        case "stops_curved":
+            s.writer.used.add("curved")
+            bent = hysteresis.bent_of(settings) or hysteresis.Bent(lo, hi, (0.0,) * len(radii))
+            ends = f"{numbers(bent.low)}, {numbers(bent.high)}"
+            return f"curved({plain()}, {d}, {numbers(bent.weights)}, {ends}, {hysteresis.CURVES + 1})"
         case _:
             return element("relays", f"{numbers(lo)}, {numbers(hi)}, {hysteresis.N_GRID}")
 

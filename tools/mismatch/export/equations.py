@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sim_devices.physics.flows import PAIRS, flow_pairs
+from sim_devices.physics.flows import PAIRS, flow_pairs, level_names, storages_of
 from tools.errors import InputError
 from tools.guest.equations import (
     ABS,
@@ -205,9 +205,11 @@ class EquationLines:
         if one.place.kind not in ("storage", "storages"):
             return []
         lines: list[str] = []
-        level = one.slot.at("empty_level" if name == "square_root_outflow" else "level")
-        for weight, (a, b) in zip(one.slot.placed.parts.weights, flow_pairs(one.slot.placed.settings), strict=True):
-            over = f"max(s[{a}] - {level}, 0.0)"
+        settings = one.slot.placed.settings
+        names = level_names("empty_level" if name == "square_root_outflow" else "level", settings)
+        levels = dict(zip(storages_of(settings), names, strict=True))
+        for weight, (a, b) in zip(one.slot.placed.parts.weights, flow_pairs(settings), strict=True):
+            over = f"max(s[{a}] - {one.slot.at(levels[a])}, 0.0)"
             flow = f"np.sqrt({over})" if name == "square_root_outflow" else over
             lines.append(f"rates[{b}] {'-' if a == b else '+'}= {one.slot.at(weight.name)} * {flow}")
         return lines

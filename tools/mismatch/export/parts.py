@@ -267,6 +267,11 @@ def bent(e, z):
     return np.hstack([e, e[:, 1:10:2] * z, e[:, 1:10:2] * z * z])
 
 
+def curved(e, x, weights, lo, hi, degree):
+    """Stops, and a curve on the loop that they make with ``weights`` (Kuhnen 2003, section 4), (n, columns)."""
+    return np.hstack([e, legendre(x + e @ np.array(weights), lo, hi, degree)])
+
+
 def loop_with_speed(x, e, speed, late, late_x):
     """Elements, every second one times log(1 + speed) and behind a lag, and the lag of x (Ang 2007, eqs. 12-15)."""
     fast = e[:, ::2]

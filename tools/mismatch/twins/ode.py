@@ -158,18 +158,33 @@ class OdeTwin(Head):
         if place.kind == "parameter":
             signal = run.signals[self.signals[place.position]]
             return signal, np.gradient(signal, run.dt)
+        (position, _), (velocity, _) = self._courses(run, theta, (place.position, place.velocity))
+        return position, velocity
+
+    def storage_ranges(self, run: Run, theta: Array, target: str, mask: NDArray[np.bool_]) -> tuple[float, ...]:
+        """What is known of every storage of a place where ``mask`` (n,) is set: see ``flows.RANGES``."""
+        stores = dict.fromkeys(int(v) for v in self.place(target).pairs[::2])
+        found: list[float] = []
+        for x, recorded in self._courses(run, theta, tuple(stores)):
+            low, high = float(np.min(x[mask])), float(np.max(x[mask]))
+            rate = float(np.sqrt(np.mean(np.gradient(x, run.dt)[mask] ** 2)))
+            found += [low, high, rate, high if recorded else high + 0.5 * (high - low)]
+        return tuple(found)
+
+    def _courses(self, run: Run, theta: Array, states: Sequence[int]) -> list[tuple[Array, bool]]:
+        """Courses (n,) of these states, and whether an output reads them: then as recorded, else as simulated."""
         x = self._simulated(run, {s: run.signals[s] for s in self.signals}, theta, ())
         c = self.linearised(self.values(theta)).c
-        found: list[Array] = []
-        for i in (place.position, place.velocity):
-            y = x[:, i]
+        found: list[tuple[Array, bool]] = []
+        for i in states:
+            y, recorded = x[:, i], False
             for k, o in enumerate(self.outputs):
                 alone = c[k, i] != 0.0 and np.count_nonzero(c[k]) == 1
                 if alone and np.allclose(self.readings(x, run, theta)[:, k], c[k, i] * y, rtol=1e-9, atol=1e-12):
-                    y = run.measured[o] / c[k, i]
+                    y, recorded = run.measured[o] / c[k, i], True
                     break
-            found.append(np.ascontiguousarray(y))
-        return found[0], found[1]
+            found.append((np.ascontiguousarray(y), recorded))
+        return found
 
     # -- simulation -----------------------------------------------------------------------------------
 
