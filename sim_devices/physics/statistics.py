@@ -134,7 +134,7 @@ def bounded_solution(gram: Array, cross: Array, low: Array, high: Array) -> Arra
     Coefficients that leave the bounds are held there and the rest is solved again, until none wants to come back
     (bounded-variable least squares: P. B. Stark, R. L. Parker, Computational Statistics 10, 1995, 129).
     """
-    w = np.linalg.solve(gram, cross)
+    w = np.asarray(np.linalg.solve(gram, cross), np.float64)
     if np.all((w >= low) & (w <= high)):
         return w
     factor = np.linalg.cholesky(gram)

@@ -184,6 +184,8 @@ def sealed(
     for text in texts:
         simulated = free_run(replace(test, twin=text))
         away = {o: test.outputs[o] - simulated[o] for o in outputs}
+        if s.mean_free:
+            away = {o: r - np.mean(r[rows]) for o, r in away.items()}
         figures.append(s.factor * _together([rms(away[o][rows]) for o in outputs]))
     worst = max(outputs, key=lambda o: rms(away[o][rows]))
     signals = {name: x[rows] for name, x in test.signals.items()}
