@@ -18,7 +18,9 @@ from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_flows import flow_starts
 from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare
 from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.make import make
 from tools.mismatch.twins.program import parse, run_program
@@ -512,3 +514,48 @@ def test_a_stretch_that_starts_afresh_is_met_by_all_its_samples_and_by_no_other(
     gap[200:220] += 5.0
     beside = replace(recording, outputs={"angle": gap})
     assert left(beside, True) == pytest.approx(left(recording, True), rel=1e-6)
+
+
+LINEAR_TANKS = """
+[twin]
+kind = "ode"
+[twin.states]
+upper = { unit = "m", start = 1.0 }
+level = { unit = "m", start = 1.0 }
+[twin.equations]
+upper = "gain * command - a * upper - deficit"
+level = "a * upper - b * level + surplus"
+[twin.parameters]
+gain = 20.0
+a = 7.0
+b = 7.0
+deficit = 7.0
+surplus = 0.0
+"""
+
+
+def test_flows_begin_in_place_of_the_linear_terms_that_are_their_tangents(tmp_path: Path) -> None:
+    channels = CHANNELS.replace('"angle"', '"level"').replace('"rad"', '"m"')
+    u = 0.7 + 0.5 * command()
+    t = np.arange(u.size) / RATE_HZ
+
+    def slopes(now: float, h: np.ndarray) -> list[float]:
+        top, low = np.sqrt(max(h[0], 0.0)), np.sqrt(max(h[1], 0.0))
+        return [20 * np.interp(now, t, u) - 14 * top, 14 * top - 14 * low]
+
+    exact = solve_ivp(slopes, (0, t[-1]), [1.0, 1.0], t_eval=t, rtol=1e-9, atol=1e-9, max_step=0.5 / RATE_HZ).y
+    recording = recorded(tmp_path, LINEAR_TANKS, u, exact[1], channels)
+    tanks = make(recording)
+    view = View.whole(recording)
+    linear = Model(tanks)
+    given = linear.start(recording)
+    root = next(p for p in sites(tanks, recording, EFFECTS["square_root_outflow"]) if p.target == "upper+level")
+    root = prepare(linear, view, given, root)
+    model = Model(tanks, [root])
+    theta = model.carry(linear, given, recording)
+    theta[model.slices(0)[0]] = 0.0
+    start = flow_starts(model, 0, view, theta, "level")[0]
+    assert np.all(start[model.slices(0)[1]] > 8.0)  # the roots carry the flow,
+    assert np.all(np.abs(start[[1, 2]]) < 3.0)  # and the linear terms do not
+    before = float(np.std(linear.residual(view, given)["level"]))
+    assert float(np.std(model.residual(view, start)["level"])) < 0.5 * before
