@@ -72,13 +72,13 @@ def test_what_wanders_slowly_is_no_change_of_level() -> None:
     found: list[int] = []
     for seed in range(8):
         white = np.random.default_rng(seed).standard_normal(1200)
-        slow = lfilter([1.0], [1.0, -memory], white)
+        slow: Array = np.asarray(lfilter([1.0], [1.0, -memory], white), np.float64)
         # the square root of the spectral density at zero of this process is 1 / (1 - memory)
         ratio.append(long_run_rms(slow) * (1 - memory))
         found.append(len(find_steps(slow, keep)[0]))
     assert 0.7 < np.mean(ratio) < 1.4
     assert sum(found) <= 1
-    jumped = white + 3.0 * (np.arange(1200) >= 700)
+    jumped: Array = np.random.default_rng(8).standard_normal(1200) + np.where(np.arange(1200) >= 700, 3.0, 0.0)
     assert find_steps(jumped, keep)[0] == [pytest.approx(700, abs=3)]
 
 
