@@ -19,7 +19,7 @@ CALLED = [
     # by a framework: numba, IPython, matplotlib, pyserial, click
     "AnyClone", "get_suitable_cache_subpath", "on_start", "_repr_*", "reset_input_buffer", "parse_args",
     # by name: the list of commands, and the module that export writes
-    "doctor", "emulate", "simulate_command", "legendre", "loop_with_speed",
+    "doctor", "emulate", "simulate_command", "curved", "legendre", "loop_with_speed",
     # by users: notebooks, tests of other projects, writers of drivers and twins
     "open_run", "to_dataframe", "to_html", "smbus", "write_quick", "read_byte*", "write_byte*", "read_word_data",
     "write_word_data", "read_fifo", "persist_offsets", "UserTwin",
