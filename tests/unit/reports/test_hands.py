@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from firmware_py.actuation.config import ActuationConfig
-from tools.reports.figures import BandFigures, TremorFigures
+from tools.reports.figures import BANDS_HZ, BandFigures, TremorFigures
 from tools.research.reports.hand_limits import Swing, band_rms_um, known_tremor_um, strongest
-from tools.research.reports.hands import HandRow, markdown
+from tools.research.reports.hands import HandRow, draw_people, markdown, people_table
 
 T_S = np.arange(4000) / 1000.0
 KEEP = (T_S > 1.0) & (T_S < 3.5)
@@ -57,7 +57,7 @@ def test_the_strongest_stretch_of_a_swing() -> None:
 def test_the_page_says_which_hands_miss_the_goal_and_why(share: float, rest_um: float, said: str) -> None:
     def row(hand: str, method: str, left_um: float) -> HandRow:
         vector = BandFigures(20.0, left_um, 100.0 * (1.0 - left_um / 20.0))
-        figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, {}, 1.0, 0.0)
+        figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, dict.fromkeys(BANDS_HZ, vector), 1.0, 0.0)
         return HandRow(hand, "-", method, figures, 1.5, 4.0, 2.0, Swing(14.0, 3.0, share, 74.0, rest_um))
 
     page = markdown([row("calm", "adaptive", 4.0), row("calm", "kalman", 9.0), row("wild", "adaptive", 8.0)], 40.0, "x")
@@ -70,9 +70,22 @@ def test_the_page_says_which_hands_miss_the_goal_and_why(share: float, rest_um: 
 
 def test_a_page_of_hands_that_all_reach_the_goal_explains_none() -> None:
     vector = BandFigures(20.0, 4.0, 80.0)
-    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, {}, 1.0, 0.0)
+    figures = TremorFigures((8.0, 12.0), (5.0, 40.0), vector, {}, vector, dict.fromkeys(BANDS_HZ, vector), 1.0, 0.0)
     page = markdown(
         [HandRow("calm", "-", "adaptive", figures, 1.5, 4.0, 2.0, Swing(9.0, 3.0, 0.9, 74.0, 5.0))], 8.0, "x"
     )
     assert "reached in 1 of 1 hands." in page
     assert "swing" not in page
+
+
+def test_people_are_drawn_from_the_revision_and_summed_up_in_every_band() -> None:
+    seeds = draw_people("abc", 3)
+    assert seeds == draw_people("abc", 3) != draw_people("abd", 3)
+    people = []
+    for left_um in (1.0, 2.0, 6.0):
+        band = BandFigures(20.0, left_um, 100.0 * (1.0 - left_um / 20.0))
+        people.append(TremorFigures((8.0, 12.0), (5.0, 40.0), band, {}, band, dict.fromkeys(BANDS_HZ, band), 1.0, 0.0))
+    lines = people_table(people, seeds)
+    assert "| 8-12 Hz | 20.00 | 3.00 | 6.00 | 85.0 | 70.0 |" in lines
+    assert "| 20-500 Hz | 20.00 | 3.00 | 6.00 | - | - |" in lines
+    assert all(str(seed) in " ".join(lines) for seed in seeds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.progress import Progress, SpinnerColumn, TimeElapsedColumn
@@ -18,6 +18,9 @@ from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
 from tools.terminal import task_name
 
+if TYPE_CHECKING:
+    from tools.reports.figures import TremorFigures
+
 
 def hands(
     bench: BenchOption = None,
@@ -30,6 +33,10 @@ def hands(
             metavar="FOLDER", help="Score every recorded hand of this folder instead of the recordings of people."
         ),
     ] = None,
+    people: Annotated[
+        int,
+        typer.Option(min=0, max=1000, help="Synthetic people to draw from the revision, too."),
+    ] = 0,
     seconds: Annotated[float, typer.Option(min=8.0, max=600.0)] = 40.0,
     out: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Write the result (FILE.json), or its page (FILE.md).")
@@ -42,7 +49,7 @@ def hands(
 
     Hands that no setting has seen, with the bench's estimator: micron hands --heldout recordings
     """
-    from tools.research.reports.hands import HandRow, markdown, run_hands
+    from tools.research.reports.hands import HandRow, draw_people, markdown, run_hands, run_people
     from tools.research.reports.hands_heldout import find_recordings, heldout_page, run_heldout
 
     with clear_errors():
@@ -51,7 +58,12 @@ def hands(
         folder = None if heldout is None else find_recordings(heldout, file)
         if folder is None and not data.is_dir():
             raise InputError(f"{data}: no such folder; name the recordings with --data FOLDER")
+        if heldout is not None and people:
+            raise InputError("--people belongs to the page of the known hands; leave out --heldout")
         rows: list[HandRow] = []
+        stamp = revision_and_day()
+        seeds = draw_people(stamp.split(",")[0], people)
+        synthetic: list[TremorFigures] = []
         with Progress(SpinnerColumn(), task_name(), TimeElapsedColumn(), console=console(), transient=True) as progress:
             task = progress.add_task("starting")
 
@@ -65,11 +77,21 @@ def hands(
                     result = run_heldout(file, folder, seconds, show)
                 for row in result:
                     rows.append(row)  # noqa: PERF402 - what is there when Ctrl-C comes is kept
+                for figures in run_people(file, seeds, seconds, show):
+                    synthetic.append(figures)  # noqa: PERF402
         need_some(rows)
-        stamp = revision_and_day()
-        page = markdown(rows, seconds, stamp) if folder is None else heldout_page(folder, rows, seconds, stamp)
+        page = (
+            markdown(rows, seconds, stamp, synthetic, seeds)
+            if folder is None
+            else heldout_page(folder, rows, seconds, stamp)
+        )
         if out is not None:
             write_result(out, page)
         if json_file != "-":
             typer.echo(page)
-        write_json({"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}, json_file)
+        found: dict[str, Any] = {"format": 1, "seconds": seconds, "rows": [row.as_dict() for row in rows]}
+        if people:
+            found["people"] = [
+                {"seed": seed, **figures.to_json()} for seed, figures in zip(seeds, synthetic, strict=False)
+            ]
+        write_json(found, json_file)

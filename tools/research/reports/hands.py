@@ -6,7 +6,8 @@ those without wires (``tools.closed_loop``), which leave the same tremor as runs
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import random
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
@@ -20,7 +21,7 @@ from sim_devices.config import emulation_config
 from sim_devices.plant.hand_file import load_hand
 from sim_devices.plant.recorded_hand import make_hand
 from tools.closed_loop.simulate import SimulatedRun, simulate
-from tools.reports.figures import TremorFigures, tremor_figures
+from tools.reports.figures import BANDS_HZ, TremorFigures, tremor_figures
 from tools.research.reports.hand_limits import Swing, causal_um, known_tremor_um, strongest
 
 METHODS = ("adaptive", "kalman", "wflc_flc")
@@ -123,20 +124,65 @@ def _limits(bench: BenchFile, source: str | None, run: SimulatedRun, from_ns: in
     return known_tremor_um(run.truth, keep, np.asarray(body), run.configs.actuation), causal_um(run.truth, keep)
 
 
-def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
+def draw_people(revision: str, count: int) -> list[int]:
+    """Return the seeds of ``count`` synthetic people, drawn from the source's revision: nobody could choose them."""
+    return sorted(random.Random(revision).sample(range(1000, 1_000_000), count))
+
+
+def run_people(
+    bench: BenchFile, seeds: Sequence[int], seconds: float, progress: Callable[[str], None]
+) -> Iterator[TremorFigures]:
+    """Run every synthetic person with the bench's own estimator."""
+    for seed in seeds:
+        progress(f"synthetic person {seed}")
+        run = simulate(bench, seconds, seed=seed)
+        figures = tremor_figures(run.truth, from_ns=run.armed_ns + round(SETTLE_S * 1e9), to_ns=run.safe_ns)
+        if figures is not None:
+            yield figures
+
+
+def people_table(people: Sequence[TremorFigures], seeds: Sequence[int]) -> list[str]:
+    """Return the section of the page that sums up the synthetic people."""
+    lines = [
+        "## Synthetic people drawn from the revision",
+        "",
+        *wrap(f"Seeds {', '.join(map(str, seeds))}; the bench's own estimator, um rms against the intended path.", 110),
+        "",
+        "| band | without, mean | with, mean | with, worst | less, mean (%) | less, worst (%) |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for low_hz, high_hz in BANDS_HZ:
+        bands = [person.bands[low_hz, high_hz] for person in people]
+        before, after = ([getattr(b, f"{kind}compensated_rms_um") for b in bands] for kind in ("un", ""))
+        less = [b.reduction_percent for b in bands]
+        share = ("-", "-") if low_hz == BANDS_HZ[3][0] else (f"{np.mean(less):.1f}", f"{min(less):.1f}")
+        cells = (f"{np.mean(before):.2f}", f"{np.mean(after):.2f}", f"{max(after):.2f}", *share)
+        name = f"below {high_hz:g} Hz" if low_hz == 0.0 else f"{low_hz:g}-{high_hz:g} Hz"
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    goals = "Goals: 8-12 Hz 85 % less, 2-500 Hz 75 % less (means), 20-500 Hz at most 1 um more than without."
+    return [*lines, "", goals, ""]
+
+
+def markdown(
+    rows: list[HandRow],
+    seconds: float,
+    revision: str,
+    people: Sequence[TremorFigures] = (),
+    seeds: Sequence[int] = (),
+) -> str:
     """The page ``docs/results/hands.json``."""
     lines = [
         "# First results: the closed loop in real hands",
         "",
-        f"Made by `micron hands --out docs/results/hands.json`, firmware revision {revision}; {seconds:g} s of virtual",
+        f"Made by `micron hands`, firmware revision {revision}; {seconds:g} s of virtual",
         f"time each, scored from {SETTLE_S:g} s after arming. Tremor: rms of the tip as a vector in 8-12 Hz on the",
         "physical truth, manipulator resting (without) and working (with). Each recorded hand is scaled to 50 um p-p",
         "in 8-12 Hz over the whole part that was chosen; the emulated instrument has all its sensor and actuator",
         "errors on.",
         "",
         "| hand | estimator | without (um rms) | with (um rms) | less (%) | limits: stroke, causal (%) "
-        "| at a limit (% of ticks) | all bands, without -> with (um rms) |",
-        "|---|---|---|---|---|---|---|---|",
+        "| at a limit (% of ticks) | all bands, without -> with (um rms) | below 2 Hz | 2-8 Hz | 20-500 Hz |",
+        "|---|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         vector, whole = row.figures.vector, row.figures.whole_band
@@ -151,6 +197,10 @@ def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
             f"{stroke:.1f}, {causal:.1f}",
             f"{row.limited_percent:.1f}",
             f"{whole.uncompensated_rms_um:.1f} -> {whole.compensated_rms_um:.1f}",
+            *(
+                f"{figures.uncompensated_rms_um:.1f} -> {figures.compensated_rms_um:.1f}"
+                for figures in (row.figures.bands[BANDS_HZ[k]] for k in (0, 1, 3))
+            ),
         )
         lines.append(f"| {' | '.join(cells)} |")
     best = {row.hand: row.figures.vector.reduction_percent for row in rows if row.method == METHODS[0]}
@@ -172,6 +222,7 @@ def markdown(rows: list[HandRow], seconds: float, revision: str) -> str:
         "and everything below 2 Hz. At a limit: the wanted displacement was out of the manipulator's reach or the",
         "amplifier's range. Motion below the tremor band yields its stroke to the band, so its error can stay large.",
         "",
+        *(people_table(people, seeds) if people else ()),
     ]
     return "\n".join(lines)
 
