@@ -70,10 +70,11 @@ def trials_not_given(folder: Path) -> list[Trial]:
         if path.name[:2] in given:
             continue
         data = loadmat(path, variable_names=("imu_gyr", "imu_acc", "imu_mag", "opt_quat", "movement"))
-        arrays = (
+        rate, force, field, truth = (
             np.ascontiguousarray(data[name], dtype=np.float64) for name in ("imu_gyr", "imu_acc", "imu_mag", "opt_quat")
         )
-        found.append(Trial(path.name[:2], *arrays, np.ravel(data["movement"]).astype(bool), {"name": path.stem}))
+        counts = np.ravel(data["movement"]).astype(bool)
+        found.append(Trial(path.name[:2], rate, force, field, truth, counts, {"name": path.stem}))
     return found
 
 
