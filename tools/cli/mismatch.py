@@ -11,6 +11,7 @@ import typer
 
 from tools.cli.bench_option import bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console, data_console, print_error, print_note
+from tools.cli.mismatch_heal import heal
 from tools.cli.mismatch_plan import plan, read_report
 from tools.cli.mismatch_watch import watch
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 app = typer.Typer(help="Find where a simulation and a recording differ, and which physics the simulation lacks.")
 app.command()(watch)
 app.command()(plan)
+app.command()(heal)
 
 RecordingArgument = Annotated[
     Path, typer.Argument(metavar="RECORDING", help="A recording (folder or .toml), or a folder of recordings.")

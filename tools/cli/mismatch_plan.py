@@ -63,7 +63,7 @@ def plan(
     Without --report: the smallest effect of each kind that the channels would show, and what would split the rest.
     With it: the input within your limits on which the equivalent models differ most (docs/mismatch.md).
 
-    Example: micron mismatch plan recordings/stack --report stack.json --out next
+    Example: micron mismatch plan recordings/stack
     """
     with clear_errors():
         check_writable(json_file)

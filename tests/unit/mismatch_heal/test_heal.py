@@ -1,0 +1,123 @@
+"""A heal keeps what helps on every band and reverts the rest; what it cannot do is refused by one message."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from hal.bench import load_bench
+from tools.cli.main import app
+from tools.mismatch.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
+from tools.mismatch.heal.heal import Healed, Step, lines, with_remedy
+from tools.mismatch.heal.parts import Lab, compare_manipulator, compare_sensors, compare_stacks
+
+ROOT = Path(__file__).parents[3]
+MICRON = ROOT / "benches/micron.toml"
+
+
+def errors(shift: dict[str, float], spread: float = 0.1) -> TipError:
+    rng = np.random.default_rng(3)
+    return TipError({b: 5.0 + shift.get(b, 0.0) + spread * rng.standard_normal(8) for b in (*BANDS, WHOLE)})
+
+
+def test_less_error_in_the_whole_band_is_better():
+    kept, why = is_better(errors({}), errors({WHOLE: -1.0, "8-12 Hz": -1.0}))
+    assert kept
+    assert "falls by 1 um" in why
+
+
+def test_slow_motion_that_gets_worse_reverts_it():
+    kept, why = is_better(errors({}), errors({WHOLE: -1.0, BANDS[0]: 0.5}))
+    assert not kept
+    assert BANDS[0] in why
+
+
+def test_a_band_that_rises_within_a_whole_that_falls_is_named():
+    kept, why = is_better(errors({}), errors({WHOLE: -1.0, "2-8 Hz": 0.5}))
+    assert kept
+    assert "but 2-8 Hz rises by 0.5 um" in why
+
+
+def test_a_whole_that_rises_reverts_it():
+    assert not is_better(errors({}), errors({WHOLE: 1.0, "8-12 Hz": -1.0}))[0]
+
+
+def test_what_changes_nothing_is_reverted():
+    assert not is_better(errors({}), errors({}))[0]
+
+
+def concealed(tmp_path: Path, table: str) -> Path:
+    text = MICRON.read_text().replace('"calibration/', f'"{MICRON.parent}/calibration/')
+    file = tmp_path / "bench.toml"
+    file.write_text(text.replace("[bus.daq0]", f"{table}\n\n[bus.daq0]", 1))
+    return file
+
+
+def lab_of(bench: Path, folder: Path) -> Lab:
+    from sim_devices.config import emulation_config
+
+    file = load_bench(bench)
+    return Lab(file, emulation_config(file.description.model_dump()), folder)
+
+
+@pytest.mark.parametrize(
+    ("table", "compare", "factor"),
+    [
+        ("[emulation.stack]\nslip_sum = 0.62", compare_stacks, 1.5),
+        ("[emulation.manipulator]\nmount_spread_deg = 2.0", compare_manipulator, 3.0),
+        ("[emulation.sensors]\nmisalignment_deg = 1.5", compare_sensors, 3.0),
+    ],
+)
+def test_each_part_shows_the_change_that_was_made_to_it(tmp_path: Path, table: str, compare, factor: float):
+    before = compare(lab_of(MICRON, tmp_path / "a"))
+    after = compare(lab_of(concealed(tmp_path, table), tmp_path / "b"))
+    assert after.unit == before.unit
+    assert after.rms > factor * before.rms
+
+
+def test_the_horizon_of_the_estimator_follows_the_preview(tmp_path: Path):
+    bench = load_bench(MICRON)
+    file = tmp_path / "piezo.toml"
+    text = (MICRON.parent / "calibration/piezo.toml").read_text()
+    file.write_text(re.sub(r"^preview_s = .*$", "preview_s = 0.00102", text, flags=re.MULTILINE))
+    healed = with_remedy(bench, file, tmp_path / "bench.toml")
+    assert healed.description.firmware["tremor"]["loop_delay_s"] == pytest.approx(0.0019)
+    assert healed.description.firmware["calibration"][-1] == str(file)
+
+
+def test_a_real_bench_is_refused_without_max_effect_and_nothing_is_written(tmp_path: Path):
+    text = (
+        MICRON.read_text()
+        .replace("sim://i2c0", "linux-i2c://1")
+        .replace('"calibration/', f'"{MICRON.parent}/calibration/')
+    )
+    bench = tmp_path / "real.toml"
+    bench.write_text(text)
+    for more, message in (([], "--max-effect 4"), (["--max-effect", "4"], "instrument of yours")):
+        result = CliRunner().invoke(app, ["mismatch", "heal", str(bench), "--out", str(tmp_path / "out"), *more])
+        assert result.exit_code == 2
+        assert message in " ".join(result.stderr.split())
+        assert not (tmp_path / "out").exists()
+
+
+def test_an_unknown_bench_is_refused():
+    result = CliRunner().invoke(app, ["mismatch", "heal", "nowhere.toml"])
+    assert result.exit_code == 2
+
+
+def test_what_has_no_remedy_is_said():
+    step = Step("stacks", 0.2, "um", ("hysteresis", "thermal_drift"), ("thermal_drift",), True, "it falls", {})
+    figures = dict.fromkeys((*BANDS, WHOLE), 1.0)
+    said = lines(Healed("a", "b", (1, 2, 3), 12.0, figures, figures, (step,)))
+    assert "  thermal drift: the firmware has no remedy." in said
+
+
+def test_tip_error_is_the_same_for_the_same_seeds():
+    bench = load_bench(MICRON)
+    one, two = (tip_error(bench, 5.0, (7, 8)) for _ in range(2))
+    for band in (*BANDS, WHOLE):
+        np.testing.assert_array_equal(one.bands[band], two.bands[band])

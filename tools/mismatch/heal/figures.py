@@ -1,0 +1,70 @@
+"""The tip error of a bench over runs with different hands and noise, and whether one bench is better than another."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student
+
+from hal.bench import BenchFile
+from tools.closed_loop.simulate import simulate
+from tools.errors import InputError
+from tools.mismatch.recording import Array
+from tools.reports.figures import tremor_figures
+
+BANDS = ("below 2 Hz", "2-8 Hz", "8-12 Hz", "20-500 Hz")
+SLOW = BANDS[0]
+WHOLE = "2-500 Hz"
+SETTLE_S = 2.0
+LEVEL = 0.05
+"""Level of the paired tests over seeds."""
+
+
+@dataclass(frozen=True)
+class TipError:
+    """Rms of the tip's error against the intended path, um, by band: one value per seed (seeds,)."""
+
+    bands: Mapping[str, Array]
+
+    def mean(self) -> dict[str, float]:
+        """The mean over seeds, by band."""
+        return {b: float(np.mean(v)) for b, v in self.bands.items()}
+
+
+def tip_error(bench: BenchFile, seconds: float, seeds: Sequence[int]) -> TipError:
+    """Run the bench without wires for each seed. InputError for a bench that has no such run, or too short a run."""
+    out: dict[str, list[float]] = {b: [] for b in (*BANDS, WHOLE)}
+    for seed in seeds:
+        run = simulate(bench, seconds, seed=seed)
+        found = tremor_figures(run.truth, from_ns=run.armed_ns + round(SETTLE_S * 1e9), to_ns=run.safe_ns)
+        if found is None:
+            raise InputError(f"--seconds {seconds:g}: too short to judge the tip after {SETTLE_S:g} s; give 5 or more")
+        for name, figures in zip((*BANDS, WHOLE), found.bands.values(), strict=True):
+            out[name].append(figures.compensated_rms_um)
+    return TipError({b: np.array(v) for b, v in out.items()})
+
+
+def is_better(before: TipError, after: TipError) -> tuple[bool, str]:
+    """Whether ``after`` is better than ``before`` on the same seeds, and why in words (paired t-tests at ``LEVEL``).
+
+    The error from 2 to 500 Hz, in which the bands above 2 Hz count by their power, must fall, and the error below 2 Hz
+    must not rise. A band above 2 Hz that rises although the whole falls is named.
+    """
+    change = {b: after.bands[b] - before.bands[b] for b in (*BANDS, WHOLE)}
+    rises = {b: f"{b} rises by {float(np.mean(d)):.2g} um" for b, d in change.items() if _p_above_zero(d) < LEVEL}
+    if SLOW in rises:
+        return False, f"the error {rises[SLOW]}"
+    if _p_above_zero(-change[WHOLE]) < LEVEL:
+        fall = f"the error {WHOLE} falls by {float(np.mean(-change[WHOLE])):.2g} um"
+        return True, ", but ".join((fall, *rises.values()))
+    return False, f"the error {WHOLE} does not fall beyond what differs between runs"
+
+
+def _p_above_zero(x: Array) -> float:
+    """One-sided p-value that the mean of ``x`` is not above zero."""
+    if float(np.ptp(x)) == 0.0:
+        return 0.0 if x[0] > 0.0 else 1.0
+    t = float(np.mean(x)) / (float(np.std(x, ddof=1)) / np.sqrt(x.size))
+    return float(student.sf(t, x.size - 1))

@@ -1,0 +1,168 @@
+"""The command ``micron mismatch heal``: experiments, a diagnosis, and remedies, each of which is kept or reverted."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from hal.bench import SIM_SCHEME, BenchFile, load_bench
+from sim_devices.config import emulation_config
+from tools.bench.bench_copy import with_calibration
+from tools.errors import InputError
+from tools.mismatch.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
+from tools.mismatch.heal.parts import PARTS, Comparison, Lab, Part
+from tools.output import write_text_atomic
+
+VERIFY_FROM = 1000
+"""First seed of the runs that decide; the bench's own seed drew the experiments."""
+STACK_EFFECTS = frozenset(
+    (
+        "hysteresis", "rate_dependent_hysteresis", "creep", "backlash", "dead_zone", "static_nonlinearity",
+        "saturation", "first_order_lag", "resonance", "dead_time",
+    )
+)  # fmt: skip
+"""Effects of a stack that the firmware's inverse (loops, creep, curve) or its feedforward (lag, resonance) undoes."""
+
+Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Step:
+    """One part: what differed, the effects that the engine named, whether its remedy was kept, and why. ``no_remedy``:
+    named effects that the firmware has nothing against.
+    """
+
+    part: str
+    difference: float
+    unit: str
+    effects: tuple[str, ...]
+    no_remedy: tuple[str, ...]
+    kept: bool
+    why: str
+    after: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Healed:
+    """``before`` and ``after``: mean tip error (um) by band over the same seeds; ``bench``: the healed file, if any."""
+
+    original: str
+    bench: str | None
+    seeds: tuple[int, ...]
+    seconds: float
+    before: Mapping[str, float]
+    after: Mapping[str, float]
+    steps: tuple[Step, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON of the command."""
+        return {"format": 1, **asdict(self)}
+
+
+def check_bench(bench: BenchFile, max_effect: int | None) -> None:
+    """InputError for a bench that cannot be healed: a real one, one with sensors that the lab does not know."""
+    if not all(bus.uri.startswith(SIM_SCHEME) for bus in bench.description.bus.values()):
+        if max_effect is None:
+            raise InputError(
+                f"{bench.path}: healing moves the outputs of a real bench over their full range; allow it with "
+                "--max-effect 4, or heal an emulated copy"
+            )
+        raise InputError(
+            f"{bench.path}: on a real bench the strokes have to be measured by an instrument of yours; record them "
+            "beside a program of micron mismatch plan, then micron calibrate piezo"
+        )
+    if emulation_config(bench.description.model_dump()).endoscope is not None:
+        raise InputError(f"{bench.path}: an endoscope bench has no tip that is compensated; name an instrument's bench")
+
+
+def heal(
+    path: Path, out: Path, *, seconds: float, runs: int, name_effects: bool = True, jobs: int = 1, say: Say
+) -> Healed:
+    """Heal the emulated bench ``path``; the healed copy and all recordings go to the folder ``out``."""
+    original = load_bench(path)
+    config = emulation_config(original.description.model_dump())
+    seeds = tuple(range(VERIFY_FROM, VERIFY_FROM + runs))
+    before = now = tip_error(original, seconds, seeds)
+    bench, steps = original, list[Step]()
+    for part in PARTS:
+        say(f"{part.name}: measuring")
+        lab = Lab(bench, config, out / "recordings")
+        compared = part.compare(lab)
+        effects = _named(compared, jobs) if name_effects else ()
+        say(f"{part.name}: identifying")
+        try:
+            file = out / f"{part.name}.toml"
+            write_text_atomic(file, part.identify(lab).read_text())
+            candidate = with_remedy(bench, file, out / f"bench-{part.name}.toml")
+            after = tip_error(candidate, seconds, seeds)
+        except InputError as error:
+            steps.append(_step(part, compared, effects, False, str(error), now))
+            continue
+        kept, why = is_better(now, after)
+        steps.append(_step(part, compared, effects, kept, why, after))
+        if kept:
+            bench, now = candidate, after
+        else:
+            candidate.path.unlink()
+            file.unlink()
+    return Healed(
+        str(path),
+        None if bench is original else str(bench.path),
+        seeds,
+        seconds,
+        before.mean(),
+        now.mean(),
+        tuple(steps),
+    )
+
+
+def with_remedy(bench: BenchFile, file: Path, out: Path) -> BenchFile:
+    """The bench with one more calibration. Where the preview of the stacks changes, the horizon of the tremor estimator
+    changes by as much.
+    """
+    from firmware_py.control.plan import load_plan
+
+    was = load_plan(bench).stages.actuation.preview_s
+    healed = load_bench(with_calibration(bench, file.resolve(), out))
+    found = re.search(r"^preview_s = ([0-9.e+-]+)$", file.read_text(), re.MULTILINE)
+    shift = float(found.group(1)) - was if found else 0.0
+    if shift:
+        text = re.sub(
+            r"^(loop_delay_s = )([0-9.e+-]+)",
+            lambda m: f"{m.group(1)}{float(m.group(2)) + shift:.6g}",
+            healed.text,
+            flags=re.MULTILINE,
+        )
+        write_text_atomic(out, text)
+        healed = load_bench(out)
+    return healed
+
+
+def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
+    if compared.recording is None:
+        return ()
+    from tools.mismatch.engine.diagnose import diagnose
+
+    report = diagnose(compared.recording, jobs=jobs)
+    return tuple(p.name for p in report.physics)
+
+
+def _step(part: Part, compared: Comparison, effects: tuple[str, ...], kept: bool, why: str, after: TipError) -> Step:
+    none = tuple(e for e in effects if e not in STACK_EFFECTS)
+    return Step(part.name, compared.rms, compared.unit, effects, none, kept, why, after.mean())
+
+
+def lines(healed: Healed) -> list[str]:
+    """What the command prints, a sentence per line, and a table."""
+    out: list[str] = []
+    for s in healed.steps:
+        named = f"; the engine names {', '.join(s.effects).replace('_', ' ')}" if s.effects else ""
+        out.append(f"{s.part}: differs from what the firmware believes by {s.difference:.3g} {s.unit} rms{named}.")
+        out += [f"  {e.replace('_', ' ')}: the firmware has no remedy." for e in s.no_remedy]
+        out.append(f"  {'kept' if s.kept else 'reverted'}: {s.why}.")
+    out.append(f"tip error, um rms, mean of {len(healed.seeds)} runs of {healed.seconds:g} s")
+    out += [f"  {b:12} {healed.before[b]:8.3f} -> {healed.after[b]:8.3f}" for b in (*BANDS, WHOLE)]
+    return out

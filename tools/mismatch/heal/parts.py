@@ -1,0 +1,199 @@
+"""What the lab measures of the stacks, the manipulator and the sensors, and what the firmware believes of each.
+
+Each part is compared on a recording of its own before anything is identified; the remedy is the calibration that
+``micron calibrate`` would write from the lab's set of recordings.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from firmware_py.actuation.config import StackConfig
+from firmware_py.actuation.manipulator import star_tip
+from firmware_py.control.plan import load_plan
+from hal.bench import BenchFile
+from sim_devices.config import EmulationConfig
+from sim_devices.plant.lab import (
+    CALIBRATION_SET,
+    INTERFEROMETER_RMS_UM,
+    in_place,
+    measure_piezo,
+    measure_tumble,
+    write_recording,
+)
+from sim_devices.plant.lab_scan import measure_scan
+from sim_devices.plant.streams import stream
+from tools.calibrate.calibration_file import calibration_toml
+from tools.calibrate.manipulator import identify_manipulator, load_scan, manipulator_calibration
+from tools.calibrate.piezo import identify_stack, piezo_calibration
+from tools.calibrate.piezo_prediction import simulate as predict_stroke
+from tools.calibrate.tumble import identify as identify_sensors
+from tools.calibrate.tumble import load_tumble
+from tools.mismatch.recording import Recording
+from tools.mismatch.recording_load import from_table, load
+
+AMPLITUDE_V = 41.7
+CHECK_S, CHECK_HZ = 8.0, 250.0
+"""Length of the recording by which a stack is compared, and the rate at which it is diagnosed."""
+PROFILES = (("loops", 10.0), ("sawtooth", 2.0))
+"""Inputs of the comparison: minor loops about every level, then one speed between those of the calibration."""
+POSITIONS, POSITION_S = 100, 5.0
+GRID = 5
+
+
+@dataclass(frozen=True)
+class Lab:
+    """The emulated bench and its reference instruments. ``seed`` draws their noise."""
+
+    bench: BenchFile
+    config: EmulationConfig
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``rms`` of measured less believed, in ``unit``; ``recording``: for the engine, with the believed course as its
+    simulated column.
+    """
+
+    rms: float
+    unit: str
+    recording: Recording | None = None
+
+
+@dataclass(frozen=True)
+class Part:
+    """``compare`` measures and compares; ``identify`` writes the calibration to a folder and returns it."""
+
+    name: str
+    compare: Callable[[Lab], Comparison]
+    identify: Callable[[Lab], Path]
+
+
+def _stack_configs(bench: BenchFile) -> Sequence[StackConfig]:
+    return load_plan(bench).stages.actuation.stacks
+
+
+def _measured_stack(lab: Lab, axis: int, profile: str, rate_hz: float, seconds: float, volts: float) -> dict[str, Any]:
+    twin = in_place(lab.config, lab.bench.path, axis, None)
+    return measure_piezo(lab.config, axis, profile, rate_hz, seconds, volts, twin)[0]
+
+
+def compare_stacks(lab: Lab) -> Comparison:
+    """The worst stack against the firmware's model of it, about the mean of both."""
+    worst: tuple[float, Recording] | None = None
+    for axis, believed in enumerate(_stack_configs(lab.bench)):
+        parts = [_measured_stack(lab, axis, p, hz, CHECK_S, AMPLITUDE_V) for p, hz in PROFILES]
+        predicted = [predict_stroke(believed, p["command_V"]) for p in parts]
+        for part, said in zip(parts, predicted, strict=True):
+            away = part["displacement_um"] - said
+            rms = float(np.std(away))
+            if worst is None or rms > worst[0]:
+                worst = (rms, _as_columns(lab, axis, part, said))
+    assert worst is not None
+    return Comparison(worst[0], "um", worst[1])
+
+
+def _as_columns(lab: Lab, axis: int, part: dict[str, Any], said: np.ndarray) -> Recording:
+    step = round(1000.0 / CHECK_HZ)
+    columns = {
+        "command_V": part["command_V"][::step],
+        "believed_um": said[::step] - said.mean() + part["displacement_um"].mean(),
+        "displacement_um": part["displacement_um"][::step],
+    }
+    text = {
+        "format": 1, "rate_hz": CHECK_HZ, "title": f"stack {axis + 1} against the firmware's model",
+        "twin": {"kind": "columns"},
+        "channels": [
+            {"column": "command_V", "role": "input", "signal": "command", "unit": "V"},
+            {"column": "believed_um", "role": "input", "signal": "simulated_displacement", "unit": "um"},
+            {"column": "displacement_um", "role": "output", "signal": "displacement", "unit": "um",
+             "noise_rms": INTERFEROMETER_RMS_UM},
+        ],
+    }  # fmt: skip
+    return from_table(lab.folder / f"stack{axis + 1}", text, columns)
+
+
+def identify_stacks(lab: Lab) -> Path:
+    """The calibration of all three stacks from the lab's set of recordings."""
+    fits: list[Any] = []
+    for axis in range(3):
+        recordings: list[Recording] = []
+        for profile, rate_hz, seconds, share in CALIBRATION_SET:
+            twin = in_place(lab.config, lab.bench.path, axis, None)
+            columns, text = measure_piezo(lab.config, axis, profile, rate_hz, seconds, share * AMPLITUDE_V, twin)
+            folder = lab.folder / f"stack{axis + 1}" / f"{profile}-{rate_hz:g}Hz-{share:g}"
+            write_recording(folder, columns, text)
+            recordings.append(load(folder))
+        fits.append(identify_stack(recordings))
+    file = lab.folder / "piezo.toml"
+    file.write_text(piezo_calibration(fits, "piezo stacks"))
+    return file
+
+
+def compare_manipulator(lab: Lab) -> Comparison:
+    """The tip against the firmware's geometry at a grid of voltages."""
+    a = load_plan(lab.bench).stages.actuation
+    data = load_scan(_scan(lab))
+    rest, at, zero = np.array(a.rest_heights_m), np.empty((len(data["tip_um"]), 3)), np.empty(3)
+    star_tip(rest, a.ball_circle_m, a.shaft_m, zero)
+    for k, stroke in enumerate(data["stroke_um"]):
+        star_tip(rest + np.array(a.lever_gain) * stroke * 1e-6, a.ball_circle_m, a.shaft_m, at[k])
+    # rows of the mounting are the manipulator's axes in the body
+    away = data["tip_um"] - 1e6 * (at - zero) @ np.array(a.mounting)
+    return Comparison(float(np.sqrt(np.mean((away - away.mean(axis=0)) ** 2))), "um")
+
+
+def _scan(lab: Lab) -> Path:
+    folder = lab.folder / "scan"
+    columns, text = measure_scan(lab.config, GRID, stream(lab.config.seed, "lab.manipulator"))
+    write_recording(folder, columns, text)
+    return folder
+
+
+def identify_geometry(lab: Lab) -> Path:
+    """The calibration of the manipulator from a scan of its workspace."""
+    file = lab.folder / "manipulator.toml"
+    file.write_text(manipulator_calibration(identify_manipulator(load_scan(_scan(lab))), "manipulator"))
+    return file
+
+
+def compare_sensors(lab: Lab) -> Comparison:
+    """The accelerometer axes against the firmware's calibration at resting attitudes."""
+    sensing = load_plan(lab.bench).stages.sensing
+    data = load_tumble(_tumble(lab))
+    gravity = lab.config.environment.gravity_m_s2
+    force = data["attitude"].transpose(0, 2, 1) @ np.array([0.0, 0.0, 1.0])
+    ratio = data["analog_V"][:, 6] * sensing.supply_divider / sensing.nominal_supply_V
+    said = np.array(sensing.bias_V) + np.array(sensing.scale_V_per_g) * (force @ np.array(sensing.axes).T)
+    away = (data["analog_V"][:, :6] / ratio[:, None] - said) / np.array(sensing.scale_V_per_g)
+    return Comparison(gravity * float(np.sqrt(np.mean(away**2))), "m/s^2")
+
+
+def _tumble(lab: Lab) -> Path:
+    folder = lab.folder / "tumble"
+    columns, text = measure_tumble(lab.config, POSITIONS, POSITION_S)
+    write_recording(folder, columns, text)
+    return folder
+
+
+def identify_tumble(lab: Lab) -> Path:
+    """The calibration of the sensors from resting attitudes."""
+    found = identify_sensors(load_tumble(_tumble(lab)), quadratic=True, fit_drift=False)
+    table = {"sensing": {**found.table, "gravity_m_s2": lab.config.environment.gravity_m_s2}}
+    file = lab.folder / "sensors.toml"
+    file.write_text(calibration_toml("sensors", "micron mismatch heal", table))
+    return file
+
+
+PARTS = (
+    Part("stacks", compare_stacks, identify_stacks),
+    Part("manipulator", compare_manipulator, identify_geometry),
+    Part("sensors", compare_sensors, identify_tumble),
+)
+"""In the order in which they are healed: what moves the tip, then what measures it."""
