@@ -233,8 +233,8 @@ def picture(truth: Mapping[str, Array], result: Mapping[str, Any]) -> bytes:
         for key, colour in (("tip_rigid_m", "0.65"), ("tip_m", "C0")):
             path = 1e6 * np.asarray(truth[key])[scored, i]
             frequency, power = welch(path, rate_hz, nperseg=min(len(path), 2048), detrend="linear")
-            right.semilogy(frequency[1:], np.sqrt(power[1:]), color=colour, lw=1.2)
-        right.set_xlim(0, 40)
+            right.loglog(frequency[1:], np.sqrt(power[1:]), color=colour, lw=1.2)
+        right.set_xlim(frequency[1], 0.5 * rate_hz)
         right.set_ylim(1e-3, None)
         right.set_ylabel("um/sqrt(Hz)")
         right.axvspan(*TREMOR_BAND_HZ, color="C1", alpha=0.12, lw=0)

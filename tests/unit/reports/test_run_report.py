@@ -119,3 +119,15 @@ def test_the_four_results_of_a_run_do_not_depend_on_one_another(
         assert json.loads(files["JSON"].read_text())["tremor"]["reduction_percent"] == 80.0
     leftovers = list(tmp_path.rglob(".*"))
     assert leftovers == []
+
+
+def test_the_page_has_every_band(sensed: dict[str, Any]) -> None:
+    bands = [
+        {"low_Hz": 0.0, "high_Hz": 2.0, "without_um": 40.0, "with_um": 41.0},
+        {"low_Hz": 20.0, "high_Hz": 500.0, "without_um": 0.1, "with_um": 0.75},
+    ]
+    tremor = {**sensed["tremor"], "bands": bands}
+    page = run_report.html_page({**sensed, "tremor": tremor}, None)
+    assert "below 2 Hz<td>40.00" in page
+    assert "20-500 Hz" in page
+    assert "<td>0.75" in page
