@@ -10,6 +10,7 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
+from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.found import _units
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.make import make
@@ -41,3 +42,34 @@ def test_unit(rec: Any, name: str, site: Any, target: str, unit: str, shown: str
     placed = Placed(EFFECTS[name], site, target, EFFECTS[name].stages[0], (output,))
     problem = cast(Any, SimpleNamespace(twin=twin))
     assert _units(problem, unit, target, output, placed) == shown
+
+
+def test_an_axis_shows_its_mass() -> None:
+    """The base parameters of a report are those of the file: the engine's own are ratios to the mass."""
+    rng = np.random.default_rng(5)
+    dt, n = 0.002, 3000
+    force = np.repeat(rng.normal(0.0, 3.0, n // 20), 20)
+    state, rows = np.zeros(2), np.empty(n)
+    system = np.array([[0.0, 1.0], [-10.0 / 1.3, -0.5 / 1.3]])
+    for k in range(n):  # Runge-Kutta of order 4 for the true mass of 1.3 kg
+        rows[k] = state[0]
+
+        def slope(x: Any, f: float = force[k]) -> Any:
+            return system @ x + np.array([0.0, f / 1.3])
+
+        a = slope(state)
+        b = slope(state + dt / 2 * a)
+        c = slope(state + dt / 2 * b)
+        state = state + dt / 6 * (a + 2 * b + 2 * c + slope(state + dt * c))
+    position = rows + rng.normal(0.0, 1e-3, n)
+    rec = recording(
+        "mechanical_axis", dt, {"force": force}, {"position": position}, {"force": "N", "position": "m"},
+        {"mass": 1.0, "damping": 0.5, "stiffness": 10.0, "hold": "zero"},
+    )  # fmt: skip
+    fit = diagnose(rec, jobs=1, effects=[]).fit
+    shown = {b.name: b for b in fit.base_human}
+    assert list(shown) == ["mass", "damping", "stiffness", "offset_force"]
+    mass = shown["mass"]
+    assert (mass.unit, mass.given) == ("N s^2/m", 1.0)
+    assert mass.with_effects == pytest.approx(1.3, rel=0.01)
+    assert mass.ci95[0] < 1.3 < mass.ci95[1]

@@ -12,9 +12,9 @@ from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.exported import exported_fit, raw_values
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.found import alternatives, physics_found
+from tools.mismatch.engine.found import alternatives, human_values, physics_found
 from tools.mismatch.engine.identifiability import detection
-from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.intervals import Uncertainty, uncertainty
 from tools.mismatch.engine.locate import follow, regime, windows
 from tools.mismatch.engine.one_way import one_way
 from tools.mismatch.engine.parsimony import Rule
@@ -55,6 +55,17 @@ def base_shifts(raw: Fit, base: Fit, fitted: Fit, deviations: Array) -> list[Bas
         v = float(fitted.theta[i])
         shifts.append(BaseShift(p.name, p.unit, float(raw.theta[i]), float(base.theta[i]), v, (v - half, v + half)))
     return shifts
+
+
+def human_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit, unsure: Uncertainty) -> list[BaseShift]:
+    """Return ``base_shifts`` under the names and units of the twin's file."""
+    given, alone = ({h.name: float(h.value) for h in fit.model.human(fit.theta)["base"]} for fit in (raw, base))
+    found = human_values(problem, fitted, unsure)["base"]
+    return [
+        BaseShift(name, v.unit, given[name], alone[name], v.value, v.ci95)
+        for name, v in found.items()
+        if name in given and name in alone
+    ]
 
 
 def assemble(
@@ -173,6 +184,7 @@ def assemble(
             decision.floors,
             dict(rec.tolerance),
             {o: rec.file_unit[o] for o in twin.outputs if rec.file_unit[o] != twin.units[o]},
+            tuple(human_shifts(problem, raw, base, fitted, unsure)),
         ),
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),

@@ -172,6 +172,8 @@ class FitSummary:
     tolerance: Mapping[str, float] = field(default_factory=dict[str, float])
     file_unit: Mapping[str, str] = field(default_factory=dict[str, str])
     """Unit of an output in the data file, where it is not ``unit``: people are shown that one."""
+    base_human: tuple[BaseShift, ...] = ()
+    """The base parameters under the names and units of the twin's file (mass, not its inverse), for people."""
     sealed: Sealed | None = None
 
 

@@ -142,8 +142,8 @@ def follows(location: Location) -> str:
 
 
 def base_rows(report: Report) -> tuple[BaseShift, ...]:
-    """Base parameters under the names that a bench engineer knows, if the engine gave them."""
-    return getattr(report.fit, "base_human", ()) or report.fit.base_parameters
+    """Return the base parameters under the names of the twin's file, if the engine gave them."""
+    return report.fit.base_human or report.fit.base_parameters
 
 
 def guilty_stages(report: Report) -> tuple[str, ...]:
