@@ -122,7 +122,8 @@ def page(runs: Sequence[Mapping[str, Any]]) -> str:
         " itself; each seed draws all its values, and its data sheet is a few per cent off. `right`: every name and no"
         " other is surer than 50 %; `part`: some of the names; `advice`: `unexplained`, with the kind of twin that"
         " would say more; `unsure`: no name is surer than 50 %; `missed`: no difference seen; `wrong`: another name"
-        " is surer than 50 %.",
+        " is surer than 50 %. The eccentric load has to be named `gravity_load`; before there was that name, `cogging`"
+        " was right.",
         "",
         f"{len(rows)} cases: " + ", ".join(f"{w} {k}" for w, k in {**tally, **bad}.items() if k or w in bad) + ".",
     ]
