@@ -293,7 +293,7 @@ def left_out(
     straight = ctx.line(x, index)
     first = float(x[0])
     wide = slips_once(lo, hi, first if before is None else before)
-    bent = loop_of(x, residual, ctx, lo, hi, wide, before) if form == "stops_curved" else None
+    bent = loop_of(x, residual, ctx, lo, hi, wide=wide, before=before) if form == "stops_curved" else None
     e = columns(x, form, lo, hi, first, ctx.starts, wide, before, bent).T
     a = np.column_stack([straight, *(ctx.to_output(np.ascontiguousarray(c))[index] for c in e)])
 
@@ -311,7 +311,7 @@ def left_out(
     return min((Chosen(left(sign), form, before, sign, bent) for sign in signs), key=lambda c: c.left)
 
 
-def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, wide: bool, before: float | None) -> Bent:
+def loop_of(x: Array, residual: Array, ctx: Context, lo: float, hi: float, *, wide: bool, before: float | None) -> Bent:
     """The loop of stops that meets the output best."""
     index = thin(ctx.keep, 6000)
     e = columns(x, "stops", lo, hi, float(x[0]), ctx.starts, wide, before)
