@@ -60,7 +60,7 @@ def actuate_dtype(n_plays: int, n_zones: int, n_creep: int) -> np.dtype[Any]:
             ("tick_hz", "f8"),
             ("yield_keep", "f8"),
             ("overdrive", "f8"),
-            ("tilts", "?"),
+            ("tilts", "i8"),
             ("centre", "f8"),  # m of every stroke, where compensation works about
             ("mounting", "f8", (3, 3)),
             ("geometry", GEOMETRY),

@@ -41,7 +41,7 @@ LEAST_ROOM = 0.1  # of a stroke's half range whatever the core takes, of that ro
 
 @kernel
 def shrink_core(
-    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, tilts: bool, keep: float, state: Record
+    stroke: Array, core: Array, low: Array, high: Array, overdrive: float, tilts: int, keep: float, state: Record
 ) -> bool:
     """Shrink the swing of ``core`` (3,) m to ``overdrive`` times the stroke at most, and ``stroke`` (3,) by as much.
     Return True if anything was shrunk.
@@ -66,7 +66,7 @@ def shrink_core(
     turned *= ticks
     forget = np.exp(-1.0 / (np.pi * ticks)) if ticks > 0.0 else 0.0
     tilt = 1.0
-    if tilts and overdrive > 0.0:
+    if tilts != 0 and overdrive > 0.0:
         for i in range(3):
             side, across = core[i] - mean, ticks * (core[i] - state.core_last[i]) - turned
             swing = np.sqrt(side * side + across * across)

@@ -104,7 +104,7 @@ def shrunk(cores: np.ndarray, overdrive: float, tilts: bool = True) -> np.ndarra
     state, out = np.zeros(1, YIELD_STATE), cores.copy()
     for core in out:
         stroke = core + 1e-6
-        shrink_core(stroke, core, LOW, HIGH, overdrive, tilts, KEEP, state[0])
+        shrink_core(stroke, core, LOW, HIGH, overdrive, int(tilts), KEEP, state[0])
         np.testing.assert_allclose(stroke - core, 1e-6, atol=1e-18)
     return out
 
@@ -161,7 +161,7 @@ def test_kernel_and_python_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     for k, core in enumerate(rng.uniform(-9e-6, 9e-6, (50, 3))):
         found, stroke = core.copy(), core + 1e-6
         monkeypatch.undo()
-        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, True, KEEP, fast[0])
+        flag = shrink_core(stroke.copy(), found, LOW, HIGH, 1.2, 1, KEEP, fast[0])
         without_compiler(monkeypatch)
-        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, True, KEEP, attributes(slow)[0]) == flag, k
+        assert yielding.shrink_core(stroke, core, LOW, HIGH, 1.2, 1, KEEP, attributes(slow)[0]) == flag, k
         np.testing.assert_allclose(core, found, atol=1e-18)
