@@ -37,7 +37,7 @@ def heal(
 
         path = bench_path(Path(bench))
         file = load_bench(path)
-        from tools.mismatch.heal import heal as healing
+        from tools.heal import heal as healing
 
         healing.check_bench(file, max_effect)
         out.mkdir(parents=True, exist_ok=True)

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 
 from hal.bench import load_bench
 from tools.cli.main import app
-from tools.mismatch.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
-from tools.mismatch.heal.heal import Healed, Step, lines, with_remedy
-from tools.mismatch.heal.parts import Lab, compare_manipulator, compare_sensors, compare_stacks
+from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
+from tools.heal.heal import Healed, Step, lines, with_remedy
+from tools.heal.parts import Lab, compare_manipulator, compare_sensors, compare_stacks
 
 ROOT = Path(__file__).parents[3]
 MICRON = ROOT / "benches/micron.toml"

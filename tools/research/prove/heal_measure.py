@@ -15,8 +15,8 @@ from typing import Any
 
 from hal.bench import load_bench
 from tools.emulate.shipped import bench_file
-from tools.mismatch.heal.figures import BANDS, WHOLE, tip_error
-from tools.mismatch.heal.heal import heal
+from tools.heal.figures import BANDS, WHOLE, tip_error
+from tools.heal.heal import heal
 from tools.output import write_text_atomic
 from tools.research.prove.harness import read_rows
 

@@ -12,8 +12,8 @@ from hal.bench import SIM_SCHEME, BenchFile, load_bench
 from sim_devices.config import emulation_config
 from tools.bench.bench_copy import with_calibration
 from tools.errors import InputError
-from tools.mismatch.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
-from tools.mismatch.heal.parts import PARTS, Comparison, Lab, Part
+from tools.heal.figures import BANDS, WHOLE, TipError, is_better, tip_error
+from tools.heal.parts import PARTS, Comparison, Lab, Part
 from tools.output import write_text_atomic
 
 VERIFY_FROM = 1000
