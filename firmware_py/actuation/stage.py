@@ -228,8 +228,9 @@ def actuate_kernel(frame: NDArray[np.float64], states: Record, params: Record) -
         nearest_reachable(tip, param.geometry, low, high, stroke)
     if param.centre != 0.0:
         on = min(state.on[0], state.on[1], state.on[2])
+        share = on * on * (3.0 - 2.0 * on)  # the way to the middle and back has no corners
         for i in range(3):
-            stroke[i] += on * param.centre
+            stroke[i] += share * param.centre
         tip_from_strokes(stroke, param.geometry, tip)
     for i in range(3):
         past = state.strokes[i]
