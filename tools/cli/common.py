@@ -30,7 +30,14 @@ JsonOption = Annotated[
 ]
 
 
-DECIDING = (("mismatch", "diagnose"), ("mismatch", "apply"), ("mismatch", "simulate"), ("mismatch", "watch"), ("run",))
+DECIDING = (
+    ("mismatch", "diagnose"),
+    ("mismatch", "apply"),
+    ("mismatch", "simulate"),
+    ("mismatch", "watch"),
+    ("mismatch", "plan"),
+    ("run",),
+)
 """The commands that take ``--trust`` and ``--allow-outside``."""
 
 

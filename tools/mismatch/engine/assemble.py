@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
-from tools.mismatch.engine.exported import exported_fit, raw_values
+from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.found import alternatives, human_values, physics_found
 from tools.mismatch.engine.identifiability import detection
@@ -95,7 +95,7 @@ def assemble(
     shifts = base_shifts(raw, base, fitted, unsure.deviations())
     runners, groups, alike = alternatives(problem, selection, rule)
     physics = physics_found(problem, selection, unsure, alike)
-    exported = exported_fit(problem, fitted)
+    exported = without_events(problem, fitted)
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
     physics = [replace(f, raw=raws.get(label, f.raw)) for f, label in zip(physics, labels, strict=True)]

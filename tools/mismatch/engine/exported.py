@@ -1,4 +1,4 @@
-"""The model that a corrected twin is written from: without what happened in one recording, fitted on all of it."""
+"""The model that a corrected twin is written from: without what happened in one recording, solved again without it."""
 
 from __future__ import annotations
 
@@ -6,44 +6,11 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from tools.mismatch.apply import EVENTS
-from tools.mismatch.engine.fit import SEARCH_ROWS, Fit, fit
+from tools.mismatch.engine.fit import SEARCH_ROWS, Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected
 from tools.mismatch.engine.residual import residuals
-from tools.mismatch.engine.split import Split
-from tools.mismatch.engine.trust import fit_loss
 from tools.mismatch.simulate import Model
-from tools.mismatch.twins.cascade import CascadeTwin
-from tools.mismatch.twins.corrected import CorrectedTwin
-from tools.mismatch.twins.dynamic import DynamicTwin
-from tools.mismatch.twins.ode import OdeTwin
-
-
-def exported_fit(problem: Problem, fitted: Fit) -> Fit:
-    """The fit that a twin file is written from: ``fitted`` without events, on every sample of the recording.
-
-    What was held out has chosen and judged the model by then; to leave it out of the parameters would waste it. A
-    ``test`` part that the recording names is not touched.
-    """
-    kept = without_events(problem, fitted)
-    if not problem.split.own:
-        return kept
-    every = on_every_sample(problem)
-    model = Model(every.twin, kept.model.placed)
-    before = fit_loss(every, residuals(every, model, kept.theta))
-    again = fit(every, model, [kept.theta], iterations=15)
-    if not again.ok or fit_loss(every, again.residual) > before:
-        return kept
-    return replace(kept, theta=again.theta, residual=residuals(problem, kept.model, again.theta))
-
-
-def on_every_sample(problem: Problem) -> Problem:
-    """The same problem with nothing held out, in the one run that a twin file is used for."""
-    twin, split = problem.twin, problem.split
-    if twin.restart and isinstance(twin, DynamicTwin | CorrectedTwin | OdeTwin | CascadeTwin):
-        twin = replace(twin, restart=False)
-    begin = min(a for a, _ in (*split.fit, *split.held_out))
-    return replace(problem, twin=twin, split=Split(split.n, ((begin, split.n),), (), (), ()), hints=())
 
 
 def without_events(problem: Problem, fitted: Fit) -> Fit:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 
 from tools.mismatch.engine.diagnose import Posed, ranges_of
-from tools.mismatch.engine.exported import exported_fit
+from tools.mismatch.engine.exported import without_events
 from tools.mismatch.engine.fit import Fit
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Sealed
@@ -64,7 +64,7 @@ def score_sealed(whole: Recording, posed: Posed, base: Fit, fitted: Fit) -> Seal
     if problem.twin.restart:
         split = shot(split, problem.init, PIECES)
     onward = replace(problem, recording=full, split=split, hints=())
-    return Sealed(tail[0], "", *(_rms(onward, f) for f in (posed.raw, base, exported_fit(problem, fitted))))
+    return Sealed(tail[0], "", *(_rms(onward, f) for f in (posed.raw, base, without_events(problem, fitted))))
 
 
 def _rms(problem: Problem, fitted: Fit) -> dict[str, float]:
