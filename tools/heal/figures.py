@@ -20,6 +20,8 @@ WHOLE = "2-500 Hz"
 SETTLE_S = 2.0
 LEVEL = 0.05
 """Level of the paired tests over seeds."""
+LEAST_FALL = 0.01
+"""Smallest fall of the error, as a share of it, for which a bench is changed."""
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,20 @@ def tip_error(bench: BenchFile, seconds: float, seeds: Sequence[int]) -> TipErro
 
 
 def is_better(before: TipError, after: TipError) -> tuple[bool, str]:
-    """Whether ``after`` is better than ``before`` on the same seeds, and why in words (paired t-tests at ``LEVEL``).
+    """Return if ``after`` is better than ``before`` on the same seeds, and why in words (paired t-tests at ``LEVEL``).
 
-    The error from 2 to 500 Hz, in which the bands above 2 Hz count by their power, must fall, and the error below 2 Hz
-    must not rise. A band above 2 Hz that rises although the whole falls is named.
+    The error from 2 to 500 Hz, in which the bands above 2 Hz count by their power, must fall by ``LEAST_FALL`` or more,
+    and the error below 2 Hz must not rise. A band above 2 Hz that rises although the whole falls is named.
     """
     change = {b: after.bands[b] - before.bands[b] for b in (*BANDS, WHOLE)}
     rises = {b: f"{b} rises by {float(np.mean(d)):.2g} um" for b, d in change.items() if _p_above_zero(d) < LEVEL}
     if SLOW in rises:
         return False, f"the error {rises[SLOW]}"
-    if _p_above_zero(-change[WHOLE]) < LEVEL:
+    is_worth_it = float(np.mean(-change[WHOLE])) >= LEAST_FALL * float(np.mean(before.bands[WHOLE]))
+    if is_worth_it and _p_above_zero(-change[WHOLE]) < LEVEL:
         fall = f"the error {WHOLE} falls by {float(np.mean(-change[WHOLE])):.2g} um"
         return True, ", but ".join((fall, *rises.values()))
-    return False, f"the error {WHOLE} does not fall beyond what differs between runs"
+    return False, f"the error {WHOLE} does not fall by {LEAST_FALL:.0%} or more, beyond what differs between runs"
 
 
 def _p_above_zero(x: Array) -> float:

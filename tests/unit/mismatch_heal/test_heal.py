@@ -50,6 +50,14 @@ def test_what_changes_nothing_is_reverted():
     assert not is_better(errors({}), errors({}))[0]
 
 
+def test_a_fall_that_is_too_small_to_matter_is_reverted():
+    before = errors({})
+    after = TipError({b: v - 0.001 for b, v in before.bands.items()})
+    kept, why = is_better(before, after)
+    assert not kept
+    assert "1% or more" in why
+
+
 def concealed(tmp_path: Path, table: str) -> Path:
     text = MICRON.read_text().replace('"calibration/', f'"{MICRON.parent}/calibration/')
     file = tmp_path / "bench.toml"
