@@ -14,6 +14,12 @@ settings.load_profile("same")
 DEFAULT_BENCH = Path(__file__).parents[1] / "benches" / "micron.toml"
 
 
+def with_keys(bench: str, table: str, keys: str) -> str:
+    """Return the text of a bench with the lines ``keys`` in ``[table]``, which may be there already."""
+    head = f"[{table}]\n"
+    return bench.replace(head, head + keys) if head in bench else f"{bench}\n{head}{keys}"
+
+
 def copy_of_default_bench(folder: Path, more_toml: str) -> Path:
     """The default bench with ``more_toml`` at its end, in ``folder``."""
     text = DEFAULT_BENCH.read_text().replace('"calibration/', f'"{DEFAULT_BENCH.parent / "calibration"}/')

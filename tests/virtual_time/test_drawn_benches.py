@@ -23,7 +23,7 @@ from firmware_py.run.loop import Loop
 from hal.bench import OpenBench, load_bench, open_bench
 from hal.errors import BenchError
 from sim_devices.lockstep_world import LockstepWorld
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import DEFAULT_BENCH, with_keys
 
 DRAWS = int(os.environ.get("MICRON_DRAWS", "10"))
 RUN_S = 0.1
@@ -75,7 +75,8 @@ class Draw:
         if self.cutoff_rad_s is not None:
             text = text.replace("[firmware.tremor]", f"[firmware.tremor]\nfilter_cutoff_rad_s = {self.cutoff_rad_s!r}")
         text += "\n[firmware.self_test]\nwatch_ms = 50.0\n"
-        text += "\n[firmware.actuation]\n" + "".join(f"{key} = {value}\n" for key, value in self.actuation.items())
+        keys = "".join(f"{key} = {value}\n" for key, value in self.actuation.items())
+        text = with_keys(text, "firmware.actuation", keys)
         path = folder / "bench.toml"
         path.write_text(text)
         return path

@@ -12,11 +12,11 @@ from hal.bench import load_bench
 from hal.errors import BenchError
 from sim_devices.config import AmplifierConfig, emulation_config
 from sim_devices.world import MONITOR_RATIO
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import DEFAULT_BENCH, with_keys
 
 
-def bench_with(tmp_path: Path, *changes: tuple[str, str], more: str = "") -> Path:
-    """The default bench without calibrations, with texts replaced and ``more`` at its end."""
+def bench_with(tmp_path: Path, *changes: tuple[str, str], actuation: str = "", more: str = "") -> Path:
+    """The default bench without calibrations, with texts replaced, keys of ``[firmware.actuation]`` and ``more``."""
     text = "".join(
         line
         for line in DEFAULT_BENCH.read_text().splitlines(keepends=True)
@@ -26,7 +26,7 @@ def bench_with(tmp_path: Path, *changes: tuple[str, str], more: str = "") -> Pat
         assert text.count(old) == 1, old
         text = text.replace(old, new)
     path = tmp_path / "bench.toml"
-    path.write_text(text + more)
+    path.write_text(with_keys(text, "firmware.actuation", actuation) + more)
     return path
 
 
@@ -40,13 +40,13 @@ def test_stage_and_emulation_follow_the_output(tmp_path: Path) -> None:
 
 
 def test_a_stage_may_be_narrower_than_its_output(tmp_path: Path) -> None:
-    path = bench_with(tmp_path, more="[firmware.actuation]\nhigh_V = 90.0\n")
+    path = bench_with(tmp_path, actuation="high_V = 90.0\n")
     assert load_plan(load_bench(path)).stages.actuation.high_V == 90.0
 
 
 @pytest.mark.parametrize("given", ["low_V = -1.0", "high_V = 120.0", "neutral_V = 49.0", "slew_V_per_s = 20001.0"])
 def test_a_stage_that_contradicts_its_output_is_refused(tmp_path: Path, given: str) -> None:
-    path = bench_with(tmp_path, more=f"[firmware.actuation]\n{given}\n")
+    path = bench_with(tmp_path, actuation=f"{given}\n")
     with pytest.raises(BenchError, match=rf"{given.split()[0]} = .* of \[device\.piezo\]: leave"):
         load_plan(load_bench(path))
 

@@ -10,16 +10,16 @@ from firmware_py.control.plan import load_plan
 from firmware_py.control.stages import Stages
 from hal.bench import load_bench
 from hal.errors import BenchError
-from tests.conftest import DEFAULT_BENCH
+from tests.conftest import DEFAULT_BENCH, with_keys
 
 
-def bench_at(tmp_path: Path, tick_hz: int, more: str = "") -> Path:
+def bench_at(tmp_path: Path, tick_hz: int, actuation: str = "") -> Path:
     """The default bench at another rate, without its calibration."""
     text = DEFAULT_BENCH.read_text()
     text = text.replace("tick_hz = 1000", f"tick_hz = {tick_hz}").replace("rate_hz = 1000", f"rate_hz = {tick_hz}")
     lines = [line for line in text.splitlines() if not line.startswith(("calibration = ", "loop_delay_s = "))]
     path = tmp_path / "bench.toml"
-    path.write_text("\n".join(lines) + "\n" + more)
+    path.write_text(with_keys("\n".join(lines) + "\n", "firmware.actuation", actuation))
     return path
 
 
@@ -33,14 +33,14 @@ def test_every_stage_is_designed_for_the_clock(tmp_path: Path, tick_hz: int) -> 
 
 
 def test_a_stage_that_names_another_rate_is_refused(tmp_path: Path) -> None:
-    path = bench_at(tmp_path, 500, "[firmware.actuation]\ntick_hz = 1000.0\n")
+    path = bench_at(tmp_path, 500, "tick_hz = 1000.0\n")
     with pytest.raises(BenchError, match=r"firmware\.actuation: tick_hz = 1000\.0, but \[clock\] tick_hz is 500"):
         load_plan(load_bench(path))
 
 
 def test_taps_of_another_rate_are_refused(tmp_path: Path) -> None:
-    path = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\n")
+    path = bench_at(tmp_path, 500, "feedforward = [1.2, -0.2]\n")
     with pytest.raises(BenchError, match=r"the taps of feedforward are for ticks of 1000 Hz, this bench has 500 Hz"):
         load_plan(load_bench(path))
-    same = bench_at(tmp_path, 500, "[firmware.actuation]\nfeedforward = [1.2, -0.2]\ntick_hz = 500.0\n")
+    same = bench_at(tmp_path, 500, "feedforward = [1.2, -0.2]\ntick_hz = 500.0\n")
     assert load_plan(load_bench(same)).stages.actuation.feedforward[0] == (1.2, -0.2)

@@ -17,6 +17,7 @@ from scipy.signal import StateSpace, dlsim, lsim
 
 from hal.trust import NotTrusted, trust_package
 from sim_devices.physics.catalogue import EFFECTS
+from sim_devices.physics.forces import COGGING, FRICTION, SPRING
 from tests.unit.mismatch_model.made import recording
 from tools.errors import RecordingError
 from tools.mismatch.placed import Placed
@@ -286,10 +287,11 @@ def test_linear_kernels_equal_python() -> None:
     args = (d.ad, d.g0, d.g1, c, u, starts)
     np.testing.assert_allclose(run_output(*args), run_output.py_func(*args), atol=1e-14)
     rows = (
-        np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0]),
+        np.array([0.2, 0.05, 0.1, 0.3, 0.02, 0.0, 0.0]),
         np.array([3.0, 0.5, 2.0, 1.0, 0.1, 0.2, 0.4, 0.05, 0.1]),
-        np.array([0.1, 0.2, 0.1, 0.0, 0.05]),
+        np.array([0.1, 0.2, 0.1, 0.0, 0.05, 0.3, -0.1]),
     )
+    assert [row.size for row in rows] == [FRICTION, SPRING, COGGING]
     more = (np.array([0.01]), np.array([2.0]))
     cp, cv = np.array([1.0, 0.0]), np.array([0.0, 1.0])
     for dry, stiff in ((True, 0.0), (False, 60.0)):
