@@ -1,4 +1,4 @@
-"""The ports that a compiled loop reads and writes by their descriptors."""
+"""Describes the ports that a compiled loop reads and writes by their descriptors."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from hal.contracts import Clock
 
 @runtime_checkable
 class Descriptor(Protocol):
-    """A port with a non-blocking file descriptor."""
+    """Describes a port with a non-blocking file descriptor."""
 
     def fileno(self) -> int: ...
 
 
 @runtime_checkable
 class Fed(Descriptor, Protocol):
-    """A port of virtual time. ``feed`` lets time pass until bytes are there, at most ``timeout_s``, and puts them where
-    the descriptor reads them; ``flush`` takes to the device what was written to the descriptor."""
+    """Describes a port of virtual time. ``feed`` lets time pass until bytes are there, at most ``timeout_s``, and puts
+    them where the descriptor reads them; ``flush`` takes to the device what was written to the descriptor."""
 
     def feed(self, timeout_s: float) -> None: ...
     def flush(self) -> None: ...

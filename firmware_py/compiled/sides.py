@@ -1,4 +1,4 @@
-"""The outputs that the compiled thread can command, as ``CompiledLoop`` sees them: memory, descriptor, hand-over."""
+"""Describes the outputs that the compiled thread can command: memory, descriptor, hand-over."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hal.types import I2cOp
 
 
 class Side(Protocol):
-    """The Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes."""
+    """Stands for the Python side of an output in the thread. In virtual time ``feed`` and ``flush`` carry its bytes."""
 
     def memory(self, fixed_ns: NDArray[np.int64]) -> Any:
         """Return what ``firmware_py.compiled.outputs`` works on. ``fixed_ns`` (1,): the time in virtual time."""
@@ -46,7 +46,7 @@ class Side(Protocol):
 
 
 class E727Side:
-    """An E-727 on a serial line."""
+    """Connects an E-727 on a serial line."""
 
     def __init__(self, driver: E727, clock: Clock) -> None:
         self._driver = driver
@@ -140,7 +140,7 @@ class VirtualBus:
 
 
 class DacSide:
-    """A DAC on an I2C bus, with or without a guardian."""
+    """Connects a DAC on an I2C bus, with or without a guardian."""
 
     def __init__(self, amplifier: GuardedAmplifier | DacOutput, clock: Clock) -> None:
         self._gate = amplifier.gate if isinstance(amplifier, GuardedAmplifier) else None

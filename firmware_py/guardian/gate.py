@@ -41,7 +41,7 @@ def silence_ns(heart: Any, now_ns: int) -> int:
 
 
 def has_lease(heart: Any, gate: Any, silent_ns: int) -> bool:
-    """Return True if the outputs are the firmware's. Comes after ``announce``: see above."""
+    """Return True if the outputs are the firmware's. Call it after ``announce`` (step 1 of the module's text)."""
     return gate[LOST] == 0 and heart[TAKEN] == 0 and silent_ns <= gate[LEASE_NS]
 
 
@@ -50,7 +50,7 @@ class LeaseGate:
 
     def __init__(self, heart: Heart, clock: Clock, name: str, lease_ms: float) -> None:
         self.words = array("q", bytes(8 * WORDS))
-        """What the gate knows, for a compiled loop as well."""
+        """This memory is all that the gate knows; a compiled loop works on it, too."""
         self.words[LEASE_NS], self.words[LAST] = round(lease_ms * 1e6), -1
         self.heart = heart
         self._clock = clock
@@ -58,7 +58,7 @@ class LeaseGate:
 
     @property
     def lost(self) -> bool:
-        """The lease is over or the guardian has the outputs: until it has given them back or is gone."""
+        """True while the lease is over or the guardian has the outputs: until it has given them back or is gone."""
         return bool(self.words[LOST])
 
     @lost.setter

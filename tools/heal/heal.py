@@ -156,7 +156,7 @@ def _step(part: Part, compared: Comparison, effects: tuple[str, ...], kept: bool
 
 
 def lines(healed: Healed) -> list[str]:
-    """What the command prints, a sentence per line, and a table."""
+    """Return what the command prints: a sentence per line, and a table."""
     out: list[str] = []
     for s in healed.steps:
         named = f"; the engine names {', '.join(s.effects).replace('_', ' ')}" if s.effects else ""

@@ -1,4 +1,4 @@
-"""What the lab measures of the stacks, the manipulator and the sensors, and what the firmware believes of each.
+"""Compares what the lab measures of stacks, manipulator and sensors with what the firmware believes of each.
 
 Each part is compared on a recording of its own before anything is identified; the remedy is the calibration that
 ``micron calibrate`` would write from the lab's set of recordings.

@@ -1,4 +1,4 @@
-"""Where a fit of flows between storages begins: beside the equations as they are, or in place of linear terms."""
+"""Says where a fit of flows between storages begins: beside the equations as they are, or in place of linear terms."""
 
 from __future__ import annotations
 

@@ -410,7 +410,7 @@ def split_recordings(recording: Recording, twin: Twin, held_out: float, seed: in
 
 
 def starts_anew(recording: Recording, twin: Twin, split: Split, init: int) -> bool:
-    """Whether the test part of an official split is another run: where its first samples may set a state and the twin,
+    """Return True if the test part of an official split is another run: its first samples may set a state and the twin,
     run on from the fitted part, is far off there at once, by more than it ever is on average.
     """
     if init <= 0:
@@ -440,7 +440,7 @@ def preferred(problem: Problem, base: Fit) -> Fit:
 
 
 Look = Callable[[Problem, Fit, tuple[Effect, ...]], tuple[set[str], list[Hint]]]
-"""What a search on a part of a recording finds: names that may matter, and what the best of them were found to be."""
+"""Describes what a search on a part of a recording finds: names that may matter, and what the best were found to be."""
 
 
 def nominated(
@@ -482,13 +482,13 @@ def one_way_forward(
 
 
 def may_hint(placed: Placed, candidate: Candidate) -> bool:
-    """Whether what a part shows of an effect says where to begin on the whole: not what is about instants or the
+    """Return True if what a part shows of an effect says where to begin on the whole: not what is about instants or the
     lattice of samples."""
     return not candidate.tested and placed.effect.driven
 
 
 def hint_of(placed: Placed, fitted: Fit) -> Hint:
-    """What the fit on a part found an effect of it to be."""
+    """Return what the fit on a part found an effect of it to be."""
     model, theta = fitted.model, fitted.theta
     nonlinear, weights = model.slices(model.placed.index(placed))
     return Hint(placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))

@@ -1,4 +1,4 @@
-"""What a search selected, in the form that a report is assembled from."""
+"""Holds what a search selected, in the form that a report is assembled from."""
 
 from __future__ import annotations
 

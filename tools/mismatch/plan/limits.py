@@ -35,7 +35,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Wish:
-    """What a person asked for; None: the default."""
+    """Holds what a person asked for. None stands for the default."""
 
     amplitude: float | None = None
     centre: float | None = None

@@ -31,7 +31,7 @@ class Rival:
 
 
 def distance(course: Recording, a: Rival, b: Rival, sigma: Mapping[str, float], iterations: int = 8) -> float:
-    """How far ``b`` stays from ``a`` on the inputs of ``course`` after it has re-fitted itself, in standard
+    """Return how far ``b`` stays from ``a`` on the inputs of ``course`` after it has re-fitted itself, in standard
     deviations. Zero where a model runs away: such an input is of no use.
     """
     problem = problem_of(course, sigma)

@@ -22,7 +22,7 @@ from tools.mismatch.plan.situation import Situation, situation
 
 @dataclass(frozen=True)
 class Asked:
-    """What the command line says beside the twin. ``inputs``: signals to be designed (none: all)."""
+    """Holds what the command line says beside the twin. ``inputs``: signals to be designed (none: all)."""
 
     wish: Wish = field(default_factory=Wish)
     inputs: tuple[str, ...] = ()
@@ -36,9 +36,9 @@ class Asked:
 
 @dataclass(frozen=True)
 class Prospect:
-    """What could be told apart before anything more is recorded. ``channels``: for each context channel that is not
-    recorded, the effects that could be named with it; ``places``: groups of places that structure cannot split, with
-    the unknowns that would.
+    """Holds what could be told apart before anything more is recorded. ``channels``: for each context channel that is
+    not recorded, the effects that could be named with it; ``places``: groups of places that structure cannot split,
+    with the unknowns that would.
     """
 
     where: Situation
@@ -130,7 +130,7 @@ def _in_twin_units(wish: Wish, given: str, to: str) -> Wish:
 
 
 def prospect(path: Path, asked: Asked) -> Prospect:
-    """What the twin's channels could tell apart. InputError or RecordingError says what is wrong."""
+    """Return what the twin's channels could tell apart. InputError or RecordingError says what is wrong."""
     where = open_situation(path, asked)
     limits = limits_of(where, asked)
     sigma = {o: where.noise(o, {}) for o in where.template.outputs}

@@ -1,4 +1,4 @@
-"""What an input would show of each effect: its response beside what the base parameters can imitate, and its tangents.
+"""Computes what an input would show of each effect: its response beside what base parameters imitate, and tangents.
 
 Everything is computed at the twin, by simulation: an effect is put in at a size, the outputs move, and what a re-fit of
 the base parameters takes back is projected out. ``rows`` are samples of all outputs, in noise standard deviations.
@@ -90,7 +90,7 @@ def ground(course: Recording, sigma: Mapping[str, float], seed: int = 0) -> Grou
 
 
 def _columns(on: Ground, model: Model, theta: Array, which: Iterable[int], now: Mapping[str, Array]) -> list[Array]:
-    """How the outputs move with parameters ``which`` of a model, each as one column of rows."""
+    """Return how the outputs move with parameters ``which`` of a model, each as one column of rows."""
     wanted = list(which)
     design = model.design(on.problem.view, theta)
     out: list[Array] = []

@@ -1,4 +1,4 @@
-"""Which effects a planned recording could tell apart, at which size, and what would split those that it cannot."""
+"""Finds the effects that a planned recording could tell apart, their sizes, and what would split the others."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Splitter:
-    """What would split a pair: ``what`` in words; ``size`` with it, in noise rms (None: not simulated)."""
+    """Names what would split a pair: ``what`` in words; ``size`` with it, in noise rms (None: not simulated)."""
 
     names: tuple[str, str]
     what: str
@@ -72,7 +72,7 @@ class Separable:
 
 
 def pair_of(a: Response, b: Response) -> Pair:
-    """How far two effects are apart."""
+    """Holds how far two effects are apart."""
     sines = (_sine(a, b), _sine(b, a))
     sizes = tuple(THRESHOLD / max(s * r.norm_per_rms, 1e-300) for s, r in zip(sines, (a, b), strict=True))
     degrees = float(np.degrees(np.arcsin(min(1.0, max(sines)))))
@@ -116,8 +116,8 @@ def separable(
     seed: int = 0,
     effects: Sequence[Effect] | None = None,
 ) -> Separable:
-    """What the channels of a situation could tell apart with the ``given`` inputs (or a random multisine), for effects
-    of ``size`` noise rms; for each pair that is too close, the input or channel that would split it.
+    """Return what the channels of a situation could tell apart with the ``given`` inputs (or a random multisine), for
+    effects of ``size`` noise rms; for each pair that is too close, the input or channel that would split it.
     """
     catalogue = tuple(effects if effects is not None else EFFECTS.values())
     rng = np.random.default_rng([seed, 3])

@@ -1,4 +1,4 @@
-"""What ``micron mismatch plan`` prints."""
+"""Prints the results of ``micron mismatch plan``."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def print_prospect(p: Prospect, say: Console) -> None:
 
 
 def print_plan(d: Designed, say: Console) -> None:
-    """What is to be recorded and what it will separate."""
+    """Return what is to be recorded and what it will separate."""
     say.print(f"Equivalent so far: {words(d.group)}.", highlight=False, soft_wrap=True)
     say.print(f"Planned input: {d.plan.description} ({d.plan.evaluations} inputs tried).", highlight=False)
     for signal, box in d.plan.limits.items():
