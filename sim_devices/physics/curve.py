@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings, no_settings
+from sim_devices.physics.effect import Array, Context, Effect, Human, Parameter, Parts, Settings
 from sim_devices.physics.statistics import least_squares, thin, value_range
 
 KNOTS = 9
@@ -97,18 +97,29 @@ def _curve_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]
     return out
 
 
+def _fold_settings(x: Array, residual: Array, ctx: Context) -> Settings:
+    k = ctx.keep
+    return {"size": (float(np.max(np.abs(x[k]))) or 1.0,)}
+
+
 def _fold_parts(settings: Settings) -> Parts:
-    terms = (Parameter("sign_lost", "1"), Parameter("growth", "1/{out}"), Parameter("zero", "{out}"))
-    return Parts((), terms, np.diag([0.0, 0.02, 0.02]))
+    size = settings.get("size", (1.0,))[0]
+    # the power is searched at a fixed size of the signal: a sum of powers leaves the scale of the signal free
+    return Parts((Parameter("power", "1", 0.5, 3.0, scale=0.2), Parameter("zero", "{out}", scale=0.05 * size)))
 
 
-def _fold_basis(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+def _fold_guess(x: Array, residual: Array, ctx: Context, settings: Settings) -> Sequence[Sequence[float]]:
+    return tuple((power, 0.0) for power in (1.0, 1.5, 2.0))
+
+
+def _fold_apply(x: Array, ctx: Context, q: Array, settings: Settings) -> Array:
+    size = settings["size"][0]
     # an offset of the twin is one of what is folded
-    return np.stack([np.abs(x) - x, x * x, np.ones(x.size)], axis=1)
+    return size * np.abs(x / size) ** q[0] + q[1]
 
 
 def _fold_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
-    return (Human("sign_lost", float(p[0]), "1"), Human("growth", float(p[1]), "1/{out}"))
+    return (Human("power", float(p[0]), "1"), Human("zero", float(p[1]), "{out}"))
 
 
 _CURVE = Effect(
@@ -129,15 +140,18 @@ _CURVE = Effect(
 _FOLD = replace(
     _CURVE,
     summary="the sign is lost: a sensor reads the magnitude, or a power of it",
+    kind="nonlinear",
     stages=("sensor",),
     parts=_fold_parts,
-    equation=r"y = x + s (|x| - x) + g x^2",
+    equation=r"y = X |x / X|^p + y_0",
     source="T. Wigren, M. Schoukens, Coupled Electric Drives Data Set and Reference Models, Uppsala 2017-024",
     excitation="both signs of the signal",
-    prepare=no_settings,
-    basis=_fold_basis,
+    prepare=_fold_settings,
+    guess=_fold_guess,
+    basis=None,
+    apply=_fold_apply,
     report=_fold_report,
     sites=("output",),
-    vanishes_with=(("sign_lost",),),
+    vanishes_with=(("power",),),
 )
 STATIC_NONLINEARITY = replace(_CURVE, variants=(_FOLD,))

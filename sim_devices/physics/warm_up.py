@@ -168,6 +168,18 @@ _TWO = Effect(
     vanishes_with=(("drift_over_record", "slow_amplitude", "fast_amplitude"),),
 )
 
+_OF_A_DRIVE = replace(
+    _TWO,
+    summary="warm-up of a drive: an offset of the input that settles with time",
+    stages=("amplifier", "actuator"),
+    parts=_one_parts,
+    equation=r"u = x + a\,e^{-t/\tau}",
+    guess=_one_guess,
+    basis=_one_basis,
+    report=_one_report,
+    sites=("input",),
+)
+
 # two exponentials fitted to one leave both times loose: the simplest that serves has the interval that holds
 THERMAL_DRIFT = replace(
     _TWO,
@@ -176,5 +188,5 @@ THERMAL_DRIFT = replace(
     guess=_one_guess,
     basis=_one_basis,
     report=_one_report,
-    variants=(_TWO, _LATE),
+    variants=(_TWO, _LATE, _OF_A_DRIVE),
 )

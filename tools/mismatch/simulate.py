@@ -289,6 +289,8 @@ class Model:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
         every = [*forces, *beside]
+        bends = (p.site == "output" and p.effect.driven and not p.effect.is_linear for p in self.placed)
+        run = replace(run, bent=any(bends))
         outputs = self.twin.respond(run, inputs, theta, every, join)
         if only is not None:
             outputs = {o: s for o, s in outputs.items() if o in only}

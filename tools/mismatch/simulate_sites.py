@@ -126,6 +126,8 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
     together: list[Placed] = []
     if effect.name in _ALIKE and len(twin.outputs) > 1:
         together = [Placed(effect, "output", "+".join(twin.outputs), stage, twin.outputs)]
+    if twin.static and effect.kind == "add" and not outputs:
+        return []  # nothing tells what is added in front of a gain from what is added behind it
     if twin.static:
         return together + _static(twin, effect, stage, usable, inputs, outputs, bool(present))
     found: list[Placed] = together
@@ -133,7 +135,7 @@ def _sites(twin: Twin, recording: Recording, effect: Effect, present: Sequence[P
         # behind a plant with states only what does not commute with it tells its place: it sits at the sensor
         behind = stage if effect.kind == "linear" else _behind(twin, effect, stage)
         found += [Placed(effect, "output", o, behind, (o,)) for o in usable]
-    if inputs and effect.driven:
+    if inputs and (effect.driven or not outputs):
         if effect.kind == "linear" and len(twin.inputs) == 1 and outputs and not present and _commutes(twin):
             return [Placed(p.effect, p.site, p.target, p.stage, p.outputs, note=SAME) for p in found]
         found += [Placed(effect, "input", s, stage, twin.outputs) for s in twin.inputs]

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import lsq_linear
 
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.projected import Projected
@@ -107,6 +108,24 @@ def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
     return out
 
 
+def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
+    """The damped Gauss-Newton step (k,) that leads lowest within ``least`` and ``most`` (k,).
+
+    A step that is solved for all parameters and cut afterwards may lead uphill, and a search then ends in a corner
+    that is no minimum. Within bounds the active set decides (P. B. Stark, R. L. Parker, Comput. Stat. 10, 1995).
+    """
+    scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+    system = hessian / np.outer(scale, scale) + damping * np.eye(scale.size)
+    step = -np.linalg.lstsq(system, gradient / scale, rcond=1e-12)[0] / scale
+    if np.all((least <= step) & (step <= most)):
+        return step
+    values, vectors = np.linalg.eigh(system)
+    root = np.sqrt(np.maximum(values, 1e-12 * values[-1]))
+    wanted = -(vectors.T @ (gradient / scale)) / root
+    found = lsq_linear(root[:, None] * vectors.T, wanted, (least * scale, most * scale), method="bvls")
+    return np.clip(found.x / scale, least, most)
+
+
 def _search(projected: Projected, theta: Array, iterations: int, tolerance: float) -> tuple[Array, float]:
     """Damped Gauss-Newton with bounds; returns theta and the cost.
 
@@ -120,6 +139,8 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
     if not free or not np.isfinite(cost):
         return theta, cost
     parameters = [model.parameters[i] for i in free]
+    lower = np.array([to_search(p, p.lo) if np.isfinite(p.lo) else -np.inf for p in parameters])
+    upper = np.array([to_search(p, p.hi) if np.isfinite(p.hi) else np.inf for p in parameters])
     damping = 1e-2
     jacobian = slopes(projected, theta, residual)
     fresh = True
@@ -129,11 +150,11 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
         z = np.array([to_search(p, theta[i]) for p, i in zip(parameters, free, strict=True)])
         gradient = jacobian.T @ residual
         hessian = jacobian.T @ jacobian
-        scale = np.sqrt(np.maximum(np.diag(hessian), 1e-300))
+        if not np.all(np.isfinite(hessian)):
+            break
         gain = -1.0
         for _try in range(6 if fresh else 2):
-            system = hessian / np.outer(scale, scale) + damping * np.eye(len(free))
-            step = -np.linalg.lstsq(system, gradient / scale, rcond=1e-12)[0] / scale
+            step = bounded_step(hessian, gradient, damping, lower - z, upper - z)
             for c, p in enumerate(parameters):
                 reach = 1.6 if p.log and p.lo > 0 else projected.width[free[c]]
                 step[c] = float(np.clip(step[c], -reach, reach))

@@ -268,9 +268,9 @@ def _dead_zone(s: Slot, x: str, d: str) -> str:
 
 
 def _curve(s: Slot, x: str, d: str) -> str:
-    if "sign_lost" in s.values:
-        folded = f"{s.at('sign_lost')} * (np.abs({d}) - {d}) + {s.at('growth')} * {d}**2"
-        return f"{x} + {folded} + {s.at('zero')}"
+    if "power" in s.values:
+        size = numbers(s.setting("size"))
+        return f"{size} * np.abs({x} / {size}) ** {s.at('power')} + {s.at('zero')}"
     lo, hi = s.placed.settings["range"]
     shape = int(s.placed.settings.get("shape", (3.0,))[0])
     middle, half = 0.5 * (lo + hi), 0.5 * (hi - lo)

@@ -72,6 +72,7 @@ class Search:
         """Extend until nothing can gain, then swap; refine what the decision is between."""
         self.expand(self.store.base)
         self.combine()
+        self.pair()
         self.grow()
         for _ in range(SWAPS):
             best = self.store.ranked()[0]
@@ -108,6 +109,28 @@ class Search:
             more = self.store.joined(grown, s)
             if more.proper and self.store.score(more) > self.store.score(grown):
                 grown = more
+
+    def pair(self) -> None:
+        """Extend the effects that gain most before their prices, where no set explains half of what can be explained.
+
+        Of two effects that only together make the recording, each alone may gain less than its price, and an effect
+        at many places less than at one. A ranking by score would not extend them.
+        """
+        base = self.store.base
+        gain = {k: self.gain_before_prices(s) for k, s in self.store.sets.items() if s.proper}
+        if max(gain.values(), default=0.0) >= HALF * self.most_gain(base):
+            return
+        alone = [s for k, s in self.store.sets.items() if len(s.placed) == 1 and gain.get(k, 0.0) > 0.0]
+        alone.sort(key=lambda s: (-gain[s.key], sorted(s.key)))
+        for s in alone[:BEAM]:
+            if self.moves:
+                self.moves -= 1
+                self.expand(s)
+
+    def gain_before_prices(self, s: Scored) -> float:
+        """Nats that a set gains over the base before its names and parameters are paid for."""
+        n = min(self.store.constants.samples, self.store.held)
+        return n * (s.mean_density - self.store.base.mean_density)
 
     def swap(self, best: Scored) -> None:
         """Every name of ``best`` replaced by those that do about as well alone on the same outputs: beside the base one

@@ -61,7 +61,8 @@ class Run:
     after each start that may set its state (0: the twin's own initial state). ``measured``: outputs (n,). ``setting``:
     sorted sample numbers that may set the states of a linear run instead (None: those of the window). ``period``:
     samples after which all inputs and outputs repeat from every start on (0: they do not): it sets the start states.
-    ``afresh``: samples where the memory of effects begins.
+    ``afresh``: samples where the memory of effects begins. ``bent``: an effect that is not linear stands between the
+    states and what was measured, which then is no linear function of a start state.
     """
 
     t: Array
@@ -75,6 +76,7 @@ class Run:
     setting: NDArray[np.int64] | None = None
     period: int = 0
     afresh: tuple[int, ...] = (0,)
+    bent: bool = False
 
 
 class Twin(Protocol):

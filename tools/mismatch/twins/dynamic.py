@@ -178,7 +178,7 @@ class DynamicTwin(Head):
                         k, r = where[link.row]
                         column = x[k][:, r]
                     add(link.j if j < 0 else j, link.output, column)
-        token = ("plant", tuple(tags), run.window)
+        token = ("plant", tuple(tags), run.window, run.bent)
         token = (*token, *(x.token for x in inputs.values()), tuple(folded))
         if join:
             token = (*token, theta[: len(self.parameters)].tobytes())
@@ -238,7 +238,8 @@ class DynamicTwin(Head):
         n = run.t.size
         zero = np.zeros(n)
         given = self.start_given or (run.window == 0 and not run.period)
-        if given and run.setting is None and self.fixed_free is not None and run.starts == (0,):
+        read = run.setting is not None and not (run.bent and self.start_given)
+        if given and not read and self.fixed_free is not None and run.starts == (0,):
             for o, y in self.fixed_free(n).items():
                 value[o] = value[o] + y
         else:

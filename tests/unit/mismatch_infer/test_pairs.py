@@ -1,0 +1,110 @@
+"""Two effects that only together make a recording are found, and a search step stays within its bounds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.optimize import lsq_linear
+
+from sim_devices.physics.catalogue import EFFECTS
+from tests.unit.mismatch_model.made import recording
+from tools.mismatch.engine.diagnose import prepared
+from tools.mismatch.engine.fit import bounded_step, fit
+from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.infer.constants import learned
+from tools.mismatch.infer.search import Search
+from tools.mismatch.recording import Recording
+from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_sites import sites
+from tools.mismatch.simulate_start import prepare, starts
+from tools.mismatch.twins.make import make
+
+N, DT = 1200, 1.0
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_steps_within_bounds_lead_to_the_minimum_of_a_quadratic(seed: int) -> None:
+    """The peer is scipy's bounded least squares. A step that is cut after it is solved does not get there."""
+    rng = np.random.default_rng(seed)
+    a = rng.normal(size=(30, 5)) @ (np.eye(5) + 3.0 * rng.normal(size=(5, 5)))
+    b = rng.normal(size=30) * 10.0
+    lo, hi = -rng.uniform(0.01, 0.3, 5), rng.uniform(0.01, 0.3, 5)
+    x = np.zeros(5)
+    for _ in range(60):
+        x = x + bounded_step(a.T @ a, a.T @ (a @ x - b), 1e-8, lo - x, hi - x)
+        assert np.all((lo <= x) & (x <= hi))
+    best = lsq_linear(a, b, (lo, hi)).cost
+    assert 0.5 * float(np.sum((a @ x - b) ** 2)) == pytest.approx(best, rel=0.02)
+
+
+def tanks(seed: int) -> Recording:
+    """Torricelli outflow of both tanks and an overflow into the lower one, by small Euler steps; the twin is linear."""
+    rng = np.random.default_rng(seed)
+    pump = np.repeat(rng.uniform(0.8, 5.2, N // 30), 30)
+    upper, lower, steps = 3.0, 3.0, 20
+    level = np.empty(N)
+    for i in range(N):
+        level[i] = lower
+        for _ in range(steps):
+            out, down = 0.17 * np.sqrt(max(upper, 0.0)), 0.17 * np.sqrt(max(lower, 0.0))
+            spill, lost = 0.4 * max(upper - 7.0, 0.0), 0.5 * max(lower - 7.5, 0.0)
+            upper += DT / steps * (0.11 * pump[i] - out - spill)
+            lower += DT / steps * (out + 0.6 * spill - down - lost)
+    level += 0.02 * rng.standard_normal(N)
+    twin = {
+        "states": {"upper": {"unit": "V", "start": 3.0}, "lower": {"unit": "V", "start": 3.0}},
+        "equations": {"upper": "gain * pump - a * upper - c", "lower": "a * upper - b * lower"},
+        "outputs": {"level": "lower"},
+        "hold": "zero", "gain": 0.11, "a": 0.045, "b": 0.045, "c": 0.1,
+    }  # fmt: skip
+    return recording("ode", DT, {"pump": pump}, {"level": level}, {"pump": "V", "level": "V"}, twin)
+
+
+def test_a_pair_of_which_each_member_gains_little_alone_is_found() -> None:
+    rec = tanks(3)
+    names = ("overflow", "square_root_outflow", "dead_time", "first_order_lag", "backlash")
+    problem, _, base = prepared(rec, 0.3, 0, was_joined=False)
+    search = Search(problem, base, [EFFECTS[n] for n in names], learned(), moves=3)
+    with np.errstate(all="ignore"):
+        search.expand(search.store.base)
+        alone = max(search.gain_before_prices(s) for s in search.store.sets.values() if len(s.placed) == 1)
+        search.pair()
+    best = search.store.ranked()[0]
+    assert best.names == {"overflow", "square_root_outflow"}
+    assert search.gain_before_prices(best) > 1.5 * alone
+
+
+def folded(power: float, seed: int) -> Recording:
+    """A reader of the magnitude behind a damped oscillator, which is integrated by small steps."""
+    rng = np.random.default_rng(seed)
+    u = np.repeat(rng.uniform(-2.0, 2.0, 40), 25)
+    x = v = 0.0
+    y = np.empty(u.size)
+    for i in range(u.size):
+        y[i] = 0.6 * abs(x) ** power
+        for _ in range(50):
+            v += 0.02 / 50 * (144.0 * (u[i] - x) - 5.0 * v)
+            x += 0.02 / 50 * v
+    y += 0.005 * rng.standard_normal(u.size)
+    twin = {"A": [[0.0, 1.0], [-140.0, -6.0]], "B": [[0.0], [140.0]], "C": [[1.0, 0.0]]}
+    twin |= {"x0": [0.0, 0.0], "hold": "zero"}
+    return recording("state_space", 0.02, {"drive": u}, {"speed": y}, {"drive": "V", "speed": "V"}, twin)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.7, 2.0])
+def test_a_sensor_that_reads_a_power_of_the_magnitude(power: float) -> None:
+    rec = folded(power, 5)
+    problem, _, base = prepared(rec, 0.3, 0, was_joined=False)
+    fold = replace(EFFECTS["static_nonlinearity"].variants[0], variants=())
+    (place,) = sites(make(rec), rec, fold)
+    placed = prepare(base.model, problem.fit_view, base.theta, place)
+    model = Model(problem.twin, (placed,))
+    theta = model.carry(base.model, base.theta, rec)
+    found = fit(problem, model, starts(model, 0, problem.fit_view, theta))
+    figures = {h.name: h.value for h in found.model.human(found.theta)[placed.label]}
+    assert figures["power"] == pytest.approx(power, abs=0.05)
+    assert float(np.std(found.residual["speed"][problem.held_rows])) < 0.01
+    # the scale of the signal is determined: every figure of the base is
+    assert np.all(np.isfinite(uncertainty(problem, found).deviations()))
