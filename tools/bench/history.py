@@ -114,6 +114,13 @@ class History:
             self._low.append(low)
             self._high.append(high)
 
+    def newest(self, channels: NDArray[np.intp], seconds: float) -> tuple[Float64Array, Float32Array]:
+        """Return times (n,) in s and single rows of ``channels`` (channels, n): those of the last ``seconds``."""
+        ring = self._fine
+        t_s = self._fine_t[np.arange(ring.tail, ring.head) % ring.depth]
+        first = ring.tail + int(np.searchsorted(t_s, self.latest_t_s - seconds))
+        return t_s[first - ring.tail :], ring.take(channels, first, ring.head)
+
     def buckets(self, channels: NDArray[np.intp], k: int, first: int, stop: int | None = None) -> Buckets:
         """Buckets of ``k`` rows from ``first`` up to ``stop`` (excluded) or the newest, which may be incomplete.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from pathlib import Path
 from typing import Any
@@ -65,11 +66,21 @@ def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[Base
             out = str(work / "recording")
             steps.append(["tools.cli.main", "export", str(source), "--out", out])
             source = Path(out)
+        return diagnose(source, f"diagnose {name}", steps, work)
+
+    def diagnose(source: Path, title: str, steps: list[list[str]], work: Path) -> Any:
         report = ("--html", str(work / "report.html"), "--json", str(work / "report.json"), "--jobs", "1")
         steps.append(["tools.cli.main", "mismatch", "diagnose", str(source), *report])
         twin = str(work / "twin.toml")
         steps.append(["tools.cli.main", "mismatch", "apply", str(source), str(work / "report.json"), "--out", twin])
-        return jobs.start("mismatch", f"diagnose {name}", steps, work).as_dict()
+        return jobs.start("mismatch", title, steps, work).as_dict()
+
+    async def last_minute(_: Request) -> Any:
+        """Diagnose what the watching twin saw last."""
+        jobs.must_be_idle()
+        work = jobs.new_folder()
+        source = await asyncio.to_thread(session.watch.write_last_minute, session.history, work / "recording")
+        return diagnose(source, "diagnose the last minute", [], work)
 
     async def apply(_: Request) -> Any:
         """The corrected twin in the place of the emulated stacks; then both benches in virtual time, side by side."""
@@ -101,6 +112,7 @@ def mismatch_routes(session: Session, jobs: Jobs, applied: Applied) -> list[Base
     return [
         Route("/api/mismatch", clear(recordings)),
         Route("/api/mismatch/start", clear(start), methods=["POST"]),
+        Route("/api/mismatch/last-minute", clear(last_minute), methods=["POST"]),
         Route("/api/mismatch/apply", clear(apply), methods=["POST"]),
         Route("/api/mismatch/difference", clear(difference)),
         *job_routes(jobs),

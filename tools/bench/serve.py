@@ -10,6 +10,7 @@ import signal
 import socket
 from collections.abc import Callable
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import uvicorn
 
@@ -21,6 +22,9 @@ from tools.bench.limits import BoundedHttp
 from tools.bench.routes import more_routes
 from tools.bench.session import Session
 from tools.errors import InputError
+
+if TYPE_CHECKING:
+    from tools.mismatch.watch.live import Settings
 
 LOOPBACK = "127.0.0.1"
 MAX_MESSAGE_BYTES = 65_536
@@ -84,6 +88,7 @@ def serve(
     *,
     names: tuple[str, ...] = (),
     token: str | None = None,
+    watch: Settings | None = None,
 ) -> None:
     """Run until SIGINT or SIGTERM; the firmware is then in its safe state. ``announce`` gets the page's address.
 
@@ -97,7 +102,7 @@ def serve(
     interrupted: list[bool] = []
 
     async def run() -> None:
-        session = Session(choice, recordings)
+        session = Session(choice, recordings, watch)
         jobs = Jobs()
         app = make_app(session, access, more_routes(session, jobs))
         server = uvicorn.Server(config_for(app))

@@ -11,7 +11,7 @@ import time
 from collections import deque
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,10 @@ from tools.bench.layouts import Layouts
 from tools.bench.recorder import RunRecorder
 from tools.bench.shadow import Shadow, make_shadow
 from tools.bench.targets import Targets
+from tools.bench.twin_watch import TwinWatch
+
+if TYPE_CHECKING:
+    from tools.mismatch.watch.live import Settings
 
 FRAME_S = 1 / 60
 STATUS_S = 0.1
@@ -77,7 +81,7 @@ class Run:
 class Session:
     """The bench as all viewers see it. ``run_forever`` is its one task; everything else is called from the loop."""
 
-    def __init__(self, choice: Choice, recordings: Path) -> None:
+    def __init__(self, choice: Choice, recordings: Path, watch: Settings | None = None) -> None:
         self.choice = choice
         self.home = choice.bench.parent  # folder of the benches to choose from; copies run from elsewhere
         self.identity = secrets.token_hex(8)  # tells an open page that the server is another one
@@ -93,6 +97,7 @@ class Session:
         self.targets = Targets(recordings / "targets")
         self.disk = Disk()
         self.shadow: Shadow | None = None
+        self.watch = TwinWatch(watch)
         self.log: deque[dict[str, Any]] = deque(maxlen=500)
         self.log_number = 0
         self.missed_rows = 0
@@ -123,6 +128,7 @@ class Session:
             self._state_s = -STATUS_S
             self.run_number += 1
             run = self.run
+            await asyncio.to_thread(self.watch.begin, bench, self.choice)
             self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
             self.firmware = await Firmware.start(
                 self.choice,
@@ -145,6 +151,7 @@ class Session:
             await self.stop_recording()
         self.firmware.close()
         self.firmware = None
+        await asyncio.to_thread(self.watch.end)
 
     def order(self, order: str, **values: Any) -> bool:
         """Pass an order on to the firmware."""
@@ -220,6 +227,7 @@ class Session:
             alerts.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
         if ticks := run.status.get("fallbacks", 0):
             alerts.append(("warn", f"Kinematics: {ticks} ticks fell back to the other solution."))
+        alerts += self.watch.alerts()
         if self.disk.low:
             alerts.append(("warn", f"Disk nearly full: {self.disk.free_bytes / 1e9:.1f} GB left for recordings."))
         if self.recorder.active and self.recorder.trouble():
@@ -274,6 +282,7 @@ class Session:
             "disk": {"free": self.disk.free_bytes, "total": self.disk.total_bytes},
             "shadow": self.shadow.method if self.shadow is not None else "",
             "recording": self.recorder.state(),
+            "watch": self.watch.state(),
             "log": self.log_number,
         }
 
@@ -342,6 +351,7 @@ class Session:
                 self.recorder.push(rows)
             if self.shadow is not None:
                 self.shadow.follow(rows.values)
+            self.watch.take(self.run.status, rows.values)
 
     def bench_time_ns(self) -> int:
         """Bench time of the newest row, which is emulated time on an emulated bench."""

@@ -11,6 +11,8 @@ from rich.text import Text
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import clear_errors, console
+from tools.cli.run_watch import RateOption, ReferenceOption, WatchOption, check_twin, watch_settings
+from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_names
 from tools.prepare import prepare
@@ -40,6 +42,11 @@ def bench(
         ),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the emulated world.")] = None,
+    watch: WatchOption = None,
+    watch_reference: ReferenceOption = None,
+    false_alarms_per_hour: RateOption = None,
+    trust: TrustOption = False,
+    allow_outside: OutsideOption = False,
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Emulated bench: on the wall clock, in processes of its own.")
     ] = False,
@@ -56,7 +63,13 @@ def bench(
         if host_name and listen is None:
             raise InputError("--host-name belongs to --listen; give both or neither")
         file = bench_path(bench).absolute()
-        prepare(load_bench(file), None, console())
+        if watch is not None:
+            decide_on([watch], trust, allow_outside)
+        description = load_bench(file)
+        watching = watch_settings(description, watch, watch_reference, false_alarms_per_hour)
+        if watching is not None:
+            check_twin(watching, description)
+        prepare(description, None, console())
         sock = bind(listen or LOOPBACK, port)
         try:
             recordings.mkdir(parents=True, exist_ok=True)
@@ -70,4 +83,4 @@ def bench(
             )
 
         choice = Choice(file, hand, None, seed, stale_ms, pace="realtime" if realtime else None)
-        serve(choice, recordings.absolute(), sock, announce, names=tuple(host_name or ()))
+        serve(choice, recordings.absolute(), sock, announce, names=tuple(host_name or ()), watch=watching)

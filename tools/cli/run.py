@@ -11,6 +11,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -31,12 +32,14 @@ from hal.bench import SIM_SCHEME, BenchFile, check_pace, load_bench
 from hal.children import child_command, child_environment
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import Exit, JsonOption, clear_errors, console
+from tools.cli.run_watch import RateOption, ReferenceOption, RunWatch, WatchOption, watch_settings
 from tools.cli.trust import OutsideOption, TrustOption, decide_on
 from tools.errors import InputError
 from tools.output import check_names, check_writable, write_json
 from tools.prepare import prepare
 
 if TYPE_CHECKING:
+    from tools.mismatch.watch.live import Settings
     from tools.reports.run_live import TipWatch
 
 FULL_EFFECT = 4
@@ -78,6 +81,9 @@ def run(
         typer.Option(metavar="PROGRAM.toml", help="The outputs play it instead of compensating; runs to its end."),
     ] = None,
     record: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the run (.mcap).")] = None,
+    watch: WatchOption = None,
+    watch_reference: ReferenceOption = None,
+    false_alarms_per_hour: RateOption = None,
     method: Annotated[
         str | None, typer.Option(metavar="NAME", help="Another tremor estimator than the bench file's.")
     ] = None,
@@ -116,7 +122,7 @@ def run(
             raise InputError("--max-effect belongs to --inject or --manual; give both or neither")
         if virtual and realtime:
             raise InputError("--virtual and --realtime exclude each other; give one of them")
-        decide_on([bench_path(bench)], trust, allow_outside)
+        decide_on([bench_path(bench), *([watch] if watch is not None else [])], trust, allow_outside)
         file = load_bench(bench_path(bench))
         pace = check_pace(file, "virtual" if virtual else "realtime" if realtime else None)
         if compiled:
@@ -129,6 +135,7 @@ def run(
         check_spin(file, spin_us)
         if manual is not None:
             seconds = max(seconds, _program_seconds(file, manual, max_effect, compiled, sense_only))
+        watching = watch_settings(file, watch, watch_reference, false_alarms_per_hour, seconds)
         request = RunRequest(
             bench=bench_path(bench),
             compiled=compiled,
@@ -157,7 +164,8 @@ def run(
             for line in opening_lines(file, seconds, pace, hand, seed, compiled):
                 console().print(line)
             prepare(file, request.method, console())
-        outcome, truth = _run_real(request) if pace == "realtime" else _run_emulated(request)
+        beside = None if watching is None else _open_watch(watching, file, request)
+        outcome, truth = _run_real(request, beside) if pace == "realtime" else _run_emulated(request, beside)
         if outcome.get("instrument") == "endoscope":
             finish_endoscope_run(outcome, truth, json_file)
             return
@@ -166,6 +174,12 @@ def run(
 
         result = complete_result(outcome, truth)
         steps = next_steps(result)
+        if beside is not None:
+            from tools.mismatch.watch.live import lines
+
+            found = beside.close()
+            result["watch"] = found.to_json()
+            steps = [*lines(found), *steps]
         write_report(result, truth, console(), json_file=json_file, html=html, image=image, more=steps)
         raise typer.Exit(exit_status(result))
 
@@ -231,16 +245,30 @@ def complete_result(outcome: dict[str, Any], truth: Mapping[str, Any] | None) ->
     return {**outcome, **figures}
 
 
-def _run_emulated(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+def _open_watch(settings: Settings, file: BenchFile, request: RunRequest) -> RunWatch:
+    """Start the watch of a run. In emulated time the run waits for it, in real time it never does."""
+    from tools.mismatch.watch.frame import World
+
+    world = World(request.seed, request.hand_file, request.hand_scale)
+    return RunWatch(settings, file, world, is_patient=request.pace != "realtime")
+
+
+def _run_emulated(request: RunRequest, beside: RunWatch | None) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """Run an emulated bench in this process: in emulated time nothing waits for the loop."""
     from firmware_py.app import run_in_process
     from tools.reports.run_live import TipWatch
 
     watch, key = TipWatch(), RearmKey(lambda: signal.raise_signal(signal.SIGUSR1))
+    if beside is not None:
+        request = replace(request, live_fds=beside.fds)
     opening = Spinner("dots", "opening the emulated bench")
     with Live(opening, console=console(), refresh_per_second=8, transient=True) as live:
 
         def show(status: dict[str, Any]) -> None:
+            if beside is not None:
+                beside.look(status)
+            if "event" in status:
+                return
             key.look(status)
             live.update(_status_line(status, request.seconds, watch))
 
@@ -271,20 +299,26 @@ class RearmKey:
             self.press()
 
 
-def _run_real(request: RunRequest) -> tuple[dict[str, Any], dict[str, Any] | None]:
+def _run_real(request: RunRequest, beside: RunWatch | None) -> tuple[dict[str, Any], dict[str, Any] | None]:
     """The firmware in a process of its own: this one draws, and a busy thread beside the loop would cost ticks."""
     with tempfile.TemporaryDirectory(prefix="micron-") as folder:
         runtime_dir = Path(folder)
+        fds = () if beside is None else beside.fds
+        if beside is not None:
+            request = replace(request, live_fds=beside.fds)
         request_file = runtime_dir / "request.json"
         request_file.write_text(request.to_json(runtime_dir))
         process = subprocess.Popen(
             child_command("firmware_py.app", str(request_file)),
             stdout=subprocess.PIPE,
             text=True,
+            pass_fds=fds,
             env=child_environment(),
         )
+        for fd in fds:
+            os.close(fd)
         try:
-            _watch(process, request.seconds)
+            _watch(process, request.seconds, beside)
         except KeyboardInterrupt:
             # the firmware ramps to neutral and reports; a second interrupt is the operator's own choice
             process.send_signal(signal.SIGINT)
@@ -317,7 +351,7 @@ def _tell_of_the_guardian(runtime_dir: Path, number: int) -> None:
     console().print(f"the firmware was killed by signal {number}; {guardian_words}")
 
 
-def _watch(process: subprocess.Popen[str], seconds: float) -> None:
+def _watch(process: subprocess.Popen[str], seconds: float, beside: RunWatch | None) -> None:
     """Draw the status lines of the firmware until it ends."""
     assert process.stdout is not None
     from tools.reports.run_live import TipWatch
@@ -327,6 +361,10 @@ def _watch(process: subprocess.Popen[str], seconds: float) -> None:
     with Live(starting, console=console(), refresh_per_second=8, transient=True) as live:
         for line in process.stdout:
             status = json.loads(line)
+            if beside is not None:
+                beside.look(status)
+            if "event" in status:
+                continue
             key.look(status)
             live.update(_status_line(status, seconds, watch))
 

@@ -115,9 +115,10 @@ class Projected:
             gram[np.ix_(at, at)] += a.T @ a
             cross[at] += a.T @ b
             kept.append((a, b, at))
+        # of a plant that ran away: no cost, and LAPACK must not see it
+        runaway = np.full(sum(b.size for _, b, _ in kept) + self.believed.size, np.inf), theta
         if not (np.all(np.isfinite(gram)) and np.all(np.isfinite(cross))):
-            # a plant that ran away: no cost, and LAPACK must not see it
-            return np.full(sum(b.size for _, b, _ in kept) + self.believed.size, np.inf), theta
+            return runaway
         # parameters of effects have no prior: their centre is zero and their width infinite
         centre = self.centre[self.linear]
         prior = 1.0 / self.width[self.linear] ** 2
@@ -131,6 +132,8 @@ class Projected:
             scaled = scaled + (rows.T @ rows) / np.outer(size, size)
         scaled[np.diag_indices(k)] += 1e-11
         target = cross / size + 1e-11 * size * centre
+        if not (np.all(np.isfinite(scaled)) and np.all(np.isfinite(target))):
+            return runaway
         try:
             solution = bounded_solution(scaled, target, self.lo * size, self.hi * size) / size
         except np.linalg.LinAlgError:

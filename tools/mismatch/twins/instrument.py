@@ -129,8 +129,10 @@ def _world(recording: Recording) -> tuple[bool, float]:
     return hand == "bench", float(start_s)
 
 
-def instrument_twin(recording: Recording) -> OpaqueTwin:
-    """The bench that ``[twin.parameters] bench`` names. RecordingError says which signal or file is wrong."""
+def bench_world(recording: Recording) -> tuple[EmulationConfig, bool, float]:
+    """Return the emulated bench that ``[twin.parameters] bench`` names, whether its own hand moves it, and how long its
+    world had run at the first sample (s). RecordingError says which signal or file is wrong.
+    """
     bench = recording.twin.parameters.get("bench")
     if not isinstance(bench, str):
         raise RecordingError(f"{recording.path}: [twin.parameters] bench must name the bench file, got {bench!r}")
@@ -154,6 +156,12 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
         raise
     except BenchError as error:
         raise RecordingError(f"{recording.path}: [twin.parameters] bench: {error}") from error
+    return config, own_hand, start_s
+
+
+def instrument_twin(recording: Recording) -> OpaqueTwin:
+    """The bench that ``[twin.parameters] bench`` names. RecordingError says which signal or file is wrong."""
+    config, own_hand, start_s = bench_world(recording)
 
     def call(inputs: Mapping[str, Array], parameters: Mapping[str, Any]) -> Mapping[str, Array]:
         si = {k: x if k == "t" else convert(x, recording.unit[k], _si_unit(k)) for k, x in inputs.items()}
@@ -169,5 +177,5 @@ def instrument_twin(recording: Recording) -> OpaqueTwin:
         free=(),
         given=dict(recording.twin.parameters),
         parameters=(),
-        source=str(Path(bench)),
+        source=str(Path(str(recording.twin.parameters["bench"]))),
     )

@@ -2,6 +2,7 @@
 import { blobUrl, download, get, post } from "../api.js";
 import { duration, h } from "../dom.js";
 import { newRecording } from "./mismatch_new.js";
+import { watchPanel } from "./mismatch_watch.js";
 
 const STEPS = { 2: ["locate and fit", "corrected twin"], 3: ["prepare", "locate and fit", "corrected twin"] };
 
@@ -31,8 +32,10 @@ export function mount(root, { link }) {
       await start();
     } catch (error) { fail(error); }
   });
+  const watch = watchPanel(link, lastMinute);
   const view = h("div.cols.mismatch", {},
-    h("section.panel", {}, h("div.row", {}, select, run, cancel, own.open, own.pick, h("span.faint", {}, "or drop a csv, npz or mcap here"), status, h("span.grow"), files, apply, back), problem, own.problem, applied, lines),
+    h("div.stack", {}, watch.element,
+      h("section.panel", {}, h("div.row", {}, select, run, cancel, own.open, own.pick, h("span.faint", {}, "or drop a csv, npz or mcap here"), status, h("span.grow"), files, apply, back), problem, own.problem, applied, lines)),
     h("div.stack", {}, own.form, report));
   own.dropOn(view);
   root.append(view);
@@ -94,6 +97,13 @@ export function mount(root, { link }) {
     try { show(await post("/api/mismatch/start", { recording: select.value })); } catch (error) { fail(error); }
   }
 
+  async function lastMinute() {
+    problem.textContent = "";
+    shown = "";
+    report.replaceChildren();
+    try { show(await post("/api/mismatch/last-minute")); } catch (error) { fail(error); }
+  }
+
   async function poll() {
     try { show(await get("/api/jobs/mismatch")); } catch (error) { fail(error); }
   }
@@ -121,5 +131,5 @@ export function mount(root, { link }) {
 
   refresh().catch(fail);
   const offServer = link.on("server", () => refresh().catch(fail));
-  return () => { offServer(); clearTimeout(timer); clearTimeout(compareTimer); };
+  return () => { offServer(); watch.stop(); clearTimeout(timer); clearTimeout(compareTimer); };
 }
