@@ -168,15 +168,27 @@ _TWO = Effect(
     vanishes_with=(("drift_over_record", "slow_amplitude", "fast_amplitude"),),
 )
 
+
+def _drive_parts(settings: Settings) -> Parts:
+    both = _warm_parts(settings)
+    return Parts(both.nonlinear[:1], (Parameter("slow", "{in}"),))
+
+
+def _drive_report(p: Array, settings: Settings, scale: float) -> Sequence[Human]:
+    # a weight at an input carries the gain of the base physics
+    own = np.array([p[0], p[1] / (scale or 1.0)])
+    return tuple(Human(h.name, h.value, h.unit.replace("out", "in")) for h in _one_report(own, settings, scale))
+
+
 _OF_A_DRIVE = replace(
     _TWO,
     summary="warm-up of a drive: an offset of the input that settles with time",
     stages=("amplifier", "actuator"),
-    parts=_one_parts,
+    parts=_drive_parts,
     equation=r"u = x + a\,e^{-t/\tau}",
     guess=_one_guess,
     basis=_one_basis,
-    report=_one_report,
+    report=_drive_report,
     sites=("input",),
 )
 

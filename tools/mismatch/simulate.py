@@ -180,6 +180,18 @@ class Model:
                 ]
         return out
 
+    @property
+    def bends(self) -> bool:
+        """Whether an output is read through an effect that is not linear."""
+        return any(p.site == "output" and p.effect.driven and not p.effect.is_linear for p in self.placed)
+
+    def base_text(self, theta: Array) -> dict[str, object]:
+        """The parameters of the twin in a twin file, with the rest that it begins at where no measurement shows it."""
+        text = dict(self.twin.to_text(theta[: self.n_base]))
+        if self.bends and getattr(self.twin, "at_rest", False):
+            text["x0"] = [0.0] * len(np.asarray(text["A"]))
+        return text
+
     # -- simulation ---------------------------------------------------------------------------------
 
     def simulate(self, view: View, theta: Array, only: Collection[str] | None = None) -> dict[str, Array]:
@@ -289,8 +301,7 @@ class Model:
             for f in forces:
                 folded.update(range(f.first_weight, f.first_weight + f.weights.size))
         every = [*forces, *beside]
-        bends = (p.site == "output" and p.effect.driven and not p.effect.is_linear for p in self.placed)
-        run = replace(run, bent=any(bends))
+        run = replace(run, bent=self.bends)
         outputs = self.twin.respond(run, inputs, theta, every, join)
         if only is not None:
             outputs = {o: s for o, s in outputs.items() if o in only}

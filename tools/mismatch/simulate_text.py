@@ -37,8 +37,7 @@ def describe(model: Model, theta: Array) -> dict[str, Any]:
                 "parameters": dict(zip(names, values, strict=True)),
             }
         )
-    base = theta[: model.n_base]
-    return {"kind": model.twin.kind, "parameters": model.twin.to_text(base), "effects": effects}
+    return {"kind": model.twin.kind, "parameters": model.base_text(theta), "effects": effects}
 
 
 def restore(recording: Recording) -> tuple[Model, Array]:

@@ -93,6 +93,25 @@ def axis() -> tuple[Recording, str]:
     return weak("mechanical_axis", "force", 20 * wave(), {"position": "m"}, given, "N"), "saturation"
 
 
+def warm_drive() -> tuple[Recording, str]:
+    """An axis whose drive has an offset that settles."""
+    given = {"mass": 2.0, "damping": 9.0, "stiffness": 300.0}
+    force = 20 * wave()
+    rec = as_given(
+        "mechanical_axis", {"force": force + 15 * np.exp(-np.arange(N) * DT / 4)}, {"position": "m"}, given, "N"
+    )
+    noisy = {o: y + np.random.default_rng(3).normal(0, 2e-3 * np.std(y), N) for o, y in rec.outputs.items()}
+    return replace(rec, inputs={"force": force}, outputs=noisy), "thermal_drift"
+
+
+def folded() -> tuple[Recording, str]:
+    """A sensor that reads the magnitude to the power of 1.6, behind a run that begins at rest."""
+    given = {"A": [[0.0, 1.0], [-90.0, -8.0]], "B": [[0.0], [1.0]], "C": [[90.0, 0.0]], "x0": [0.0, 0.0]}
+    rec = as_given("state_space", {"u": wave()}, {"y": "V"}, given, "V")
+    noise = np.random.default_rng(3).normal(0, 2e-3, N)
+    return replace(rec, outputs={"y": 1.3 * np.abs(rec.outputs["y"]) ** 1.6 + noise}), "static_nonlinearity"
+
+
 def equations() -> tuple[Recording, str]:
     given: dict[str, Any] = {"states": {"angle": "rad"}, "gain": 2.0, "lag": 0.2, "hard": 0.3}
     given["equations"] = {"angle": "(gain * volts - angle - hard * angle**3) / lag"}
@@ -122,7 +141,9 @@ MADE: dict[str, Callable[[], tuple[Recording, str]]] = {
     "magnetometer": lambda: axes("magnetometer", "field", "uT", {"bias_V": 2.5, "scale_V_per_uT": 0.02}),
     "accelerometer_cluster": cluster,
     "mechanical_axis": axis,
+    "mechanical_axis with a warm drive": warm_drive,
     "state_space": space,
+    "state_space with a folded sign": folded,
     "state_space with names": lambda: space(states={"place": "m", "speed": "m/s"}),
     "state_space in two": cascade,
     "ode": equations,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from tests.unit.mismatch_model.made import recording
 from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.fit import bounded_step, fit
 from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.vary import added
 from tools.mismatch.infer.constants import learned
 from tools.mismatch.infer.search import Search
 from tools.mismatch.recording import Recording
@@ -108,3 +110,34 @@ def test_a_sensor_that_reads_a_power_of_the_magnitude(power: float) -> None:
     assert float(np.std(found.residual["speed"][problem.held_rows])) < 0.01
     # the scale of the signal is determined: every figure of the base is
     assert np.all(np.isfinite(uncertainty(problem, found).deviations()))
+
+
+def creeping_axis(tau_s: float, newton: float) -> Recording:
+    """An axis whose drive adds an offset that settles, integrated by small steps of its own."""
+    rng = np.random.default_rng(11)
+    n, dt = 3000, 0.01
+    force = np.repeat(rng.uniform(-8.0, 8.0, n // 50), 50)
+    x = v = 0.0
+    y = np.empty(n)
+    for i in range(n):
+        y[i] = x
+        for k in range(20):
+            now = (i + k / 20) * dt
+            v += dt / 20 * (force[i] + newton * math.exp(-now / tau_s) - 6.0 * v - 120.0 * x) / 2.0
+            x += dt / 20 * v
+    y += 2e-4 * rng.standard_normal(n)
+    twin = {"mass": 2.0, "damping": 6.0, "stiffness": 120.0, "hold": "zero"}
+    return recording("mechanical_axis", dt, {"force": force}, {"position": y}, {"force": "N", "position": "m"}, twin)
+
+
+def test_the_offset_of_a_drive_that_settles() -> None:
+    rec = creeping_axis(9.0, 1.5)
+    problem, _, base = prepared(rec, 0.3, 0, was_joined=False)
+    every = sites(make(rec), rec, EFFECTS["thermal_drift"])
+    (place,) = [p for p in every if p.site == "input"]
+    with np.errstate(all="ignore"):
+        found = added(problem, base, place)
+    figures = {h.name: (h.value, h.unit) for h in found.model.human(found.theta)[place.label]}
+    assert figures["time_constant_s"][0] == pytest.approx(9.0, rel=0.05)
+    assert figures["slow_amplitude"] == (pytest.approx(-1.5, rel=0.05), "{in}")
+    assert float(np.std(found.residual["position"][problem.held_rows])) < 2.5e-4

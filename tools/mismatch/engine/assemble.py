@@ -196,7 +196,7 @@ def assemble(
         seconds=0.0,
         seed=problem.seed,
         chain=twin.chain,
-        corrected_base=twin.to_text(exported.theta[: Model(twin).n_base]),
+        corrected_base=exported.model.base_text(exported.theta),
         corrected_parameters=tuple(float(v) for v in exported.theta[: Model(twin).n_base]),
         tested=tuple(
             {

@@ -84,6 +84,8 @@ class DynamicTwin(Head):
     apart: bool = False
     counted: Counted = ""
     start_given: bool = False
+    at_rest: bool = False
+    """Whether the start that was given is zero."""
 
     def start(self, recording: object) -> Array:
         """See Twin."""
@@ -238,7 +240,7 @@ class DynamicTwin(Head):
         n = run.t.size
         zero = np.zeros(n)
         given = self.start_given or (run.window == 0 and not run.period)
-        read = run.setting is not None and not (run.bent and self.start_given)
+        read = run.setting is not None and not (run.bent and self.at_rest)
         if given and not read and self.fixed_free is not None and run.starts == (0,):
             for o, y in self.fixed_free(n).items():
                 value[o] = value[o] + y

@@ -178,6 +178,7 @@ def state_space_twin(recording: Recording) -> DynamicTwin:
         feedback_on=outputs[0] if len(inputs) == 1 and s else "",
         fastest_per_s=float(np.max(np.abs(continuous))) if continuous else 0.0,
         start_given="x0" in recording.twin.parameters,
+        at_rest="x0" in recording.twin.parameters and not np.any(m.x0),
     )
 
 
