@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tools.mismatch.engine.diagnose import prepared
-from tools.mismatch.engine.fit import bounded_step, fit
+from tools.mismatch.engine.fit import bounded_step, fit, without_unseen
 from tools.mismatch.engine.intervals import uncertainty
 from tools.mismatch.engine.vary import added
 from tools.mismatch.infer.constants import learned
@@ -141,3 +141,15 @@ def test_the_offset_of_a_drive_that_settles() -> None:
     assert figures["time_constant_s"][0] == pytest.approx(9.0, rel=0.05)
     assert figures["slow_amplitude"] == (pytest.approx(-1.5, rel=0.05), "{in}")
     assert float(np.std(found.residual["position"][problem.held_rows])) < 2.5e-4
+
+
+def test_what_moves_nothing_stays_where_it_is() -> None:
+    """Friction whose level is zero has an asymmetry without effect: by the rounding of its slope it ran to 1e136."""
+    j = np.array([[1.0, 1e-70], [2.0, -3e-70]])
+    residual = np.array([0.5, -1.0])
+    gradient, hessian = without_unseen(j.T @ residual, j.T @ j, np.ones(2), float(residual @ residual))
+    wide = np.full(2, np.inf)
+    step = bounded_step(hessian, gradient, 1e-8, -wide, wide)
+    assert step[1] == 0.0
+    assert step[0] == pytest.approx(0.3)
+    assert abs(bounded_step(j.T @ j, j.T @ residual, 1e-8, -wide, wide)[1]) > 1e50

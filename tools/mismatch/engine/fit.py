@@ -108,6 +108,20 @@ def slopes(projected: Projected, theta: Array, residual: Array) -> Array:
     return out
 
 
+UNSEEN = 1e-9
+"""Change of a residual by a parameter as a whole, relative to the residual, below which the parameter stays put."""
+
+
+def without_unseen(gradient: Array, hessian: Array, typical: Array, cost: float) -> tuple[Array, Array]:
+    """(gradient, hessian) with zeros for what moves no output: its slope is rounding, and a step along it has no end.
+
+    ``typical`` (k,): sizes of the parameters; ``cost``: square of the residual.
+    """
+    moves = np.sqrt(np.maximum(np.diag(hessian), 0.0)) * np.where(np.isfinite(typical), typical, 1.0)
+    seen = moves > UNSEEN * np.sqrt(cost)
+    return np.where(seen, gradient, 0.0), np.where(np.outer(seen, seen), hessian, 0.0)
+
+
 def bounded_step(hessian: Array, gradient: Array, damping: float, least: Array, most: Array) -> Array:
     """The damped Gauss-Newton step (k,) that leads lowest within ``least`` and ``most`` (k,).
 
@@ -152,6 +166,8 @@ def _search(projected: Projected, theta: Array, iterations: int, tolerance: floa
         hessian = jacobian.T @ jacobian
         if not np.all(np.isfinite(hessian)):
             break
+        typical = [1.0 if p.log and p.lo > 0 else max(abs(v), abs(p.scale)) for p, v in zip(parameters, z, strict=True)]
+        gradient, hessian = without_unseen(gradient, hessian, np.array(typical), cost)
         gain = -1.0
         for _try in range(6 if fresh else 2):
             step = bounded_step(hessian, gradient, damping, lower - z, upper - z)
