@@ -6,9 +6,10 @@ Column starts are plain integers (``frame[RATE + 1]``), because compiled kernels
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -107,10 +108,21 @@ class Clip(IntFlag):
 
 
 class Layout:
-    """Names, units and slices of a frame's columns; ``layout["rate"]`` is a slice. ``quantities`` lists name, unit,
-    parts and meaning of each, from left to right."""
+    """Describes the frame of one instrument; ``layout["rate"]`` is a slice. ``quantities`` lists name, unit, parts and
+    meaning of each, from left to right. ``plotted`` names the quantities that a scope shows first; ``held`` is the
+    column, and the bits in it, that say that a hold keeps the instrument at rest."""
 
-    def __init__(self, quantities: Iterable[tuple[str, str, tuple[str, ...], str]]) -> None:
+    def __init__(
+        self,
+        instrument: str,
+        quantities: Iterable[tuple[str, str, tuple[str, ...], str]],
+        *,
+        plotted: tuple[str, ...],
+        held: tuple[str, int],
+    ) -> None:
+        self.instrument = instrument
+        self.plotted = plotted
+        self._held_in, self._held_bits = held
         columns: list[Column] = []
         start = 0
         for name, unit, parts, what in quantities:
@@ -140,12 +152,26 @@ class Layout:
         """Return one unit per element of the frame, in order."""
         return tuple(column.unit for column in self.columns for _ in range(column.size))
 
+    def find_column(self, scalar: str) -> Column | None:
+        """Return the quantity that the scalar ``scalar`` belongs to, ``None`` where the frame has none."""
+        return next((column for column in self.columns if scalar in column.scalar_names()), None)
+
+    def read_holds(self, names: Sequence[str], rows: NDArray[np.floating[Any]]) -> NDArray[np.bool_]:
+        """Return for each row (last axis of ``rows`` is the column ``names``) whether a hold lasts in it.
+
+        A value that is not finite, and a recording without the column, say that none does."""
+        if self._held_in not in names:
+            return np.zeros(len(rows), dtype=np.bool_)
+        values = rows[:, names.index(self._held_in)]
+        words = np.where(np.isfinite(values), values, 0.0).astype(np.int64)
+        return np.asarray((words & self._held_bits) != 0)
+
     def new_frame(self) -> NDArray[np.float64]:
         """A frame of zeros."""
         return np.zeros(self.size)
 
 
-LAYOUT = Layout(_QUANTITIES)
+LAYOUT = Layout("micron", _QUANTITIES, plotted=("tip_displacement", "command"), held=("status", int(FrameStatus.HELD)))
 
 TICK = LAYOUT.start("tick")
 TIME = LAYOUT.start("t")

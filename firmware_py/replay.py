@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from firmware_py.layouts import layout_of_recording
 from firmware_py.recording.reader import Recording
 from firmware_py.recording.replay import ReplayReport
 
@@ -9,7 +10,7 @@ from firmware_py.recording.replay import ReplayReport
 def replay_recording(recording: Recording) -> ReplayReport:
     """Run the recorded configuration over the recorded inputs and return how the outputs compare. Raises
     ``RecordingError`` for a recording that is not of a run."""
-    if "endoscope" in recording.metadata:
+    if layout_of_recording(recording.metadata).instrument == "endoscope":
         from firmware_py.endoscope.replay import replay_endoscope
 
         return replay_endoscope(recording)

@@ -27,7 +27,7 @@ _QUANTITIES: tuple[tuple[str, str, tuple[str, ...], str], ...] = (
     ("reached", "1", (), "targets reached so far"),
 )
 
-LAYOUT = Layout(_QUANTITIES)
+LAYOUT = Layout("endoscope", _QUANTITIES, plotted=("psi", "theta", "view_x", "view_y"), held=("held", 1))
 
 TICK, TIME = LAYOUT.start("tick"), LAYOUT.start("t")
 ACCEL, GYRO, TEMPERATURE = LAYOUT.start("accel"), LAYOUT.start("gyro"), LAYOUT.start("temperature")

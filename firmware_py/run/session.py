@@ -103,7 +103,14 @@ def _open_link(
 def _tell_devices(run: Run, loop: Loop, parts: OpenedInstrument) -> None:
     """Tell the page which devices there are, and the names of the histograms in its memory."""
     if run.on_status is not None and run.live is not None:
-        run.on_status({"event": "devices", "identities": parts.identities, "histograms": list(loop.histograms())})
+        run.on_status(
+            {
+                "event": "devices",
+                "identities": parts.identities,
+                "histograms": list(loop.histograms()),
+                "has_outputs": run.output is not None,
+            }
+        )
 
 
 def limits_of(limits: SafetyLimits, request: RunRequest) -> SafetyLimits:

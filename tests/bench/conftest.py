@@ -110,15 +110,16 @@ class Server:
 
 
 @contextmanager
-def bench_server(more_toml: str) -> Iterator[Server]:
-    """``micron bench`` on the default bench and ``more_toml``, in paced emulated time.
+def bench_server(more_toml: str = "", name: str = "bench") -> Iterator[Server]:
+    """``micron bench`` on ``bench`` (the default one and ``more_toml``) or ``endoscope``, in paced emulated time.
 
     Its files are in a short path, for Unix sockets.
     """
     folder = Path(tempfile.mkdtemp(prefix="mb", dir="/tmp"))
     recordings = folder / "recordings"
-    bench = copy_of_default_bench(folder, more_toml)
-    shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)  # has the motion card
+    copy_of_default_bench(folder, more_toml)
+    shutil.copy(DEFAULT_BENCH.with_name("endoscope.toml"), folder)
+    bench = folder / f"{name}.toml"
     command = [sys.executable, "-m", "tools.cli.main", "bench", "--port", "0"]
     command += ["--bench", str(bench)]
     process = subprocess.Popen(

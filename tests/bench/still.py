@@ -25,6 +25,7 @@ from firmware_py.frame import LAYOUT
 from tests.conftest import DEFAULT_BENCH
 from tools.bench.app import make_app
 from tools.bench.firmware import Choice
+from tools.bench.history import History
 from tools.bench.jobs import Jobs
 from tools.bench.layouts import Layouts
 from tools.bench.routes import more_routes
@@ -109,7 +110,7 @@ class StillSession(Session):
         self.run_number += 1
         self.run.phase = "running"
         self.run.status = status()
-        self.history = self._new_history()
+        self.history = History(self.layout)
         self.history.append(made_up_rows())
 
     async def stop(self) -> None:
@@ -151,7 +152,7 @@ def fill(recordings: Path) -> None:
         file.write_bytes(bytes(1000 * (i + 1)))
         os.utime(file, (1.79e9 + i, 1.79e9 + i))
         notes = ["probe 3, holder changed", "the cable was moved after the first minute"]
-        sidecar = {"notes": notes[: i + 1], "ticks": 60_000 * (i + 1), "dropped": 3 if i == 1 else 0}
+        sidecar = {"notes": notes[: i + 1], "ticks": 60_000 * (i + 1), "rate_hz": "1000", "dropped": 3 if i == 1 else 0}
         file.with_suffix(".json").write_text(json.dumps(sidecar), encoding="utf-8")
 
 

@@ -1,12 +1,10 @@
-"""Calibrations and a corrected twin laid over a copy of the bench; one way back. No firmware: the session is a stub."""
+"""Calibrations and a corrected twin laid over a copy of the bench; one way back. The session only notes its starts."""
 
 from __future__ import annotations
 
 import asyncio
 import tomllib
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
 import pytest
 
@@ -17,6 +15,7 @@ from tests.conftest import DEFAULT_BENCH
 from tools.bench.applied import Applied
 from tools.bench.firmware import Choice
 from tools.bench.mismatch import figures
+from tools.bench.session import Session
 from tools.calibrate.calibration_file import calibration_toml
 from tools.errors import InputError
 
@@ -32,15 +31,15 @@ offset_um = 0.0
 CALIBRATION = "format = 1\n[sensing]\nrange_g = 1.6\n"
 
 
-class Stub:
-    """A session that only remembers which bench it was started with."""
+class NotedStarts(Session):
+    """A session that only remembers with which bench it was to start the firmware."""
 
-    def __init__(self, folder: Path) -> None:
-        self.choice = Choice(DEFAULT_BENCH)
-        self.recorder = SimpleNamespace(folder=folder, active=False)
+    def __init__(self, folder: Path, bench: Path = DEFAULT_BENCH) -> None:
+        super().__init__(Choice(bench), folder)
         self.started: list[Path] = []
 
-    async def start(self, choice: Choice) -> None:
+    async def start(self, choice: Choice | None = None) -> None:
+        assert choice is not None
         self.choice = choice
         self.started.append(choice.bench)
 
@@ -52,13 +51,12 @@ def twin(folder: Path) -> Path:
 
 
 @pytest.fixture
-def bench(tmp_path: Path) -> tuple[Applied, Stub]:
-    session: Any = Stub(tmp_path / "recordings")
-    session.recorder.folder.mkdir()
+def bench(tmp_path: Path) -> tuple[Applied, NotedStarts]:
+    session = NotedStarts(tmp_path / "recordings")
     return Applied(session), session
 
 
-def test_one_over_the_other_and_back(bench: tuple[Applied, Stub], tmp_path: Path):
+def test_one_over_the_other_and_back(bench: tuple[Applied, NotedStarts], tmp_path: Path):
     applied, session = bench
     first = asyncio.run(applied.calibration("poses", CALIBRATION))
     second = asyncio.run(applied.twin(twin(tmp_path)))
@@ -76,18 +74,32 @@ def test_one_over_the_other_and_back(bench: tuple[Applied, Stub], tmp_path: Path
     assert applied.what == []
 
 
-def test_a_second_twin_and_a_running_recording_are_refused(bench: tuple[Applied, Stub], tmp_path: Path):
+def test_a_second_twin_and_a_running_recording_are_refused(bench: tuple[Applied, NotedStarts], tmp_path: Path):
     applied, session = bench
     asyncio.run(applied.twin(twin(tmp_path)))
     with pytest.raises(InputError, match="applied already"):
         asyncio.run(applied.twin(twin(tmp_path)))
-    session.recorder.active = True
-    with pytest.raises(InputError, match="a recording is running"):
-        asyncio.run(applied.calibration("poses", CALIBRATION))
+
+    async def while_recording() -> None:
+        await session.recorder.start("first", "", {"tick_hz": "1000"}, session.layout)
+        with pytest.raises(InputError, match="a recording is running"):
+            await applied.calibration("poses", CALIBRATION)
+        await session.recorder.stop({})
+
+    asyncio.run(while_recording())
     assert len(session.started) == 1
 
 
-def test_a_twin_that_the_bench_cannot_run_changes_nothing(bench: tuple[Applied, Stub], tmp_path: Path):
+def test_a_bench_of_another_instrument_takes_neither(tmp_path: Path):
+    session = NotedStarts(tmp_path / "recordings", DEFAULT_BENCH.with_name("endoscope.toml"))
+    applied = Applied(session)
+    with pytest.raises(InputError, match="takes neither calibrations nor twins"):
+        asyncio.run(applied.calibration("poses", CALIBRATION))
+    assert not session.started
+    assert not list(session.recorder.folder.iterdir()), "nothing half written"
+
+
+def test_a_twin_that_the_bench_cannot_run_changes_nothing(bench: tuple[Applied, NotedStarts], tmp_path: Path):
     applied, session = bench
     wrong = tmp_path / "wrong.toml"
     wrong.write_text(TWIN.replace("piezo_stack", "mechanical_axis"))
@@ -107,7 +119,7 @@ def test_figures_of_a_run(tmp_path: Path):
     assert figures(path) == {"band": [25.0, 5.0, 80.0], "all": [30.0, 9.0]}
 
 
-def test_another_attitude_filter_for_the_firmware(bench: tuple[Applied, Stub]):
+def test_another_attitude_filter_for_the_firmware(bench: tuple[Applied, NotedStarts]):
     applied, _ = bench
     toml = calibration_toml("attitude filter", "micron bench", {"sensing": {"attitude_method": "observer"}})
     out = asyncio.run(applied.calibration("attitude filter", toml))

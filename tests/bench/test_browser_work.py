@@ -1,4 +1,4 @@
-"""What a person does on the page beside looking: recordings taken away, filters compared, the card, long jobs."""
+"""What a person does on the page beside looking: recordings taken away, filters compared, long jobs."""
 
 from __future__ import annotations
 
@@ -81,19 +81,6 @@ def test_another_filter_runs_beside_the_firmwares_and_then_in_it(page: Any, serv
     page.wait_for_selector("h2:has-text('Firmware: observer')")
     page.click("text=Back to the original bench")
     server.wait_for(lambda s: s["bench_file"] == original and s["phase"] == "running", "the original bench", 220)
-
-
-@pytest.mark.slow
-def test_the_emulated_motion_card_steers_the_game(page: Any):
-    go(page, "targets")
-    page.click("text=motion card")
-    page.wait_for_selector("select option[value$='endoscope.toml']", state="attached")
-    page.click("#target-start")
-    # the emulated hand turns the card and presses its button by plan: the view follows while it is active
-    page.wait_for_function("micron.game() && micron.game().source === 'card' && micron.game().status === 1")
-    view = page.evaluate("micron.game().view")
-    page.wait_for_function(f"Math.hypot(micron.game().view.x - {view['x']}, micron.game().view.y - {view['y']}) > 5")
-    assert page.evaluate("micron.game().error") == ""
 
 
 def wait_for_job(server: Server, kind: str) -> None:

@@ -7,9 +7,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from firmware_py.frame import Layout
 from tools.bench.history import BLOCK, History, rows_per_bucket
 from tools.bench.wire import HEADER, encode
 from tools.diagnose.extremes import extremes
+
+
+def layout(columns: int) -> Layout:
+    """The frame of an instrument with a time and ``columns - 1`` values."""
+    values = tuple(str(i) for i in range(columns - 1))
+    return Layout("test", [("t", "s", (), ""), ("x", "1", values, "")], plotted=("x",), held=("x_0", 1))
 
 
 def filled(
@@ -18,7 +25,7 @@ def filled(
     rng = np.random.default_rng(seed)
     rows = rng.standard_normal((n, 3)).astype(np.float32).astype(np.float64)
     rows[:, 0] = np.arange(n) * 1e-3
-    history = History(3, 0, fine, coarse)
+    history = History(layout(3), fine, coarse)
     for start in range(0, n, chunk):
         history.append(rows[start : start + chunk])
     return history, rows
@@ -42,7 +49,7 @@ def test_every_bucket_holds_the_extremes_of_its_rows(n: int, k: int, chunk: int)
 def test_a_spike_of_two_samples_is_in_every_zoom(rows: int, pixels: int):
     data = np.zeros((rows, 2))
     data[rows // 3 : rows // 3 + 2, 1] = 5.0
-    history = History(2, 0, 1 << 16, 1 << 17)
+    history = History(layout(2), 1 << 16, 1 << 17)
     history.append(data)
     found = history.buckets(np.array([1]), rows_per_bucket(rows, pixels), 0)
     assert found.high.max() == 5.0

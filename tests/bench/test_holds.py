@@ -8,33 +8,34 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from firmware_py.frame import LAYOUT, FrameStatus
+from firmware_py.endoscope import frame as endoscope_frame
+from firmware_py.frame import LAYOUT, STATUS, FrameStatus
 from tests.bench.conftest import go
 from tests.bench.still import RATE_HZ, Still, made_up_rows
 from tools.bench.hold_spans import MOST_SPANS, HoldSpans
 
 pytestmark = pytest.mark.timeout(400)
 
-HELD = float(FrameStatus.HELD | FrameStatus.SATURATED)
 CAUSE = "daq: no new scan for 5 ms"
 
 
 def test_edges_are_those_of_the_rows_however_they_are_cut():
     t_s = np.arange(1000) / RATE_HZ
-    status = np.zeros(1000)
-    status[100:150] = status[700:] = HELD
-    status[400] = np.nan
+    rows = np.zeros((1000, LAYOUT.size))
+    rows[100:150, STATUS] = rows[700:, STATUS] = FrameStatus.HELD | FrameStatus.SATURATED
+    rows[400, STATUS] = np.nan
+    held = LAYOUT.read_holds(LAYOUT.scalar_names(), rows)
     for cut in ([], [120], [100], [150], [99, 700, 999]):
         holds = HoldSpans()
-        for rows in np.split(np.arange(1000), cut):
-            holds.follow(t_s[rows], status[rows])
+        for part in np.split(np.arange(1000), cut):
+            holds.follow(t_s[part], held[part])
         found = [(span.from_s, span.to_s) for span in holds.spans]
         assert found == [(t_s[100], t_s[150]), (t_s[700], None)], cut
         assert holds.current is holds.spans[-1]
 
 
 def test_a_cause_belongs_to_its_hold_whichever_is_told_first():
-    t_s, held, free = np.array([1.0]), np.array([HELD]), np.array([0.0])
+    t_s, held, free = np.array([1.0]), np.array([True]), np.array([False])
     holds = HoldSpans()
     holds.name(CAUSE)  # the status line is faster than the rows
     holds.follow(t_s, held)
@@ -57,13 +58,13 @@ def test_a_hold_that_no_status_told_is_named_by_the_outcome(rows_first: bool):
     holds, t_s = HoldSpans(), np.array([3.0, 3.1, 9.0, 9.01])
     told = [{"t_s": 3.01, "cause": "supply: 4.2 V"}, {"t_s": 9.0, "cause": CAUSE}]
     holds.name("supply: 4.2 V")
-    holds.follow(t_s[:2], np.array([HELD, 0.0]))
+    holds.follow(t_s[:2], np.array([True, False]))
     holds.name("")
     if rows_first:
-        holds.follow(t_s[2:], np.array([HELD, HELD]))
+        holds.follow(t_s[2:], np.array([True, True]))
     holds.name_by_outcome(told)
     if not rows_first:
-        holds.follow(t_s[2:], np.array([HELD, HELD]))
+        holds.follow(t_s[2:], np.array([True, True]))
     assert [span.cause for span in holds.spans] == ["supply: 4.2 V", CAUSE]
 
 
@@ -72,7 +73,7 @@ def page(still: Still, still_page: Any) -> Any:
     if not still.session.holds.spans:
         t_s = made_up_rows()[:, LAYOUT.start("t")]
         still.session.holds.name(CAUSE)
-        still.session.holds.follow(t_s, np.where((t_s > 10.6) & (t_s < 11.1), HELD, 0.0))
+        still.session.holds.follow(t_s, (t_s > 10.6) & (t_s < 11.1))
     return still_page
 
 
@@ -129,3 +130,12 @@ def test_four_bands_beside_scipy(page: Any):
             expected = 1e6 * np.sqrt(density[:, inside].sum() * hz[1])
             assert float(text) == pytest.approx(expected, rel=0.02, abs=0.006), row
     assert shown[2][3].startswith("−")
+
+
+def test_each_instrument_says_its_holds_in_its_own_column():
+    rows = np.zeros((3, endoscope_frame.LAYOUT.size))
+    rows[1, endoscope_frame.HELD] = 1.0
+    rows[2, endoscope_frame.STATUS] = float(FrameStatus.HELD)  # there, the status is that of the card
+    names = endoscope_frame.LAYOUT.scalar_names()
+    assert endoscope_frame.LAYOUT.read_holds(names, rows).tolist() == [False, True, False]
+    assert not LAYOUT.read_holds(("t", "volts_0"), np.ones((4, 2))).any(), "a recording without a status has no holds"

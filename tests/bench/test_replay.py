@@ -82,7 +82,7 @@ def test_any_place_is_read_without_what_is_before(recording: tuple[Path, np.ndar
 def test_half_an_hour_costs_a_seek_as_many_chunks_as_a_short_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     """The time is measured by benchmarks.bench_page; here the work is counted."""
     write(tmp_path / "a.mcap", 180.0)
-    history = RecordedHistory(tmp_path / "a.mcap")
+    history = RecordedHistory(tmp_path / "a.mcap", LAYOUT)
     opened = history._recording
     read: list[int] = []
     monkeypatch.setattr(opened, "_read", lambda k, real=opened._read: (read.append(k), real(k))[1])
@@ -96,9 +96,9 @@ def test_half_an_hour_costs_a_seek_as_many_chunks_as_a_short_one(tmp_path: Path,
 
 def test_it_answers_as_the_live_history_does(recording: tuple[Path, np.ndarray], tmp_path: Path):
     path, rows = recording
-    live = History(LAYOUT.size, T)
+    live = History(LAYOUT)
     live.append(rows)
-    replay = RecordedHistory(path)
+    replay = RecordedHistory(path, LAYOUT)
     replay.head = len(rows)
     channels = np.array([NAMES.index(n) for n in ("volts_3", "t", "command_2", "status")])
     for k, first, stop in ((1, 100, 700), (7, 40, 90), (1, 19_000, None)):
@@ -126,7 +126,7 @@ def test_it_answers_as_the_live_history_does(recording: tuple[Path, np.ndarray],
 
 def test_where_ticks_are_missing_nothing_is_made_up(tmp_path: Path):
     rows = write(tmp_path / "gap.mcap", 6.0, missing=range(3000, 3400))
-    replay = RecordedHistory(tmp_path / "gap.mcap")
+    replay = RecordedHistory(tmp_path / "gap.mcap", LAYOUT)
     replay.head = replay.n_rows
     found = replay.buckets(np.array([NAMES.index("volts_0")]), 1, 2900, 3500)
     assert np.isnan(found.low[0, 100:500]).all()
@@ -149,7 +149,7 @@ def test_a_span_is_a_recording_of_its_own(recording: tuple[Path, np.ndarray], tm
         if made.stem == "recovered":
             (tmp_path / "torn.mcap").write_bytes(path.read_bytes()[:-3000])
             assert recover(tmp_path / "torn.mcap", made).rows > 15_000
-        opened = RecordedHistory(made)  # its events lie beside the ticks of their time: the index can be searched
+        opened = RecordedHistory(made, LAYOUT)  # events lie beside the ticks of their time: the index can be searched
         assert opened.n_rows == Recording(made).n_rows
         opened.close()
     with pytest.raises(RecordingError, match="no ticks between 90 and 91 s"):
@@ -162,12 +162,12 @@ def test_a_torn_file_is_one_message(recording: tuple[Path, np.ndarray], tmp_path
     torn = tmp_path / "torn.mcap"
     torn.write_bytes(recording[0].read_bytes()[:left])
     with pytest.raises(RecordingError, match=r"no index: it was torn|is not a recording|no column layout"):
-        RecordedHistory(torn)
+        RecordedHistory(torn, LAYOUT)
 
 
 def test_a_place_beyond_the_ends_is_the_end(recording: tuple[Path, np.ndarray]):
     async def moves() -> None:
-        replay = Replay(Recorded(recording[0]))
+        replay = Replay(Recorded(recording[0], LAYOUT))
         history = replay.first.history
         replay.seek(-5.0)
         assert (replay.position_s, history.head) == (0.0, 1)
@@ -175,7 +175,7 @@ def test_a_place_beyond_the_ends_is_the_end(recording: tuple[Path, np.ndarray]):
         assert (replay.position_s, history.head) == (history.length_s, history.n_rows)
         replay.play(True)  # at the end: from the start again
         assert replay.position_s == 0.0
-        second = Recorded(recording[0])
+        second = Recorded(recording[0], LAYOUT)
         await replay.lay_over(second, 2.0)
         replay.seek(5.0)
         assert (history.head, second.history.head) == (5001, 7001)

@@ -16,7 +16,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from firmware_py.frame import LAYOUT
+from firmware_py.frame import Layout
 from tools.bench.guard import Access, Guard
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
@@ -29,12 +29,18 @@ RESERVED_VIEWERS = 4
 """Further places for pages that show the token within ``viewer.HELLO_S``."""
 
 
-def catalogue() -> list[dict[str, Any]]:
-    """Every scalar that can be looked at."""
+def catalogue(layout: Layout) -> list[dict[str, Any]]:
+    """Return every scalar of the instrument's frame. ``plotted``: the scope shows it first."""
     return [
-        {"name": name, "unit": column.unit, "group": column.name, "what": column.what, "index": column.start + i}
-        for column in LAYOUT
-        for i, name in enumerate(column.scalar_names())
+        {
+            "name": name,
+            "unit": column.unit,
+            "group": column.name,
+            "what": column.what,
+            "plotted": column.name in layout.plotted,
+        }
+        for column in layout
+        for name in column.scalar_names()
     ]
 
 
@@ -46,7 +52,7 @@ def core_routes(session: Session, access: Access) -> list[BaseRoute]:
         return FileResponse(STATIC / "index.html")
 
     async def channels(_: Request) -> Any:
-        return {"channels": catalogue()}
+        return {"instrument": session.layout.instrument, "channels": catalogue(session.layout)}
 
     async def benches(_: Request) -> Any:
         return {"benches": sorted(str(p) for p in session.home.glob("*.toml")), "now": str(session.choice.bench)}

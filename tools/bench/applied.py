@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+from firmware_py.frame import LAYOUT
 from hal.bench import BenchFile, load_bench
 from tools.bench.bench_copy import with_calibration, with_twin
 from tools.bench.session import Session
@@ -46,6 +47,8 @@ class Applied:
     async def _apply(self, what: str, name: str, toml: str, laid_over: Callable[[BenchFile, Path, Path], Path]) -> Path:
         if self._session.recorder.active:
             raise InputError("a recording is running; stop it first: the firmware starts again with the copy")
+        if self._session.layout is not LAYOUT:
+            raise InputError("this bench is of another instrument, which takes neither calibrations nor twins")
         choice = self._session.choice
         original = self.original or choice.bench
         self._folder.mkdir(parents=True, exist_ok=True)

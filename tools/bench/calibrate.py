@@ -11,7 +11,6 @@ import numpy as np
 from starlette.requests import Request
 from starlette.routing import BaseRoute, Route
 
-from firmware_py.frame import LAYOUT
 from hal.types import STANDARD_GRAVITY
 from tools.bench.applied import Applied
 from tools.bench.history import BLOCK
@@ -83,7 +82,7 @@ class Calibration:
     async def warmth(self, _: Request) -> Any:
         """Temperature since the start, and whether it has settled."""
         history = self._session.history
-        column = np.array([LAYOUT.start("temperature")])
+        column = np.array([history.layout.start("temperature")])
         k = BLOCK * 16
         buckets = history.buckets(column, k, max(0, history.head - WARM_UP_ROWS) // k)
         t, value = buckets.t_s, 0.5 * (buckets.low[0] + buckets.high[0]).astype(np.float64)

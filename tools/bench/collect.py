@@ -13,6 +13,7 @@ from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
+from firmware_py.layouts import layout_of_recording
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.files import is_being_recorded
 from firmware_py.recording.format import TIME_COLUMN, load_json
@@ -20,6 +21,7 @@ from firmware_py.recording.reader import Recording
 from tools.bench.hold_spans import HoldSpans
 from tools.bench.jobs import Jobs
 from tools.bench.recorder import SUFFIX, check_name, is_own_file
+from tools.bench.replay import rate_of
 from tools.bench.requests import body, clear, text
 from tools.bench.session import Session
 from tools.errors import InputError
@@ -52,12 +54,18 @@ def listing(folder: Path, recording: str) -> list[dict[str, Any]]:
                 "modified": status.st_mtime,
                 "recording": path.stem == recording,
                 "notes": table.get("notes", []),
-                "ticks": table.get("ticks"),
+                "seconds": _seconds(table),
                 "dropped": table.get("dropped"),
                 "problem": table.get("problem", ""),
             }
         )
     return recordings
+
+
+def _seconds(notes: dict[str, Any]) -> float | None:
+    """Return how long a recording is by the notes beside it, ``None`` where they do not say it."""
+    ticks = notes.get("ticks")
+    return ticks / rate_of(notes.get("rate_hz")) if isinstance(ticks, int) else None
 
 
 def _notes(sidecar: Path) -> dict[str, Any]:
@@ -96,7 +104,7 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
     t_s = np.zeros(n_buckets)
     row = 0
     holds = HoldSpans()
-    status = recording.names.index("status") if "status" in recording.names else None
+    layout = layout_of_recording(recording.metadata)
     for block in recording.blocks():
         data = block.data[index]
         n = data.shape[1]
@@ -110,8 +118,7 @@ def quick_look(path: Path, channels: list[str]) -> dict[str, Any]:
         is_first = (row + starts) % k == 0
         t_s[first:stop][is_first] = data[-1, starts[is_first]]
         row += n
-        if status is not None:
-            holds.follow(block.data[index[-1]], block.data[status])
+        holds.follow(block.data[index[-1]], layout.read_holds(recording.names, block.data.T))
     holds.name_by_events(recording.events)
     units = {column.name: column.unit for column in recording.columns}
     return {

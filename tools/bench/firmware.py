@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from firmware_py.frame import LAYOUT
 from firmware_py.live.memory import LiveMemory
 from firmware_py.run_request import RunRequest
 from hal.children import child_command, child_environment
@@ -41,11 +40,11 @@ class Choice:
 class Firmware:
     """Start with ``start``; ``on_line`` gets every status line, ``on_end`` the outcome or the reason of the failure."""
 
-    def __init__(self, choice: Choice, runtime_dir: Path) -> None:
+    def __init__(self, choice: Choice, columns: int, runtime_dir: Path) -> None:
         """Use ``start``."""
         self.choice = choice
         self.runtime_dir = runtime_dir
-        self.memory = LiveMemory.create(LAYOUT.size)
+        self.memory = LiveMemory.create(columns)
         self._control, self._their_control = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._control.setblocking(False)
         self._process: asyncio.subprocess.Process | None = None
@@ -55,11 +54,12 @@ class Firmware:
     async def start(
         cls,
         choice: Choice,
+        columns: int,
         on_line: Callable[[dict[str, Any]], None],
         on_end: Callable[[dict[str, Any] | None, str], None],
     ) -> Firmware:
-        """Start the process; what it says comes through the callbacks."""
-        self = cls(choice, Path(tempfile.mkdtemp(prefix="micron-bench-")))
+        """Start the process, whose frames have ``columns`` values; what it says comes through the callbacks."""
+        self = cls(choice, columns, Path(tempfile.mkdtemp(prefix="micron-bench-")))
         fds = (self.memory.fd, self._their_control.fileno())
         request = RunRequest(
             bench=choice.bench,

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from firmware_py.frame import Layout
 from tools.diagnose.extremes import extremes
 
 Float32Array = NDArray[np.float32]
@@ -69,15 +70,15 @@ class _Ring:
 class History:
     """Single rows for ``fine_rows``, extremes of blocks of 16 rows for ``coarse_rows``."""
 
-    def __init__(self, n_columns: int, time_column: int, fine_rows: int = 1 << 17, coarse_rows: int = 600_000) -> None:
-        self._time_column = time_column
-        self._fine = _Ring(n_columns, fine_rows)
-        self._low = _Ring(n_columns, coarse_rows // BLOCK)
-        self._high = _Ring(n_columns, coarse_rows // BLOCK)
+    def __init__(self, layout: Layout, fine_rows: int = 1 << 17, coarse_rows: int = 600_000) -> None:
+        self.layout = layout
+        self._time_column = layout.start("t")
+        self._fine = _Ring(layout.size, fine_rows)
+        self._low = _Ring(layout.size, coarse_rows // BLOCK)
+        self._high = _Ring(layout.size, coarse_rows // BLOCK)
         # times need more digits than a float32 has after some hours
         self._fine_t = np.zeros(fine_rows)
         self._coarse_t = np.zeros(coarse_rows // BLOCK)
-        self._n_columns = n_columns
 
     @property
     def head(self) -> int:
@@ -107,7 +108,7 @@ class History:
         whole = self._fine.head // BLOCK
         first = self._low.head
         if whole > first:
-            block = self._fine.take(np.arange(self._n_columns), first * BLOCK, whole * BLOCK)
+            block = self._fine.take(np.arange(self.layout.size), first * BLOCK, whole * BLOCK)
             low, high = extremes(block, block, BLOCK)
             starts = np.arange(first, whole)
             self._coarse_t[starts % self._low.depth] = self._fine_t[starts * BLOCK % self._fine.depth]

@@ -1,4 +1,4 @@
-"""Holds as spans of bench time: their edges from the status of every row, their causes from what the firmware says."""
+"""Holds as spans of bench time: their edges from every row, their causes from what the firmware says."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.frame import FrameStatus
 from firmware_py.recording.reader import Event
 
 MOST_SPANS = 200
@@ -40,10 +39,8 @@ class HoldSpans:
         """The hold that lasts, as far as rows have come."""
         return self.spans[-1] if self.spans and self.spans[-1].to_s is None else None
 
-    def follow(self, t_s: NDArray[np.float64], status: NDArray[np.float64]) -> None:
-        """Take rows: times [n] in s and status words [n]; NaN is no status."""
-        words = np.where(np.isfinite(status), status, 0.0).astype(np.int64)
-        held = (words & int(FrameStatus.HELD)) != 0
+    def follow(self, t_s: NDArray[np.float64], held: NDArray[np.bool_]) -> None:
+        """Take rows: times [n] in s, and whether each is within a hold [n]."""
         was = np.concatenate(([self.current is not None], held[:-1]))
         for at in np.flatnonzero(held != was):
             if held[at]:

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from firmware_py.layouts import layout_of_recording
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.index import IndexedRecording
 from firmware_py.recording.reader import Recording
@@ -43,12 +44,13 @@ def summarize(path: Path, folder: Path, rate_hz: float) -> None:
     extremes[:] = np.nan
     _tell(entries=n, ready=0)
     holds = HoldSpans()
-    status = recording.names.index("status") if "status" in recording.names else None
+    layout = layout_of_recording(recording.metadata)
     with warnings.catch_warnings(action="ignore"):  # entries whose every value is NaN stay NaN
         for start in range(0, recording.n_chunks, STEP):
             rows = [recording.chunk(k) for k in range(start, min(start + STEP, recording.n_chunks))]
             t_s = np.concatenate([r.t_s for r in rows])
             values = np.concatenate([r.values for r in rows], axis=1)
+            holds.follow(t_s, layout.read_holds(recording.names, values.T))
             entry = np.clip(np.round((t_s - recording.start_s) * rate_hz), 0, n * BLOCK - 1).astype(np.int64) // BLOCK
             order = np.argsort(entry, kind="stable")
             entry, values = entry[order], values[:, order]
@@ -56,8 +58,6 @@ def summarize(path: Path, folder: Path, rate_hz: float) -> None:
             at = entry[begins]
             extremes[0][:, at] = np.fmin(extremes[0][:, at], np.fmin.reduceat(values, begins, axis=1))
             extremes[1][:, at] = np.fmax(extremes[1][:, at], np.fmax.reduceat(values, begins, axis=1))
-            if status is not None:
-                holds.follow(t_s, np.concatenate([r.values[status] for r in rows]))
             _tell(ready=int(at[-1]) if len(at) else 0)
     extremes.flush()
     recording.close()

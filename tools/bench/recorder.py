@@ -13,7 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from firmware_py.frame import LAYOUT
+from firmware_py.frame import Layout
 from firmware_py.live.memory import LiveRows
 from firmware_py.recording.drain import RecorderState
 from firmware_py.recording.recorder import RecorderProcess
@@ -58,7 +58,7 @@ class RunRecorder:
     def path(self, name: str) -> Path:
         return self.folder / (check_name(name) + SUFFIX)
 
-    async def start(self, name: str, notes: str, metadata: dict[str, Any]) -> None:
+    async def start(self, name: str, notes: str, metadata: dict[str, Any], layout: Layout) -> None:
         """Begin; the default name is the time. ``InputError`` when one is running or nothing can be recorded."""
         if self._recorder is not None or self._starting:
             raise InputError(f"a recording is running already ({self.name}); stop it first")
@@ -67,7 +67,7 @@ class RunRecorder:
         name = check_name(name or datetime.now(UTC).strftime("run %Y-%m-%d %H.%M.%S"))
         if self.path(name).is_symlink():
             raise InputError(f"{self.path(name)} is a symbolic link; choose another name")
-        columns = list(zip(LAYOUT.scalar_names(), LAYOUT.scalar_units(), strict=True))
+        columns = list(zip(layout.scalar_names(), layout.scalar_units(), strict=True))
         self._starting = True
         try:
             self._recorder = await asyncio.to_thread(
@@ -77,6 +77,7 @@ class RunRecorder:
             self._starting = False
         self.name, self._missed, self._started_s = name, 0, time.monotonic()
         self._sidecar = {"notes": [notes] if notes else [], "started": datetime.now(UTC).isoformat(timespec="seconds")}
+        self._sidecar["rate_hz"] = metadata.get("tick_hz")
         self._save()
 
     def push(self, rows: LiveRows) -> None:

@@ -20,7 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.frame import LAYOUT
+from firmware_py.frame import Layout
+from firmware_py.layouts import layout_of_recording
 from firmware_py.recording.errors import RecordingError
 from firmware_py.recording.index import IndexedRecording
 from hal.children import child_command, child_environment
@@ -30,30 +31,32 @@ from tools.errors import InputError
 
 MOST_FINE_ROWS = 1 << 17
 SPEEDS = (0.1, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 50.0)
-_NAMES = LAYOUT.scalar_names()
 
 
 class RecordedHistory:
     """Answers ``buckets`` as ``history.History`` does, from a file; ``head`` is the first row that is not shown yet.
 
-    Raises ``RecordingError`` or ``InputError`` for a file that cannot be shown. ``lock`` keeps threads
-    apart.
+    ``layout`` is that of the instrument whose channels the page shows. Raises ``RecordingError`` or ``InputError`` for
+    a file that cannot be shown. ``lock`` keeps threads apart.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.lock = threading.Lock()
+        self.layout = layout
         self._recording = IndexedRecording(path)
-        names = self._recording.names
-        self.missing = [name for name in _NAMES if name not in names]
-        if len(self.missing) > len(_NAMES) - 2:  # t alone is everybody's
+        names, channels = self._recording.names, layout.scalar_names()
+        self.missing = [name for name in channels if name not in names]
+        made_by = layout_of_recording(self._recording.metadata)
+        if made_by is not layout or len(self.missing) > len(channels) - 2:  # t alone is everybody's
             self._recording.close()
             some_names = ", ".join(names[:6])
             raise InputError(
-                f"{path.name} is a recording of another instrument: none of its columns ({some_names} ...) is a "
-                "channel of this page. Export it, and drop the csv into Mismatch"
+                f"{path.name} is a recording of another instrument: its columns ({some_names} ...) are not the "
+                f"channels of the {layout.instrument}. Start the page with a bench of that instrument, or export it "
+                "and drop the csv into Mismatch"
             )
-        self._column = np.array([names.index(name) if name in names else -1 for name in _NAMES])
-        self.rate_hz = _rate_of(self._recording.metadata.get("tick_hz"))
+        self._column = np.array([names.index(name) if name in names else -1 for name in channels])
+        self.rate_hz = rate_of(self._recording.metadata.get("tick_hz"))
         self.start_s = self._recording.start_s
         self.n_rows = round((self._recording.end_s - self.start_s) * self.rate_hz) + 1
         self.n_entries = entries_of(self._recording, self.rate_hz)
@@ -135,7 +138,7 @@ class RecordedHistory:
         return low, high
 
 
-def _rate_of(value: Any) -> float:
+def rate_of(value: Any) -> float:
     """Return the ticks per second that a recording states; 1000 where it states none."""
     try:
         rate_hz = float(value)
@@ -155,10 +158,10 @@ def _fill_single_gaps(values: NDArray[np.float32]) -> None:
 class Recorded:
     """Holds one opened recording and the process that reads its overview."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, layout: Layout) -> None:
         self.name = path.stem
         self.path = path
-        self.history = RecordedHistory(path)
+        self.history = RecordedHistory(path, layout)
         self.spans: dict[str, Any] = {"holds": [], "notes": [], "health": [], "lost": False}
         self.error = ""
         self._folder = Path(tempfile.mkdtemp(prefix="micron-overview-"))
@@ -272,6 +275,7 @@ class Replay:
         return {
             "type": "replay",
             "name": first.name,
+            "rate_hz": first.history.rate_hz,
             "start_s": first.history.start_s,
             "length_s": first.history.length_s,
             "progress": first.progress,
@@ -294,10 +298,10 @@ class Replay:
             await self.second.close()
 
 
-async def open_recorded(path: Path) -> Recorded:
+async def open_recorded(path: Path, layout: Layout) -> Recorded:
     """Open ``path`` beside the loop. ``RecordingError`` or ``InputError`` when it cannot be shown."""
     try:
-        recorded = await asyncio.to_thread(Recorded, path)
+        recorded = await asyncio.to_thread(Recorded, path, layout)
     except OSError as error:
         raise RecordingError(f"{path}: cannot be read ({error.strerror})") from error
     await recorded.start()

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import json
-from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 from starlette.requests import Request
 from starlette.responses import FileResponse
 from starlette.routing import BaseRoute, Route
 
-from hal.bench import load_bench
-from hal.errors import HalError
 from tools.bench.applied import Applied
 from tools.bench.calibrate import calibrate_routes
 from tools.bench.collect import collect_routes
@@ -46,16 +42,8 @@ def more_routes(session: Session, jobs: Jobs) -> list[BaseRoute]:
 def _targets(session: Session) -> list[BaseRoute]:
     targets = session.targets
 
-    def benches() -> dict[str, Path]:
-        with_card: dict[str, Path] = {}
-        for path in sorted(session.home.glob("*.toml")):
-            with suppress(HalError):
-                if load_bench(path).description.devices_with("motion_card"):
-                    with_card[str(path)] = path
-        return with_card
-
     async def state(_: Request) -> Any:
-        return {"reports": targets.reports(), "benches": list(benches())}
+        return {"reports": targets.reports()}
 
     async def start(request: Request) -> Any:
         table = await body(request)
@@ -63,8 +51,8 @@ def _targets(session: Session) -> list[BaseRoute]:
         if not isinstance(seed, int) or not 0 <= seed < 1 << 31:
             raise InputError("seed must be a whole number, 0 or more")
         name = text(table, "user", "user", longest=60)
-        bench = benches().get(text(table, "bench"))
-        await targets.start(name, text(table, "mapping", "position"), text(table, "source", "mouse"), bench, seed)
+        source = text(table, "source", "mouse")
+        targets.start(name, text(table, "mapping", "position"), source, seed, session.layout)
 
     async def report(request: Request) -> Any:
         path = targets.report(request.path_params["name"])
@@ -81,7 +69,7 @@ def _attitude(session: Session, applied: Applied) -> list[BaseRoute]:
     async def filters(_: Request) -> Any:
         stages = json.loads(session.metadata().get("stages", "{}"))
         running = stages.get("sensing", {}).get("attitude_method", "")
-        return {"methods": METHODS, "running": running, "stages": stages, "applied": applied.what}
+        return {"methods": METHODS if stages else (), "running": running, "stages": stages, "applied": applied.what}
 
     async def compare(request: Request) -> Any:
         await session.compare(text(await body(request), "method"))

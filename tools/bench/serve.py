@@ -127,7 +127,6 @@ def serve(
             await server.serve(sockets=[sock])
         finally:
             await asyncio.gather(*stopping)
-            await session.targets.stop()
             await jobs.close()
             session.dropped.close()
 

@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_py.endoscope.wiring import is_endoscope
-from firmware_py.frame import LAYOUT, STATUS, TIME
-from hal.bench import BenchFile, load_bench
-from hal.errors import BenchError
+from firmware_py.frame import Layout
+from firmware_py.layouts import layout_of
+from hal.bench import load_bench
 from tools.bench.dropped_files import Dropped
 from tools.bench.firmware import Choice, Firmware
 from tools.bench.history import Buckets, History
 from tools.bench.hold_spans import HoldSpans
 from tools.bench.layouts import Layouts
 from tools.bench.recorder import RunRecorder
+from tools.bench.replay import rate_of
 from tools.bench.shadow import Shadow, make_shadow
 from tools.bench.targets import Targets
 from tools.bench.twin_watch import TwinWatch
@@ -43,14 +43,6 @@ DISK_LOW_BYTES = 2 << 30
 DISK_LOW_SHARE = 0.03
 
 
-def instrument_bench(path: Path) -> BenchFile:
-    """The bench file, if the page can run it. Raises ``BenchError``."""
-    bench = load_bench(path)
-    if is_endoscope(bench.description):
-        raise BenchError(f"{path}: the page runs the instrument; a motion card is used in its Targets view")
-    return bench
-
-
 @dataclass
 class Disk:
     """Room where recordings go."""
@@ -65,8 +57,10 @@ class Disk:
 
 @dataclass
 class Run:
-    """Holds the reported state of one firmware process. ``phase`` is starting, running, safe, ended or failed."""
+    """Holds the reported state of one firmware process. ``phase`` is starting, running, safe, ended or failed;
+    ``rate_hz`` is the rate of its rows, ``has_outputs`` says whether something of it moves."""
 
+    rate_hz: float
     phase: str = "starting"
     reason: str = ""
     reached: bool = False
@@ -74,8 +68,14 @@ class Run:
     status: dict[str, Any] = field(default_factory=dict[str, Any])
     devices: dict[str, str] = field(default_factory=dict[str, str])
     histograms: list[str] = field(default_factory=list[str])
+    has_outputs: bool = True
     safe_ms: float | None = None
     outcome: dict[str, Any] | None = None
+
+    @property
+    def at_rest(self) -> str:
+        """Return what a hold and the safe state mean for the instrument, in words."""
+        return "outputs at neutral" if self.has_outputs else "the view stands still"
 
 
 class Session:
@@ -86,11 +86,11 @@ class Session:
         self.home = choice.bench.parent  # folder of the benches to choose from; copies run from elsewhere
         self.identity = secrets.token_hex(8)  # tells an open page that the server is another one
         self.layouts = Layouts(self.home / "layouts")
-        self.bench = instrument_bench(choice.bench)
+        self.bench = load_bench(choice.bench)
         self.firmware: Firmware | None = None
-        self.run = Run()
+        self.run = self._new_run()
         self.run_number = 0
-        self.history = self._new_history()
+        self.history = History(self.layout)
         self.holds = HoldSpans()
         self.recorder = RunRecorder(recordings)
         self.dropped = Dropped(recordings)
@@ -110,19 +110,24 @@ class Session:
         self._fresh_s = time.monotonic()
         self._lock = asyncio.Lock()
 
-    @staticmethod
-    def _new_history() -> History:
-        return History(LAYOUT.size, LAYOUT.start("t"))
+    @property
+    def layout(self) -> Layout:
+        """Return the layout of the frames of the instrument that the bench file describes."""
+        return layout_of(self.bench.description)
+
+    def _new_run(self) -> Run:
+        """Return the state of a run that begins. Its rate is the tick's until the devices are open."""
+        return Run(float(self.bench.description.clock.tick_hz))
 
     # -- firmware -------------------------------------------------------------------------------------------
 
     async def start(self, choice: Choice | None = None) -> None:
         """End what runs and start again, with another bench if ``choice`` says so. ``HalError`` for a wrong bench."""
         async with self._lock:
-            bench = instrument_bench((choice or self.choice).bench)
+            bench = load_bench((choice or self.choice).bench)
             await self._end()
             self.choice, self.bench = choice or self.choice, bench
-            self.run, self.history, self._row, self.shadow = Run(), self._new_history(), 0, None
+            self.run, self.history, self._row, self.shadow = self._new_run(), History(self.layout), 0, None
             self.holds = HoldSpans()
             self._frame_buckets.clear()
             self._state_s = -STATUS_S
@@ -132,6 +137,7 @@ class Session:
             self.note("info", f"starting {self.bench.description.name} ({self.choice.bench})")
             self.firmware = await Firmware.start(
                 self.choice,
+                self.layout.size,
                 lambda line: self._on_line(run, line),
                 lambda outcome, failure: self._on_end(run, outcome, failure),
             )
@@ -161,6 +167,8 @@ class Session:
         event = line.get("event")
         if event == "devices":
             run.devices, run.histograms = line["identities"], line["histograms"]
+            run.has_outputs = line["has_outputs"]
+            run.rate_hz = rate_of(self.metadata().get("tick_hz"))
             self.note("info", "devices open: " + ", ".join(run.devices.values()))
         elif event == "safe state":
             run.phase, run.reason, run.reached = "safe", line["reason"], line["reached"]
@@ -168,7 +176,7 @@ class Session:
             if line["asked_ns"] and line["reached_ns"]:
                 run.safe_ms = (line["reached_ns"] - line["asked_ns"]) * 1e-6
             took = f", {run.safe_ms:.0f} ms after it was asked for" if run.safe_ms is not None else ""
-            how = "outputs at neutral" if run.reached else "NEUTRAL NOT CONFIRMED: switch the amplifier off"
+            how = run.at_rest if run.reached else "NEUTRAL NOT CONFIRMED: switch the amplifier off"
             self.note("info" if run.reached and run.normal else "error", f"safe state: {run.reason}; {how}{took}")
         else:
             run.status = line
@@ -184,7 +192,7 @@ class Session:
             run.phase = "safe" if outcome["safe_state"]["reached"] else "ended"
             run.reached, run.normal = outcome["safe_state"]["reached"], outcome["safe_state"]["normal"]
             # counts of the last ticks, too
-            run.status |= {"lost": outcome["samples"]["lost"], "fallbacks": outcome["kinematics"]["fallbacks"]}
+            run.status |= {"lost": outcome["samples"]["lost"], **outcome.get("kinematics", {})}
             if run is self.run:
                 self.holds.name_by_outcome(outcome["holds"])
         else:
@@ -222,7 +230,7 @@ class Session:
             alerts.append(("error", f"Neutral was NOT confirmed. Switch the amplifier off. {run.reason}"))
         elif run.phase == "safe":
             kind = "info" if run.normal else "error"
-            alerts.append((kind, f"Safe state, outputs at neutral: {run.reason}."))
+            alerts.append((kind, f"Safe state, {run.at_rest}: {run.reason}."))
         elif run.phase == "running" and self.stale_s() > STALE_S:
             alerts.append(("error", f"Stale data: nothing new from the firmware for {self.stale_s():.1f} s."))
         if ticks := run.status.get("fallbacks", 0):
@@ -239,17 +247,19 @@ class Session:
         driven."""
         if not self.run.status:
             return f"The firmware did not start: {self.run.reason}"
+        if not self.run.has_outputs:
+            return f"The firmware died: {self.run.reason}. Start it again."
         return (
             f"The firmware died: {self.run.reason}. Nobody confirmed neutral: switch the amplifier off, look at the "
             "tip, then start again."
         )
 
     def _hold_alert(self) -> list[dict[str, str]]:
-        """Why the outputs rest at neutral; with ``order`` where a person may end that."""
+        """Return why a hold lasts; with ``order`` where a person may end it."""
         hold = self.run.status.get("hold")
         if self.run.phase != "running" or not hold:
             return []
-        text = f"Hold, outputs at neutral: {hold['cause']}."
+        text = f"Hold, {self.run.at_rest}: {hold['cause']}."
         if hold["waits_for"] and hold["waits_for"] != hold["cause"]:
             text += f" It waits for {hold['waits_for']}."
         return [{"kind": "warn", "text": text, **({"order": "rearm"} if hold["waits_for"] == OPERATOR else {})}]
@@ -265,6 +275,7 @@ class Session:
         return {
             "type": "state",
             "run": self.run_number,
+            "rate_hz": run.rate_hz,
             "bench": self.bench.description.name,
             "bench_file": str(self.choice.bench),
             "emulated": bool(self.bench.description.emulated_buses()),
@@ -346,7 +357,9 @@ class Session:
             self._row = rows.first + len(rows.values)
             self._fresh_s = time.monotonic()
             self.history.append(rows.values)
-            self.holds.follow(rows.values[:, TIME], rows.values[:, STATUS])
+            t_s = rows.values[:, self.layout.start("t")]
+            self.holds.follow(t_s, self.layout.read_holds(self.layout.scalar_names(), rows.values))
+            self.targets.follow(rows.values, self.layout)
             if self.recorder.active:
                 self.recorder.push(rows)
             if self.shadow is not None:
@@ -374,7 +387,7 @@ class Session:
 
     async def start_recording(self, name: str, notes: str) -> None:
         """Raises ``RecordingError`` or ``InputError`` when that cannot be."""
-        await self.recorder.start(name, notes, self.metadata())
+        await self.recorder.start(name, notes, self.metadata(), self.layout)
         self.note("info", f"recording {self.recorder.name}")
 
     async def stop_recording(self) -> dict[str, Any]:

@@ -52,6 +52,8 @@ async def make_shadow(metadata: dict[str, Any], method: str) -> Shadow:
         raise InputError(f"{method!r} is not an attitude filter; there are {', '.join(METHODS)}")
     if not metadata:
         raise InputError("no firmware is running")
+    if "stages" not in metadata:
+        raise InputError("this instrument's filter is [firmware] fusion of its bench file; there is none beside it")
     configs = StageConfigs.from_dict(json.loads(metadata["stages"]), "running firmware")
     config = configs.sensing.model_copy(update={"attitude_method": method})
     return await asyncio.to_thread(Shadow, config)

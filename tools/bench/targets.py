@@ -1,11 +1,8 @@
 """Runs the targeting experiment on the page: the firmware's state machine, driven by the pointer that a browser reports
-or by the motion card of an endoscope bench, read in a process of its own."""
+or by the motion card of the endoscope bench that runs."""
 
 from __future__ import annotations
 
-import asyncio
-import contextlib
-import json
 import math
 import time
 from collections.abc import Callable
@@ -13,17 +10,26 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from firmware_py.endoscope.control import ControlConfig
 from firmware_py.endoscope.report import experiment, report_csv
 from firmware_py.endoscope.targets import GameConfig, GameState, TargetGame
-from hal.bench import load_bench
-from hal.children import child_command, child_environment
+from firmware_py.frame import Layout
 from tools.bench.recorder import check_name
 from tools.errors import InputError
 from tools.output import write_text_atomic
 
 Source = Literal["mouse", "card"]
 MAX_ANGLE_DEG = 180.0
+CARD = ("psi", "theta", "card_status", "used")
+"""Columns of the endoscope's frame that play in place of the mouse."""
+
+
+def has_card(layout: Layout) -> bool:
+    """Return True for an instrument that is steered by a motion card."""
+    return set(CARD) <= set(layout.scalar_names())
 
 
 class Game:
@@ -78,45 +84,6 @@ class Game:
         return table
 
 
-class CardReader:
-    """``python -m tools.bench.card BENCH`` and what it says, a JSON line per sample."""
-
-    def __init__(self, process: asyncio.subprocess.Process, on_sample: Callable[[dict[str, Any]], None]) -> None:
-        self._process = process
-        self.error = ""
-        self._task = asyncio.create_task(self._read(on_sample))
-
-    @classmethod
-    async def start(cls, bench: Path, on_sample: Callable[[dict[str, Any]], None]) -> CardReader:
-        """Start a game. Raises ``InputError`` for a bench without a motion card."""
-        if not load_bench(bench).description.devices_with("motion_card"):
-            raise InputError(f"{bench} has no motion_card; choose a bench like endoscope.toml")
-        process = await asyncio.create_subprocess_exec(
-            *child_command("tools.bench.card", str(bench)),
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.PIPE,
-            env=child_environment(),
-        )
-        return cls(process, on_sample)
-
-    async def _read(self, on_sample: Callable[[dict[str, Any]], None]) -> None:
-        assert self._process.stdout is not None
-        assert self._process.stderr is not None
-        async for line in self._process.stdout:
-            with contextlib.suppress(ValueError):
-                on_sample(json.loads(line))
-        stderr = (await self._process.stderr.read()).decode(errors="replace").strip()
-        if await self._process.wait() > 0:
-            self.error = stderr.splitlines()[-1] if stderr else "the motion card's reader ended"
-
-    async def stop(self) -> None:
-        if self._process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                self._process.terminate()
-        await asyncio.gather(self._task, return_exceptions=True)
-
-
 class Targets:
     """The experiment that is on; one for all viewers of the bench."""
 
@@ -125,29 +92,26 @@ class Targets:
         self._read_clock_s = read_clock_s
         self.game: Game | None = None
         self.source: Source = "mouse"
-        self._reader: CardReader | None = None
 
-    async def start(self, user: str, mapping: str, source: str, bench: Path | None, seed: int) -> None:
-        """A new run. ``InputError`` when it cannot be."""
+    def start(self, user: str, mapping: str, source: str, seed: int, layout: Layout) -> None:
+        """Start a game. ``layout`` is that of the instrument that runs. Raises ``InputError`` when it cannot be."""
         if mapping not in ("position", "speed"):
             raise InputError(f"{mapping!r} is not a mapping; there are position and speed")
-        await self.stop()
         config = GameConfig(control=ControlConfig(mapping=mapping), seed=seed)  # pyright: ignore[reportArgumentType]
         game = Game(config, user, self._folder, self._read_clock_s)
-        if source == "card":
-            if bench is None:
-                raise InputError("name the bench file whose motion card shall be used")
-            self._reader = await CardReader.start(
-                bench, lambda s: game.card(s["psi"], s["theta"], s["status"], s["use"])
-            )
-        elif source != "mouse":
+        if source not in ("mouse", "card"):
             raise InputError(f"{source!r} is not a pointer; there are mouse and card")
+        if source == "card" and not has_card(layout):
+            raise InputError("the bench that runs has no motion card; run one that has, such as endoscope.toml (Setup)")
         self.game, self.source = game, "card" if source == "card" else "mouse"
 
-    async def stop(self) -> None:
-        reader, self._reader, self.game = self._reader, None, None
-        if reader is not None:
-            await reader.stop()
+    def follow(self, rows: NDArray[np.float64], layout: Layout) -> None:
+        """Take ``rows`` (n, columns) of the running instrument. They move the view if the card plays."""
+        if self.game is None or self.source != "card" or not has_card(layout):
+            return
+        for row in rows[:, [layout.start(name) for name in CARD]].tolist():
+            psi, theta, status, used = row
+            self.game.card(psi, theta, round(status), bool(used))
 
     def pointer(self, psi_deg: float, theta_deg: float, pressed: bool) -> None:
         if self.game is not None and self.source == "mouse":
@@ -157,8 +121,7 @@ class Targets:
         """Return the JSON values for the page, or None when nothing is played."""
         if self.game is None:
             return None
-        error = self._reader.error if self._reader is not None else ""
-        return {**self.game.as_dict(), "source": self.source, "error": error}
+        return {**self.game.as_dict(), "source": self.source}
 
     def reports(self) -> list[str]:
         return sorted((p.name for p in self._folder.glob("*.csv")), reverse=True)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from firmware_py.frame import LAYOUT
+from firmware_py.layouts import layout_of
 from hal.bench import BenchFile
 from tools.bench.firmware import Choice
 from tools.bench.history import History
@@ -43,6 +44,8 @@ class TwinWatch:
 
         self._problem, self._is_own_world = "", choice.seed is None and choice.hand_file is None
         try:
+            if layout_of(bench.description) is not LAYOUT:
+                raise InputError("it belongs to the first instrument, and this bench is of another one")
             world = World(choice.seed, choice.hand_file, choice.hand_scale)
             self._twin = open_twin(self._settings.twin, bench, LAYOUT.scalar_names(), world)
         except (InputError, RecordingError) as error:

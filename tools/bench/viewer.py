@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from firmware_py.frame import LAYOUT
+from firmware_py.frame import Layout
 from firmware_py.recording.errors import RecordingError
 from tools.bench.guard import Access
 from tools.bench.history import Buckets, History, rows_per_bucket
@@ -37,7 +37,6 @@ ORDERS_PER_S = 100
 HELLO_S = 5.0
 SEND_S = 30.0
 COUNTS_S = 0.5
-_INDEX = {name: i for i, name in enumerate(LAYOUT.scalar_names())}
 
 
 class Nonsense(ValueError):
@@ -50,6 +49,7 @@ class Subscription:
     yet). ``sent_rows``: rows of the history when it was sent something last."""
 
     id: int
+    layout: Layout
     channels: NDArray[np.intp]
     rows: int
     per_bucket: int
@@ -65,11 +65,11 @@ def _number(message: dict[str, Any], key: str, low: float, high: float) -> float
     return value
 
 
-def _channels(message: dict[str, Any]) -> NDArray[np.intp]:
-    names = message.get("channels")
-    if not isinstance(names, list) or len(names) > MAX_CHANNELS or any(name not in _INDEX for name in names):
+def _channels(message: dict[str, Any], layout: Layout) -> NDArray[np.intp]:
+    names, known = message.get("channels"), layout.scalar_names()
+    if not isinstance(names, list) or len(names) > MAX_CHANNELS or any(name not in known for name in names):
         raise Nonsense("channels must be names of columns")
-    return np.array([_INDEX[name] for name in names], dtype=np.intp)
+    return np.array([known.index(name) for name in names], dtype=np.intp)
 
 
 def _source(message: dict[str, Any]) -> int:
@@ -185,7 +185,10 @@ class Viewer:
             raise Nonsense("too many subscriptions")
         rows = int(_number(message, "rows", 1, 1e6))
         k = rows_per_bucket(rows, int(_number(message, "pixels", 1, MAX_PIXELS)))
-        self._subscriptions[number] = Subscription(number, _channels(message), rows, k, _source(message))
+        layout = self._session.layout
+        self._subscriptions[number] = Subscription(
+            number, layout, _channels(message, layout), rows, k, _source(message)
+        )
 
     async def _range(self, message: dict[str, Any]) -> None:
         """Send a part of the past once. A later request replaces an earlier one that is not sent yet."""
@@ -197,7 +200,7 @@ class Viewer:
         history = self._history(_source(message))
         if history is None:
             raise Nonsense("there is no second run")
-        buckets = await _read(history, _channels(message), k, first // k, -(-stop // k))
+        buckets = await _read(history, _channels(message, history.layout), k, first // k, -(-stop // k))
         self._ranges[number] = encode(buckets, number)
 
     def _history(self, source: int) -> History | RecordedHistory | None:
@@ -219,7 +222,7 @@ class Viewer:
     async def _change_replay(self, message: dict[str, Any]) -> None:
         replay = self._replay
         if "name" in message:
-            recorded = await open_recorded(self._recording(message["name"]))
+            recorded = await open_recorded(self._recording(message["name"]), self._session.layout)
             self._replay, self._generation, self._replay_told, self._place_told = Replay(recorded), -1, None, None
             if replay is not None:
                 await replay.close()
@@ -239,8 +242,9 @@ class Viewer:
         elif "shift" in message and replay.second is not None:
             await replay.lay_over(replay.second, _number(message, "shift", -1e6, 1e6))
         elif "second" in message:
-            second = await open_recorded(self._recording(message["second"])) if message["second"] else None
-            await replay.lay_over(second)
+            second = message["second"]
+            layout = replay.first.history.layout
+            await replay.lay_over(await open_recorded(self._recording(second), layout) if second else None)
 
     def _recording(self, name: Any) -> Path:
         path = self._session.recorder.path(check_name(name if isinstance(name, str) else ""))
@@ -312,7 +316,13 @@ class Viewer:
             if self._replay is None or subscription.source == LIVE:
                 subscription.next_bucket = None
         await self._socket.send_json(
-            {"type": "hello", "run": self._run, "may_order": self._may_order, "server": session.identity}
+            {
+                "type": "hello",
+                "run": self._run,
+                "may_order": self._may_order,
+                "server": session.identity,
+                "instrument": session.layout.instrument,
+            }
         )
 
     async def _move_replay(self) -> None:
@@ -341,8 +351,8 @@ class Viewer:
 
     async def _send_new(self, subscription: Subscription) -> None:
         history, k = self._history(subscription.source), subscription.per_bucket
-        if history is None:
-            return
+        if history is None or history.layout is not subscription.layout:
+            return  # the page of another instrument, until it loads again
         newest = history.head // k
         oldest = max(0, history.head - subscription.rows) // k
         first = subscription.next_bucket

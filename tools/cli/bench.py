@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from firmware_py.endoscope.wiring import is_endoscope
 from hal.bench import load_bench
 from tools.cli.bench_option import BenchOption, bench_path
 from tools.cli.common import clear_errors, console
@@ -69,7 +70,10 @@ def bench(
         watching = watch_settings(description, watch, watch_reference, false_alarms_per_hour)
         if watching is not None:
             check_twin(watching, description)
-        prepare(description, None, console())
+        if not is_endoscope(description.description):
+            prepare(description, None, console())
+        elif hand is not None:
+            raise InputError("--hand belongs to the instrument; an endoscope bench has none")
         sock = bind(listen or LOOPBACK, port)
         try:
             recordings.mkdir(parents=True, exist_ok=True)

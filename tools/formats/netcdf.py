@@ -17,7 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from firmware_py.frame import LAYOUT, Clip, FrameStatus
+from firmware_py.frame import Clip, FrameStatus
+from firmware_py.layouts import layout_of_recording
 from firmware_py.recording import format as fmt
 from firmware_py.recording.reader import Recording
 from hal.jsonable import to_jsonable
@@ -127,11 +128,11 @@ def _attributes(recording: Recording, name: str) -> dict[str, str]:
     found = {"units": _NOT_UDUNITS.get(unit, unit)}
     if found["units"] != unit:
         found["unit_recorded"] = unit
-    column = next((c for c in LAYOUT if name in c.scalar_names()), None)
+    column = layout_of_recording(recording.metadata).find_column(name)
     if column is not None and column.unit == unit:
         part = name.removeprefix(column.name).strip("_")
         found["long_name"] = f"{column.what}{f', {part}' if part else ''}"
-        flags = {"clip": Clip, "status": FrameStatus}.get(name)
+        flags = {"clip": Clip, "status": FrameStatus}.get(name) if column.unit == "bits" else None
         if flags is not None:
             found["comment"] = "bits: " + ", ".join(f"{flag.value} {flag.name}" for flag in flags if flag.value)
     return found

@@ -4,6 +4,7 @@ import { h } from "./dom.js";
 export const FIGURES = {
   "run time": "Time since the firmware's first scan.",
   "sample to command p50": "Time from the instant at which a sample was taken to the acknowledged command, median since the start. Normal: below 2 ms, the delay over which the tremor is predicted.",
+  "arrival to view p50": "Time from a sample's arrival to the view that follows from it, median since the start.",
   "lost scans": "Scans of the converter that never reached the firmware. Normal: 0.",
   "outputs held": "Share of ticks in which the outputs kept their last value because a new command would have come too late. Normal: 0 %; short holds do no harm.",
   tremor: "Amplitude of the estimated tremor at the tip, all three axes together.",

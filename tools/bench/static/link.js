@@ -76,6 +76,9 @@ export class Link extends EventTarget {
     return () => this.removeEventListener(name, listener);
   }
 
+  /** Rows a second of what the views show. */
+  get rateHz() { return (this.replay || this.state)?.rate_hz ?? 1000; }
+
   /** Holds of what the views show. */
   get holds() { return this.replay ? this.replay.holds : this.state?.holds; }
 
@@ -138,7 +141,7 @@ export class Link extends EventTarget {
       const another = this.server && this.server !== message.server;
       const same = !another && this.run === message.run; // only the connection, or the token, is another one
       [this.server, this.run] = [message.server, message.run];
-      this.emit("run", { same });
+      this.emit("run", { same, instrument: message.instrument });
       if (another) this.emit("server", message.server);
     } else if (message.type === "replay") {
       const began = message.name && this.replay?.name !== message.name;

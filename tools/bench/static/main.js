@@ -6,16 +6,17 @@ import { layoutPanel } from "./layouts.js";
 import { Link } from "./link.js";
 import { replayBar } from "./replay.js";
 
-const VIEWS = [
+/** Key, title, picture, and the channels without which a view shows nothing: an instrument has the views that it has channels for. */
+const ALL_VIEWS = [
   ["scope", "Scope", "M3 5v14h18M6 14c2 0 2-6 4-6s2 9 4 9 2-5 4-5"],
-  ["attitude", "Attitude", "M12 3l8 4.5v9L12 21l-8-4.5v-9zM12 12l8-4.5M12 12v9M12 12L4 7.5"],
-  ["tremor", "Tremor", "M2 12h3l2-7 4 14 3-11 2 4h6"],
+  ["attitude", "Attitude", "M12 3l8 4.5v9L12 21l-8-4.5v-9zM12 12l8-4.5M12 12v9M12 12L4 7.5", "quaternion"],
+  ["tremor", "Tremor", "M2 12h3l2-7 4 14 3-11 2 4h6", "tremor"],
   ["latency", "Latency", "M12 8v5l3 2M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18z"],
-  ["actuators", "Actuators", "M6 3v18M12 3v18M18 3v18M4 14h4M10 8h4M16 16h4"],
+  ["actuators", "Actuators", "M6 3v18M12 3v18M18 3v18M4 14h4M10 8h4M16 16h4", "command"],
   ["targets", "Targets", "M12 3a9 9 0 1 0 0 18 9 9 0 0 0 0-18zM12 8a4 4 0 1 0 0 8 4 4 0 0 0 0-8zM12 1v4M12 19v4M1 12h4M19 12h4"],
   ["collect", "Collect", "M12 3v12m-4-4l4 4 4-4M4 17v3h16v-3"],
   ["mismatch", "Mismatch", "M3 17c3 0 4-10 9-10s5 6 9 6M3 20c4 0 5-7 9-7s6 3 9 3"],
-  ["calibrate", "Calibrate", "M4 20l5-5m0 0l9-9 2 2-9 9zM13 7l4 4"],
+  ["calibrate", "Calibrate", "M4 20l5-5m0 0l9-9 2 2-9 9zM13 7l4 4", "volts"],
   ["setup", "Setup", "M5 4v6a3 3 0 0 0 3 3h8a3 3 0 0 1 3 3v4M3 4h4M17 20h4M12 13v7M10 20h4"],
 ];
 
@@ -29,6 +30,7 @@ setToken(token);
 
 const byId = (id) => document.getElementById(id);
 const link = new Link(token);
+let VIEWS = [];
 const context = { link, catalogue: [], navigate: (name) => { location.hash = `/${name}`; }, view: () => shown, reload, say };
 let unmount = null;
 let shown = "";
@@ -116,17 +118,18 @@ function keepSafeNear() {
 let vitals = new Map();
 function showVitals(state) {
   const s = state.status;
-  const timing = state.timing["sample to command"];
+  const latency = Object.keys(state.timing).find((name) => name.includes(" to ")); // the instrument's own, beside its tasks
+  const timing = state.timing[latency];
   const outputs = s.tasks?.actuate; // rate, budget, runs, overruns, late, skipped
   const share = outputs ? (100 * outputs[5]) / Math.max(1, outputs[2] + outputs[5]) : 0;
   const items = [ // name, value, whether it is as it should be
     ["run time", s.t_s === undefined ? "–" : duration(s.t_s), true],
-    ["sample to command p50", timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–", true],
+    [`${latency} p50`, timing?.[0] ? `${(timing[1] / 1000).toFixed(2)} ms` : "–", true],
     ["lost scans", s.lost ?? "–", !s.lost],
     ["outputs held", outputs ? `${share === 0 ? 0 : share < 0.1 ? "<0.1" : share.toFixed(1)} %` : "–", share < 1],
     ["tremor", s.amplitude_um ? `${Math.hypot(...s.amplitude_um).toFixed(0)} µm` : "–", true],
-  ];
-  if (!vitals.size) {
+  ].filter(([name]) => (name !== "tremor" || s.amplitude_um) && (name !== "outputs held" || outputs) && (name !== `${latency} p50` || latency));
+  if (items.map(([name]) => name).join() !== [...vitals.keys()].join()) {
     vitals = new Map(items.map(([name]) => [name, h("dd")]));
     byId("vitals").replaceChildren(...items.map(([name]) => h("div", {}, h("dt", {}, figure(name)), vitals.get(name))));
   }
@@ -146,7 +149,7 @@ function showPhase() {
   const pill = byId("phase");
   const state = link.state;
   let [kind, text] = state ? PHASES[state.phase] : ["", "connecting"];
-  if (state?.phase === "running") text = state.status.manual !== "off" ? "manual drive" : state.status.state;
+  if (state?.phase === "running") text = (state.status.manual ?? "off") !== "off" ? "manual drive" : state.status.state;
   if (state?.phase === "running" && state.status.state !== "running") kind = "warn";
   if (!link.connected) [kind, text] = ["bad", "not connected"];
   pill.className = `pill ${kind}`;
@@ -232,9 +235,25 @@ function bindKeys() {
   });
 }
 
+/** The channels of the instrument that runs, and the views that it has channels for. Another instrument is another page. */
+async function loadInstrument() {
+  let found = null;
+  while (!found) { // behind --listen an old token is refused until the new one is given
+    try { found = await get("/api/channels"); } catch { await new Promise((done) => setTimeout(done, 1000)); }
+  }
+  context.catalogue = found.channels;
+  VIEWS = ALL_VIEWS.filter(([, , , needs]) => !needs || found.channels.some((c) => c.group === needs));
+  link.on("run", ({ instrument }) => { if (instrument !== found.instrument) location.reload(); });
+  let rateHz = link.rateHz;
+  const follow = () => { // rows of another rate: the view asks for others
+    if (link.rateHz !== rateHz && shown) { rateHz = link.rateHz; reload(shown); }
+  };
+  link.on("state", follow);
+  link.on("source", follow);
+}
+
 async function boot() {
   setTheme(localStorage.getItem("micron.theme") || (matchMedia("(prefers-color-scheme: light)").matches ? "light" : "dark"));
-  buildNav();
   bindKeys();
   byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
   byId("safe").onclick = byId("safe-near").onclick = goSafe;
@@ -256,9 +275,8 @@ async function boot() {
   link.on("connection", () => { showPhase(); showAlerts(); });
   setInterval(() => { showPhase(); showAlerts(); }, 500);
   byId("ask-token").onsubmit = useToken;
-  while (!context.catalogue.length) { // behind --listen an old token is refused until the new one is given
-    try { context.catalogue = (await get("/api/channels")).channels; } catch { await new Promise((done) => setTimeout(done, 1000)); }
-  }
+  await loadInstrument();
+  buildNav();
   window.addEventListener("hashchange", () => show(location.hash.slice(2)));
   await show(location.hash.slice(2));
 }

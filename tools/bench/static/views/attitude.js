@@ -6,7 +6,7 @@ import { holdSpans } from "../holds.js";
 import { Strip, interleave, times } from "../plot.js";
 import { angleBetween, drawInstrument, euler, orbit } from "../solid.js";
 
-const CHANNELS = ["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z", "rate_x", "rate_y", "rate_z"];
+const QUATERNION = ["quaternion_w", "quaternion_x", "quaternion_y", "quaternion_z"];
 
 function palette() {
   const dark = document.documentElement.dataset.theme === "dark";
@@ -19,10 +19,11 @@ function palette() {
 
 const NUMBERS = [["roll", "roll (x)"], ["pitch", "pitch (y)"], ["yaw", "yaw (z)"], ["quaternion", "q w, x"], ["quaternion", "q y, z"], ["turned since zero"]];
 
-export function mount(root, { link }) {
+export function mount(root, { link, catalogue }) {
   const settings = persistent("attitude", { compare: "" });
-  const subscription = link.subscribe(CHANNELS, 100, 100);
-  const history = link.subscribe(CHANNELS.slice(4), 10000, 600);
+  const rates = catalogue.filter((c) => c.unit === "rad/s").slice(0, 3).map((c) => c.name);
+  const subscription = link.subscribe(QUATERNION, 100, 100);
+  const history = link.subscribe(rates, 10 * link.rateHz, 600);
   let colours = palette();
   let reference = null;
   let q = null;
@@ -40,6 +41,8 @@ export function mount(root, { link }) {
     h("h2", {}, "Beside it: ", gap), h("div.chart.square", {}, second));
   const numbers = h("table");
   const error = h("p.note");
+  const beside = h("section.panel", { hidden: true }, h("h2", {}, "Compare with"), h("div.row", {}, choice, use, back), error,
+    h("p.note", {}, "It runs in the server on the same raw samples. Drag a picture to turn it."));
   const strip = new Strip(["x", "y", "z"].map((a) => ({ label: `rate ${a}`, unit: "°/s" })), { least: 2, xTitle: "time, s", yTitle: "°/s" });
 
   async function compare(method) {
@@ -60,6 +63,7 @@ export function mount(root, { link }) {
   async function listFilters() {
     const found = await get("/api/filters");
     running = found.running;
+    beside.hidden = !found.methods.length;
     title.replaceChildren("Firmware: ", h("b", { style: "color:var(--text)" }, running));
     if (!choice.options.length) choice.replaceChildren(h("option", { value: "" }, "nothing"), ...found.methods.map((m) => h("option", { value: m }, m)));
     choice.value = link.state?.shadow || "";
@@ -77,8 +81,7 @@ export function mount(root, { link }) {
     h("div.stack.side", {},
       h("section.panel", {}, h("h2", {}, "Attitude ", h("small", {}, "body to world")), numbers,
         h("div.row", { style: "margin-top:10px" }, h("button", { onclick: () => { reference = q; } }, "Zero the drift here"))),
-      h("section.panel", {}, h("h2", {}, "Compare with"), h("div.row", {}, choice, use, back), error,
-        h("p.note", {}, "It runs in the server on the same raw samples. Drag a picture to turn it."))),
+      beside),
     h("div.strips", {}, strip.element)));
 
   let frame = 0;

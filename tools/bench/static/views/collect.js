@@ -5,12 +5,14 @@ import { explained, figure } from "../figures.js";
 import { holdSpans } from "../holds.js";
 import { Strip } from "../plot.js";
 
-const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["temperature", "temperature"]];
+const LOOKS = [["command_1,command_2,command_3", "commands"], ["tremor_x,tremor_y,tremor_z", "tremor"], ["accelerometer_1x,accelerometer_2y,accelerometer_1z", "accelerometers"], ["rate_x,rate_y,rate_z", "rates"], ["psi,theta", "angles"], ["view_x,view_y,view_size", "view"], ["accel_x,accel_y,accel_z", "accelerometers"], ["gyro_x,gyro_y,gyro_z", "rates"], ["temperature", "temperature"]];
 
 export function mount(root, context) {
   const { link } = context;
   let chosen = null;
-  let what = LOOKS[0][0];
+  const channels = new Set(context.catalogue.map((c) => c.name));
+  const looks = LOOKS.filter(([value]) => value.split(",").every((name) => channels.has(name)));
+  let what = looks[0][0];
   let strip = null;
   let listed = ""; // the list that is shown, as text
 
@@ -47,7 +49,7 @@ export function mount(root, context) {
     body.replaceChildren(...list.recordings.map((r) => h("tr", { style: r.name === chosen ? "background:var(--raised)" : "" },
       h("td.whole", {}, h("button.quiet.name", { onclick: () => show(r.name), disabled: r.recording }, r.name), r.recording ? h("span.bad", {}, " recording") : null),
       h("td.soft.notes.whole", { title: r.notes.join("\n") }, r.notes.join(" · ")),
-      h("td.num", { "data-label": "length" }, r.ticks === null ? "–" : duration(r.ticks / 1000)),
+      h("td.num", { "data-label": "length" }, r.seconds === null ? "–" : duration(r.seconds)),
       h("td.num", { className: r.dropped ? "num bad" : "num", "data-label": "lost", ...explained("lost") }, r.problem ? "!" : r.dropped ?? "–"), h("td.num", { "data-label": "size" }, bytes(r.bytes)),
       h("td.num.soft.when", { "data-label": "when" }, new Date(r.modified * 1000).toLocaleString([], { dateStyle: "short", timeStyle: "short" })),
       h("td.whole", {}, r.recording ? null : h("div.row", {}, actions(r, list))))));
@@ -106,7 +108,7 @@ export function mount(root, context) {
     strip = new Strip(data.channels.map((label, i) => ({ label, unit: data.units[i], colour: palette[i] })), { xTitle: "time, s", yTitle: unitText(data.units[0] || "1") });
     const x = Float64Array.from(data.t.flatMap((t) => [t, t]));
     const ys = data.low.map((low, c) => Float32Array.from(low.flatMap((v, i) => [v, data.high[c][i]])));
-    const picker = h("select", { "aria-label": "What to look at", onchange: () => { what = picker.value; show(which); } }, LOOKS.map(([value, title]) => h("option", { value, selected: value === what }, title)));
+    const picker = h("select", { "aria-label": "What to look at", onchange: () => { what = picker.value; show(which); } }, looks.map(([value, title]) => h("option", { value, selected: value === what }, title)));
     look.replaceChildren(h("h2", {}, which, picker), strip.element, h("p.note", { className: data.lost ? "note bad" : "note" }, data.health.join(" · ")));
     strip.show(x, ys, x[0], x[x.length - 1], null, holdSpans(data.holds, 0, x[0], x[x.length - 1]));
     refresh();

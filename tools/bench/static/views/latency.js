@@ -1,4 +1,4 @@
-// Where the time of a tick goes: one histogram per task against its budget, and from sample to command.
+// Where the time of a tick goes: one histogram per task against its budget, and the whole way of a sample.
 import { canvas, css, h } from "../dom.js";
 import { explained, figure } from "../figures.js";
 
@@ -24,8 +24,10 @@ function budgetBar() {
 
 export function mount(root, { link }) {
   let counts = {};
+  let own = "sample to command"; // the instrument's own histogram, beside those of its tasks
+  const ownTitle = h("h2", {}, "From sample to command");
   const rows = new Map();
-  const big = canvas((g, w, hgt) => histogram(g, w, hgt, counts["sample to command"], null, true), "Histogram of sample to command");
+  const big = canvas((g, w, hgt) => histogram(g, w, hgt, counts[own], null, true), "Histogram of the whole latency");
   const headline = h("div.row.headline");
   const said = new Map();
   headline.say = (name, value, unit) => {
@@ -40,7 +42,7 @@ export function mount(root, { link }) {
   const note = h("p.warn-text", { hidden: true }, "A recording is shown. A recording holds no timing: these figures are of the bench that runs now.");
   root.append(note, h("div.cols.latency", {},
     h("section.panel.total", {},
-      h("div", {}, h("h2", {}, "From sample to command"), headline),
+      h("div", {}, ownTitle, headline),
       h("div.chart", {}, big)),
     h("section.panel.tasks", {}, h("h2", {}, "Tasks ", h("small", {}, "µs since the start; line: budget. normal: p99 below the budget, nothing late, nothing held")),
       h("table.cards", {}, h("thead", {}, h("tr", {}, head.map((t, i) => h(i === 0 || i === 2 ? "th" : "th.num", {}, i === 2 ? t : figure(t))))), body))));
@@ -88,13 +90,15 @@ export function mount(root, { link }) {
   function show(state) {
     const { timing, status } = state;
     note.hidden = !link.replay;
-    const total = timing["sample to command"];
+    own = Object.keys(timing).find((name) => name.includes(" to ")) || own;
+    ownTitle.textContent = `From ${own}`;
+    const total = timing[own];
     if (total?.[0]) {
       for (const [name, value] of [["p50", total[1]], ["p99", total[2]], ["worst", total[4]]]) headline.say(name, (value / 1000).toFixed(2), "ms");
       headline.say("held ticks", String(status.skipped ?? 0), "");
     }
     for (const [name, [n, p50, p99, p999, worst, tick]] of Object.entries(timing)) {
-      if (name === "sample to command") continue;
+      if (name === own) continue;
       const r = row(name);
       const task = status.tasks?.[name];
       r.budget = task?.[1] ?? null;

@@ -9,9 +9,9 @@ import { tidy } from "./scope_settings.js";
 import { divisionOf, laneTicks, listTraces, mathsPanel, placeIn, samplesOf, tracePanel } from "./scope_traces.js";
 import { Trigger, triggerControls } from "./scope_trigger.js";
 
+/** Windows in ms. */
 const WINDOWS = [[500, "0.5 s"], [1000, "1 s"], [2000, "2 s"], [5000, "5 s"], [10000, "10 s"], [30000, "30 s"], [60000, "1 min"], [300000, "5 min"], [600000, "10 min"]];
 const MODES = [["time", "Time"], ["xy", "XY"], ["fft", "FFT"], ["spectrogram", "Spectrogram"]];
-const HZ = 1000;
 const MOST_PIXELS = 8192; // the server gives no more
 const ANALYSIS_MS = 200;
 const [AXIS_PX, CHARACTER_PX] = [8, 6.1]; // of the vertical axis: its marks and gap, and a letter of 10 px
@@ -19,14 +19,15 @@ const SLACK = 0.3; // further part of the window in which a trigger may be found
 
 export function mount(root, { link, catalogue, bar }) {
   const defaults = {
-    channels: catalogue.filter((c) => ["tip_displacement", "command"].includes(c.group)).map((c) => c.name),
+    channels: catalogue.filter((c) => c.plotted).map((c) => c.name),
     // the tip also wanders, by more than it trembles: without that the tremor is seen
     traces: Object.fromEntries(["x", "y", "z"].map((axis) => [`tip_displacement_${axis}`, { filter: "high" }])),
     maths: [], rows: 2000, side: true, display: "lanes", mode: "time", top: 30, first: "", second: "",
-    trigger: { on: true, channel: "tip_displacement_x", level: 0, slope: "up", mode: "auto" },
+    trigger: { on: true, channel: catalogue.find((c) => c.plotted).name, level: 0, slope: "up", mode: "auto" },
   };
   const known = new Map(catalogue.map((c) => [c.name, c]));
   const settings = persistent("scope.2", defaults);
+  const rowsIn = (ms) => Math.ceil((ms * link.rateHz) / 1000);
   const unknown = tidy(settings, defaults, known, { windows: WINDOWS.map(([rows]) => rows), modes: MODES.map(([mode]) => mode), tops: TOPS });
   let traces = [];
   let columns = []; // what is subscribed to: channels shown, and what maths and trigger need
@@ -83,7 +84,7 @@ export function mount(root, { link, catalogue, bar }) {
   function subscribe() {
     link.drop(subscription);
     const more = settings.trigger.on ? 1 + SLACK : 1;
-    const ask = (source) => link.subscribe(columns, settings.rows * more, Math.min(MOST_PIXELS, pixels(settings.rows) * more), source);
+    const ask = (source) => link.subscribe(columns, rowsIn(settings.rows * more), Math.min(MOST_PIXELS, pixels(rowsIn(settings.rows)) * more), source);
     link.drop(over);
     subscription = columns.length ? ask(0) : null;
     over = columns.length && link.replay?.second ? ask(1) : null;
@@ -148,7 +149,7 @@ export function mount(root, { link, catalogue, bar }) {
     if (!t?.length) return;
     const tEnd = t[t.length - 1];
     const { first, n, perBucket } = subscription.buckets;
-    paused = { tEnd, head: (first + n) * perBucket, view: [-settings.rows / HZ, 0], buckets: snapshot(subscription.buckets), columns };
+    paused = { tEnd, head: (first + n) * perBucket, view: [-settings.rows / 1000, 0], buckets: snapshot(subscription.buckets), columns };
     if (over?.buckets.n) Object.assign(paused, { second: snapshot(over.buckets), secondHead: (over.buckets.first + over.buckets.n) * over.buckets.perBucket });
     pauseButton.textContent = "Go on";
     pauseButton.setAttribute("aria-pressed", "true");
@@ -181,7 +182,7 @@ export function mount(root, { link, catalogue, bar }) {
 
   function zoomOut() {
     if (!paused) return;
-    paused.view = [-settings.rows / HZ, 0];
+    paused.view = [-settings.rows / 1000, 0];
     refetch();
   }
 
@@ -205,11 +206,11 @@ export function mount(root, { link, catalogue, bar }) {
   async function refetch() {
     if (fetching || !paused || paused.over) return;
     fetching = true;
-    const [x0, x1] = paused.view;
+    const [hz, [x0, x1]] = [link.rateHz, paused.view];
     const asked = paused;
     const wanted = columns;
-    const buckets = await link.range(columns, asked.head + x0 * HZ - 4, asked.head + x1 * HZ + 4, pixels(Math.ceil((x1 - x0) * HZ) + 8));
-    const second = over && asked.secondHead ? await link.range(columns, asked.secondHead + x0 * HZ - 4, asked.secondHead + x1 * HZ + 4, pixels(Math.ceil((x1 - x0) * HZ) + 8), 1) : null;
+    const buckets = await link.range(columns, asked.head + x0 * hz - 4, asked.head + x1 * hz + 4, pixels(Math.ceil((x1 - x0) * hz) + 8));
+    const second = over && asked.secondHead ? await link.range(columns, asked.secondHead + x0 * hz - 4, asked.secondHead + x1 * hz + 4, pixels(Math.ceil((x1 - x0) * hz) + 8), 1) : null;
     fetching = false;
     if (paused !== asked) return;
     if (second?.n) asked.second = second;
@@ -233,7 +234,7 @@ export function mount(root, { link, catalogue, bar }) {
   /** The channel of the trigger as it is drawn; null when it is not. */
   function triggerTrace(buckets) {
     const trace = traces.find((t) => !t.op && t.name === settings.trigger.channel);
-    return trace ? samplesOf(trace, buckets, columns, HZ / buckets.perBucket) : null;
+    return trace ? samplesOf(trace, buckets, columns, link.rateHz / buckets.perBucket) : null;
   }
 
   function draw() {
@@ -244,7 +245,7 @@ export function mount(root, { link, catalogue, bar }) {
     analysedAt = performance.now();
     const live = subscription?.buckets;
     if (!paused && live?.n && settings.trigger.on) {
-      const found = trigger.update(live, { channels: columns, rows: settings.rows, seen: triggerTrace(live) });
+      const found = trigger.update(live, { channels: columns, rows: rowsIn(settings.rows), seen: triggerTrace(live) });
       if (found === "single") pause();
     }
     const held = settings.trigger.on && settings.mode === "time" ? trigger.held : null;
@@ -252,8 +253,8 @@ export function mount(root, { link, catalogue, bar }) {
     if (!buckets?.n || buckets.channels !== columns.length) return;
     const t = buckets.times();
     const tEnd = paused ? paused.tEnd : held ? trigger.heldAt : t[t.length - 1];
-    const [x0, x1] = paused ? paused.view : held ? trigger.view(settings.rows / HZ) : [-settings.rows / HZ, 0];
-    const rateHz = HZ / buckets.perBucket;
+    const [x0, x1] = paused ? paused.view : held ? trigger.view(settings.rows / 1000) : [-settings.rows / 1000, 0];
+    const rateHz = link.rateHz / buckets.perBucket;
     const samples = new Map(traces.map((trace) => [trace, samplesOf(trace, buckets, columns, rateHz)]));
     const second = paused ? paused.second : over?.buckets;
     triggerBox.say(paused ? (paused.over ? "paused; this run is over, its picture stays" : "paused") : settings.mode === "time" ? trigger.text() : "");
@@ -267,9 +268,9 @@ export function mount(root, { link, catalogue, bar }) {
   /** The second run on the grid of the first: traces whose buckets are those at the same time since each run's start. */
   function placed(second, t, rateHz) {
     const { start_s: start, second_start_s: secondStart, shift_s: shift } = link.replay || {};
-    const own = new Map(traces.map((trace) => [trace, samplesOf(trace, second, columns, HZ / second.perBucket)]));
+    const own = new Map(traces.map((trace) => [trace, samplesOf(trace, second, columns, link.rateHz / second.perBucket)]));
     const first = second.times()[0] - secondStart;
-    const at = Array.from(t, (v) => Math.round((v - start + shift - first) * (HZ / second.perBucket)));
+    const at = Array.from(t, (v) => Math.round((v - start + shift - first) * (link.rateHz / second.perBucket)));
     return new Map(traces.map((trace) => {
       const { low, high, base } = own.get(trace);
       const take = (values) => Float64Array.from(at, (i) => (i >= 0 && i < values.length ? values[i] - base : NaN));

@@ -5,6 +5,8 @@ const PRESETS = [
   ["Sensors, volts", ["volts", "supply", "magnetometer_raw"]],
   ["Sensors, raw counts", ["counts"]],
   ["Sensors, calibrated", ["accelerometer", "magnetometer", "temperature"]],
+  ["Sensor", ["accel", "gyro", "temperature"]],
+  ["View", ["psi", "theta", "view_x", "view_y", "view_size", "status"]],
   ["Motion of the body", ["specific_force", "rate", "angular_acceleration", "quaternion"]],
   ["Tip and tremor", ["tip_displacement", "tremor", "tremor_ahead", "confidence"]],
   ["Actuators", ["desired_tip", "stroke", "command", "clip"]],
@@ -15,6 +17,7 @@ export const MAX_CHANNELS = 32;
 export function channelPicker(catalogue, settings, changed) {
   const boxes = new Map();
   const groups = [...new Set(catalogue.map((c) => c.group))];
+  const presets = PRESETS.filter(([, names]) => names.every((name) => groups.includes(name)));
   const details = groups.map((group) => {
     const members = catalogue.filter((c) => c.group === group);
     const all = h("input", { type: "checkbox", "aria-label": `All of ${group.replaceAll("_", " ")}`, onchange: () => choose(members.map((m) => m.name), all.checked) });
@@ -47,13 +50,13 @@ export function channelPicker(catalogue, settings, changed) {
   }
 
   const preset = h("select", { "aria-label": "Preset", style: "width:100%", onchange: () => {
-    const wanted = PRESETS[Number(preset.value)]?.[1];
+    const wanted = presets[Number(preset.value)]?.[1];
     if (wanted) {
       settings.channels = [];
       choose(catalogue.filter((c) => wanted.includes(c.group)).map((c) => c.name), true);
     }
     preset.value = "";
-  } }, h("option", { value: "" }, "Preset …"), PRESETS.map(([title], i) => h("option", { value: i }, title)));
+  } }, h("option", { value: "" }, "Preset …"), presets.map(([title], i) => h("option", { value: i }, title)));
   show();
   return h("div.panel.picker", {}, h("h2", {}, "Channels"), preset, h("div", { style: "margin-top:6px" }, details));
 }

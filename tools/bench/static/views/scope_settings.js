@@ -18,6 +18,7 @@ export function tidy(settings, defaults, known, lists) {
   if (!Array.isArray(settings.channels)) settings.channels = defaults.channels;
   const unknown = settings.channels.filter((name) => !known.has(name)).map(String);
   settings.channels = [...new Set(settings.channels.filter((name) => known.has(name)))].slice(0, MAX_CHANNELS);
+  if (unknown.length && !settings.channels.length) settings.channels = defaults.channels; // what another instrument showed
   settings.maths = (Array.isArray(settings.maths) ? settings.maths : [])
     .filter((m) => isObject(m) && Object.hasOwn(MATHS, m.op) && typeof m.a === "string" && typeof m.b === "string").slice(0, 8);
   const traces = isObject(settings.traces) ? settings.traces : {};

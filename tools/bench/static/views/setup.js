@@ -7,8 +7,9 @@ const BUSES = [["daq0", "serial", "converter of the accelerometers"], ["i2c0", "
 const PARTS = [["piezo", "i2c0", 0x0c, "DAC of the outputs"], ["magnetometer", "i2c1", 0x48, "converter of the magnetometer"], ["monitor", "i2c1", 0x49, "converter of the monitor"]];
 const hex = (v) => `0x${v.toString(16).padStart(2, "0").toUpperCase()}`;
 
-export function mount(root, { link, navigate }) {
-  const subscription = link.subscribe(VOLTS, 200, 200, 2);
+export function mount(root, { link, navigate, catalogue }) {
+  const hasVolts = catalogue.some((c) => c.name === VOLTS[0]); // an instrument without a converter has none
+  const subscription = hasVolts ? link.subscribe(VOLTS, 200, 200, 2) : null;
   const inputs = { "1x": 0, "1z": 1, "2y": 2, "2z": 3, "3x": 4, "3y": 5, supply: 6, temperature: 7 };
   const problem = h("p.bad", { role: "alert" });
   const fail = (error) => { problem.textContent = error.message; };
@@ -144,6 +145,8 @@ export function mount(root, { link, navigate }) {
   }) }, "Write the bench file");
   const attempt = h("button", { title: "The firmware starts again with this file; nothing is armed", onclick: () => act(() => post("/api/setup/try", { path: written })) }, "Try it: sensing only");
   const folder = h("small");
+  const benches = h("select", { "aria-label": "Bench to run" });
+  const runIt = h("button", { title: "Ends what runs, in its safe state, and starts this bench", onclick: () => act(() => post("/api/firmware/start", { bench: benches.value })) }, "Run it");
 
   root.append(h("div.cols.setup", {},
     h("section.panel", {}, h("h2", {}, "Buses ", h("small", {}, "what this machine has is offered")),
@@ -154,10 +157,10 @@ export function mount(root, { link, navigate }) {
       h("div.wiring", {}, h("div.chips", {}, chips), h("div.slots", {}, places)),
       h("p.note", {}, "Tilt or tap one sensor: the volts that move are its own.")),
     h("section.panel", {}, h("h2", {}, "Bench file ", folder),
-      h("div.row", {}, h("label", {}, "name", name), check, write, attempt, h("button.quiet", { onclick: () => navigate("scope") }, "See it in the scope")), problem, findings, content)));
+      h("div.row", {}, h("label", {}, "name", name), check, write, attempt, h("button.quiet", { onclick: () => navigate("scope") }, "See it in the scope")), h("div.row", {}, h("label", {}, "another bench", benches), runIt), problem, findings, content)));
 
   function enable() {
-    for (const button of [check, write, scanButton]) button.disabled = !link.mayOrder;
+    for (const button of [check, write, scanButton, runIt]) button.disabled = !link.mayOrder;
     attempt.disabled = !link.mayOrder || !written;
   }
 
@@ -176,13 +179,15 @@ export function mount(root, { link, navigate }) {
       output.append(...Object.entries(found.outputs).map(([key, [title]]) => h("option", { value: key }, title)));
       outputBus = Object.fromEntries(Object.entries(found.outputs).map(([key, [, bus]]) => [key, bus]));
     }
+    const others = await get("/api/benches");
+    benches.replaceChildren(...others.benches.map((path) => h("option", { value: path, selected: path === others.now }, path.split("/").pop())));
     showNeeded();
     enable();
   }
 
   const timer = setInterval(() => {
-    const b = subscription.buckets;
-    if (!b.n) return;
+    const b = subscription?.buckets;
+    if (!b?.n) return;
     VOLTS.forEach((_, i) => { live[i].textContent = `${digits(b.last(i), 4)} V`; });
     for (const [place, input] of Object.entries(inputs)) shownIn[place].textContent = `${digits(b.last(input), 4)} V`;
   }, 150);

@@ -17,7 +17,6 @@ export function mount(root, { link, navigate }) {
   screen.style.touchAction = "none";
   screen.id = "target-screen";
   const user = h("input", { type: "text", value: settings.user, placeholder: "Your name", maxLength: 60, oninput: () => { settings.user = user.value; settings.save(); } });
-  const bench = h("select", { "aria-label": "Bench with the motion card", hidden: settings.source !== "card" });
   const play = h("button.primary", { id: "target-start", onclick: start }, "New game");
   const problem = h("p.bad", { role: "alert" });
   const facts = h("table", {}, h("tr", {}, h("td.faint", {}, "None was started yet.")));
@@ -30,8 +29,8 @@ export function mount(root, { link, navigate }) {
     h("div.stack.side", {},
       h("section.panel.stack", { style: "gap:8px" }, user,
         segments([["position", "angle to place"], ["speed", "angle to speed"]], settings.mapping, (v) => { settings.mapping = v; settings.save(); }, "Mapping"),
-        segments([["mouse", "mouse"], ["card", "motion card"]], settings.source, (v) => { settings.source = v; settings.save(); bench.hidden = v !== "card"; }, "Pointer"),
-        bench, play, problem),
+        segments([["mouse", "mouse"], ["card", "motion card"]], settings.source, (v) => { settings.source = v; settings.save(); }, "Pointer"),
+        play, problem),
       h("section.panel", {}, h("h2", {}, "This game"), facts, results),
       h("section.panel", {}, h("h2", {}, "How"), h("p.note", { style: "margin:0" }, "Five squares, one after the other. Click: the view follows the mouse. Click again: it stays. Press for half a second: left and right change the size. A target counts when place and size fit within the tolerance.")),
       h("section.panel", {}, h("h2", {}, "Reports"), reports))));
@@ -39,7 +38,7 @@ export function mount(root, { link, navigate }) {
   async function start() {
     problem.textContent = "";
     try {
-      await post("/api/targets/start", { user: settings.user || "user", mapping: settings.mapping, source: settings.source, bench: bench.value || "", seed: window.micron.seed ?? seed() });
+      await post("/api/targets/start", { user: settings.user || "user", mapping: settings.mapping, source: settings.source, seed: window.micron.seed ?? seed() });
       screen.focus();
     } catch (error) { problem.textContent = error.message; }
   }
@@ -105,7 +104,6 @@ export function mount(root, { link, navigate }) {
     if (shown !== names) facts.replaceChildren(...rows.map(([n]) => h("tr", {}, h("td.soft", {}, n ? figure(n) : n), h("td.num"))));
     shown = names; // rows stay while their names do: what is pointed at keeps its explanation
     rows.forEach(([, v], i) => { facts.rows[i].cells[1].textContent = v; });
-    problem.textContent = game.error || "";
     if (game.result) {
       results.replaceChildren(h("table", {}, h("tr", {}, h("th", {}, "#"), h("th.num", {}, "time"), h("th.num", {}, figure("clicks")), h("th.num", {}, figure("turns"))),
         game.result.rows.map((r) => h("tr", {}, h("td", {}, r.target), h("td.num", {}, `${r.elapsed_s.toFixed(1)} s`), h("td.num", {}, r.clicks), h("td.num", {}, r.activations)))));
@@ -114,10 +112,9 @@ export function mount(root, { link, navigate }) {
   }
 
   async function listReports() {
-    const { reports: names, benches } = await get("/api/targets");
+    const { reports: names } = await get("/api/targets");
     reports.replaceChildren(...names.slice(0, 8).map((n) => h("div", {}, h("button.quiet", { style: "padding:2px 4px", onclick: () => download(`/api/targets/reports/${encodeURIComponent(n)}`, n) }, n))));
     if (!names.length) reports.replaceChildren(h("span.faint", {}, "One file per game, when it is done."));
-    bench.replaceChildren(...benches.map((b) => h("option", { value: b }, b.split("/").pop())));
   }
 
   const off = link.on("game", show);

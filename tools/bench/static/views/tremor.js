@@ -10,15 +10,15 @@ const FAST = [...AXES.map((a) => `tremor_${a}`), ...AXES.map((a) => `tremor_ahea
 const BANDS = [[0, 2], [2, 8], [8, 12], [20, 500]];
 const SLOW = [...AXES.map((a) => `tremor_amplitude_${a}`), ...AXES.map((a) => `tremor_frequency_${a}`)];
 const UM = 1e6;
-const HZ = 1000;
 const PATH = 700;
 const COMMANDED = 128;
 const MANUAL = 256;
 
 export function mount(root, { link }) {
   const settings = persistent("tremor", { plane: "xy" }, { plane: ["xy", "xz", "yz"] });
-  const fast = link.subscribe(FAST, 4200, 4200);
-  const slow = link.subscribe(SLOW, 60000, 900);
+  const HZ = link.rateHz;
+  const fast = link.subscribe(FAST, 4.2 * HZ, 4.2 * HZ);
+  const slow = link.subscribe(SLOW, 60 * HZ, 900);
   let before = null;
   let after = null;
   let tip = null; // [without, with]: motion of the tip along x, y, z
