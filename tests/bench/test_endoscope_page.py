@@ -134,14 +134,18 @@ def test_the_browser_shows_its_views_and_no_others(browser: Any, endoscope: Serv
 
 def test_another_bench_is_started_in_setup_and_the_page_becomes_its_own(browser: Any, endoscope: Server):
     endoscope.wait_running()
+    assert endoscope.request("POST", "/api/recording/start", b'{"name": "seen"}')[0] == 200
+    own = endoscope.wait_for(lambda s: s["recording"]["written"] > 20, "rows")["bench_file"]
     with opened_tab(browser, f"{endoscope.base}/#token={endoscope.token}", READY) as page:
         go(page, "setup")
         page.select_option("select[aria-label='Bench to run']", label="bench.toml")
-        page.click("text=Run it")
+        page.click("text=Run it")  # ends the recording, too
         page.wait_for_selector("#nav a[data-view=tremor]")
         endoscope.wait_for(lambda s: s["rate_hz"] == 1000.0 and s["rows"] > 100, "rows of the first instrument")
         status, answer = endoscope.request("POST", "/api/targets/start", b'{"source": "card"}')
         assert (status, "no motion card" in answer["error"]) == (400, True)
-        # a recording of the endoscope is not shown with the channels of another instrument
-        page.evaluate("micron.link.replayTo({ name: 'turning' })")
-        page.wait_for_selector("#say:has-text('turning.mcap is a recording of another instrument')")
+        page.evaluate("micron.link.replayTo({ name: 'seen' })")
+        page.wait_for_selector("#say:has-text('seen.mcap is a recording of another instrument')")
+        back = json.dumps({"bench": own}).encode()
+        assert endoscope.request("POST", "/api/firmware/start", back)[0] == 200
+        endoscope.wait_for(lambda s: s["rate_hz"] == 100.0 and s["rows"] > 20, "rows of the endoscope")
