@@ -40,7 +40,7 @@ JOBS = {
     ),
     "mismatch diagnose": (
         "from benchmarks.mismatch import stack_recording; "
-        "from tools.mismatch.engine.diagnose import diagnose; r = stack_recording({n} / 1000)",
+        "from tools.mismatch.infer import diagnose; r = stack_recording({n} / 1000)",
         "diagnose(r, jobs=1)",
         15_000,
     ),

@@ -72,7 +72,7 @@ def axis_recording(seconds: float):
 
 def measure(seconds: float, jobs: int, make: Callable[[float], Any] = stack_recording) -> tuple[float, float, int]:
     """(wall s, CPU s of this process, candidates that were screened)."""
-    from tools.mismatch.engine.diagnose import diagnose
+    from tools.mismatch.infer import diagnose
 
     recording = make(seconds)
     wall, cpu = time.perf_counter(), time.process_time()

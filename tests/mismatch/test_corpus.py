@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from tools.research.prove import corpus_page, gate
 from tools.research.prove.corpus import BLOCK, CORPORA, draw_case, first_block
 from tools.research.prove.corpus_table import corpus_table
 from tools.research.prove.exact import compare_paired, reliability, score_exactly, summarise
@@ -142,14 +141,14 @@ def test_a_run_goes_on_where_it_was_and_its_table_fits(tmp_path: Path) -> None:
         asked.append(path)
         return _silent(path)
 
-    few = Run("develop", "old", 2, 1000)
+    few = Run("develop", 2, 1000)
     first = run_corpus(few, tmp_path, diagnose=counting, progress=lambda text: None)
-    again = run_corpus(Run("develop", "old", 3, 1000), tmp_path, diagnose=counting, progress=lambda text: None)
+    again = run_corpus(Run("develop", 3, 1000), tmp_path, diagnose=counting, progress=lambda text: None)
     left_out = first.left_out + again.left_out
     assert len(asked) + left_out >= 3
     assert len(asked) == len(set(asked)), "no case is diagnosed twice"
     assert [r["case"] for r in again.rows][: len(first.rows)] == [r["case"] for r in first.rows]
-    none = run_corpus(Run("develop", "old", 5, 1000, minutes=0.0), tmp_path, progress=lambda text: None)
+    none = run_corpus(Run("develop", 5, 1000, minutes=0.0), tmp_path, progress=lambda text: None)
     assert none.open_cases == 2
     assert json.loads(json.dumps(none.to_json()))["open_cases"] == 2
     console = Console(width=80, record=True, file=io.StringIO())
@@ -168,7 +167,7 @@ def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatc
     from tools.research.prove import harness
 
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc")
-    result = run_corpus(Run("sealed", "old", 2, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
+    result = run_corpus(Run("sealed", 2, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
     assert result.rows == ()
     assert result.summary["cases"] + result.left_out == 2
     assert not list(tmp_path.rglob("recording.toml"))
@@ -176,70 +175,4 @@ def test_of_a_sealed_case_scores_are_all_that_is_kept(tmp_path: Path, monkeypatc
     assert len(sealed_draws(tmp_path)) == 1
     monkeypatch.setattr(harness, "git_revision", lambda: "0123abc-dirty")
     with pytest.raises(ValueError, match="commit first"):
-        run_corpus(Run("sealed", "old", 1, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)
-
-
-def test_the_page_pairs_the_cases_that_both_engines_have(tmp_path: Path) -> None:
-    right, wrong = _report("missing_physics", "creep"), _report("missing_physics", "spikes")
-    answer = _answer("single", "creep")
-    runs = []
-    for name, reports in (("old", (right, wrong, right)), ("new", (right, right))):
-        rows = [{"case": f"c{i}", "cpu_s": 1.0, **score_exactly(answer, r)} for i, r in enumerate(reports)]
-        body = {"corpus": "develop", "max_samples": 1000, "revision": "0" * 40, "date": "today", "rows": rows}
-        (tmp_path / name).write_text(json.dumps(body))
-        runs.append(corpus_page.read(tmp_path / name))
-    text = corpus_page.document(runs[0], runs[1], {"provenance": {"learned": False}})
-    assert "2 cases that both engines have" in text
-    assert "| set of names right | 1 | 0 | 1 | 0 |" in text
-    assert "| c1 | piezo_stack | creep (severity 4) | wrong, missing_physics: spikes | right," in text
-    with pytest.raises(ValueError, match="differ in max_samples"):
-        corpus_page.document(runs[0], {**runs[1], "max_samples": 2000}, {"provenance": {"learned": False}})
-    (tmp_path / "old").write_text("{}")
-    with pytest.raises(ValueError, match="not a run over a corpus"):
-        corpus_page.read(tmp_path / "old")
-
-
-def _rows(*said: tuple[str, str, tuple[str, ...]]) -> list[dict[str, Any]]:
-    """Rows of (kind, verdict, names said); what is missing is a creep, or a creep and spikes in a pair."""
-    true = {"single": ("creep",), "pair": ("creep", "spikes")}
-    return [
-        {
-            "case": f"c{i:05d}",
-            **score_exactly(_answer(kind, *true.get(kind, ())), _report(verdict, *names)),
-            "cpu_s": 2.0,
-        }
-        for i, (kind, verdict, names) in enumerate(said)
-    ]
-
-
-def test_the_gate_is_passed_by_an_engine_that_is_right_and_by_no_other() -> None:
-    right = _rows(
-        ("single", "missing_physics", ("creep",)), ("pair", "missing_physics", ("creep", "spikes")),
-        ("agrees", "agrees", ()),
-    )  # fmt: skip
-    wrong = _rows(
-        ("single", "missing_physics", ("backlash",)), ("pair", "missing_physics", ("creep",)),
-        ("agrees", "missing_physics", ("creep",)),
-    )  # fmt: skip
-    better = {c.text.split(":")[0]: c.passes for c in gate.criteria((wrong, right))}
-    assert better.pop("95 % intervals that hold") is None  # no case has one
-    assert better.pop('expected calibration error of "sure"') is False  # 0.9 is said, and all are right
-    assert set(better.values()) == {True}
-    worse = {c.text.split(":")[0]: c.passes for c in gate.criteria((right, wrong))}
-    assert {k for k, v in worse.items() if v} == {"CPU"}
-
-
-def test_the_gate_pairs_the_cases_of_one_draw(tmp_path: Path) -> None:
-    (tmp_path / "rows").mkdir()
-    rows = _rows(("single", "missing_physics", ("creep",)), ("agrees", "agrees", ()))
-    for engine, starts in (("old", ("7", "7")), ("new", ("7", "8"))):
-        lines = [json.dumps({**r, "digest": f"a-b-{start}"}) for r, start in zip(rows, starts, strict=True)]
-        (tmp_path / "rows" / f"sealed-2000-{engine}.jsonl").write_text("\n".join(lines))
-    old, new = gate.paired(tmp_path, 2000)
-    assert (old, new) == ([], [])  # the last draw has no case of both
-    (tmp_path / "rows" / "sealed-2000-new.jsonl").write_text(json.dumps({**rows[0], "digest": "c-b-7"}))
-    old, new = gate.paired(tmp_path, 2000)
-    assert [r["case"] for r in old] == [r["case"] for r in new] == ["c00000"]
-    page = gate.document((old, new), 2000, "0123456789abcdef", 1)
-    assert "1 sealed cases" in page
-    assert "partial" in page
+        run_corpus(Run("sealed", 1, 1000), tmp_path, diagnose=_silent, progress=lambda text: None)

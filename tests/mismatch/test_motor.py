@@ -15,8 +15,8 @@ import pytest
 from firmware_py.recording.revision import git_revision
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Human
-from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.fit import fit
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.reach import not_tried
 from tools.mismatch.engine.report import Report
 from tools.mismatch.engine.score import misfits
@@ -25,6 +25,7 @@ from tools.mismatch.engine.trial import extended
 from tools.mismatch.export.module import python_module
 from tools.mismatch.export.run import whole_run, whole_view
 from tools.mismatch.export.write import runnable
+from tools.mismatch.infer import diagnose
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model

@@ -41,14 +41,9 @@ RecordingsArgument = Annotated[
         metavar="RECORDING...", help="A recording (folder or .toml) or a folder of recordings; several with --together."
     ),
 ]
-EngineOption = Annotated[
-    str | None, typer.Option(metavar="old|new", help="Engine that decides; 'new' is an experiment.")
-]
 SeedOption = Annotated[
     int, typer.Option(min=0, help="Seed of the search; the same recording and seed give the same answer.")
 ]
-
-
 MOST_SHARED = 1_000_000
 """Samples above which one process works alone: every further one would hold a gigabyte of columns of its own."""
 
@@ -71,7 +66,6 @@ def diagnose(
     ] = None,
     trust: TrustOption = False,
     allow_outside: OutsideOption = False,
-    engine: EngineOption = None,
     together: Annotated[
         bool,
         typer.Option("--together", help="Give all recordings of one system one diagnosis, and report what differs."),
@@ -91,9 +85,6 @@ def diagnose(
     with clear_errors():
         check_writable(json_file, html)
         check_folder(out)
-        from tools.mismatch.engines import check_engine
-
-        check_engine(engine)
         processes = jobs or os.cpu_count() or 1
         if together:
             if dask is not None:
@@ -102,7 +93,7 @@ def diagnose(
 
             decide_on([*recordings_of(recordings).values()], trust, allow_outside)
             joined = load_together(recordings, per_recording or [])
-            _show(_diagnose_one(joined, held_out, seed, processes, engine), json_file, html, out)
+            _show(_diagnose_one(joined, held_out, seed, processes), json_file, html, out)
             return
         if per_recording:
             raise InputError("--per-recording needs --together: it says what differs between recordings")
@@ -117,18 +108,18 @@ def diagnose(
         if is_folder_of_recordings(recording):
             if html is not None:
                 raise InputError(f"--html is for one recording; {recording} is a folder of them: use --out FOLDER")
-            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask, engine)
+            _diagnose_folder(recording, json_file, out, held_out, seed, processes, dask)
             return
         if dask is not None:
             raise InputError("--dask spreads a folder of recordings; for one recording use --jobs")
-        report = _diagnose_one(recording, held_out, seed, processes, engine)
+        report = _diagnose_one(recording, held_out, seed, processes)
         _show(report, json_file, html, out)
 
 
-def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int, engine: str | None) -> Report:
+def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs: int) -> Report:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-    from tools.mismatch.engines import diagnose
+    from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
     loaded = load(recording) if isinstance(recording, Path) else recording
@@ -145,7 +136,7 @@ def _diagnose_one(recording: Path | Recording, held_out: float, seed: int, jobs:
 
         alone = loaded.n > MOST_SHARED
         shared = 1 if alone else jobs
-        return diagnose(loaded, held_out=held_out, seed=seed, jobs=shared, progress=show, engine=engine)
+        return diagnose(loaded, held_out=held_out, seed=seed, jobs=shared, progress=show)
 
 
 def _show(report: Report, json_file: str | None, html: Path | None, out: Path | None) -> None:
@@ -172,14 +163,13 @@ def _show(report: Report, json_file: str | None, html: Path | None, out: Path | 
 
 def _diagnose_folder(
     folder: Path, json_file: str | None, out: Path | None, held_out: float, seed: int, jobs: int, dask: str | None,
-    engine: str | None,
 ) -> None:  # fmt: skip
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeRemainingColumn
 
     from tools.mismatch import batch
     from tools.mismatch.report.terminal import batch_report
 
-    work = batch.jobs_for(batch.find(folder), out, held_out, seed, engine)
+    work = batch.jobs_for(batch.find(folder), out, held_out, seed)
     stream = batch.run_here(work, jobs) if dask is None else batch.run_on_dask(work, dask)
     rows: list[batch.Row] = []
     with Progress(

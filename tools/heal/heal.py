@@ -144,7 +144,7 @@ def with_remedy(bench: BenchFile, file: Path, out: Path) -> BenchFile:
 def _named(compared: Comparison, jobs: int) -> tuple[str, ...]:
     if compared.recording is None:
         return ()
-    from tools.mismatch.engine.diagnose import diagnose
+    from tools.mismatch.infer import diagnose
 
     report = diagnose(compared.recording, jobs=jobs)
     return tuple(p.name for p in report.physics)

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any, cast
 from hal.errors import BenchError
 from hal.trust import NotTrusted
 from tools.errors import InputError
-from tools.mismatch.engines import diagnose
 from tools.mismatch.report.wording import number, scaled, words
 
 if TYPE_CHECKING:
@@ -36,7 +35,6 @@ class Job:
     out: Path | None
     held_out: float
     seed: int
-    engine: str | None = None
 
 
 @dataclass(frozen=True)
@@ -98,22 +96,21 @@ def find(folder: Path) -> dict[str, Path]:
     return found
 
 
-def jobs_for(
-    recordings: dict[str, Path], out: Path | None, held_out: float, seed: int, engine: str | None = None
-) -> list[Job]:
+def jobs_for(recordings: dict[str, Path], out: Path | None, held_out: float, seed: int) -> list[Job]:
     """One job per recording, each with a folder of its own under ``out``."""
     return [
-        Job(n, p.absolute(), None if out is None else (out / n).absolute(), held_out, seed, engine)
+        Job(n, p.absolute(), None if out is None else (out / n).absolute(), held_out, seed)
         for n, p in recordings.items()
     ]
 
 
 def diagnose_one(job: Job) -> Row:
     """Diagnose one recording in this process and write its reports. Never raises: a bad recording is a row."""
+    from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
     try:
-        report = diagnose(load(job.path), held_out=job.held_out, seed=job.seed, jobs=1, engine=job.engine)
+        report = diagnose(load(job.path), held_out=job.held_out, seed=job.seed, jobs=1)
         if job.out is not None:
             write_reports(report, job.out)
         return Row(job.name, str(job.path), report.to_json())

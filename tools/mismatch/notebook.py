@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from tools.errors import InputError
-from tools.mismatch.engines import diagnose as run_engine
 from tools.mismatch.recording import Array, Simulate, TwinText
 from tools.mismatch.recording import Recording as Loaded
 
@@ -323,7 +322,6 @@ class Diagnosis:
 
 def diagnose(
     recording: Recording, twin: Twin | None = None, *, held_out: float = 0.3, seed: int = 0, jobs: int = 1,
-    engine: str | None = None,
 ) -> Diagnosis:  # fmt: skip
     """Find where a twin and a recording differ, which physics the twin lacks, and fit it.
 
@@ -332,7 +330,9 @@ def diagnose(
     """
     if not 0.1 <= held_out <= 0.6:
         raise InputError(f"held_out must be a share between 0.1 and 0.6, not {held_out}")
-    return Diagnosis(run_engine(recording.with_twin(twin), held_out=held_out, seed=seed, jobs=jobs, engine=engine))
+    from tools.mismatch.infer import diagnose as run
+
+    return Diagnosis(run(recording.with_twin(twin), held_out=held_out, seed=seed, jobs=jobs))
 
 
 def _frame(columns: Mapping[str, Any], t: Array | None = None) -> DataFrame:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 HERE = Path(__file__).parent

@@ -8,7 +8,7 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tools.errors import RecordingError
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 HERE = Path(__file__).parent

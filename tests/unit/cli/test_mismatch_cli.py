@@ -39,7 +39,7 @@ def engine(monkeypatch: pytest.MonkeyPatch) -> dict:
             progress("step 1: screen", 3, 9)
         return asked["report"]
 
-    monkeypatch.setattr("tools.mismatch.engine.diagnose.diagnose", diagnose)
+    monkeypatch.setattr("tools.mismatch.infer.diagnose", diagnose)
     return asked
 
 
@@ -110,7 +110,7 @@ def test_an_engine_failure_in_a_folder_is_exit_1(tmp_path: Path, monkeypatch: py
     def fails(rec, **_):
         raise ZeroDivisionError("x")
 
-    monkeypatch.setattr("tools.mismatch.engine.diagnose.diagnose", fails)
+    monkeypatch.setattr("tools.mismatch.infer.diagnose", fails)
     recording(tmp_path / "a", change=straight, samples=300)
     assert run("diagnose", tmp_path, "--jobs", 1).exit_code == 1
 
@@ -255,7 +255,6 @@ def test_every_command_has_an_example(command: str):
 @pytest.mark.parametrize(
     ("options", "text"),
     [
-        (("--engine", "third"), "use old or new"),
         (("--corpus", "mine"), "use calibrate, develop, sealed"),
         (("--corpus", "develop", "--seed", 3), "leave --seed out"),
     ],
@@ -266,11 +265,11 @@ def test_prove_says_what_is_wrong_with_a_corpus(options: tuple[object, ...], tex
     assert text in " ".join(result.stderr.split())
 
 
-def test_the_new_engine_writes_the_same_kind_of_report(stack: Path, tmp_path: Path):
-    result = run("diagnose", stack, "--engine", "new", "--jobs", 1, "--json", tmp_path / "r.json")
+def test_one_recording_and_a_folder_get_the_same_kind_of_report(stack: Path, tmp_path: Path):
+    result = run("diagnose", stack, "--jobs", 1, "--json", tmp_path / "r.json")
     assert result.exit_code == 0, result.stderr
     assert json.loads((tmp_path / "r.json").read_text())["verdict"] in ("agrees", "recalibrate")
-    many = run("diagnose", stack.parent, "--engine", "new", "--jobs", 1, "--json", tmp_path / "all.json")
+    many = run("diagnose", stack.parent, "--jobs", 1, "--json", tmp_path / "all.json")
     assert many.exit_code == 0, many.stderr
     (row,) = json.loads((tmp_path / "all.json").read_text())["recordings"]
     assert row["report"]["verdict"] in ("agrees", "recalibrate")

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
 from scipy.signal import lfilter
 
+from sim_devices.physics.catalogue import EFFECTS
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording, Split, TwinText
 
 Array = np.ndarray
@@ -142,3 +145,9 @@ def stack(
         context=context,
         noise={"displacement": sigma},
     )
+
+
+def named(made: Recording, names: Iterable[str]) -> set[str]:
+    """What is named of a recording where these are the effects that are known."""
+    report = diagnose(made, effects=[EFFECTS[n] for n in names], jobs=1)
+    return {p.name for p in report.physics}

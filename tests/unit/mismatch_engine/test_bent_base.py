@@ -7,8 +7,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
-from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.fit import fit
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.score import misfits
 from tools.mismatch.engine.screen import bend, one_step, places
 from tools.mismatch.engine.trial import extended

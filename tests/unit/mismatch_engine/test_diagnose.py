@@ -8,8 +8,8 @@ from scipy.signal import lsim
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import RATE, N, noise, recording, stack, wave
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.report import Report
+from tools.mismatch.infer import diagnose
 
 SIGMA = 0.05
 

@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
-from tests.unit.mismatch_engine.cases import RATE, recording, wave
-from tools.mismatch.engine.diagnose import diagnose, prepared
-from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero, weigh_evidence
-from tools.mismatch.engine.found import share_among
-from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.report import ParameterValue, Report
-from tools.mismatch.engine.screen import Candidate, places
-from tools.mismatch.engine.selection import Selection
-from tools.mismatch.engine.trial import Trial
-from tools.mismatch.engine.vary import added
-from tools.mismatch.placed import Placed
+from tests.unit.mismatch_engine.cases import RATE, named, recording, wave
+from tools.mismatch.engine.evidence import absent_groups, doubt_of, holds_zero
+from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.pose import prepared
+from tools.mismatch.engine.report import ParameterValue, Report, Withheld
+from tools.mismatch.engine.screen import places
+from tools.mismatch.infer import diagnose
+from tools.mismatch.infer.borne_out import borne_out as borne_out_of
+from tools.mismatch.infer.constants import learned
+from tools.mismatch.infer.store import Store
 from tools.mismatch.recording import Recording
 
 
@@ -41,13 +40,14 @@ def stage(seed: int, *, coulomb: float = 0.0, late_samples: float = 0.0) -> Reco
     return recording("mechanical_axis", {"force": force}, {"position": measured}, believed)
 
 
-def with_effect(made: Recording, name: str) -> tuple[Problem, Selection]:
-    """A selection that holds one effect, as if a search had accepted it."""
+def weighed(made: Recording, name: str) -> tuple[frozenset[str], tuple[Withheld, ...], Store]:
+    """What is named and what is withheld where a search took one effect; and the sets of that search."""
     problem, _, base = prepared(made, 0.3, 0, False)
-    place = places(problem, [EFFECTS[name]], ())[0]
+    store = Store(problem, base, learned())
     with np.errstate(all="ignore"):
-        fitted = added(problem, base, place)
-    return problem, Selection(problem, base, fitted, (), ())
+        one = store.with_one(store.base, places(problem, [EFFECTS[name]], ())[0])
+        sets, withheld = borne_out_of(store, [one, store.base])
+    return sets[0].names, withheld, store
 
 
 def borne_out(report: Report) -> None:
@@ -63,18 +63,16 @@ def borne_out(report: Report) -> None:
 
 @pytest.mark.parametrize("name", ["backlash", "dead_time", "first_order_lag", "coulomb_friction"])
 def test_an_effect_that_is_not_there_is_not_named_though_a_search_took_it(name: str) -> None:
-    problem, selection = with_effect(stage(3), name)
-    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
-    assert kept.fitted.model.placed == ()
+    names, withheld, _ = weighed(stage(3), name)
+    assert not names
     assert [w.name for w in withheld] == [name]
     assert withheld[0].reason in ("holds_zero", "at_limit")
     assert withheld[0].shown_by
 
 
 def test_friction_that_is_there_stays() -> None:
-    problem, selection = with_effect(stage(4, coulomb=0.3), "coulomb_friction")
-    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
-    assert [p.effect.name for p in kept.fitted.model.placed] == ["coulomb_friction"]
+    names, withheld, _ = weighed(stage(4, coulomb=0.3), "coulomb_friction")
+    assert names == {"coulomb_friction"}
     assert withheld == ()
 
 
@@ -115,13 +113,11 @@ def test_of_several_sizes_one_may_be_away_from_zero_by_chance() -> None:
 
 
 def test_a_loop_whose_change_with_speed_may_be_zero_is_a_plain_loop() -> None:
-    made = slow_loop()
-    problem, selection = with_effect(made, "rate_dependent_hysteresis")
-    kept, withheld = weigh_evidence(problem, selection, tuple(EFFECTS.values()))
-    names = [p.effect.name for p in kept.fitted.model.placed]
-    assert [(w.name, w.replaced_by) for w in withheld] == [("rate_dependent_hysteresis", "hysteresis")]
-    assert names == ["hysteresis"]
-    doubt = doubt_of(selection.fitted.model.placed[0], 0, RATE_FREE, ())
+    _, withheld, store = weighed(slow_loop(), "rate_dependent_hysteresis")
+    assert [w.name for w in withheld] == ["rate_dependent_hysteresis"]
+    assert named(slow_loop(), ("rate_dependent_hysteresis", "hysteresis")) == {"hysteresis"}
+    fitted = next(s.fitted for s in store.sets.values() if s.placed)
+    doubt = doubt_of(fitted, 0, RATE_FREE, uncertainty(store.problem, fitted))
     assert doubt is not None
     assert doubt.shown_by == ("change_with_speed",)
 
@@ -154,15 +150,12 @@ def test_a_record_of_one_speed_does_not_say_that_a_loop_changes_with_speed() -> 
             assert not holds_zero(p.parameters["change_with_speed"])
 
 
-def test_those_that_cannot_be_told_apart_share_what_is_sure() -> None:
-    def trial(parameters: int) -> Trial:
-        line = EFFECTS["vibration"]
-        orders = tuple(float(i + 1) for i in range(parameters))
-        placed = Placed(line, "output", "position", "environment", ("position",), {"harmonics": orders})
-        return Trial(placed, Candidate(placed, 0.5, 1e-9, False, ()), None, None, {}, np.ones((3, 1)), 2)
-
-    step = trial(1)
-    assert share_among(step, ()) == 1.0
-    assert share_among(step, (step,)) == pytest.approx(0.5)
-    assert share_among(step, (step, step)) == pytest.approx(1 / 3)
-    assert 0.5 <= share_among(step, (trial(2),)) < 1.0
+def test_a_curve_that_trades_with_a_gain_is_sure_as_a_whole() -> None:
+    """Two sines through a cubic: the gain and the weights of the curve are nearly collinear."""
+    t = np.arange(900) * 0.01
+    u = np.sin(2 * np.pi * 0.5 * t) + 0.4 * np.sin(2 * np.pi * 1.7 * t)
+    y = 2.0 * u + 0.5 * u**3 + np.random.default_rng(1).normal(0, 0.01, t.size)
+    made = recording("piezo_stack", {"command": u}, {"displacement": y}, {"gain_um_per_V": 2.0, "offset_um": 0.0})
+    names, withheld, _ = weighed(made, "static_nonlinearity")
+    assert names == {"static_nonlinearity"}
+    assert not withheld

@@ -15,11 +15,12 @@ from scipy.signal import lfilter
 
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
 from tools.mismatch.engine.dependence import Dependence
-from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.noise import NoiseFloor, floor_interval, noise_floor, repeat_floor, rest_floor
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.unexplained import Leftover
 from tools.mismatch.engine.verdict import fit_trouble, meaning_of
 from tools.mismatch.engine.windows import bad_windows
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 

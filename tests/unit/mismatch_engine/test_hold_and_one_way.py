@@ -9,12 +9,11 @@ from scipy.signal import dlsim, dlti
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.exponential import exponential
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
-from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, with_hold
 from tools.mismatch.engine.one_way import direction, one_way
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.report import BaseShift
 from tools.mismatch.engine.screen import places
-from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.vary import added
 from tools.mismatch.recording import Recording
 from tools.mismatch.report import wording
@@ -100,13 +99,11 @@ def test_a_named_delay_of_half_a_sample_is_the_hold() -> None:
     place = places(problem, [EFFECTS["dead_time"]], ())[0]
     with np.errstate(all="ignore"):
         fitted = added(problem, base, place)
-    found = delay_is_hold(problem, Selection(problem, base, fitted, (), ()))
-    assert found is not None
-    assert found.fitted.model.placed == ()
+    assert delay_is_hold(problem, fitted)
     late, _, base = prepared(axis(5, zero=False, late=3.0), 0.3, 0, False)
     with np.errstate(all="ignore"):
         fitted = added(late, base, place)
-    assert delay_is_hold(late, Selection(late, base, fitted, (), ())) is None
+    assert not delay_is_hold(late, fitted)
 
 
 def test_which_way_a_load_moved() -> None:

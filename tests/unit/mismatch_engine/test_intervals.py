@@ -12,13 +12,13 @@ from scipy.stats import t as student
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tools.mismatch.engine.colour import Whitener, fit_whitener
-from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.found import human_values
 from tools.mismatch.engine.intervals import few_blocks, uncertainty
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.split import own_split
 from tools.mismatch.engine.trial import extended
-from tools.mismatch.engine.unexplained import lone_event
+from tools.mismatch.infer import diagnose
 
 Array = np.ndarray
 
@@ -100,18 +100,6 @@ def test_a_fit_part_has_some_of_what_is_seldom() -> None:
     assert 0.1 < share < 0.6
 
 
-def test_one_loud_stretch_that_runs_on_is_an_event_and_noise_is_none() -> None:
-    rng = np.random.default_rng(6)
-    noise = 0.02 * rng.standard_t(4, 3000)
-    problem, _, base = prepared(stack(noise), 0.3, 0, False)
-    assert not lone_event(problem, base, "displacement")
-    bump = noise.copy()
-    a = problem.split.held_out[0][0] + 20
-    bump[a : a + 60] += 1.0 * np.hanning(60)
-    problem, _, base = prepared(stack(bump), 0.3, 0, False)
-    assert lone_event(problem, base, "displacement")
-
-
 def test_a_delay_before_a_coarse_grid_has_an_interval_that_is_no_point() -> None:
     rate_hz, delay_s, step = 100.0, 0.013, 0.1
     u = 50 + 30 * wave(np.random.default_rng(5), 3000)
@@ -121,5 +109,5 @@ def test_a_delay_before_a_coarse_grid_has_an_interval_that_is_no_point() -> None
     rec = recording("piezo_stack", {"command": u}, {"displacement": y}, parameters, rate_hz=rate_hz)
     found = {p.name: p.parameters for p in diagnose(rec, jobs=1).physics}
     delay = found["dead_time"]["delay_s"]
-    assert delay.value == pytest.approx(delay_s, abs=5e-5)
-    assert 1e-6 < delay.ci95[1] - delay.ci95[0] < 1 / rate_hz
+    assert delay.ci95[0] < delay_s < delay.ci95[1]
+    assert 1e-6 < delay.ci95[1] - delay.ci95[0] < 0.1 / rate_hz

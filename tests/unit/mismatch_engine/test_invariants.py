@@ -10,8 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tests.unit.mismatch_engine.cases import RATE, recording
-from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.fit import as_given
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.trust import broken, fit_loss
 from tools.mismatch.export.run import whole_run

@@ -10,7 +10,7 @@ import pytest
 
 from tests.unit.mismatch_report.systems import recording
 from tools.mismatch.engine import workers
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 

@@ -10,10 +10,11 @@ from scipy.signal import lfilter
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
-from tools.mismatch.engine.diagnose import diagnose, prepared
 from tools.mismatch.engine.fit import OPENING, fit
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.problem import LEAST_OPENING, Problem
 from tools.mismatch.engine.screen import bend, one_step, places
+from tools.mismatch.infer import diagnose
 from tools.mismatch.simulate import Model
 
 RATE_HZ = 1000.0

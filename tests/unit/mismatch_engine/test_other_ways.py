@@ -14,14 +14,12 @@ from sim_devices.physics.effect import Context
 from sim_devices.physics.lines import mean_spread
 from sim_devices.physics.spikes import SPIKES
 from sim_devices.physics.step_shift import STEP_SHIFT, edges
-from tests.unit.mismatch_engine.cases import RATE, recording, wave
+from tests.unit.mismatch_engine.cases import RATE, named, recording, wave
 from tools.mismatch.engine import workers
-from tools.mismatch.engine.diagnose import prepared
-from tools.mismatch.engine.forward import Work, candidates, forward
-from tools.mismatch.engine.other_way import beginnings
-from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.projected import Projected
-from tools.mismatch.engine.select import outdone, search
+from tools.mismatch.engine.screen import places
+from tools.mismatch.engine.vary import added
 from tools.mismatch.simulate_sites import sites
 from tools.mismatch.simulate_start import moved
 from tools.mismatch.twins.make import make
@@ -82,10 +80,8 @@ def test_a_step_beside_a_curve_is_no_walk() -> None:
     rng = np.random.default_rng(5)
     u = 50 + 40 * wave(rng, n)
     y = 0.125 * u + 4e-4 * (u - 50) ** 2 + 0.5 * ((np.arange(n) > 500) + 1.0 * (np.arange(n) > 1100))
-    problem, _, base = prepared(stack(y + 0.01 * rng.standard_normal(n), u), 0.3, 0, False)
     names = ("static_nonlinearity", "step_shift", "random_walk", "thermal_drift")
-    steps = search(problem, base, [EFFECTS[m] for m in names]).steps
-    assert sorted(t.name for t in steps) == ["static_nonlinearity", "step_shift"]
+    assert named(stack(y + 0.01 * rng.standard_normal(n), u), names) == {"static_nonlinearity", "step_shift"}
 
 
 def test_one_step_among_heavy_tails_is_no_walk() -> None:
@@ -93,9 +89,7 @@ def test_one_step_among_heavy_tails_is_no_walk() -> None:
     rng = np.random.default_rng(12)
     u = np.repeat(rng.uniform(10, 90, 25), n // 25)
     y = 0.125 * u + 0.15 * (np.arange(n) > 1330) + 0.02 * rng.standard_t(4, n)
-    problem, _, base = prepared(stack(y, u), 0.3, 0, False)
-    steps = search(problem, base, [EFFECTS[m] for m in ("step_shift", "random_walk")]).steps
-    assert [t.name for t in steps] == ["step_shift"]
+    assert named(stack(y, u), ("step_shift", "random_walk")) == {"step_shift"}
 
 
 def test_bursts_that_all_lie_in_what_is_held_out_are_seen() -> None:
@@ -110,31 +104,6 @@ def test_bursts_that_all_lie_in_what_is_held_out_are_seen() -> None:
     assert SPIKES.test(e, np.where(keep, e, 0.0), replace(context(e), mask=keep)).p_value < 1e-7
 
 
-def trial(name: str, excess: float, taken: float) -> SimpleNamespace:
-    effect = EFFECTS[name]
-    placed = SimpleNamespace(effect=effect, outputs=("y",))
-    comparison = SimpleNamespace(excess_gain=taken)
-    return SimpleNamespace(name=name, placed=placed, comparison=comparison, misfits={"y": 1.0 + excess})
-
-
-def test_levels_read_off_bursts_are_no_model_of_them() -> None:
-    spikes, steps, lag = trial("spikes", 30.0, 0.6), trial("step_shift", 28.0, 0.6), trial("dead_time", 20.0, 0.6)
-    assert candidates([spikes, steps]) == [spikes]  # pyright: ignore[reportArgumentType]
-    assert candidates([spikes, steps, lag]) == [lag]  # pyright: ignore[reportArgumentType]
-    assert candidates([spikes, trial("step_shift", 3.0, 0.9)])[0].name == "step_shift"  # pyright: ignore[reportArgumentType]
-
-
-def test_no_pair_begins_with_bursts() -> None:
-    def tried(name: str) -> SimpleNamespace:
-        one = trial(name, 3.0, 0.9)
-        candidate = SimpleNamespace(tested=name == "spikes", p_value=0.0, share=0.9)
-        fitted = SimpleNamespace(ok=True)
-        return SimpleNamespace(**vars(one), fitted=fitted, refused=False, candidate=candidate, label=name)
-
-    begun = beginnings([tried("spikes"), tried("dead_time")], "y")  # pyright: ignore[reportArgumentType]
-    assert [t.name for t in begun] == ["dead_time"]
-
-
 def test_one_command_of_several_may_be_late() -> None:
     n = 400
     two = {s: wave(np.random.default_rng(i), n) for i, s in enumerate(("force", "push"))}
@@ -145,51 +114,14 @@ def test_one_command_of_several_may_be_late() -> None:
     assert {p.stage for p in late if p.site == "input"} <= {"amplifier", "actuator"}
 
 
-def test_the_same_physics_on_every_output_takes_one_search() -> None:
-    n = 1500
-    rng = np.random.default_rng(7)
-    f = np.column_stack([wave(rng, n) for _ in "xyz"])
-    volts = 2.5 + f + 0.2 * f**2 + 2e-3 * rng.standard_normal(f.shape)
-    rec = recording(
-        "accelerometer",
-        {f"specific_force_{a}": f[:, i] for i, a in enumerate("xyz")},
-        {f"voltage_{a}": volts[:, i] for i, a in enumerate("xyz")},
-        {"bias_V": 2.5, "scale_V_per_g": 1.0},
-    )
-    problem, _, base = prepared(rec, 0.3, 0, False)
-    looked: list[str] = []
-    work = Work(
-        (EFFECTS["static_nonlinearity"],), Rule(), progress=lambda what, done, of: looked.append(what.split(":")[0])
-    )
-    way = forward(problem, base, base, (), work)
-    assert [t.name for t in way.steps] == ["static_nonlinearity"] * 3
-    assert set(looked) == {"step 1"}
-
-
-def test_a_second_way_must_leave_half() -> None:
-    rng = np.random.default_rng(8)
-    u = 50 + 40 * wave(rng, 800)
-    problem, *_ = prepared(stack(0.125 * u + 0.02 * rng.standard_normal(u.size), u), 0.3, 0, False)
-
-    def leaves(excess: float) -> SimpleNamespace:
-        s = problem.sigma("displacement")
-        return SimpleNamespace(residual={"displacement": np.full(problem.index.size, s * np.sqrt(1 + excess))}, ok=True)
-
-    first = SimpleNamespace(problem=problem, fitted=leaves(10.0), steps=(1,))
-    assert outdone(first, leaves(4.9), 1)  # pyright: ignore[reportArgumentType]
-    assert not outdone(first, leaves(5.5), 1)  # pyright: ignore[reportArgumentType]
-    assert not outdone(first, leaves(4.9), 2)  # pyright: ignore[reportArgumentType]
-    assert outdone(first, leaves(2.4), 2)  # pyright: ignore[reportArgumentType]
-
-
 def test_what_a_sensor_adds_is_not_the_course_of_the_plant() -> None:
     n = 1200
     rng = np.random.default_rng(9)
     u = 50 + 40 * wave(rng, n)
     y = 0.125 * u + 2.0 * (np.arange(n) >= 600) + 0.01 * rng.standard_normal(n)
     problem, _, base = prepared(stack(y, u), 0.3, 0, False)
-    step = search(problem, base, [EFFECTS["step_shift"]]).fitted
-    assert step.names == ("step_shift",)
+    place = places(problem, [EFFECTS["step_shift"]], ())[0]
+    step = added(problem, base, place)
     view = problem.fit_view
     plant = moved(step.model, view, step.theta, "displacement")
     line = np.polynomial.Polynomial.fit(u, plant, 1)

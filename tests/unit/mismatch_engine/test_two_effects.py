@@ -9,18 +9,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import RATE, recording, wave
-from tools.mismatch.engine.diagnose import diagnose, prepared
-from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.forward import acceptable
-from tools.mismatch.engine.parsimony import Rule, freedom
-from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.score import Comparison
-from tools.mismatch.engine.screen import Candidate, places
-from tools.mismatch.engine.trial import Trial
-from tools.mismatch.placed import Placed
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording
-from tools.mismatch.simulate import Model
-from tools.mismatch.simulate_start import prepare
 
 N = 1500
 AXES = "xyz"
@@ -67,53 +57,6 @@ def test_a_walk_does_not_hide_a_curve_and_a_recorded_temperature() -> None:
     recorded = accelerometer(change, f, context={"temperature": warm})
     report = diagnose(recorded, effects=[EFFECTS[n] for n in names], jobs=1)
     assert {p.name for p in report.physics} == {"temperature_sensitivity", "static_nonlinearity"}
-
-
-def judged(first: str, second: str, after: float, z: float = 30.0) -> bool:
-    """May ``second`` be named beside ``first``, whose form may leave four noise variances, if it leaves ``after``?"""
-    f = forces(3)
-    problem, _, base = prepared(accelerometer(np.zeros((N, 3)), f), 0.3, 0, False)
-    o = "voltage_x"
-    there: list[Placed] = []
-    for name in (first, second):
-        model = Model(problem.twin, there)
-        theta = model.carry(base.model, base.theta, problem.recording)
-        place = next(p for p in places(problem, (EFFECTS[name],), ()) if o in p.outputs)
-        there.append(prepare(model, problem.fit_view, theta, place))
-    return acceptable(_trial(problem, base, there, o, after, z), Rule(), 4.0)
-
-
-def _trial(problem: Problem, base: Fit, there: list[Placed], output: str, after: float, z: float) -> Trial:
-    model = Model(problem.twin, there)
-    fitted = replace(base, model=model, theta=model.carry(base.model, base.theta, problem.recording))
-    placed = there[-1]
-    before = 1.0 + 4 * (after - 0.99)
-    comparison = Comparison(z, {output: before}, {output: after}, {output: 1.0})
-    candidate = Candidate(placed, 0.9, 0.0, False, ())
-    return Trial(placed, candidate, fitted, comparison, {output: after}, np.empty((0, 0)), 1)
-
-
-@pytest.mark.parametrize(
-    ("first", "second", "after", "named"),
-    [
-        ("first_order_lag", "channel_delay", 1.1, False),  # the second pole of a loaded RC
-        ("static_nonlinearity", "channel_delay", 1.1, True),
-        ("random_walk", "static_nonlinearity", 2.0, True),  # few numbers, nearly all of it
-        ("random_walk", "creep", 2.0, False),  # one family explains what another leaves
-    ],
-)
-def test_what_may_be_named_below_the_form_of_an_earlier_effect(
-    first: str, second: str, after: float, named: bool
-) -> None:
-    assert judged(first, second, after) is named
-
-
-def test_the_wander_of_a_line_is_no_freedom_of_its_physics() -> None:
-    f = forces(4)
-    problem, _, _ = prepared(accelerometer(np.zeros((N, 3)), f), 0.3, 0, False)
-    for name in ("mains_interference", "vibration"):
-        place = places(problem, (EFFECTS[name],), ())[0]
-        assert freedom(replace(place, settings={**place.settings, "times_s": (0.0,) * 40})) == 6
 
 
 def test_no_vibration_at_the_frequency_of_the_mains() -> None:

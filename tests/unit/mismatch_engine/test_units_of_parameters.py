@@ -10,8 +10,8 @@ import pytest
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.engine.found import _units
+from tools.mismatch.infer import diagnose
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.make import make
 

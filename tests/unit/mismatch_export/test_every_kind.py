@@ -16,9 +16,9 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
 from tests.unit.mismatch_model.test_cascade import circuit, in_two
 from tools.mismatch.apply import corrected_twin
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.export.run import simulate_file
 from tools.mismatch.export.write import write_twin
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model

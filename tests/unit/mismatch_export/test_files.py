@@ -18,8 +18,8 @@ from hal.trust import NotTrusted, trust_program
 from sim_devices.physics.catalogue import EFFECTS
 from tools.cli.main import app
 from tools.errors import RecordingError
-from tools.mismatch.engine.diagnose import diagnose
 from tools.mismatch.export.run import simulate_file
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 runner = CliRunner()
@@ -115,18 +115,22 @@ def held_rms(folder: Path, report: dict[str, Any], simulated: dict[str, np.ndarr
     return scale * float(np.sqrt(np.mean(held**2)))
 
 
+def as_reported(rms: float, fitted: float) -> bool:
+    """Not above the report's figure by 2 %, nor below by 5 %: a run of the whole sets its start state from more samples
+    than a diagnosis, and may be the better for it."""
+    return 0.95 * fitted < rms < 1.02 * fitted
+
+
 @pytest.mark.parametrize("form", ["toml", "py"])
 def test_a_twin_loaded_again_gives_the_residual_of_the_report(
     found: tuple[Path, Path, dict[str, Any]], form: str, tmp_path: Path
 ) -> None:
-    """Run freely over the whole recording, judged where the report was; 2 %: a diagnosis may set the start state from
-    fewer samples than a run of the whole.
-    """
+    """Run freely over the whole recording, judged where the report was."""
     folder, file, report = found
     out = tmp_path / f"twin.{form}"
     run("apply", folder, file, "--out", out)
     (fitted,) = report["fit"]["fitted_rms"].values()
-    assert held_rms(folder, report, simulate_file(out, folder)) == pytest.approx(fitted, rel=0.02)
+    assert as_reported(held_rms(folder, report, simulate_file(out, folder)), fitted)
     said = run("simulate", out, folder, "--out", tmp_path / "again.csv")
     assert "residual" in said
     table = np.genfromtxt(tmp_path / "again.csv", delimiter=",", names=True)
@@ -143,7 +147,7 @@ def test_simulated_columns(found: tuple[Path, Path, dict[str, Any]], tmp_path: P
     (o,) = rec.outputs
     assert table.dtype.names == ("t_s", *(rec.column[s] for s in (*rec.inputs, o)), f"{rec.column[o]}_simulated")
     (fitted,) = report["fit"]["fitted_rms"].values()
-    assert held_rms(folder, report, {o: table[f"{rec.column[o]}_simulated"]}) == pytest.approx(fitted, rel=0.02)
+    assert as_reported(held_rms(folder, report, {o: table[f"{rec.column[o]}_simulated"]}), fitted)
 
 
 def test_the_module_runs_where_nothing_of_ours_is(found: tuple[Path, Path, dict[str, Any]], tmp_path: Path) -> None:

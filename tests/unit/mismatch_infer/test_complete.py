@@ -10,9 +10,7 @@ import pytest
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_engine.cases import recording, wave
 from tests.unit.mismatch_engine.test_hold_and_one_way import axis
-from tools.errors import InputError
-from tools.mismatch import engines
-from tools.mismatch.engine import diagnose as preparation
+from tools.mismatch.engine import pose as preparation
 from tools.mismatch.engine.report import Hold, Report
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort
@@ -36,10 +34,10 @@ def stack(change: np.ndarray, u: np.ndarray) -> Recording:
 def test_a_named_delay_of_half_a_sample_is_the_hold(monkeypatch: pytest.MonkeyPatch) -> None:
     """Held inputs through a twin that runs them straight, on data that are made not to tell which of the two it is."""
     monkeypatch.setattr(preparation, "infer_hold", lambda problem, base: Hold("linear", "assumed"))
-    report = diagnose(axis(5, zero=True), jobs=1, constants=START, effects=[EFFECTS["dead_time"]])
+    report = diagnose(axis(5, zero=True), jobs=1, effects=[EFFECTS["dead_time"]])
     assert {h.how for h in report.hold.values()} == {"instead_of_delay"}
     assert not report.physics
-    late = diagnose(axis(5, zero=False, late=3.0), jobs=1, constants=START, effects=[EFFECTS["dead_time"]])
+    late = diagnose(axis(5, zero=False, late=3.0), jobs=1, effects=[EFFECTS["dead_time"]])
     assert [p.name for p in late.physics] == ["dead_time"]
     assert {h.how for h in late.hold.values()} == {"assumed"}
 
@@ -109,11 +107,6 @@ def test_the_chance_of_a_name_counts_every_candidate() -> None:
     )
     assert [p.name for p in report.physics] == [p.name for p in alone.physics] == ["saturation"]
     assert report.checks.false_alarm_p_value > alone.checks.false_alarm_p_value
-
-
-def test_an_engine_that_there_is_not_is_refused() -> None:
-    with pytest.raises(InputError, match="use old or new"):
-        engines.check_engine("third")
 
 
 def test_the_smallest_effect_that_would_have_been_named_is_true() -> None:

@@ -11,9 +11,9 @@ from scipy.optimize import lsq_linear
 
 from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_model.made import recording
-from tools.mismatch.engine.diagnose import prepared
 from tools.mismatch.engine.fit import bounded_step, fit, without_unseen
 from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.pose import prepared
 from tools.mismatch.engine.vary import added
 from tools.mismatch.infer.constants import learned
 from tools.mismatch.infer.search import Search

@@ -12,8 +12,9 @@ from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.diode import conducted
 from tests.unit.mismatch_engine.cases import recording
 from tools.errors import RecordingError
-from tools.mismatch.engine.diagnose import diagnose, opened
 from tools.mismatch.engine.partition import Filter
+from tools.mismatch.engine.pose import opened
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.simulate_sites import sites, why_not

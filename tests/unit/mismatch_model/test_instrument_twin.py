@@ -15,7 +15,7 @@ from sim_devices.plant.instrument import Instrument
 from sim_devices.plant.recorded_hand import make_hand
 from tests.conftest import DEFAULT_BENCH
 from tools.errors import RecordingError
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.instrument import GivenHand, simulate_instrument
 from tools.mismatch.twins.make import make

@@ -9,8 +9,8 @@ import pytest
 
 from tests.unit.mismatch_model.test_loader import GOOD
 from tools.errors import RecordingError
-from tools.mismatch.engine.diagnose import ranges_of
 from tools.mismatch.engine.join import joined
+from tools.mismatch.engine.pose import ranges_of
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.make import make
 

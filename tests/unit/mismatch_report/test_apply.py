@@ -14,7 +14,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_report.systems import TWIN, recording
 from tools.errors import InputError, RecordingError
 from tools.mismatch.apply import corrected_twin, twin_toml
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import TwinText
 from tools.mismatch.recording_load import load
 from tools.mismatch.simulate import Model

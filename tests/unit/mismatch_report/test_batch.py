@@ -39,9 +39,7 @@ def test_an_empty_folder_is_bad_input(tmp_path: Path):
 
 @pytest.fixture
 def canned_engine(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(
-        "tools.mismatch.engine.diagnose.diagnose", lambda rec, **_: replace(missing_physics(), pictures=None)
-    )
+    monkeypatch.setattr("tools.mismatch.infer.diagnose", lambda rec, **_: replace(missing_physics(), pictures=None))
 
 
 def test_every_recording_gets_its_reports_and_a_bad_one_a_row(tmp_path: Path, canned_engine: None):
@@ -68,7 +66,7 @@ def test_an_engine_that_breaks_loses_one_recording_only(tmp_path: Path, monkeypa
             raise np.linalg.LinAlgError("singular")
         return missing_physics()
 
-    monkeypatch.setattr("tools.mismatch.engine.diagnose.diagnose", breaks_once)
+    monkeypatch.setattr("tools.mismatch.infer.diagnose", breaks_once)
     stack(tmp_path / "a")
     stack(tmp_path / "b")
     a, b = batch.run_here(batch.jobs_for(batch.find(tmp_path), None, 0.3, 0), 1)

@@ -10,7 +10,7 @@ from sim_devices.physics.catalogue import EFFECTS
 from tests.unit.mismatch_report.canned import all_verdicts
 from tests.unit.mismatch_report.contract_check import NAMES, faults
 from tests.unit.mismatch_report.systems import recording
-from tools.mismatch.engine.diagnose import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from tests.unit.mismatch_model.test_cascade import PRODUCT, circuit, matrices, unit_gain
 from tools.cli.main import app
 from tools.errors import InputError
-from tools.mismatch.engine.diagnose import opened
+from tools.mismatch.engine.pose import opened
 from tools.mismatch.recording_load import load
 from tools.mismatch.twins.cascade import CascadeTwin
 from tools.mismatch.twins.make import make
@@ -118,15 +118,15 @@ STACK = MeasuredSet(
 
 def test_the_engine_never_sees_the_test_and_the_file_is_scored(made: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     seen: list[int] = []
-    from tools.mismatch.engine import diagnose as engine
+    from tools.research.reproduce import measured
 
-    real = engine.diagnose
+    real = measured.diagnose
 
     def watched(recording: Any, **options: Any) -> Any:
         seen.append(recording.n)
         return real(recording, **options)
 
-    monkeypatch.setattr("tools.mismatch.engine.diagnose.diagnose", watched)
+    monkeypatch.setattr(measured, "diagnose", watched)
     done = score(STACK, made / "work", {})
     assert done.error == ""
     assert seen == [1200]
@@ -146,7 +146,7 @@ def test_a_run_goes_on_where_it_was_stopped(made: Path, monkeypatch: pytest.Monk
     """The command, its JSON, its page; a set that the rows hold is not run again."""
     asked: list[str] = []
 
-    def quick(s: MeasuredSet, folder: Path, diagnosed: object, engine: str | None) -> Scored:
+    def quick(s: MeasuredSet, folder: Path, diagnosed: object) -> Scored:
         asked.append(s.name)
         return scored(s.name, 5.0, ("coulomb_friction",))
 

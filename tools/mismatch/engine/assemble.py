@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_devices.physics.effect import Effect
+from tools.mismatch.engine.checks import messages
 from tools.mismatch.engine.colour import fit_whitener, ljung_box
 from tools.mismatch.engine.exported import raw_values, without_events
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.found import alternatives, human_values, physics_found
-from tools.mismatch.engine.identifiability import detection
+from tools.mismatch.engine.found import human_values, physics_found
+from tools.mismatch.engine.identifiability import LeastNamed, detection
 from tools.mismatch.engine.intervals import Uncertainty, uncertainty
 from tools.mismatch.engine.locate import follow, regime, windows
+from tools.mismatch.engine.many import compare_recordings
 from tools.mismatch.engine.one_way import one_way
-from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.pose import Ended, Posed
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.reach import imitable, much_left, not_tried, out_of_reach, tempered
 from tools.mismatch.engine.report import (
@@ -25,7 +26,6 @@ from tools.mismatch.engine.report import (
     Checks,
     DependsOn,
     FitSummary,
-    Hold,
     Location,
     PhysicsFound,
     Pictures,
@@ -35,12 +35,13 @@ from tools.mismatch.engine.report import (
 )
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import held_rms
-from tools.mismatch.engine.selection import Selection
+from tools.mismatch.engine.trial import Trial
 from tools.mismatch.engine.unexplained import Leftover, about
-from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio, judge, within_tolerance
+from tools.mismatch.engine.verdict import OF_THE_CLOCK, Decision, compare_ratio, within_tolerance
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.report.wording import number, scaled
 from tools.mismatch.simulate import Model
+from tools.mismatch.simulate_view import View
 from tools.mismatch.twins.ode import inside_of
 
 Array = NDArray[np.float64]
@@ -69,32 +70,18 @@ def human_shifts(problem: Problem, raw: Fit, base: Fit, fitted: Fit, unsure: Unc
 
 
 def assemble(
-    problem: Problem,
-    raw: Fit,
-    base: Fit,
-    selection: Selection,
-    left: dict[str, Leftover],
-    effects: Sequence[Effect],
-    rule: Rule,
-    said: Sequence[str] = (),
-    official: Problem | None = None,
-    jobs: int = 1,
-    withheld: Sequence[Withheld] = (),
-    hold: Hold | None = None,
-    decision: Decision | None = None,
-) -> Report:
-    """Everything the contract asks for. ``said``: messages of the checks; ``official``: the held-out part in one
-    free run, when the decisions were made on shorter stretches; ``withheld``: effects that are not named;
-    ``hold``: what the inputs do between their samples; ``decision``: the verdict, if it was reached elsewhere.
+    posed: Posed, ended: Ended, screened: Sequence[Trial], left: dict[str, Leftover], *, decision: Decision,
+    sure: Mapping[str, float], least: LeastNamed, withheld: Sequence[Withheld] = (), jobs: int = 1,
+) -> Report:  # fmt: skip
+    """Everything the contract asks for. ``screened``: the candidates beside the base; ``sure``: per name;
+    ``withheld``: effects that are not named.
     """
-    rec, twin = problem.recording, problem.twin
-    fitted = selection.fitted
-    decision = decision or judge(problem, raw, base, selection, left, rule)
-    verdict, p = decision.verdict, decision.p_value
+    problem, raw, base, fitted = posed.problem, posed.raw, ended.base, ended.fitted
+    rec, twin, official = problem.recording, problem.twin, ended.official
+    verdict = decision.verdict
     unsure = uncertainty(problem, fitted)
     shifts = base_shifts(raw, base, fitted, unsure.deviations())
-    runners, groups, alike = alternatives(problem, selection, rule)
-    physics = physics_found(problem, selection, unsure, alike)
+    physics = physics_found(problem, fitted, unsure, sure)
     exported = without_events(problem, fitted)
     raws = raw_values(exported)
     labels = [p.label for p in fitted.model.placed]
@@ -145,11 +132,10 @@ def assemble(
     elif guilty:
         stage = guess_stage(twin.chain, depends)
     noise_filters = {o: fit_whitener(fitted.residual[o], stretches=problem.held_spans) for o in twin.outputs}
-    screened = {
-        (t.name, t.placed.effect.kind, t.placed.site, t.placed.target): (t.placed, t.candidate.starts)
-        for t in selection.first
+    known = {
+        (t.name, t.placed.effect.kind, t.placed.site, t.placed.target): (t.placed, t.candidate.starts) for t in screened
     }
-    limits = detection(problem, base, effects, noise_filters, z=rule.z, gain=rule.gain, known=screened)
+    limits = detection(problem, base, posed.effects, noise_filters, least, known=known)
     held = problem.split.held_out_mask()[problem.index]
     rows = problem.held_rows
     simulated = lambda f: {o: problem.measured[o] - f.residual[o] for o in twin.outputs}  # noqa: E731
@@ -166,8 +152,8 @@ def assemble(
             tuple(depends[:6]),
         ),
         physics=tuple(physics),
-        alternatives=tuple(runners),
-        equivalent=tuple(groups),
+        alternatives=(),
+        equivalent=(),
         detection_limit=limits.limit,
         cannot_show=limits.cannot,
         fit=FitSummary(
@@ -189,8 +175,8 @@ def assemble(
         checks=Checks(
             all(ljung_box(base.residual[o][rows]) > 0.01 for o in twin.outputs),
             all(ljung_box(fitted.residual[o][rows]) > 0.01 for o in twin.outputs),
-            p,
-            tuple(said),
+            decision.p_value,
+            tuple(gross(posed)),
             memory_p,
         ),
         seconds=0.0,
@@ -208,13 +194,13 @@ def assemble(
                 "gain": t.comparison.gain if t.comparison else 0.0,
                 "misfit": float(np.mean(list(t.misfits.values()))) if t.misfits else None,
             }
-            for t in selection.first
+            for t in screened
         ),
         withheld=tuple(withheld),
         meaning=decision.meaning,
         trouble=decision.trouble,
         doubtful=decision.doubtful,
-        hold=dict.fromkeys(twin.inputs, hold) if hold is not None else {},
+        hold=dict.fromkeys(twin.inputs, posed.hold) if posed.hold is not None else {},
         one_way=one_way(problem, fitted, shifts),
         pictures=Pictures(
             rec.t[problem.index],
@@ -228,6 +214,31 @@ def assemble(
         ),
         not_tried=not_tried(twin),
     )
+
+
+def conclude(
+    posed: Posed, ended: Ended, screened: Sequence[Trial], left: dict[str, Leftover], *, decision: Decision,
+    sure: Mapping[str, float], least: LeastNamed, withheld: Sequence[Withheld] = (), jobs: int = 1,
+) -> Report:  # fmt: skip
+    """The report of a finished search. ``screened``: the candidates beside the base; ``sure``: per name."""
+    report = assemble(
+        posed, ended, screened, left, decision=decision, sure=sure, least=least, withheld=withheld, jobs=jobs
+    )
+    if posed.recording.parts:
+        # what is not named is not part of the model that recordings are compared under
+        named = ended.fitted if report.physics else ended.base
+        report = replace(report, together=compare_recordings(posed.problem, ended.base, named, jobs))
+    return report
+
+
+def gross(posed: Posed) -> list[str]:
+    """Messages of the cheap checks, on the simulation as given."""
+    recording, twin, raw = posed.recording, posed.problem.twin, posed.raw
+    whole = View.whole(recording)
+    with np.errstate(all="ignore"):
+        simulated = raw.model.simulate(whole, raw.theta)
+    drives = {o: twin.drive(o) for o in twin.outputs}
+    return messages(recording.inputs, recording.outputs, recording.context, simulated, drives, recording.dt)
 
 
 def led_by_physics(problem: Problem, base: Fit, fitted: Fit, depends: Sequence[DependsOn]) -> list[DependsOn]:

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from tools.mismatch.engine.events import half_widths
 from tools.mismatch.engine.fit import Fit
-from tools.mismatch.engine.identifiability import experiment
 from tools.mismatch.engine.intervals import Uncertainty
-from tools.mismatch.engine.parsimony import Rule, as_good, complexity
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.report import Alternative, Equivalent, ParameterValue, PhysicsFound
-from tools.mismatch.engine.score import compare, misfits, paired_t
-from tools.mismatch.engine.selection import Selection
-from tools.mismatch.engine.trial import Trial
+from tools.mismatch.engine.report import ParameterValue, PhysicsFound
+from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.vary import reduced
 from tools.mismatch.placed import Placed
 from tools.mismatch.twins.ode import inside_of
@@ -90,13 +85,8 @@ def parameters_of(
     }
 
 
-def physics_found(
-    problem: Problem, selection: Selection, unsure: Uncertainty, alike: Mapping[str, Sequence[Trial]]
-) -> list[PhysicsFound]:
-    """Accepted effects in the order of their acceptance, parameters from the joint fit.
-    ``alike``: per label the rivals that this recording cannot tell from it.
-    """
-    fitted = selection.fitted
+def physics_found(problem: Problem, fitted: Fit, unsure: Uncertainty, sure: Mapping[str, float]) -> list[PhysicsFound]:
+    """The effects of a model, parameters from the joint fit. ``sure``: the probability of every name."""
     if not fitted.model.placed:
         return []
     values = human_values(problem, fitted, unsure)
@@ -108,12 +98,6 @@ def physics_found(
         worst = max(placed.outputs, key=lambda o: c.effect_rms.get(o, 0.0) / problem.sigma(o))
         if placed.site == "feedback":
             worst = placed.target if placed.target in small.residual else worst  # whose unit its parameters have
-        step = next((i for i, s in enumerate(selection.steps) if s.label == placed.label), None)
-        sure = float(norm.cdf(min(c.z, 8.0)))
-        if step is not None:
-            same = alike.get(placed.label, ())
-            others = [t for t in selection.rivals[step] if t.name not in {a.name for a in same}]
-            sure *= against_rivals(selection.steps[step], others) * share_among(selection.steps[step], same)
         a, b = fitted.model.slices(k)
         raw = {
             fitted.model.parameters[i].name.rsplit(".", 1)[-1]: float(fitted.theta[i])
@@ -125,7 +109,7 @@ def physics_found(
                 placed.effect.name,
                 worst,
                 placed.stage,
-                round(min(sure, 0.999), 4),
+                round(sure[placed.effect.name], 4),
                 parameters,
                 placed.effect.equation,
                 placed.effect.source,
@@ -141,69 +125,3 @@ def physics_found(
             )
         )
     return out
-
-
-def against_rivals(step: Trial, rivals: Sequence[Trial]) -> float:
-    """How sure the named effect is against the best other name: a simpler one's lead counts in full, a family with more
-    freedom that fits as well only casts some doubt.
-    """
-    sure = 1.0
-    for t in rivals:
-        if t.name == step.name or not set(t.placed.outputs) & set(step.placed.outputs):
-            continue
-        lead = float(norm.cdf(paired_t(t.energy, step.energy)))
-        sure = min(sure, lead if t.parameters <= step.parameters else max(lead, 0.8))
-    return sure
-
-
-PER_PARAMETER = 0.4
-"""Nats that a free parameter costs: the lower end of what two sets of generated cases gave (0.4 to 0.9), so that the
-plainer of two equals is preferred by no more than was seen."""
-
-
-def share_among(step: Trial, alike: Sequence[Trial]) -> float:
-    """Probability of the named effect among those that fit as well: their likelihoods count as equal, so only what
-    further parameters cost tells them apart. A rival with fewer parameters counts as much as the named effect.
-    """
-    odds = (np.exp(-PER_PARAMETER * max(complexity(t) - complexity(step), 0.0)) for t in alike)
-    return 1.0 / (1.0 + float(sum(odds)))
-
-
-AS_WELL = 1.05
-"""Times what the named effect leaves: a rival that leaves more does not fit as well, however plain it is."""
-
-
-def alternatives(
-    problem: Problem, selection: Selection, rule: Rule
-) -> tuple[list[Alternative], list[Equivalent], dict[str, list[Trial]]]:
-    """Runners-up of each step with why not, groups that this recording cannot tell apart, and the rivals of these
-    groups by the label of the effect that is named."""
-    out: list[Alternative] = []
-    groups: list[Equivalent] = []
-    same_by_label: dict[str, list[Trial]] = {}
-    named = {p.effect.name for p in selection.fitted.model.placed}
-    rows = problem.held_rows
-    before = misfits(problem, selection.base)
-    for step, rivals in zip(selection.steps, selection.rivals, strict=True):
-        alike: list[Trial] = []
-        assert step.fitted is not None
-        theirs = step.fitted.residual
-        for t in rivals[:6]:
-            if t.fitted is None or t.name in named:
-                continue
-            o = next(q for q in t.placed.outputs if q in step.placed.outputs)
-            left = rms(t.fitted.residual[o][rows])
-            same = as_good(t, step, rule, o, before[o]) and left <= AS_WELL * rms(theirs[o][rows])
-            if same:
-                why = f"fits as well; {step.name} is simpler" if t.parameters > step.parameters else "fits as well"
-                if t.name not in (a.name for a in alike):
-                    alike.append(t)
-            else:
-                mine, best = (np.mean([v.misfits.get(q, np.inf) for q in t.placed.outputs]) for v in (t, step))
-                why = f"leaves {np.sqrt(mine / max(best, 1e-12)):.2f} times the residual of {step.name}"
-            out.append(Alternative(t.name, o, left, why))
-        if alike:
-            names = (step.name, *(t.name for t in alike))
-            groups.append(Equivalent(names, experiment(step.placed.effect, alike[0].placed.effect)))
-            same_by_label[step.label] = alike
-    return out, groups, same_by_label

@@ -19,7 +19,6 @@ from tools.mismatch.engine.intervals import jacobian, uncertainty
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.score import misfits
-from tools.mismatch.engine.selection import Selection
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
 from tools.mismatch.twins.make import make
@@ -144,11 +143,8 @@ DELAYS = ("dead_time", "channel_delay")
 NO_WORSE = 1.02
 
 
-def delay_is_hold(problem: Problem, selection: Selection) -> Selection | None:
-    """The selection with held inputs in place of a delay of half a sample; None where there is no such delay, or where
-    held inputs do not explain the held-out part as well.
-    """
-    fitted = selection.fitted
+def delay_is_hold(problem: Problem, fitted: Fit) -> bool:
+    """Whether the model has a delay of half a sample in whose place held inputs explain the held-out part as well."""
     half = 0.5 * problem.recording.dt
     values = human_values(problem, fitted, uncertainty(problem, fitted))
     for k, placed in enumerate(fitted.model.placed):
@@ -162,13 +158,5 @@ def delay_is_hold(problem: Problem, selection: Selection) -> Selection | None:
         again = fit(other, model, [theta], iterations=25)
         before, after = misfits(problem, fitted), misfits(other, again)
         if again.ok and all(after[o] <= NO_WORSE * before[o] + 0.02 for o in before):
-            keep = [i for i, s in enumerate(selection.steps) if s.label != placed.label]
-            return replace(
-                selection,
-                problem=other,
-                base=fit_base(other),
-                fitted=again,
-                steps=tuple(selection.steps[i] for i in keep),
-                rivals=tuple(selection.rivals[i] for i in keep),
-            )
-    return None
+            return True
+    return False

@@ -74,6 +74,15 @@ def experiment(a: Effect, b: Effect) -> str:
 
 
 @dataclass(frozen=True)
+class LeastNamed:
+    """What an effect of one parameter on one output must show to be named: the ``z`` of its test, and the ``gain`` as a
+    share of the held-out mean square."""
+
+    z: float
+    gain: float
+
+
+@dataclass(frozen=True)
 class Limits:
     """``limit[output][effect]`` the smallest effect rms in the output's unit that would have been named; effects
     that the excitation cannot show are in ``cannot`` with what a recording would need.
@@ -120,9 +129,8 @@ def detection(
     current: Fit,
     effects: Iterable[Effect],
     filters: dict[str, Whitener],
+    least: LeastNamed,
     *,
-    z: float,
-    gain: float,
     known: Mapping[tuple[str, ...], tuple[Placed, Sequence[Array]]] | None = None,
 ) -> Limits:
     """Smallest effect rms per output and effect that would have been named beside ``current``.
@@ -171,8 +179,8 @@ def detection(
                     moved = whiten(filters[o], left, problem.held_spans)
                     noise = max(filters[o].innovation_rms, 1e-300)
                     power = float(np.linalg.norm(moved)) / noise
-                    by_test = (z + 1.0) * size / max(power, 1e-300)
-                    by_gain = np.sqrt(gain / (1 - gain)) * problem.sigma(o) * size / rest
+                    by_test = (least.z + 1.0) * size / max(power, 1e-300)
+                    by_gain = np.sqrt(least.gain / (1 - least.gain)) * problem.sigma(o) * size / rest
                     values.append(max(by_test, by_gain))
                 if values:
                     value = float(np.median(values))

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 from scipy.stats import t as student
 
 from tools.mismatch.engine.colour import fit_whitener
@@ -80,6 +81,23 @@ class Uncertainty:
         accounts = [np.sum(moved**2, axis=0) * few_blocks(moved) ** 2]
         accounts += [np.einsum("ij,jk,ik->i", gradients, c, gradients) for c in (self.plain, self.coloured)]
         return np.sqrt(np.maximum(np.max(accounts, axis=0), 0.0) * self.beyond + gradients**2 @ self.own)
+
+    def chance_of_none(self, values: Array, which: slice) -> float:
+        """The p-value that the parameters ``which`` of ``values`` (parameters,) are all zero (Wald's test), by the
+        account that makes it likeliest: parameters that cancel one another are sure together and unsure each.
+        """
+        v = values[which]
+        accounts = (
+            self.moved[:, which].T @ self.moved[:, which],
+            self.plain[which, which],
+            self.coloured[which, which],
+        )
+        least = np.inf
+        for c in accounts:
+            size = np.sqrt(np.maximum(np.diag(c), 1e-300))
+            scaled = v / size
+            least = min(least, float(scaled @ np.linalg.pinv(c / np.outer(size, size), hermitian=True) @ scaled))
+        return float(chi2.sf(least / self.beyond, max(v.size, 1)))
 
     def deviations(self) -> Array:
         """Standard deviation of each parameter (parameters,)."""

@@ -35,27 +35,9 @@ class Comparison:
     effect_rms: dict[str, float]
 
     @property
-    def improvement(self) -> float:
-        """Mean square over noise variance that goes, summed over outputs."""
-        return sum(self.before[o] - self.after[o] for o in self.before)
-
-    @property
     def gain(self) -> float:
         """Share of the mean square that goes, on the output where most goes."""
         return max((1 - self.after[o] / max(b, 1e-300) for o, b in self.before.items()), default=0.0)
-
-    @property
-    def excess_gain(self) -> float:
-        """Share of what stands above the noise that goes, over the outputs that change."""
-        room = sum(max(b - 1.0, 0.0) for b in self.before.values())
-        return self.improvement / max(room, 1e-9)
-
-    @property
-    def log_p(self) -> float:
-        """Natural logarithm of the one-sided p-value of ``z`` (30 degrees of freedom at most matter not here)."""
-        from scipy.stats import norm
-
-        return float(norm.logsf(self.z))
 
 
 def winsorised(r: Array, floor: float, lively: NDArray[np.bool_] | None = None) -> Array:
@@ -77,16 +59,6 @@ def fit_rms(problem: Problem, fitted: Fit) -> dict[str, float]:
     return {o: float(np.sqrt(np.mean(r[rows] ** 2))) for o, r in fitted.residual.items()}
 
 
-def block_energy(problem: Problem, fitted: Fit, blocks: list[Span]) -> Array:
-    """Mean square over noise variance per block (blocks, outputs), outliers pulled in."""
-    out = np.empty((len(blocks), len(problem.twin.outputs)))
-    for j, o in enumerate(problem.twin.outputs):
-        r = winsorised(fitted.residual[o], problem.sigma(o), problem.lively) / problem.sigma(o)
-        for i, (a, b) in enumerate(blocks):
-            out[i, j] = float(np.mean(r[a:b] ** 2)) if b > a else 0.0
-    return out
-
-
 def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
     """Mean square over noise variance on held-out samples, per output; 1 is perfect."""
     rows = problem.held_rows
@@ -101,13 +73,6 @@ def misfits(problem: Problem, fitted: Fit) -> dict[str, float]:
 def misfit(problem: Problem, fitted: Fit) -> float:
     """The same, averaged over outputs."""
     return float(np.mean(list(misfits(problem, fitted).values())))
-
-
-def paired_t(a: Array, b: Array) -> float:
-    """Paired t of block energies: positive when ``b`` is lower (better). ``a``, ``b`` (blocks, outputs)."""
-    d = np.sum(a - b, axis=1)
-    spread = float(np.std(d, ddof=1)) if d.size > 1 else 0.0
-    return float(np.mean(d) / (spread / np.sqrt(d.size))) if spread > 0 else 0.0
 
 
 def whiteners(problem: Problem, fitted: Fit) -> dict[str, Whitener]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.score import Comparison, block_energy, compare, misfits
+from tools.mismatch.engine.score import Comparison, compare, misfits
 from tools.mismatch.engine.screen import Candidate, Ground, bend, one_step
 from tools.mismatch.engine.workers import mapped
 from tools.mismatch.placed import Placed
@@ -50,8 +50,7 @@ MOST_TOP = 0.999
 @dataclass(frozen=True)
 class Trial:
     """A candidate's outcome: ``fitted`` is None when the screen let it drop. ``misfits`` per output on held-out
-    samples (1 is perfect), ``energy`` (blocks, outputs) of held-out blocks, ``parameters`` how many it adds;
-    ``outputs`` names the columns of ``energy``.
+    samples (1 is perfect).
     """
 
     placed: Placed
@@ -59,9 +58,6 @@ class Trial:
     fitted: Fit | None
     comparison: Comparison | None
     misfits: dict[str, float]
-    energy: Array
-    parameters: int
-    outputs: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -71,15 +67,6 @@ class Trial:
     def refused(self) -> bool:
         """Whether the effect's own test finds nothing of it: then no fit, alone or with others, makes it a name."""
         return self.candidate.tested and self.candidate.p_value > LEAST_P
-
-    @property
-    def improvement(self) -> float:
-        """Held-out mean square over noise variance that goes."""
-        return self.comparison.improvement if self.comparison else -np.inf
-
-    @property
-    def label(self) -> str:
-        return self.placed.label
 
 
 def extended(problem: Problem, current: Fit, placed: Placed) -> tuple[Model, Array]:
@@ -99,21 +86,17 @@ def fit_one(
     candidate: Candidate,
     stride: int,
     tops: dict[str, float],
-    effort: Effort | None = None,
+    effort: Effort,
 ) -> Trial:
     """Fit one candidate jointly with everything that is there, compare on held-out samples.
 
-    ``tops``: the best one-step share per output; who stays far below it is not refined, by ``effort`` where it is
-    given.
+    ``tops``: the best one-step share per output; who stays far below it is not refined, as ``effort`` says.
     """
     model, _ = extended(problem, current, candidate.placed)
     rows = problem.fit_rows
     touched = candidate.placed.outputs
     now = {o: float(np.mean((current.residual[o][rows] / problem.sigma(o)) ** 2)) for o in model.together(touched)}
-    if effort is None:
-        gone = max(0.5 * tops[o] * now[o] for o in touched)
-    else:
-        gone = max((1.0 - effort.most_left(tops[o])) * now[o] for o in touched)
+    gone = max((1.0 - effort.most_left(tops[o])) * now[o] for o in touched)
     limit = (sum(now.values()) - gone) / len(now)
     thin = max(stride, rows.size * len(now) // TRIAL_ROWS)
     fitted = fit(
@@ -121,10 +104,7 @@ def fit_one(
         keep=current, touched=touched,
     )  # fmt: skip
     comparison = compare(problem, current, fitted)
-    value = misfits(problem, fitted)
-    energy = block_energy(problem, fitted, problem.held_blocks)
-    added = len(model.parameters) - len(current.model.parameters)
-    return Trial(candidate.placed, candidate, fitted, comparison, value, energy, added, problem.twin.outputs)
+    return Trial(candidate.placed, candidate, fitted, comparison, misfits(problem, fitted))
 
 
 def freedom(candidate: Candidate) -> int:
@@ -176,11 +156,11 @@ def try_all(
     *,
     stride: int,
     jobs: int,
+    effort: Effort,
     progress: Progress | None = None,
     what: str = "candidates",
     least: int = LEAST_FITS,
     most: int = MOST_FITS,
-    effort: Effort | None = None,
 ) -> list[Trial]:
     """Every candidate screened, the ``hopeful`` ones fitted. The answer does not depend on ``jobs``."""
 
@@ -198,15 +178,12 @@ def try_all(
     chosen = [c for c, k in zip(screened, keep, strict=True) if k]
     tops = dict.fromkeys(problem.twin.outputs, 0.0)
     # shares are of the mean square of all outputs; one output may have little of it
-    part = dict.fromkeys(tops, 1.0) if effort is None else _parts(problem, current)
+    part = _parts(problem, current)
     for c in chosen:
         for o in c.placed.outputs:
             tops[o] = max(tops[o], c.share / len(c.placed.outputs) / part[o])
     fitted = iter(run(fit_one, chosen, (stride, tops, effort), f"{what}: fit"))
-    return [
-        next(fitted) if k else Trial(c.placed, c, None, None, {}, np.empty((0, 0)), 0)
-        for c, k in zip(screened, keep, strict=True)
-    ]
+    return [next(fitted) if k else Trial(c.placed, c, None, None, {}) for c, k in zip(screened, keep, strict=True)]
 
 
 def _parts(problem: Problem, current: Fit) -> dict[str, float]:

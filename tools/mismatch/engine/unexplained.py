@@ -56,28 +56,6 @@ def leftover(
     return Leftover(output, ratio, tuple(said), memory, bool(followed or loud))
 
 
-def lone_event(problem: Problem, fitted: Fit, output: str, *, louder: float = 20.0, smooth: float = 0.6) -> bool:
-    """Whether one block, fitted or held out, is far louder than all others and its residual runs on from sample to
-    sample: no stationary noise does that, and no fit that sees it once can say what it was. Where a simulation starts,
-    its state is not known: the first twentieth of the record, and twins that start afresh everywhere, are left out.
-    """
-    if problem.twin.restart:
-        return False
-    r = fitted.residual[output]
-    blocks = [r[a:b] for a, b in (*problem.fit_blocks, *problem.held_blocks) if b - a >= 8 and a > r.size // 20]
-    if len(blocks) < 12:
-        return False
-    energy = np.array([float(np.mean(e**2)) for e in blocks])
-    usual = float(np.quantile(energy, 0.9))
-    e = blocks[int(np.argmax(energy))]
-    runs_on = float(e[1:] @ e[:-1]) / max(float(e @ e), 1e-300)
-    return float(energy.max()) > louder * max(usual, problem.sigma(output) ** 2) and runs_on > smooth
-
-
-SHAPELESS = frozenset(("random_walk", "step_shift", "spikes", "dropped_samples"))
-"""Effects made of events or of levels read off the data: they imitate anything that changes in time."""
-
-
 @dataclass(frozen=True)
 class Stranger:
     """A recorded context signal that a free curve follows better than named effects do: ``share`` of the residual's
@@ -137,43 +115,6 @@ def block_means(x: Array, dt: float, problem: Problem) -> Array:
     k = max(1, round(dt / problem.recording.dt))
     m = x.size // k
     return x[: m * k].reshape(m, k).mean(axis=1)
-
-
-def stranger(
-    problem: Problem, before: Fit, after: Fit, output: str, said: Iterable[str], *, p_limit: float = 1e-8
-) -> Stranger | None:
-    """Does a free curve of a context signal explain what the effects between ``before`` and ``after`` do not?
-
-    Only signals that no effect of ``after`` is about. The curve must leave less than the effects; where all of
-    these (``said``) are shapeless, which imitate whatever changes, it may leave up to three times as much
-    if it takes a third, or whatever it leaves when it takes nearly all.
-    """
-    used = {s for p in after.model.placed if output in p.outputs for s in about(p.effect)}
-    names = [s for s in problem.recording.context if s not in used]
-    said = set(said)
-    if not names or not said:
-        return None
-    s = problem.sigma(output)
-    rows = problem.held_rows
-
-    def level(fitted: Fit) -> float:
-        r = winsorised(fitted.residual[output][rows], s, problem.lively[rows])
-        return float(np.mean((r / s) ** 2))
-
-    start, end = level(before), level(after)
-    if end < 1.15:
-        return None
-    limit = (3.0 if said <= SHAPELESS else 1.0) * (end - 1)
-    if said <= SHAPELESS:
-        return _plainest(
-            problem,
-            before,
-            output,
-            names,
-            p_limit,
-            lambda share: share > 0.85 or (share > 0.3 and (1 - share) * start - 1 < limit),
-        )
-    return _plainest(problem, before, output, names, p_limit, lambda share: (1 - share) * start - 1 < limit)
 
 
 def _plainest(

@@ -93,7 +93,7 @@ def whole_run(recording: Recording, model: Model, theta: Array) -> dict[str, Arr
 
 def whole_view(recording: Recording, model: Model) -> View:
     """The whole recording as one free run, with the first samples that a diagnosis would use to set its state."""
-    from tools.mismatch.engine.diagnose import free_run as course
+    from tools.mismatch.engine.pose import free_run as course
 
     init = recording.split.initialization or course(recording, model.twin)[1]
     return View(recording, ((0, recording.n),), init)

@@ -9,7 +9,7 @@ import numpy as np
 from tools.mismatch.engine.evidence import Doubt, doubt_of
 from tools.mismatch.engine.fit import as_given
 from tools.mismatch.engine.found import human_values, parameters_of
-from tools.mismatch.engine.intervals import uncertainty
+from tools.mismatch.engine.intervals import Uncertainty, uncertainty
 from tools.mismatch.engine.report import ParameterValue, Withheld
 from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.trust import broken
@@ -33,8 +33,9 @@ def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple
         if broken(store.problem, given, s.fitted.theta, s.fitted.residual):
             left.pop(0)
             continue
-        values = human_values(store.problem, s.fitted, uncertainty(store.problem, s.fitted))
-        doubts = [d for k in range(len(s.placed)) if (d := _doubt(store, s, k, values)) is not None]
+        unsure = uncertainty(store.problem, s.fitted)
+        values = human_values(store.problem, s.fitted, unsure)
+        doubts = [d for k in range(len(s.placed)) if (d := _doubt(store, s, k, values, unsure)) is not None]
         if not doubts:
             break
         names = {s.placed[d.k].effect.name for d in doubts}
@@ -43,10 +44,10 @@ def borne_out(store: Store, sets: Sequence[Scored]) -> tuple[list[Scored], tuple
     return left, tuple(withheld)
 
 
-def _doubt(store: Store, s: Scored, k: int, values: Values) -> Doubt | None:
+def _doubt(store: Store, s: Scored, k: int, values: Values, unsure: Uncertainty) -> Doubt | None:
     """Why effect ``k`` of a set is not named: a figure, or a size within the tolerances that the recording declares."""
     p, placed = store.problem, s.placed[k]
-    doubt = doubt_of(placed, k, values.get(placed.label, {}), s.fitted.at_bound)
+    doubt = doubt_of(s.fitted, k, values.get(placed.label, {}), unsure)
     if doubt is not None:
         return doubt
     limits = {o: p.recording.tolerance.get(o, 0.0) for o in placed.outputs}

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -48,8 +48,9 @@ class Rival:
 @dataclass(frozen=True)
 class Answer:
     """``chosen`` (the base where nothing is named); ``sure`` per name; ``rivals``; ``strange``: a recorded signal whose
-    free curve is a better account than any set; ``left`` per output; ``whole``: nothing more is left than form errors;
-    ``withheld``: effects that scored better and are not borne out.
+    free curve is a better account than any set; ``left`` per output; ``floors``: per output the interval of the noise
+    rms; ``whole``: nothing more is left than form errors; ``doubtful``: outputs where the two ends of that interval
+    differ in this; ``withheld``: effects that scored better and are not borne out.
     """
 
     chosen: Scored
@@ -57,7 +58,9 @@ class Answer:
     rivals: tuple[Rival, ...]
     strange: Stranger | None
     left: Mapping[str, Leftover]
+    floors: Mapping[str, tuple[float, float]]
     whole: bool
+    doubtful: tuple[str, ...] = ()
     withheld: tuple[Withheld, ...] = ()
 
 
@@ -68,7 +71,7 @@ def tested(store: Store) -> list[tuple[Scored, float]]:
     passed, c = 0, store.constants
     for s in store.ranked()[:DEEPEST]:
         out.append((s, store.least_z(s)))
-        passed += out[-1][1] > c.least_z and weighty(store.shares(s).values(), c)
+        passed += out[-1][1] > c.least_z
         if not s.names or (len(out) >= TESTED and passed):
             break
     return out
@@ -77,13 +80,8 @@ def tested(store: Store) -> list[tuple[Scored, float]]:
 def accepted(store: Store) -> list[Scored]:
     """Sets of which every name passes its test, best first; at least the empty one."""
     c = store.constants
-    out = [s for s, z in tested(store) if z > c.least_z and weighty(store.shares(s).values(), c)]
+    out = [s for s, z in tested(store) if z > c.least_z]
     return out if any(not s.names for s in out) else [*out, store.base]
-
-
-def weighty(shares: Iterable[tuple[float, float]], c: Constants) -> bool:
-    """Whether every name explains more than the form of the others may leave (``Store.shares``)."""
-    return all(not is_whole(explained, taken, c) for explained, taken in shares)
 
 
 def surenesses(
@@ -158,33 +156,48 @@ def free_curve(problem: Problem, fitted: Fit, known: frozenset[str]) -> Stranger
 def curve_score(store: Store, s: Scored, found: Stranger) -> float:
     """The score of ``s`` with a free curve beside it: its gain on blocks that it has not seen, less its price."""
     c = store.constants
-    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * min(c.samples, store.held) / store.outputs
+    gain = -0.5 * math.log(max(1.0 - found.share, 1e-12)) * store.counted / store.outputs
     room = store.room(s)[found.output]
     return store.score(s) + min(gain, room) - c.per_name - c.per_parameter * CURVE
 
 
-def leftovers(problem: Problem, fitted: Fit) -> tuple[Fit, dict[str, Leftover]]:
-    """(the fit with what nothing predicts as its residual, what that follows per output). It is real, too, where it is
-    louder than the noise can be, whether it follows anything or not."""
+@dataclass(frozen=True)
+class Rest:
+    """What a model leaves: ``fit`` with what nothing predicts as its residual, ``left`` what that follows per output,
+    ``floors`` the interval of the noise rms."""
+
+    fit: Fit = field(repr=False)
+    left: Mapping[str, Leftover]
+    floors: Mapping[str, tuple[float, float]]
+
+
+def rest_of(problem: Problem, fitted: Fit) -> Rest:
+    """What a model leaves. It is real, too, where it is louder than the noise can be, whether it follows anything or
+    not. Readings on a lattice are as loud as its rounding: beside an edge nobody knows the side."""
     rest = unpredicted(problem, fitted)
     left: dict[str, Leftover] = {}
+    floors: dict[str, tuple[float, float]] = {}
     for o in problem.twin.outputs:
         v = leftover(problem, rest, o)
         follows = max((d.strength for d in v.follows), default=0.0) if v.real else 0.0
         held = rest.residual[o][problem.held_rows]
-        _, most = floor_interval(problem.floors[o], held, follows, 1 / problem.recording.dt)
+        low, most = floor_interval(problem.floors[o], held, follows, 1 / problem.recording.dt)
+        most = max(most, problem.floors[o].step / math.sqrt(12.0))
         left[o] = replace(v, real=v.real or v.ratio * problem.sigma(o) ** 2 > LOUD * most**2)
-    return rest, left
+        floors[o] = low, most
+    return Rest(rest, left, floors)
 
 
-def worst_left(problem: Problem, base: Fit, left: Mapping[str, Leftover]) -> tuple[float, float]:
-    """(noise variances that follow something on the output where most does, those that were explained there)."""
-    real = [v for v in left.values() if v.real]
+def worst_left(problem: Problem, base: Fit, rest: Rest, *, doubt: bool) -> tuple[float, float]:
+    """(noise variances that follow something on the output where most does, those that were explained there). With
+    ``doubt`` the noise is as loud as it can be, else as it was estimated."""
+    noise = {o: max(rest.floors[o][1], problem.sigma(o)) if doubt else problem.sigma(o) for o in rest.left}
+    real = {o: v.ratio * (problem.sigma(o) / noise[o]) ** 2 for o, v in rest.left.items() if v.real}
     if not real:
         return 0.0, 0.0
-    worst = max(real, key=lambda v: v.ratio)
-    before = float(np.mean((base.residual[worst.output][problem.held_rows] / problem.sigma(worst.output)) ** 2))
-    return worst.ratio - 1.0, max(before - worst.ratio, 0.0)
+    o = max(real, key=lambda o: real[o])
+    before = float(np.mean((base.residual[o][problem.held_rows] / noise[o]) ** 2))
+    return max(real[o] - 1.0, 0.0), max(before - real[o], 0.0)
 
 
 def is_whole(rest: float, taken: float, c: Constants) -> bool:
@@ -192,10 +205,10 @@ def is_whole(rest: float, taken: float, c: Constants) -> bool:
     return rest <= max(c.cut, c.cut_share * taken)
 
 
-def _with_leads(problem: Problem, rest: Fit, left: Mapping[str, Leftover]) -> dict[str, Leftover]:
-    """What is left, led by the recorded condition that most of it follows. ``rest``: as ``leftovers`` gives it."""
-    found = {o: lead(problem, rest, o) if v.real else None for o, v in left.items()}
-    return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in left.items()}
+def _with_leads(problem: Problem, rest: Rest) -> dict[str, Leftover]:
+    """What is left, led by the recorded condition that most of it follows."""
+    found = {o: lead(problem, rest.fit, o) if v.real else None for o, v in rest.left.items()}
+    return {o: v if (led := found[o]) is None else v.led_by(led) for o, v in rest.left.items()}
 
 
 UNLIKELY = 0.5
@@ -213,13 +226,15 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
     else:
         strange = None
     said = store.with_events(chosen)
-    rest_of, left = leftovers(p, said.fitted)
+    rest = rest_of(p, said.fitted)
     if strange is not None:
-        left[strange.output] = left[strange.output].led_by(strange)
+        left = {o: v.led_by(strange) if o == strange.output else v for o, v in rest.left.items()}
     else:
-        left = _with_leads(p, rest_of, left)
-    rest, taken = worst_left(p, store.base.fitted, left)
-    whole = strange is None and is_whole(rest, taken, c)
+        left = _with_leads(p, rest)
+    quiet, loud = (is_whole(*worst_left(p, store.base.fitted, rest, doubt=doubt), c) for doubt in (False, True))
+    # with nothing named the doubt is what is said
+    whole = strange is None and (loud if said.placed else quiet)
+    doubtful = tuple(o for o, (_, hi) in rest.floors.items() if hi > p.sigma(o)) if loud and not quiet else ()
     sure = surenesses(chosen.names, [(s.names, store.score(s)) for s in good], whole, c)
     sure |= {name: stated(1.0 - p_value, whole, c) for name, p_value in store.eventful[chosen.key][1].items()}
     least = 0.0 if whole else UNLIKELY * stated(1.0, False, c)
@@ -228,16 +243,17 @@ def decide(store: Store, first: Sequence[Trial]) -> Answer:
         withheld += tuple(entry_of(store, said, k) for k, e in enumerate(said.placed) if e.effect.name in unlikely)
         said = store.without(said, lambda e: e.effect.name in unlikely)
         chosen = store.without(chosen, lambda e: e.effect.name in unlikely)
-        left = _with_leads(p, *leftovers(p, said.fitted))
-    return Answer(said, sure, rivals_of(store, chosen), strange, left, whole, withheld)
+        rest = rest_of(p, said.fitted)
+        left = _with_leads(p, rest)
+    return Answer(said, sure, rivals_of(store, chosen), strange, left, rest.floors, whole, doubtful, withheld)
 
 
 def recalibrated(store: Store, raw: Fit) -> bool:
     """Whether re-fitted base parameters predict better than the given ones by more than their price."""
     p, c = store.problem, store.constants
     before = float(np.mean([np.mean(w.density[p.held_rows]) for w in weigh(p, raw).values()]))
-    gain = min(c.samples, store.held) * (float(np.mean([*store.base.density.values()])) - before)
+    gain = store.counted * (float(np.mean([*store.base.density.values()])) - before)
     return gain > c.per_parameter * store.base.fitted.model.n_base + c.per_name
 
 
-__all__ = ["Answer", "Rival", "accepted", "decide", "leftovers", "recalibrated"]
+__all__ = ["Answer", "Rival", "accepted", "decide", "recalibrated"]

@@ -13,24 +13,18 @@ from scipy.stats import norm
 from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.diagnose import Posed, conclude, gross, pose, run_through
-from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.assemble import conclude
 from tools.mismatch.engine.hold import delay_is_hold, with_hold
-from tools.mismatch.engine.identifiability import experiment
-from tools.mismatch.engine.noise import floor_interval
-from tools.mismatch.engine.parsimony import Rule
+from tools.mismatch.engine.identifiability import LeastNamed, experiment
+from tools.mismatch.engine.pose import Posed, pose, run_through
 from tools.mismatch.engine.report import Alternative, Equivalent, Hold, Report, Sealed
-from tools.mismatch.engine.score import block_energy, compare, held_rms, misfits
-from tools.mismatch.engine.screen import Candidate
-from tools.mismatch.engine.selection import Selection
-from tools.mismatch.engine.trial import Trial
-from tools.mismatch.engine.vary import size
+from tools.mismatch.engine.score import held_rms
 from tools.mismatch.engine.verdict import Decision, fit_trouble, meaning_of, within_tolerance
 from tools.mismatch.infer.constants import Constants, learned
 from tools.mismatch.infer.decide import Answer, decide, recalibrated
 from tools.mismatch.infer.sealed import score_sealed, seal
 from tools.mismatch.infer.search import Found, look, search
-from tools.mismatch.infer.store import Scored, Store, part_of
+from tools.mismatch.infer.store import Scored, Store
 from tools.mismatch.recording import Recording
 from tools.mismatch.report.wording import rival_remark
 
@@ -87,8 +81,7 @@ def names_the_hold(inferred: Inferred, answer: Answer) -> bool:
     hold, store = inferred.posed.hold, inferred.found.store
     if hold is None or hold.how != "assumed" or not answer.chosen.placed:
         return False
-    selection = Selection(store.problem, store.base.fitted, answer.chosen.fitted, (), ())
-    return delay_is_hold(store.problem, selection) is not None
+    return delay_is_hold(store.problem, answer.chosen.fitted)
 
 
 def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) -> Report:
@@ -97,60 +90,37 @@ def report_of(inferred: Inferred, answer: Answer, held_out: float, jobs: int) ->
     decision = verdict_of(posed, store, answer)
     named = decision.verdict in ("missing_physics", "unexplained")
     chosen = answer.chosen if named else store.base
-    selection = Selection(
-        store.problem, store.base.fitted, chosen.fitted,
-        tuple(trial_of(store, chosen, k) for k in range(len(chosen.placed))),
-        tuple(() for _ in chosen.placed), inferred.found.first, answer.strange,
-    )  # fmt: skip
-    remarks = gross(posed.recording, posed.problem.twin, posed.raw)
-    ended = run_through(posed, selection, held_out)
+    ended = run_through(posed, store.base.fitted, chosen.fitted, held_out)
     report = conclude(
-        posed,
-        ended,
-        dict(answer.left),
-        least_named(store.constants),
-        remarks,
-        jobs,
-        withheld=answer.withheld,
-        decision=decision,
-    )
+        posed, ended, inferred.found.first, dict(answer.left), decision=decision, sure=answer.sure,
+        least=least_named(store), withheld=answer.withheld, jobs=jobs,
+    )  # fmt: skip
     sealed = Sealed(None, inferred.unsealed)
     if not inferred.unsealed:
-        sealed = score_sealed(inferred.whole, posed, ended.base, ended.selection.fitted)
-    physics = [replace(p, confidence=round(answer.sure.get(p.name, p.confidence), 4)) for p in report.physics]
+        sealed = score_sealed(inferred.whole, posed, ended.base, ended.fitted)
     return replace(
         report,
         fit=replace(report.fit, sealed=sealed),
         # the likeliest first; of equals the one that takes more
-        physics=tuple(sorted(physics, key=lambda p: -effect_size(store, chosen, p.name))),
+        physics=tuple(sorted(report.physics, key=lambda p: -effect_size(store, chosen, p.name))),
         alternatives=alternatives_of(store, answer) if chosen.placed else (),
         equivalent=equivalents_of(store, answer) if chosen.placed else (),
     )
 
 
-def least_named(c: Constants) -> Rule:
-    """What an effect of one parameter on one output must show to be named, as the limits of detection are computed: its
-    test, and the noise variances that pay for it and are more than the form of others may leave."""
-    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / c.samples)
+def least_named(store: Store) -> LeastNamed:
+    """What an effect must show to be named, as the limits of detection are computed: its test, and the noise variances
+    that pay for it and are more than the form of others may leave."""
+    c = store.constants
+    pays = math.expm1(2.0 * (c.per_name + c.per_parameter) / store.counted)
     least = max(pays, c.cut)
-    return Rule(z=c.least_z, gain=least / (1.0 + least))
+    return LeastNamed(c.least_z, least / (1.0 + least))
 
 
 def effect_size(store: Store, chosen: Scored, name: str) -> float:
     """Nats that a name brings to a set."""
     small = store.without(chosen, lambda p: p.effect.name == name)
     return sum(chosen.density.values()) - sum(small.density.values())
-
-
-def trial_of(store: Store, chosen: Scored, k: int) -> Trial:
-    """Effect ``k`` of a set in the form that the report is assembled from."""
-    p, placed = store.problem, chosen.placed[k]
-    small = store.without(chosen, lambda e: e is placed)
-    seen = store.seen.get(part_of(placed)) or Candidate(placed, 0.0, 1.0, False, ())
-    return Trial(
-        placed, seen, chosen.fitted, compare(p, small.fitted, chosen.fitted), misfits(p, chosen.fitted),
-        block_energy(p, chosen.fitted, p.held_blocks), size(placed), p.twin.outputs,
-    )  # fmt: skip
 
 
 def alternatives_of(store: Store, answer: Answer) -> tuple[Alternative, ...]:
@@ -174,31 +144,23 @@ def equivalents_of(store: Store, answer: Answer) -> tuple[Equivalent, ...]:
 def verdict_of(posed: Posed, store: Store, answer: Answer) -> Decision:
     """The verdict. Differences within a declared tolerance count as none."""
     problem, raw, base, fitted = store.problem, posed.raw, store.base.fitted, answer.chosen.fitted
-    floors = {o: floors_of(store, fitted, o, answer) for o in problem.twin.outputs}
+    floors = dict(answer.floors)
     if all(within_tolerance(problem, raw).values()):
         return Decision("agrees", 1.0, "", (), floors)
     if not answer.whole:
         trouble = fit_trouble(problem, raw, base, fitted)
         p = answer.strange.p_value if answer.strange is not None else least_p(answer.left.values())
-        return Decision("unexplained", p, meaning_of(problem, dict(answer.left), trouble), trouble, floors)
+        meaning = "floor_doubtful" if answer.doubtful else meaning_of(problem, dict(answer.left), trouble)
+        return Decision("unexplained", p, meaning, trouble, floors, answer.doubtful)
     if answer.chosen.placed:
         # corrected for every candidate that was looked at (Bonferroni)
         p = min(1.0, float(norm.sf(store.least_z(answer.chosen))) * max(len(store.seen), 1))
-        return Decision("missing_physics", p, "", (), floors)
+        return Decision("missing_physics", p, "", (), floors, answer.doubtful)
     return Decision("recalibrate" if recalibrated(store, raw) else "agrees", 1.0, "", (), floors)
 
 
 def least_p(left: Iterable[object]) -> float:
     return min((d.p_value for v in left for d in getattr(v, "follows", ())), default=1.0)
-
-
-def floors_of(store: Store, fitted: Fit, output: str, answer: Answer) -> tuple[float, float]:
-    """The interval that the noise rms of an output lies in."""
-    problem, left = store.problem, answer.left[output]
-    follows = max((d.strength for d in left.follows), default=0.0) if left.real else 0.0
-    return floor_interval(
-        problem.floors[output], fitted.residual[output][problem.held_rows], follows, 1 / problem.recording.dt
-    )
 
 
 __all__: Sequence[str] = ["Inferred", "diagnose", "infer", "report_of"]

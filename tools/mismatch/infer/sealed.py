@@ -8,9 +8,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from tools.mismatch.engine.diagnose import Posed, ranges_of
 from tools.mismatch.engine.exported import without_events
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.pose import Posed, ranges_of
 from tools.mismatch.engine.problem import Problem
 from tools.mismatch.engine.report import Sealed
 from tools.mismatch.engine.residual import residuals

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.diagnose import hint_of, may_hint
 from tools.mismatch.engine.fit import Fit
+from tools.mismatch.engine.pose import hint_of, may_hint
 from tools.mismatch.engine.problem import Hint, Problem
 from tools.mismatch.engine.screen import places
 from tools.mismatch.engine.trial import Effort, Trial, try_all
@@ -64,7 +64,7 @@ class Search:
         self.stride = max(1, problem.fit_rows.size // 12000)
         c = constants
         # by half of the price of its name
-        least = 1.0 - float(np.exp(-c.per_name / max(min(c.samples, self.store.held), 1.0)))
+        least = 1.0 - float(np.exp(-c.per_name / max(self.store.counted, 1.0)))
         self.effort = Effort(WORTH_REFINING, least)
         self.first: tuple[Trial, ...] = ()
 
@@ -129,8 +129,7 @@ class Search:
 
     def gain_before_prices(self, s: Scored) -> float:
         """Nats that a set gains over the base before its names and parameters are paid for."""
-        n = min(self.store.constants.samples, self.store.held)
-        return n * (s.mean_density - self.store.base.mean_density)
+        return self.store.counted * (s.mean_density - self.store.base.mean_density)
 
     def swap(self, best: Scored) -> None:
         """Every name of ``best`` replaced by those that do about as well alone on the same outputs: beside the base one

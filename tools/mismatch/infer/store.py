@@ -12,7 +12,7 @@ from scipy.stats import norm
 from sim_devices.physics.effect import Effect
 from tools.mismatch.engine.fit import Fit, fit
 from tools.mismatch.engine.problem import Problem
-from tools.mismatch.engine.score import compare, winsorised
+from tools.mismatch.engine.score import compare
 from tools.mismatch.engine.screen import Candidate, bend, one_step, places
 from tools.mismatch.engine.trial import LEAST_P
 from tools.mismatch.engine.vary import added, beyond_limits, size
@@ -73,15 +73,15 @@ class Scored:
     def placed(self) -> tuple[Placed, ...]:
         return self.fitted.model.placed
 
-    def score(self, c: Constants, held: int) -> float:
+    def score(self, c: Constants, counted: float) -> float:
         """Nats: the tempered log density (Miller and Dunson 2019: a likelihood raised to a power below one, because the
-        form of a model is never quite right) less the prices of names and parameters. ``held``: samples held out.
+        form of a model is never quite right) less the prices of names and parameters. ``counted``: samples that a
+        residual counts for.
 
         The mean over the outputs that have something to explain counts: what the form of an effect leaves on one of
         them it leaves on all.
         """
-        gain = min(c.samples, float(held)) * self.mean_density
-        return gain - c.per_name * len(self.names) - c.per_parameter * self.parameters
+        return counted * self.mean_density - c.per_name * len(self.names) - c.per_parameter * self.parameters
 
 
 class Store:
@@ -92,12 +92,13 @@ class Store:
         self.problem = problem
         self.events = tuple(events)
         self.constants = constants
-        self.held = int(problem.held_rows.size)
+        held = int(problem.held_rows.size)
+        self.counted = min(constants.samples * recordings_held(problem), float(held))
+        """Samples that a held-out residual counts for: form errors are systematic within one recording."""
         self.sets: dict[Key, Scored] = {}
         self.seen: dict[Part, Candidate] = {}
         self.eventful: dict[Key, tuple[Scored, dict[str, float]]] = {}
         self._tests: dict[tuple[Key, str], float] = {}
-        self._shares: dict[Key, dict[str, tuple[float, float]]] = {}
         self._best = best_log_density(problem)
         self._exact = exact_log_density(problem)
         self.outputs = float(len(problem.twin.outputs))
@@ -122,17 +123,17 @@ class Store:
         proper = proper and all(self.lawful(w.predictable) for w in every.values())
         proper = proper and not any(follower(p, fitted, o, figures_of) for o in p.twin.outputs)
         # values that a law is free to follow have the price of parameters, among the samples that count
-        free = min(self.constants.samples, self.held) / self.outputs * sum(w.free for w in every.values())
+        free = self.counted / self.outputs * sum(w.free for w in every.values())
         figures = free + sum(figures_of(e) for e in fitted.model.placed)
         return Scored(key_of(fitted.model.placed), fitted, mean, blocks, figures, proper, self.outputs)
 
     def lawful(self, predictable: float) -> bool:
         """Whether so many nats per sample may be left in what a law of noise could not predict: no more than another
         name would cost."""
-        return min(self.constants.samples, self.held) * predictable < self.constants.per_name
+        return self.counted * predictable < self.constants.per_name
 
     def score(self, s: Scored) -> float:
-        return s.score(self.constants, self.held) if s.proper else -np.inf
+        return s.score(self.constants, self.counted) if s.proper else -np.inf
 
     def ranked(self, sets: Sequence[Scored] | None = None) -> list[Scored]:
         """Proper sets, the best of each set of names, best first."""
@@ -145,7 +146,7 @@ class Store:
     def room(self, s: Scored) -> dict[str, float]:
         """Nats per output by which a larger set can be better at most: up to noise at its floor, and where a set has
         found readings on a lattice, up to all of them exactly there."""
-        n = min(self.constants.samples, self.held) / self.outputs
+        n = self.counted / self.outputs
         best = {
             o: b if d < b else max(b, self._exact[o])
             for (o, d), b in zip(s.density.items(), self._best.values(), strict=True)
@@ -231,8 +232,10 @@ class Store:
                 o = c.placed.outputs[0]
                 r = unpredicted(p, s.fitted).residual[o][rows]
                 taken = c.placed.effect.claims(c.placed.settings, p.recording.n)[p.index][rows]
-                span = float(np.ptp(p.measured[o]))
-                gain += gain_of_events(r - np.median(r), taken, span, LEAST * p.floors[o].rms)
+                span, r = float(np.ptp(p.measured[o])), r - np.median(r)
+                # a reading beside an edge of its lattice falls on either side
+                taken &= np.abs(r) > EDGE * p.floors[o].step
+                gain += gain_of_events(r, taken, span, LEAST * p.floors[o].rms)
         return gain > self.constants.per_name
 
     def z_of(self, s: Scored, name: str) -> float:
@@ -254,29 +257,15 @@ class Store:
             self._tests[s.key, name] = z
         return self._tests[s.key, name]
 
-    def shares(self, s: Scored) -> dict[str, tuple[float, float]]:
-        """Per name (noise variances that it explains and nothing else of the set would, those that the set explains),
-        held out, on the output where it does most."""
-        p = self.problem
-
-        def left(fitted: Fit) -> dict[str, float]:
-            rest = unpredicted(p, fitted).residual
-            return {o: mean_square(p, rest[o], o) for o in p.twin.outputs}
-
-        if s.key not in self._shares:
-            with_all, base = left(s.fitted), left(self.base.fitted)
-            found: dict[str, tuple[float, float]] = {}
-            for name in s.names:
-                without = left(self.without(s, lambda e, n=name: e.effect.name == n).fitted)
-                found[name] = max(
-                    ((without[o] - with_all[o], base[o] - with_all[o]) for o in p.twin.outputs), key=lambda v: v[0]
-                )
-            self._shares[s.key] = found
-        return self._shares[s.key]
-
     def least_z(self, s: Scored) -> float:
         """The weakest of the names of a set; infinite for the empty set."""
         return min((self.z_of(s, n) for n in s.names), default=np.inf)
+
+
+def recordings_held(problem: Problem) -> int:
+    """How many recordings have samples that are held out; 1 where there is one recording."""
+    held = problem.split.held_out
+    return max(sum(any(a < p.stop and p.start < b for a, b in held) for p in problem.recording.parts), 1)
 
 
 def outputs_at_odds(room: Sequence[float]) -> float:
@@ -288,12 +277,8 @@ def outputs_at_odds(room: Sequence[float]) -> float:
     return float(np.sum(left)) ** 2 / squares if squares > 0.0 else float(left.size)
 
 
-def mean_square(problem: Problem, r: Array, output: str) -> float:
-    """Of the held-out samples of ``r`` (m,), in noise variances, single outliers cut."""
-    s, rows = problem.sigma(output), problem.held_rows
-    return float(np.mean((winsorised(r[rows], s, problem.lively[rows]) / s) ** 2))
-
-
+EDGE = 1.001
+"""Steps of the lattice of readings up to which a residual is no event; above one by its rounding."""
 EVENTS = 2
 """Numbers that a law of noise has: how much of it there is, and of what size. What it did at which sample is not a
 number of the law: the density has paid for that, sample by sample."""

@@ -9,9 +9,7 @@ from typing import Annotated, cast
 import typer
 
 from tools.cli.common import JsonOption, clear_errors, console, data_console
-from tools.cli.mismatch import EngineOption
 from tools.errors import InputError
-from tools.mismatch.engines import check_engine
 from tools.output import check_folder, check_writable, write_json
 
 
@@ -31,7 +29,6 @@ def prove(
     corpus: Annotated[
         str | None, typer.Option(metavar="NAME", help="calibrate, develop or sealed: exact scores on its own seeds.")
     ] = None,
-    engine: EngineOption = None,
     samples: Annotated[int, typer.Option(min=500, help="Most samples of a recording of a corpus.")] = 8000,
     minutes: Annotated[
         float | None, typer.Option(min=0.0, help="With --corpus: begin no case after these; run again to go on.")
@@ -47,13 +44,11 @@ def prove(
         check_folder(keep, "--keep")
         if keep is not None:
             keep.mkdir(exist_ok=True)
-        engine = check_engine(engine)
         if corpus is not None:
             if seed is not None:
                 raise InputError("--corpus has seeds of its own; leave --seed out")
-            _prove_corpus(corpus, engine, cases, first, samples, minutes, jobs, keep, json_file)
+            _prove_corpus(corpus, cases, first, samples, minutes, jobs, keep, json_file)
             return
-        from functools import partial
 
         from tools.research.prove import prove as run_proof
         from tools.research.prove.runner import tool
@@ -66,7 +61,7 @@ def prove(
             jobs or os.cpu_count() or 1,
             keep,
             max_samples=samples,
-            diagnose=partial(tool, engine=engine),
+            diagnose=tool,
             progress=lambda text: err.print(text, markup=False, soft_wrap=True),
         )
         show(result, err if json_file == "-" else data_console())
@@ -75,7 +70,6 @@ def prove(
 
 def _prove_corpus(
     corpus: str,
-    engine: str,
     cases: int,
     first: int,
     samples: int,
@@ -94,7 +88,7 @@ def _prove_corpus(
     if corpus not in NAMES:
         raise InputError(f"--corpus {corpus}: there is no such corpus; use {', '.join(NAMES)}")
     limit = float("inf") if minutes is None else minutes
-    run = Run(cast(Name, corpus), check_engine(engine), cases, samples, limit, jobs or os.cpu_count() or 1, first)
+    run = Run(cast(Name, corpus), cases, samples, limit, jobs or os.cpu_count() or 1, first)
     err = console()
     with ExitStack() as stack:
         folder = keep or Path(stack.enter_context(TemporaryDirectory(prefix="micron-corpus-")))
@@ -118,7 +112,7 @@ def calibrate(
     partial: Annotated[bool, typer.Option("--partial", help="Learn from the cases that are finished so far.")] = False,
     json_file: JsonOption = None,
 ) -> None:
-    """Learn the constants of the new engine from the calibrate corpus and write them with their provenance.
+    """Learn the constants of the engine from the calibrate corpus and write them with their provenance.
 
     Example: micron mismatch calibrate --keep calibration
     """

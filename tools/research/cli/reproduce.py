@@ -13,7 +13,6 @@ from rich.text import Text
 from tools.cli.common import JsonOption, clear_errors, console, data_console
 from tools.errors import InputError
 from tools.interrupt import keep_what_is_there, need_some
-from tools.mismatch.engines import check_engine
 from tools.output import check_names, check_writable, write_json
 from tools.research.results.artefact import write_result
 from tools.research.stamp import revision_and_day
@@ -37,7 +36,6 @@ def reproduce(
         Path | None,
         typer.Option(metavar="FILE", help="Folder of finished sets of section measured; a stopped run goes on there."),
     ] = None,
-    engine: Annotated[str | None, typer.Option(metavar="old|new", help="Of measured: which engine decides.")] = None,
 ) -> None:
     """Compute published figures again and print them beside ours.
 
@@ -98,12 +96,11 @@ def reproduce(
         check_names(rows)
         check_writable(json_file, out)
         wanted = expand(names)
-        check_engine(engine)
         options: dict[str, Any] = {}
-        if sets or rows or engine:
-            options = {"only": tuple(sets or ()), "rows_file": rows, "engine": engine}
+        if sets or rows:
+            options = {"only": tuple(sets or ()), "rows_file": rows}
         if options and wanted != ["measured"]:
-            raise InputError("--set, --rows and --engine belong to 'micron reproduce measured' alone")
+            raise InputError("--set and --rows belong to 'micron reproduce measured' alone")
         if sets and out is not None and out.exists():
             options["before"] = out
         tables: list[Table] = []

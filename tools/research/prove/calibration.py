@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from firmware_py.recording.revision import git_revision
-from tools.mismatch.infer.constants import FILE, START
+from tools.mismatch.infer.constants import FILE, START, Constants
+from tools.mismatch.infer.decide import stated
 from tools.mismatch.infer.run import infer
 from tools.mismatch.recording_load import load
 from tools.output import write_text_atomic
@@ -17,15 +18,13 @@ from tools.research.prove.corpus import CORPORA, answers_digest, digest_of, draw
 from tools.research.prove.exact import reliability
 from tools.research.prove.guests import installed
 from tools.research.prove.harness import SHARED
-from tools.research.prove.learn import Case, cross_validated, learn, learn_sure, raw_surenesses, traits_of
+from tools.research.prove.learn import Case, StatedName, cross_validated, learn, learn_sure, traits_of
 from tools.research.prove.plans import SELDOM
 
 SEARCHING = (*SHARED, *(f"tools/mismatch/infer/{name}.py" for name in ("density", "search", "store")))
 """What the traits of a search depend on."""
 LEAST_CASES = 15
 """Cases with fewer of which no constants are learned."""
-EVERY = 3
-"""One case in so many is kept for the map of "sure" alone."""
 
 
 def traits_file(folder: Path, samples: int) -> Path:
@@ -88,12 +87,11 @@ def calibrate(
     kept = {n: r for n, r in rows.items() if "traits" in r}
     if (left and not partial) or len(kept) < LEAST_CASES:
         return None, left
-    known = {n: case_of(n, r) for n, r in kept.items()}
-    main = [c for n, c in known.items() if n % EVERY]
-    apart = [c for n, c in known.items() if n % EVERY == 0]
-    constants = learn_sure(learn(main), apart)
+    known = [case_of(n, r) for n, r in kept.items()]
+    crossed = cross_validated(known)
+    constants = learn_sure(learn(known), [n for of in crossed.stated for n in of])
     corpus = CORPORA["calibrate"]
-    stated = [p for k in range(len(apart)) for p in _left_out(constants, apart, k)]
+    left_out = [p for k in range(len(crossed.stated)) for p in _left_out(constants, crossed.stated, k)]
     return {
         "format": 1,
         "constants": constants.to_json(),
@@ -112,18 +110,20 @@ def calibrate(
             "date": time.strftime("%Y-%m-%d", time.gmtime()),
         },
         "cross_validated": {
-            **cross_validated(main),
-            "with_the_start": float(sum(c.right(START) for c in main)),
-            "true_set_was_searched": float(sum(any(s.names == c.names for s in c.sets) for c in main)),
-            "sure": {"cases": len(apart), **reliability(stated)},
+            "cases": crossed.cases,
+            "exactly_right": crossed.exactly_right,
+            "mean_log_probability": crossed.mean_log_probability,
+            "with_the_start": sum(c.right(START) for c in known),
+            "true_set_was_searched": sum(any(s.names == c.names for s in c.sets) for c in known),
+            "sure": reliability(left_out),
         },
     }, left  # fmt: skip
 
 
-def _left_out(constants: Any, cases: list[Case], k: int) -> list[tuple[float, float]]:
-    """Names of one case with the map of "sure" that the others give."""
-    others = learn_sure(constants, cases[:k] + cases[k + 1 :])
-    return [(n.sure, float(n.right)) for n in raw_surenesses(others, [cases[k]])]
+def _left_out(constants: Constants, names: Sequence[Sequence[StatedName]], k: int) -> list[tuple[float, float]]:
+    """Names of case ``k`` with the map of "sure" that the others give."""
+    others = learn_sure(constants, [n for i, of in enumerate(names) if i != k for n in of])
+    return [(stated(n.sure, n.whole, others), float(n.right)) for n in names[k]]
 
 
 def case_of(number: int, row: dict[str, Any]) -> Case:

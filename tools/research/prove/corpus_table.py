@@ -46,7 +46,7 @@ def share_text(got: float, of: float) -> str:
 def corpus_table(result: Result) -> RenderableType:
     """Scores, the reliability diagram, and kinds of twin apart."""
     s, run = result.summary, result.run
-    totals = Table(title=f"Corpus {run.corpus}, engine {run.engine}", title_justify="left")
+    totals = Table(title=f"Corpus {run.corpus}", title_justify="left")
     for name in ("score", "count", "share (95 %)"):
         totals.add_column(name, justify="left" if name == "score" else "right")
     for key, text in LINES.items():

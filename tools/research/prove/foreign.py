@@ -21,7 +21,7 @@ from typing import Any
 from firmware_py.recording.revision import git_revision
 from hal.trust import decide, trust_program
 from tools.mismatch.engine.report import Report
-from tools.mismatch.engines import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording_load import load
 from tools.research.results.artefact import write_result
 

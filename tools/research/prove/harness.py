@@ -1,4 +1,4 @@
-"""Runs an engine over a corpus and keeps a row per case on disk, so that a stopped run goes on where it was."""
+"""Runs the engine over a corpus and keeps a row per case on disk, so that a stopped run goes on where it was."""
 
 from __future__ import annotations
 
@@ -7,32 +7,28 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 from firmware_py.recording.revision import git_revision
-from tools.mismatch.engines import Engine
 from tools.research.prove.corpus import CORPORA, Corpus, Name, digest_of, draw_case, first_block, generator_digest
 from tools.research.prove.exact import score_exactly as score
 from tools.research.prove.exact import summarise
 from tools.research.prove.runner import Diagnose, in_processes, timed, tool
 
 SHARED = ("tools/mismatch/engine", "tools/mismatch/twins", "sim_devices/physics")
-SOURCES = MappingProxyType({"old": SHARED, "new": (*SHARED, "tools/mismatch/infer")})
-"""What a diagnosis by an engine depends on: a row that was made with other sources is made again."""
+SOURCES = (*SHARED, "tools/mismatch/infer")
+"""What a diagnosis depends on: a row that was made with other sources is made again."""
 
 
 @dataclass(frozen=True)
 class Run:
-    """What is run: ``cases`` of a corpus from number ``first`` on, at ``max_samples``, by an engine.
+    """What is run: ``cases`` of a corpus from number ``first`` on, at ``max_samples``.
 
     ``minutes``: no case is begun after these.
     """
 
     corpus: Name
-    engine: Engine
     cases: int
     max_samples: int
     minutes: float = float("inf")
@@ -56,7 +52,7 @@ class Result:
         """Return what ``micron mismatch prove --corpus ... --json`` writes."""
         r = self.run
         return {
-            "format": 1, "corpus": r.corpus, "engine": r.engine, "cases_asked": r.cases, "max_samples": r.max_samples,
+            "format": 1, "corpus": r.corpus, "cases_asked": r.cases, "max_samples": r.max_samples,
             "revision": git_revision(), "engine_digest": self.digest, "date": time.strftime("%Y-%m-%d", time.gmtime()),
             "left_out": self.left_out, "open_cases": self.open_cases, "summary": self.summary, "rows": list(self.rows),
         }  # fmt: skip
@@ -114,7 +110,7 @@ def run_corpus(
 ) -> Result:
     """Diagnose what ``folder`` holds no row of yet; score; summarise all rows. Raises ValueError on a bad ``run``.
 
-    Rows are appended to ``<folder>/rows/<corpus>-<samples>-<engine>.jsonl``; only those of the present sources count.
+    Rows are appended to ``<folder>/rows/<corpus>-<samples>.jsonl``; only those of the present sources count.
     """
     if run.cases < 1 or run.max_samples < 500:
         raise ValueError("a corpus is run on at least one case of at least 500 samples")
@@ -123,13 +119,13 @@ def run_corpus(
     if not corpus.open and revision.endswith("-dirty"):
         raise ValueError("the sealed corpus is drawn from a commit's hash; commit first")
     start = first_block(corpus, revision)
-    digest = f"{digest_of(*SOURCES[run.engine])[:16]}-{generator_digest()[:16]}-{start}"
-    file = folder / "rows" / f"{run.corpus}-{run.max_samples}-{run.engine}.jsonl"
+    digest = f"{digest_of(*SOURCES)[:16]}-{generator_digest()[:16]}-{start}"
+    file = folder / "rows" / f"{run.corpus}-{run.max_samples}.jsonl"
     file.parent.mkdir(parents=True, exist_ok=True)
     done = {r["case"]: _scored_again(r, corpus, folder, run, start) for r in read_rows(file, digest)}
     if not corpus.open:
         _remember_draw(folder, run, revision)
-    call = diagnose or partial(tool, engine=run.engine)
+    call = diagnose or tool
     numbers = range(run.first, run.first + run.cases)
     left = [n for n in numbers if f"c{n:05d}" not in done]
     until = time.monotonic() + 60.0 * run.minutes
@@ -169,7 +165,7 @@ def read_rows(file: Path, digest: str | None = None) -> list[dict[str, Any]]:
 
 def _remember_draw(folder: Path, run: Run, revision: str) -> None:
     """Count how often the sealed corpus was drawn: its page says so."""
-    entry = {"revision": revision, "engine": run.engine, "cases": run.cases, "date": time.strftime("%Y-%m-%d")}
+    entry = {"revision": revision, "cases": run.cases, "date": time.strftime("%Y-%m-%d")}
     with (folder / "sealed-draws.jsonl").open("a") as file:
         file.write(json.dumps(entry) + "\n")
 

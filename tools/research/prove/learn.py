@@ -20,12 +20,11 @@ from tools.mismatch.infer.decide import (
     candidate_signals,
     free_curve,
     is_whole,
-    leftovers,
     log_odds,
+    rest_of,
     stated,
     surenesses,
     tested,
-    weighty,
     worst_left,
 )
 from tools.mismatch.infer.run import Inferred
@@ -50,9 +49,8 @@ SETS = 60
 class SetTraits:
     """What a decision reads of one set of names.
 
-    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested), ``shares`` what every
-    name explains (``Store.shares``); ``rest`` and ``taken`` are those of ``worst_left`` (None: not looked at);
-    ``events`` the p-values of those that were found beside it.
+    ``density`` is the mean over outputs; ``z`` is that of the weakest name (None: not tested); ``rest`` and ``taken``
+    are those of ``worst_left`` (None: not looked at); ``events`` the p-values of those that were found beside it.
     """
 
     names: frozenset[str]
@@ -62,7 +60,6 @@ class SetTraits:
     rest: float | None
     taken: float | None
     events: Mapping[str, float] = field(default_factory=dict[str, float])
-    shares: Sequence[tuple[float, float]] = ()
 
     def with_events(self, c: Constants) -> frozenset[str]:
         """The names that a report of this set has."""
@@ -76,18 +73,19 @@ class SetTraits:
 def traits_of(inferred: Inferred) -> dict[str, Any]:
     """What a decision reads of a search, as plain JSON."""
     store = inferred.found.store
-    weakest = {s.key: (z, list(store.shares(s).values())) for s, z in tested(store) if s.names}
+    weakest = {s.key: z for s, z in tested(store) if s.names}
     ranked = store.ranked()  # tests may have fitted sets anew
     leaves: dict[frozenset[tuple[str, ...]], tuple[float, float]] = {}
     events: dict[frozenset[tuple[str, ...]], dict[str, float]] = {}
     for s in [*ranked[:LOOKED_AT], store.base]:
-        _, left = leftovers(store.problem, store.with_events(s).fitted)
-        leaves[s.key] = worst_left(store.problem, store.base.fitted, left)
+        said = store.with_events(s)
+        rest = rest_of(store.problem, said.fitted)
+        leaves[s.key] = worst_left(store.problem, store.base.fitted, rest, doubt=bool(said.placed))
         events[s.key] = store.eventful[s.key][1]
     strange = free_curve(store.problem, store.base.fitted, candidate_signals(inferred.found.first))
     kept = sorted((s for s in store.sets.values() if s.proper), key=lambda s: -store.score(s))[:SETS]
     return {
-        "held": store.held,
+        "held": int(store.problem.held_rows.size),
         "outputs": len(store.problem.twin.outputs),
         "sets": [
             {"names": sorted(s.names), "density": s.mean_density, "parameters": s.parameters,
@@ -103,19 +101,18 @@ def traits_of(inferred: Inferred) -> dict[str, Any]:
 
 def _density_room(store: Store, s: Scored, output: str) -> float:
     """Nats per sample by which an output can be predicted better at most."""
-    return store.room(s)[output] / min(store.constants.samples, store.held)
+    return store.room(s)[output] / store.counted
 
 
 def sets_of(traits: Traits) -> list[SetTraits]:
     """The sets of a search. What was tested of one set of names stands for its other places and forms, too."""
-    passed: dict[frozenset[str], tuple[float, list[tuple[float, float]]]] = {}
+    passed: dict[frozenset[str], float] = {}
     left: dict[frozenset[str], tuple[float, float]] = {}
     events: dict[frozenset[str], Mapping[str, float]] = {}
     for s in traits["sets"]:
         names = frozenset(s["names"])
         if s["tested"] is not None:
-            z, shares = s["tested"]
-            passed.setdefault(names, (float(z), [(float(a), float(b)) for a, b in shares]))
+            passed.setdefault(names, float(s["tested"]))
         if s["left"] is not None:
             left.setdefault(names, (float(s["left"][0]), float(s["left"][1])))
             events.setdefault(names, {n: float(p) for n, p in s["events"].items()})
@@ -123,9 +120,10 @@ def sets_of(traits: Traits) -> list[SetTraits]:
     for s in traits["sets"]:
         names = frozenset(s["names"])
         rest, taken = left.get(names, (None, None))
-        z, shares = passed.get(names, (None, []))
         beside = events.get(names, {})
-        out.append(SetTraits(names, float(s["density"]), float(s["parameters"]), z, rest, taken, beside, shares))
+        out.append(
+            SetTraits(names, float(s["density"]), float(s["parameters"]), passed.get(names), rest, taken, beside)
+        )
     return out
 
 
@@ -161,7 +159,7 @@ class Case:
         for s in self.ranked(c):
             if not s.names:
                 return [*out, s]
-            if s.z is not None and s.z > c.least_z and weighty(s.shares, c):
+            if s.z is not None and s.z > c.least_z:
                 out.append(s)
         return out
 
@@ -234,12 +232,18 @@ def best_of(c: Constants, options: Iterator[Mapping[str, float]], cases: Sequenc
     return top[int(np.argmin(np.sum((at - middle) ** 2, axis=1)))]
 
 
-def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
-    """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases of their own, held
-    weakly at the identity; and the most that is stated, by the rule of succession (Laplace 1774) over the sure ones of
-    whole accounts: so many cases cannot vouch for more."""
-    raw = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
-    stated_names = list(raw_surenesses(raw, cases))
+class StatedName(NamedTuple):
+    """A name of a report: its raw probability, whether it is right, and whether the account is whole."""
+
+    sure: float
+    right: bool
+    whole: bool
+
+
+def learn_sure(c: Constants, stated_names: Sequence[StatedName]) -> Constants:
+    """The map from log odds to stated ones by logistic regression (Platt 1999) on names of cases that the constants
+    were not learned on, held weakly at the identity; and the most that is stated, by the rule of succession (Laplace
+    1774) over the sure ones of whole accounts: so many cases cannot vouch for more."""
     if not stated_names:
         return c
     x = np.array([log_odds(n.sure) for n in stated_names])
@@ -259,16 +263,9 @@ def learn_sure(c: Constants, cases: Sequence[Case]) -> Constants:
     )  # fmt: skip
 
 
-class StatedName(NamedTuple):
-    """A name of a report: the probability that it states, whether it is right, and whether the account is whole."""
-
-    sure: float
-    right: bool
-    whole: bool
-
-
 def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
-    """Every name that would be reported."""
+    """Every name that would be reported, with its probability before the map."""
+    c = replace(c, sure_offset=0.0, sure_slope=1.0, sure_open=0.0, most_sure=1.0)
     for case in cases:
         said, chosen = case.says(c)
         whole = said != "unexplained"
@@ -279,14 +276,24 @@ def raw_surenesses(c: Constants, cases: Sequence[Case]) -> Iterator[StatedName]:
             yield StatedName(p, name in case.names, whole)
 
 
-def cross_validated(cases: Sequence[Case], learner: Callable[[Sequence[Case]], Constants] = learn) -> dict[str, float]:
-    """What the constants do on cases that they were not learned on: every fold by constants of the others."""
-    right = probability = count = 0.0
+@dataclass(frozen=True)
+class CrossValidated:
+    """What the constants do on cases that they were not learned on, every fold by constants of the others; ``stated``
+    are the names per case, before the map."""
+
+    cases: int
+    exactly_right: int
+    mean_log_probability: float
+    stated: Sequence[Sequence[StatedName]]
+
+
+def cross_validated(cases: Sequence[Case], learner: Callable[[Sequence[Case]], Constants] = learn) -> CrossValidated:
+    """The learner on cases that it has not seen."""
+    right, values, stated_names = 0, list[float](), list[Sequence[StatedName]]()
     for fold in range(FOLDS):
         held = [c for i, c in enumerate(cases) if i % FOLDS == fold]
         constants = learner([c for i, c in enumerate(cases) if i % FOLDS != fold])
         right += sum(c.right(constants) for c in held)
-        known = [c for c in held if c.kind != "unknown"]
-        probability += sum(c.log_probability(constants) for c in known)
-        count += len(known)
-    return {"cases": len(cases), "exactly_right": right, "mean_log_probability": probability / max(count, 1.0)}
+        values += [c.log_probability(constants) for c in held if c.kind != "unknown"]
+        stated_names += [list(raw_surenesses(constants, [c])) for c in held]
+    return CrossValidated(len(cases), right, float(np.mean(values)) if values else 0.0, stated_names)

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from hal.children import begin_as_worker, use_one_thread
-from tools.mismatch.engines import diagnose
 from tools.research.prove.guests import installed
 
 Diagnose = Callable[[Path], dict[str, Any]]
@@ -21,11 +20,12 @@ A = TypeVar("A")
 B = TypeVar("B")
 
 
-def tool(path: Path, engine: str | None = None) -> dict[str, Any]:
+def tool(path: Path) -> dict[str, Any]:
     """`micron mismatch diagnose` on one recording, in this process, one job: the JSON report."""
+    from tools.mismatch.infer import diagnose
     from tools.mismatch.recording_load import load
 
-    return as_plain(diagnose(load(path), engine=engine))
+    return as_plain(diagnose(load(path)))
 
 
 def as_plain(report: Any) -> dict[str, Any]:

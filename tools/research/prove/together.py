@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from tools.mismatch.engine.report import Report
-from tools.mismatch.engines import diagnose
+from tools.mismatch.infer import diagnose
 from tools.mismatch.recording import Part, Recording, Split
 from tools.mismatch.recording_load import load
 from tools.research.prove import disk, draw
@@ -65,7 +65,7 @@ def plan_of(seed: int, index: int, *, null: bool) -> draw.Plan:
     return draw.Plan("single", twin, (str(rng.choice([e for e in EFFECTS if e in TABLE[twin]])),), SEVERITY)
 
 
-def run_one(seed: int, index: int, max_samples: int, *, null: bool, engine: str | None = None) -> dict[str, Any]:
+def run_one(seed: int, index: int, max_samples: int, *, null: bool) -> dict[str, Any]:
     """Draw, cut and diagnose one family; what was said of it, as a row."""
     plan = plan_of(seed, index, null=null)
     row: dict[str, Any] = {"index": index, "null": null, "twin": plan.twin, "effect": ", ".join(plan.effects)}
@@ -79,11 +79,11 @@ def run_one(seed: int, index: int, max_samples: int, *, null: bool, engine: str 
     count = int(np.clip(recording.n // USUAL, LEAST, MOST))
     joined = family(recording, count)
     began = time.process_time()
-    report = diagnose(joined, jobs=1, engine=engine)
+    report = diagnose(joined, jobs=1)
     row |= {"drawn": True, "recordings": count, "samples": recording.n, **_said(report, plan.effects)}
     row["cpu_s"] = round(time.process_time() - began, 1)
     if not null:
-        row["alone"] = _said(diagnose(first_alone(joined), jobs=1, engine=engine), plan.effects)
+        row["alone"] = _said(diagnose(first_alone(joined), jobs=1), plan.effects)
     return row
 
 
@@ -129,7 +129,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--nulls", type=int, default=20)
     parser.add_argument("--seed", type=int, default=26)
     parser.add_argument("--samples", type=int, default=4000, help="most samples of a family")
-    parser.add_argument("--engine", help="old or new; the default one otherwise")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="begin no family after these")
     options = parser.parse_args(arguments)
     options.keep.mkdir(parents=True, exist_ok=True)
@@ -144,7 +143,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             continue
         if time.monotonic() - began > 60 * options.minutes:
             break
-        rows.append(run_one(options.seed, index, options.samples, null=null, engine=options.engine))
+        rows.append(run_one(options.seed, index, options.samples, null=null))
         with file.open("a") as out:
             out.write(json.dumps(rows[-1]) + "\n")
     print(table(rows))

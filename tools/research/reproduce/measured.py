@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from firmware_py.recording.revision import git_revision
 from tools.errors import InputError
-from tools.mismatch.engines import diagnose
+from tools.mismatch.infer import diagnose
 from tools.numbers import rms
 from tools.research.prove.disk import toml_text
 from tools.research.prove.runner import as_plain
@@ -54,9 +54,7 @@ def chosen(only: Sequence[str]) -> list[MeasuredSet]:
     return [s for s in SETS if not only or any(o in s.name for o in only)]
 
 
-def table(
-    only: Sequence[str] = (), rows_file: Path | None = None, engine: str | None = None, before: Path | None = None
-) -> Table:
+def table(only: Sequence[str] = (), rows_file: Path | None = None, before: Path | None = None) -> Table:
     """Run the sets and compare. ``rows_file`` (JSON) keeps each that is done; what it holds is not run again.
     ``before``: a result of an earlier run, whose rows stand for the other sets.
     """
@@ -70,7 +68,7 @@ def table(
         if s.name in found:
             continue
         with tempfile.TemporaryDirectory(prefix="micron-measured-") as tmp:
-            found[s.name] = score(s, Path(tmp), diagnosed, engine)
+            found[s.name] = score(s, Path(tmp), diagnosed)
         done = found[s.name]
         print(f"{s.name}: {done.verdict} {', '.join(done.named)} ({done.cpu_s:.0f} s of CPU)", file=sys.stderr)
         if rows_file is not None:
@@ -89,9 +87,7 @@ def _scored(name: str, kept: Mapping[str, Any]) -> Scored:
     return Scored(**{**kept, "name": name, "left": left})
 
 
-def score(
-    s: MeasuredSet, folder: Path, diagnosed: dict[str, tuple[dict[str, Any], float]], engine: str | None = None
-) -> Scored:
+def score(s: MeasuredSet, folder: Path, diagnosed: dict[str, tuple[dict[str, Any], float]]) -> Scored:
     """Diagnose the fit part of a set and score the sealed test. ``diagnosed``: reports that sets of one fit share."""
     from tools.mismatch.recording_load import load
 
@@ -101,7 +97,7 @@ def score(
     try:
         if key not in diagnosed:
             cpu = time.process_time()
-            report = as_plain(diagnose(load(fit), engine=engine))
+            report = as_plain(diagnose(load(fit)))
             diagnosed[key] = (report, time.process_time() - cpu)
         report, cpu_s = diagnosed[key]
         floors = report["fit"]["noise_floor_rms"]
@@ -142,7 +138,7 @@ def sealed(
 ) -> tuple[list[float], tuple[tuple[str, str, float], ...]]:
     """Residual rms on the sealed test, (as given, re-fitted, corrected), and what the last one follows."""
     from tools.mismatch.apply import corrected_twin
-    from tools.mismatch.engine.diagnose import opened
+    from tools.mismatch.engine.pose import opened
     from tools.mismatch.export.run import free_run
     from tools.mismatch.recording import TwinText
     from tools.mismatch.recording_load import load

@@ -47,7 +47,7 @@ SHOWN: dict[str, tuple[str, ...]] = {
     "mismatch-false-alarms": (),
     "mismatch-foreign": (),
     "mismatch-measured": (),
-    "mismatch-engines": ("The same cases", "Where they differ"),
+    "mismatch-gate": ("The same cases",),
 }
 """The results in the page's order, each with the sections (by the begin of their titles) that the page shows whole.
 

@@ -1,41 +1,28 @@
-"""From a recording to a report: the whole chain of decisions in order."""
+"""A recording made ready for a search; and after it, the fits once more in one run through the whole record."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from sim_devices.physics.catalogue import EFFECTS
 from sim_devices.physics.effect import Effect
-from tools.mismatch.engine.assemble import assemble
-from tools.mismatch.engine.checks import messages
-from tools.mismatch.engine.evidence import weigh_evidence
 from tools.mismatch.engine.fit import Fit, as_given, fit, fit_base
-from tools.mismatch.engine.forward import Work, forward
-from tools.mismatch.engine.hold import delay_is_hold, holdable, infer_hold, said_hold, with_hold
+from tools.mismatch.engine.hold import holdable, infer_hold, said_hold, with_hold
 from tools.mismatch.engine.join import joined
-from tools.mismatch.engine.many import compare_recordings, levelled, repeated_noise
+from tools.mismatch.engine.many import levelled, repeated_noise
 from tools.mismatch.engine.noise import noise_floor
-from tools.mismatch.engine.parsimony import Rule
 from tools.mismatch.engine.partition import SAMPLES, split_inside, splittable
 from tools.mismatch.engine.problem import Hint, Problem
 from tools.mismatch.engine.reduce import OVER_ALL, SLOW, VERY_LONG, excerpt, fitted_part, is_long, part_of, thinned_copy
-from tools.mismatch.engine.report import Hold, Report, Withheld
+from tools.mismatch.engine.report import Hold
 from tools.mismatch.engine.residual import residuals
 from tools.mismatch.engine.score import misfit
 from tools.mismatch.engine.screen import Candidate
-from tools.mismatch.engine.select import search
-from tools.mismatch.engine.selection import Selection
 from tools.mismatch.engine.split import Split, given_split, own_split, shot, split_of_parts
-from tools.mismatch.engine.trust import broken, stayed
-from tools.mismatch.engine.unexplained import Leftover, Stranger, about, lead, leftover, stranger
-from tools.mismatch.engine.verdict import Decision
-from tools.mismatch.engine.workers import mapped
+from tools.mismatch.engine.trust import stayed
 from tools.mismatch.placed import Placed
 from tools.mismatch.recording import Recording
 from tools.mismatch.simulate import Model
@@ -121,15 +108,6 @@ def restarting(twin: Twin, restart: bool) -> Twin:
     return replace(twin, restart=restart)
 
 
-def gross(recording: Recording, twin: Twin, raw: Fit) -> list[str]:
-    """Messages of the cheap checks, on the simulation as given."""
-    whole = View.whole(recording)
-    with np.errstate(all="ignore"):
-        simulated = raw.model.simulate(whole, raw.theta)
-    drives = {o: twin.drive(o) for o in twin.outputs}
-    return messages(recording.inputs, recording.outputs, recording.context, simulated, drives, recording.dt)
-
-
 def set_floors(problem: Problem, base: Fit) -> Problem:
     """Noise floors from the recalibrated residual."""
     rec = problem.recording
@@ -152,28 +130,6 @@ def set_floors(problem: Problem, base: Fit) -> Problem:
         if again is not None:
             floors[o] = replace(floors[o], rms=again, white_rms=min(floors[o].white_rms, again), method="repeats")
     return problem.with_floors(floors)
-
-
-def diagnose(
-    recording: Recording,
-    *,
-    held_out: float = 0.3,
-    seed: int = 0,
-    jobs: int = 2,
-    progress: Progress | None = None,
-    effects: Iterable[Effect] | None = None,
-    rule: Rule | None = None,
-) -> Report:
-    """Locate the mismatch between a recording and its twin, name the physics, fit it, and say how sure that is.
-
-    ``held_out`` share of the record that no fit sees; ``jobs`` processes. Same recording and seed: same report
-    (but for ``seconds``).
-    """
-    began = time.perf_counter()
-    # threads of the linear algebra spin against each other on small matrices: ten times slower, measured
-    with threadpool_limits(1):
-        report = _diagnose(recording, held_out, seed, jobs, progress, effects, rule or Rule())
-    return replace(report, seconds=time.perf_counter() - began)
 
 
 @dataclass(frozen=True)
@@ -225,103 +181,27 @@ def pose(
     return Posed(recording, catalogue, replace(problem, hints=hints), raw, base, hold)
 
 
-def _diagnose(
-    recording: Recording,
-    held_out: float,
-    seed: int,
-    jobs: int,
-    progress: Progress | None,
-    effects: Iterable[Effect] | None,
-    rule: Rule,
-) -> Report:
-    posed = pose(recording, held_out, seed, jobs, progress, effects, partial(one_way_forward, rule, jobs, progress))
-    recording, catalogue, problem, raw = posed.recording, posed.effects, posed.problem, posed.raw
-    base, hold, twin = posed.base, posed.hold, posed.problem.twin
-    stride = max(1, problem.fit_rows.size // 12000)
-    selection = search(problem, base, catalogue, rule=rule, stride=stride, jobs=jobs, progress=progress)
-    problem, strange = selection.problem, selection.strange
-    discarded = broken(problem, as_given(problem).residual, selection.fitted.theta, selection.fitted.residual)
-    if discarded:
-        selection = replace(selection, fitted=base, steps=(), rivals=())
-    if strange is None:
-        said = {t.name for t in selection.steps}
-        known = {s for t in selection.first for s in about(t.placed.effect)}
-        found = (stranger(problem, base, selection.fitted, o, said) for o in twin.outputs)
-        strange = next((f for f in found if f is not None and f.signal not in known), None)
-        if strange is not None:
-            # the effects only imitated it: nothing is named
-            selection = replace(selection, fitted=base, steps=(), rivals=(), strange=strange)
-    if hold is not None and hold.how == "assumed":
-        without_delay = delay_is_hold(problem, selection)
-        if without_delay is not None:
-            selection, hold = without_delay, Hold("zero", "instead_of_delay")
-            problem, base = selection.problem, selection.base
-            recording, twin = problem.recording, problem.twin
-    selection, withheld = weigh_evidence(problem, selection, catalogue)
-    fitted = selection.fitted
-    outputs = twin.outputs
-    remains: list[Leftover] = mapped(problem, leftover, [(problem, fitted, o) for o in outputs], jobs)
-    left = dict(zip(outputs, remains, strict=True))
-    leads: list[Stranger | None] = [strange]
-    if strange is None:
-        leads = mapped(problem, lead, [(problem, fitted, o) for o in outputs if left[o].real], jobs)
-    for found in leads:
-        if found is not None:
-            left[found.output] = left[found.output].led_by(found)
-    remarks = gross(recording, twin, raw)
-    if discarded:
-        remarks.append(f"{discarded} It was discarded, and nothing is named.")
-    posed = replace(posed, recording=recording, problem=problem, base=base, hold=hold)
-    ended = run_through(posed, selection, held_out)
-    return conclude(posed, ended, left, rule, remarks, jobs, withheld=withheld)
-
-
 @dataclass(frozen=True)
 class Ended:
     """A search whose fits run through the whole record. ``official``: the held-out part in one free run, where the
     decisions were made on shorter stretches."""
 
     base: Fit
-    selection: Selection
+    fitted: Fit
     official: Problem | None = None
 
 
-def run_through(posed: Posed, selection: Selection, held_out: float = 0.3) -> Ended:
+def run_through(posed: Posed, base: Fit, fitted: Fit, held_out: float = 0.3) -> Ended:
     """The fits as they are written down: the exported twin runs through, and what adds up over a whole run is fitted
     in one."""
-    problem, base, twin = posed.problem, posed.base, posed.problem.twin
+    problem, twin = posed.problem, posed.problem.twin
     if not twin.restart or problem.settle:
-        return Ended(base, selection)
+        return Ended(base, fitted)
     through = restarting(twin, False) if problem.split.own else twin
     whole = problem.split if problem.split.own else make_split(posed.recording, held_out, problem.seed, True)
     course = replace(problem, recording=posed.recording, twin=through, split=whole, hints=())
-    base = over_the_whole(problem, course, base)
-    selection = replace(selection, base=base, fitted=over_the_whole(problem, course, selection.fitted))
-    return Ended(base, selection, None if problem.split.own else course)
-
-
-def conclude(
-    posed: Posed,
-    ended: Ended,
-    left: dict[str, Leftover],
-    rule: Rule,
-    remarks: Sequence[str],
-    jobs: int,
-    *,
-    withheld: Sequence[Withheld] = (),
-    decision: Decision | None = None,
-) -> Report:
-    """The report of a finished search. ``decision``: the verdict where it was reached elsewhere; else ``judge``'s."""
-    problem, raw, base, selection = posed.problem, posed.raw, ended.base, ended.selection
-    report = assemble(
-        problem, raw, base, selection, left, posed.effects, rule, remarks, ended.official, jobs, withheld,
-        posed.hold, decision,
-    )  # fmt: skip
-    if posed.recording.parts:
-        # what is not named is not part of the model that recordings are compared under
-        named = selection.fitted if report.physics else base
-        report = replace(report, together=compare_recordings(problem, base, named, jobs))
-    return report
+    base, fitted = (over_the_whole(problem, course, f) for f in (base, fitted))
+    return Ended(base, fitted, None if problem.split.own else course)
 
 
 def opened(recording: Recording, held_out: float = 0.3, seed: int = 0) -> Recording:
@@ -470,17 +350,6 @@ def nominated(
     return tuple(e for e in catalogue if e.name in names), tuple(hints)
 
 
-def one_way_forward(
-    rule: Rule, jobs: int, progress: Progress | None, problem: Problem, base: Fit, allowed: tuple[Effect, ...]
-) -> tuple[set[str], list[Hint]]:
-    """A ``Look`` by one way forward: second thoughts are for the whole."""
-    stride = max(1, problem.fit_rows.size // 12000)
-    way = forward(problem, base, base, (), Work(allowed, rule, stride, jobs, progress))
-    trials = [*way.steps, *(t for rivals in way.rivals for t in rivals[:2])]
-    hints = [hint_of(t.placed, t.fitted) for t in trials if t.fitted is not None and may_hint(t.placed, t.candidate)]
-    return {t.name for t in trials}, hints
-
-
 def may_hint(placed: Placed, candidate: Candidate) -> bool:
     """Return True if what a part shows of an effect says where to begin on the whole: not what is about instants or the
     lattice of samples."""
@@ -492,6 +361,3 @@ def hint_of(placed: Placed, fitted: Fit) -> Hint:
     model, theta = fitted.model, fitted.theta
     nonlinear, weights = model.slices(model.placed.index(placed))
     return Hint(placed, theta[: model.n_base], (theta[nonlinear], theta[weights]))
-
-
-__all__ = ["diagnose"]
