@@ -87,17 +87,27 @@ wheel: setup
 	! grep "^tools/research/" out/wheel/files.txt
 	cd out/wheel && PYTHONPATH= venv/bin/micron --version && PYTHONPATH= venv/bin/micron run --virtual --seconds 2
 
-# coverage by branch of every room in one run. Kernels are left out (a tracer cannot see compiled code; their pure-Python
-# twins are tested), and so is what runs in processes of its own. Of the slow tests only the sample SLOW runs: the examples
-# of every command's help, which reach the commands, and diagnoses of whole recordings, which reach the mismatch engine
+# coverage by branch of every room, CORES folders of tests at a time: a run that was stopped goes on where it was, and begins
+# anew once a source has changed. Kernels are left out (a tracer cannot see compiled code; their pure-Python twins are
+# tested), and so is what runs in processes of its own. Of the slow tests only the sample SLOW runs: the examples of every
+# command's help, which reach the commands, and diagnoses of whole recordings, which reach the mismatch engine
+CORES ?= 2
 SLOW = tests/unit/cli/test_worked_examples.py tests/unit/mismatch_engine
-COVERAGE = $(BIN)/pytest -n 2 -q --ignore=tests/perf --cov --cov-append --cov-report= --cov-fail-under=0
+FOLDERS = $(filter-out tests/perf,$(patsubst %/,%,$(sort $(dir $(wildcard tests/*/test_*.py tests/unit/*/test_*.py)))))
+MEASURED = $(FOLDERS:%=out/coverage/%.data) $(SLOW:%=out/coverage/slow/%.data)
+SOURCES = $(shell git ls-files '*.py')
+out/coverage/slow/%.data: MARK = slow
+out/coverage/%.data: MARK = not slow and not realtime
+out/coverage/slow/%.data out/coverage/%.data: $(SOURCES)
+	mkdir -p $(@D) && rm -f $@.part
+	COVERAGE_FILE=$@.part $(BIN)/pytest -q -m "$(MARK)" $* --cov --cov-report= --cov-fail-under=0 || [ $$? -eq 5 ]
+	if [ -e $@.part ]; then mv $@.part $@; else touch $@; fi
 coverage: setup quality
-	rm -f .coverage
-	$(COVERAGE) -m "not slow and not realtime"
-	$(COVERAGE) -m slow $(SLOW)
+	$(MAKE) -j $(CORES) $(MEASURED)
+	$(BIN)/coverage combine -q --keep --data-file=out/coverage/all $$(find out/coverage -name '*.data' -size +0)
 	for room in hal:90 drivers:90 firmware_py:90 sim_devices:85 tools:85; do \
-	  $(BIN)/coverage report --include="$${room%:*}/*" --fail-under=$${room#*:} --skip-covered --sort=cover || exit 1; done
+	  $(BIN)/coverage report --data-file=out/coverage/all --include="$${room%:*}/*" --fail-under=$${room#*:} \
+	    --skip-covered --sort=cover || exit 1; done
 
 # does a test fail when a line is changed? minutes to an hour; make mutation ONLY="safety can" for some of it
 mutation: setup quality
